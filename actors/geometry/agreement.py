@@ -1,0 +1,141 @@
+"""Do the depth images of a recording agree with its camera poses?
+
+Each image alone may look sound in a wrong unit: 2600 is 2.6 m in millimetres and 52 cm in the
+fifths of millimetres of the TUM recordings.  Two views of one place decide: what one camera saw,
+carried to the other by the poses, must lie where the other saw it, and only at the right scale
+does it.  On five frames of a Redwood recording that span 10 cm the median disagreement is
+0.31 % in millimetres, 0.88 % if stored in fifths of them.
+"""
+
+from __future__ import annotations
+
+from itertools import combinations
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from actors.geometry.files import InputFileError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    import numpy.typing as npt
+
+    from actors.geometry.calibration import Intrinsics
+    from actors.geometry.recordings import RecordedFrame
+
+UNITS: Final = {0.1: "tenths of millimetres", 0.2: "fifths of millimetres (TUM)", 10.0: "cm"}
+"""Other units in use, as millimetres per step."""
+
+DISAGREEMENT_NORMAL: Final = 0.005
+"""Median relative disagreement below which nothing is asked further."""
+
+DISAGREEMENT_MAX: Final = 0.10
+"""Median relative disagreement of two near views above which poses and depth do not belong
+together; noise of a depth camera stays below 0.03."""
+
+FRAMES_COMPARED_MAX: Final = 40
+"""Frames looked at, evenly spread, so that a long recording costs no more than a short one."""
+
+
+def check_agreement(
+    directory: Path, frames: Sequence[RecordedFrame], intrinsics: Intrinsics
+) -> None:
+    """Refuse depth in a unit, or poses of a kind, that contradict each other.
+
+    Says nothing when no two views are near enough to be compared.
+
+    Args:
+        directory: The recording, for the message.
+        frames: With depth in what should be millimetres.
+        intrinsics: Of the depth images.
+
+    Raises:
+        InputFileError: Another unit fits much better, the poses fit when inverted, or nothing
+            fits.
+    """
+    pair = _widest_near_pair(frames)
+    if pair is None:
+        return
+    poses = pair[0].world_from_camera, pair[1].world_from_camera
+    inverse = np.linalg.inv(poses[0]), np.linalg.inv(poses[1])
+    now = _disagreement(pair, poses, intrinsics, scale=1.0)
+    if np.isnan(now) or now <= DISAGREEMENT_NORMAL:
+        return
+    between = f"frames {pair[0].name} and {pair[1].name} disagree by {now:.1%}"
+    others = [(_disagreement(pair, poses, intrinsics, scale=s), s) for s in UNITS]
+    others.append((_disagreement(pair, inverse, intrinsics, scale=1.0), 0.0))
+    then, scale = min((other for other in others if not np.isnan(other[0])), default=(now, 1.0))
+    if then < 0.6 * now and scale > 0.0:
+        raise InputFileError(
+            directory,
+            asked="depth in millimetres",
+            found=f"{UNITS[scale]}: {between} as millimetres and by {then:.1%} as these",
+            remedy=f"multiply the depth images by {scale:g}",
+        )
+    if then < 0.6 * now:
+        raise InputFileError(
+            directory / "trajectory.log",
+            asked="poses world_from_camera",
+            found=f"camera_from_world: {between}, and by {then:.1%} with the poses inverted",
+            remedy="invert each matrix",
+        )
+    if now > DISAGREEMENT_MAX:
+        raise InputFileError(
+            directory / "trajectory.log",
+            asked="poses in metres that agree with the depth images",
+            found=f"that {between}",
+            remedy="poses and images are of different recordings, or the poses not in metres",
+        )
+
+
+def _widest_near_pair(
+    frames: Sequence[RecordedFrame],
+) -> tuple[RecordedFrame, RecordedFrame] | None:
+    """Return the two frames farthest apart among those that must see the same surfaces.
+
+    They do if they look within 25 degrees the same way from within a quarter of their depth.
+    """
+    step = max(1, len(frames) // FRAMES_COMPARED_MAX)
+    chosen = frames[::step]
+    depth_m = [float(np.median(f.depth_mm[f.depth_mm > 0])) / 1000.0 for f in chosen]
+    best, best_baseline_m = None, 0.005
+    for (i, a), (j, b) in combinations(enumerate(chosen), 2):
+        same_way = a.world_from_camera[:3, 2] @ b.world_from_camera[:3, 2] > np.cos(np.radians(25))
+        baseline_m = np.linalg.norm(a.world_from_camera[:3, 3] - b.world_from_camera[:3, 3])
+        near = baseline_m < 0.25 * min(depth_m[i], depth_m[j])
+        if same_way and near and baseline_m > best_baseline_m:
+            best, best_baseline_m = (a, b), float(baseline_m)
+    return best
+
+
+def _disagreement(
+    pair: tuple[RecordedFrame, RecordedFrame],
+    poses: tuple[npt.NDArray[Any], npt.NDArray[Any]],
+    intrinsics: Intrinsics,
+    *,
+    scale: float,
+) -> float:
+    """Return the median relative difference of depth, first view carried to the second."""
+    here, there = (frame.depth_mm * (scale / 1000.0) for frame in pair)
+    v, u = np.mgrid[0 : intrinsics.height : 6, 0 : intrinsics.width : 6].reshape(2, -1)
+    z = here[v, u]
+    u, v, z = u[z > 0], v[z > 0], z[z > 0]
+    point = np.stack(
+        [
+            (u - intrinsics.cx) / intrinsics.fx * z,
+            (v - intrinsics.cy) / intrinsics.fy * z,
+            z,
+            np.ones_like(z),
+        ]
+    )
+    x, y, z = (np.linalg.inv(poses[1]) @ poses[0] @ point)[:3]
+    front = z > 1e-6
+    x, y, z = x[front], y[front], z[front]
+    column = np.rint(x / z * intrinsics.fx + intrinsics.cx)
+    row = np.rint(y / z * intrinsics.fy + intrinsics.cy)
+    inside = (column >= 0) & (row >= 0) & (column < intrinsics.width) & (row < intrinsics.height)
+    seen = there[row[inside].astype(int), column[inside].astype(int)]
+    difference = np.abs(z[inside] - seen)[seen > 0] / seen[seen > 0]
+    return float(np.median(difference)) if difference.size >= 100 else float("nan")
