@@ -1,0 +1,240 @@
+"""Static check of a cell's actors: who reads and writes what, before any of them runs.
+
+Reported are (error: `enact up` refuses; warning: it starts):
+
+=======  ===================  ===================================================================
+level    kind                 what
+=======  ===================  ===================================================================
+error    unbound role         a role that no world context is bound to
+error    unknown role         a binding for a role that the actor does not have
+error    unknown world        a world context that the cell does not list
+error    unknown aspect       an aspect that the cell does not list
+error    two types            one aspect name with two datum types
+error    own trigger          an actor that, as bound, writes what triggers it
+error    two writers          two actors that write one slot, not both declaring it as `shared`
+warning  unwritten trigger    a trigger that no actor writes: only a write from outside runs it
+warning  unwritten read       a reading request for data that no actor writes
+=======  ===================  ===================================================================
+
+"World contexts" and "aspects" are checked only where the cell lists any.  What a patterned write
+without `Each` can reach is narrowed by what triggers its actor only as far as the pattern says.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+from enact_dist.actor import same_data
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+
+    from enact_dist.actor import Actor, Declared
+
+Level = Literal["error", "warning"]
+
+
+@dataclass(frozen=True, slots=True)
+class ActorDeclaration:
+    """One actor of a cell: under which name it runs, its class, what its roles are bound to.
+
+    `worlds` None binds each role to the world context of the same name, as running it does.
+    """
+
+    name: str
+    actor_class: type[Actor]
+    worlds: Mapping[str, str] | None = None
+
+    def world_of(self, role: str) -> str | None:
+        """Return the world context that a role is bound to."""
+        return role if self.worlds is None else self.worlds.get(role)
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing that is wrong, or likely so, with the actors of a cell.
+
+    Attributes:
+        level: "error" or "warning".
+        kind: As in the table of this module.
+        actors: Names of the actors concerned.
+        text: What was found and what to do.
+    """
+
+    level: Level
+    kind: str
+    actors: tuple[str, ...]
+    text: str
+
+    def __str__(self) -> str:
+        return f"{self.level}: {self.kind}: {self.text}"
+
+
+@dataclass(frozen=True, slots=True)
+class _Use:
+    """One declared request of one actor, its role bound."""
+
+    actor: ActorDeclaration
+    name: str
+    request: Declared
+    world: str
+
+    @property
+    def shared(self) -> bool:
+        return self.request in self.actor.actor_class.declaration.shared
+
+    def meets(self, other: _Use) -> bool:
+        return self.world == other.world and same_data(self.request, other.request)
+
+    def __str__(self) -> str:
+        _, entity, aspect = self.request.address
+        access = type(self.request).__name__
+        return f"{self.actor.name}.{self.name} ({access} {self.world}/{entity} {aspect})"
+
+
+def check_actors(
+    actors: Sequence[ActorDeclaration],
+    *,
+    worlds: Collection[str] = (),
+    aspects: Collection[str] = (),
+    initial: Collection[str] = (),
+) -> tuple[Finding, ...]:
+    """Check all declared reads and writes of a cell against each other.
+
+    Args:
+        actors: Every actor that runs in the cell.
+        worlds: World contexts of the cell; empty: any.
+        aspects: Aspects that the cell lists; empty: any.
+        initial: Names of aspects that are written from outside (`init`, other programs).
+
+    Returns:
+        Errors first, each kind in the order of `actors`.
+    """
+    uses = [use for actor in actors for use in _uses_of(actor)]
+    findings = [
+        *_roles(actors, worlds),
+        *_aspects(uses, aspects),
+        *_types(uses),
+        *_own_triggers(uses),
+        *_writers(uses),
+        *_unwritten(uses, initial),
+    ]
+    return tuple(sorted(findings, key=lambda finding: finding.level != "error"))
+
+
+def _uses_of(actor: ActorDeclaration) -> Iterator[_Use]:
+    for name, request in actor.actor_class.declaration.requests.items():
+        world = actor.world_of(request.world.name)
+        if world is not None:
+            yield _Use(actor, name, request, world)
+
+
+def _roles(actors: Iterable[ActorDeclaration], worlds: Collection[str]) -> Iterator[Finding]:
+    for actor in actors:
+        roles = actor.actor_class.declaration.roles
+        for role in roles:
+            world = actor.world_of(role)
+            if world is None:
+                yield Finding(
+                    "error",
+                    "unbound role",
+                    (actor.name,),
+                    f"role {role} of actor {actor.name} is bound to no world context; bind it"
+                    f" with worlds = {{ {role} = NAME }}, or --world {role}=NAME",
+                )
+            elif worlds and world not in worlds:
+                yield Finding(
+                    "error",
+                    "unknown world",
+                    (actor.name,),
+                    f"role {role} of actor {actor.name} is bound to {world}, which the cell does"
+                    f" not have; it has {', '.join(sorted(worlds))}",
+                )
+        for role in actor.worlds or ():
+            if role not in roles:
+                yield Finding(
+                    "error",
+                    "unknown role",
+                    (actor.name,),
+                    f"actor {actor.name} has no role {role}; it has {', '.join(roles)}",
+                )
+
+
+def _aspects(uses: Iterable[_Use], aspects: Collection[str]) -> Iterator[Finding]:
+    for use in uses:
+        aspect = use.request.aspect.name
+        if aspects and aspect not in aspects:
+            yield Finding(
+                "error",
+                "unknown aspect",
+                (use.actor.name,),
+                f"{use} uses the aspect {aspect}, which the cell does not list; it lists"
+                f" {', '.join(sorted(aspects))}",
+            )
+
+
+def _types(uses: Iterable[_Use]) -> Iterator[Finding]:
+    from enact_dist.wire.fingerprint import fingerprint
+
+    first: dict[str, tuple[_Use, str]] = {}
+    for use in uses:
+        aspect = use.request.aspect
+        found = fingerprint(aspect.datum_type)
+        other, wanted = first.setdefault(aspect.name, (use, found))
+        if found != wanted:
+            yield Finding(
+                "error",
+                "two types",
+                (other.actor.name, use.actor.name),
+                f"aspect {aspect.name} is {wanted} for {other}, but {found} for {use}",
+            )
+
+
+def _own_triggers(uses: Sequence[_Use]) -> Iterator[Finding]:
+    for use in uses:
+        if use.request not in use.actor.actor_class.declaration.triggers:
+            continue
+        for other in uses:
+            if other.actor is use.actor and other.request.access.writes and other.meets(use):
+                yield Finding(
+                    "error",
+                    "own trigger",
+                    (use.actor.name,),
+                    f"{other} writes what {use} triggers on, so each update causes the next one;"
+                    " bind the roles to different world contexts",
+                )
+
+
+def _writers(uses: Sequence[_Use]) -> Iterator[Finding]:
+    writes = [use for use in uses if use.request.access.writes]
+    for index, one in enumerate(writes):
+        for other in writes[index + 1 :]:
+            if one.actor is other.actor or not one.meets(other) or (one.shared and other.shared):
+                continue
+            yield Finding(
+                "error",
+                "two writers",
+                (one.actor.name, other.actor.name),
+                f"{one} and {other} can write one slot, and the later one hides the other's datum;"
+                " give each its own, or list the request in `shared` of both classes if each"
+                " keeps what the other wrote",
+            )
+
+
+def _unwritten(uses: Sequence[_Use], initial: Collection[str]) -> Iterator[Finding]:
+    writes = [use for use in uses if use.request.access.writes]
+    for use in uses:
+        request = use.request
+        if request.access.writes or request.aspect.name in initial:
+            continue
+        if any(write.meets(use) for write in writes):
+            continue
+        triggers = request in use.actor.actor_class.declaration.triggers
+        yield Finding(
+            "warning",
+            "unwritten trigger" if triggers else "unwritten read",
+            (use.actor.name,),
+            f"no actor of the cell writes what {use} {'waits for' if triggers else 'reads'};"
+            " it stays null unless something outside writes it",
+        )

@@ -1,0 +1,184 @@
+"""`MODULE:CLASS` and options, as a command line or `cell.toml` writes them, made into an actor.
+
+An option is a keyword parameter of the class's `__init__`; its annotation says how the text is
+read.  Everything wrong is a `ConfigError` that names the parameter, the text and what was wanted.
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import inspect
+import math
+import types
+import typing
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.actor import Actor
+from enact_dist.errors import ConfigError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+OptionValue = str | int | float | bool
+"""An option as a command line (text) or a TOML file (text, number, truth value) gives it."""
+
+_TRUTH: Final = {"true": True, "yes": True, "1": True, "false": False, "no": False, "0": False}
+_WANTED: Final[Mapping[object, str]] = {
+    int: "a whole number",
+    float: "a finite number",
+    bool: "true or false",
+    str: "a text",
+    Path: "a path",
+}
+
+
+def load_class(target: str) -> type[Actor]:
+    """Return the actor class that `target` names.
+
+    Args:
+        target: ``MODULE:CLASS``, for example ``actors.palletizing.deviation:DeviationDetection``.
+
+    Raises:
+        ConfigError: Not of that form, no such module or class, or the class is no `Actor`.
+        MisuseError: The class declares something that cannot work.
+    """
+    module_name, colon, class_name = target.partition(":")
+    if not colon or not module_name or not class_name.isidentifier():
+        raise ConfigError(
+            f"{target!r} names no actor; write MODULE:CLASS, for example"
+            " actors.palletizing.deviation:DeviationDetection"
+        )
+    try:
+        module = importlib.import_module(module_name)
+    except ModuleNotFoundError as error:
+        if error.name is None or not f"{module_name}.".startswith(f"{error.name}."):
+            raise ConfigError(
+                f"{module_name} of actor {target!r} cannot be imported: it needs the module"
+                f" {error.name}, which is not installed; the actors of this repository need"
+                " pip install 'enact-dist[actors]'"
+            ) from error
+        raise ConfigError(
+            f"no module {error.name} for actor {target!r}; run from the folder that holds it, or"
+            " install its package"
+        ) from error
+    found = getattr(module, class_name, None)
+    if not isinstance(found, type) or not issubclass(found, Actor):
+        actors = [
+            name
+            for name, value in vars(module).items()
+            if isinstance(value, type) and issubclass(value, Actor) and value is not Actor
+        ]
+        kind = "no actor class" if found is None else f"{found!r}, which is no subclass of Actor"
+        raise ConfigError(
+            f"{module_name} has {kind} under the name {class_name!r}; its actors:"
+            f" {', '.join(actors) or 'none'}{_suggestion(class_name, actors)}"
+        )
+    return found
+
+
+def load_actor(target: str, options: Mapping[str, OptionValue] | None = None) -> Actor:
+    """Make the actor that `target` names, its options read by the annotations of `__init__`.
+
+    ::
+
+        load_actor("actors.palletizing.deviation:DeviationDetection", {"tolerance_m": "0.003"})
+
+    Args:
+        target: ``MODULE:CLASS``.
+        options: Parameter name → value; text is converted, numbers and truth values are checked.
+
+    Raises:
+        ConfigError: See `load_class`; an unknown, missing or unreadable option.
+        MisuseError: The class declares something that cannot work.
+    """
+    return make_actor(load_class(target), options or {})
+
+
+def make_actor(actor_class: type[Actor], options: Mapping[str, OptionValue]) -> Actor:
+    """Make an actor of a class from options.
+
+    Raises:
+        ConfigError: An unknown, missing or unreadable option, or `__init__` refused a value.
+    """
+    parameters = {
+        name: parameter
+        for name, parameter in inspect.signature(actor_class).parameters.items()
+        if parameter.kind in (parameter.POSITIONAL_OR_KEYWORD, parameter.KEYWORD_ONLY)
+    }
+    name = actor_class.__name__
+    for option in options:
+        if option not in parameters:
+            raise ConfigError(
+                f"actor {name} has no option {option!r}; it has"
+                f" {', '.join(parameters) or 'none'}{_suggestion(option, parameters)}"
+            )
+    missing = [
+        option
+        for option, parameter in parameters.items()
+        if parameter.default is parameter.empty and option not in options
+    ]
+    if missing:
+        raise ConfigError(f"actor {name} needs the option {', '.join(missing)}")
+    hints = typing.get_type_hints(actor_class.__init__)
+    arguments = {
+        option: read_option(f"option {option} of actor {name}", value, hints.get(option, str))
+        for option, value in options.items()
+    }
+    try:
+        return actor_class(**arguments)
+    except ValueError as error:
+        raise ConfigError(f"actor {name} refuses its options {dict(options)}: {error}") from error
+
+
+def read_option(
+    where: str, value: OptionValue, annotation: object
+) -> int | float | bool | str | Path | None:
+    """Return `value` as the type that `annotation` asks for.
+
+    Args:
+        where: What is read, for messages.
+        value: Text, or a number or truth value that is already of its type.
+        annotation: `int`, `float`, `bool`, `str`, `Path`, or one of these ``| None``; the text
+            ``none`` then gives None.
+
+    Raises:
+        ConfigError: The value is not of that type, or no option can be.
+    """
+    if typing.get_origin(annotation) in (typing.Union, types.UnionType):
+        kinds = [kind for kind in typing.get_args(annotation) if kind is not type(None)]
+        if len(kinds) == 1:
+            return None if value == "none" else read_option(where, value, kinds[0])
+    if annotation not in _WANTED:
+        raise ConfigError(
+            f"{where} is annotated {annotation!r}; options are int, float, bool, str or Path,"
+            " each also | None"
+        )
+    read = _read(value, annotation)
+    if read is None:
+        raise ConfigError(f"{where} is {value!r}; it must be {_WANTED[annotation]}")
+    return read
+
+
+def _read(value: OptionValue, kind: object) -> int | float | bool | str | Path | None:
+    if kind is bool:
+        return value if isinstance(value, bool) else _TRUTH.get(str(value).lower())
+    if isinstance(value, bool):
+        return None
+    if kind is str or kind is Path:
+        if not isinstance(value, str):
+            return None
+        return value if kind is str else Path(value).expanduser()
+    try:
+        number = int(value, 0) if kind is int and isinstance(value, str) else float(value)
+    except ValueError:
+        return None
+    if not math.isfinite(number) or (kind is int and number != int(number)):
+        return None
+    return int(number) if kind is int else number
+
+
+def _suggestion(name: str, known: Iterable[str]) -> str:
+    close = difflib.get_close_matches(name, list(known), n=1)
+    return f"; did you mean {close[0]!r}?" if close else ""

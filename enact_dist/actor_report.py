@@ -1,0 +1,210 @@
+"""What a running actor reports of itself: counters, rates, lock waits, its last error.
+
+`ActorStatistics` is a snapshot; `ActorRecord` collects (PURE: time arrives as an argument);
+`encode_reports` and `decode_reports` carry the snapshots of all actors of one process through
+the session's keep-alive to `enact actor ls`.
+
+Nothing here grows: rates come from the newest `STAMPS_MAX` updates, lock waits from the newest
+`WAITS_MAX`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import deque
+from dataclasses import dataclass
+from typing import Final
+
+import msgpack
+
+from enact_dist.errors import ProtocolError
+
+REPORT_VERSION: Final = 1
+RATE_WINDOW_NS: Final = 5_000_000_000
+"""Rates are over the last 5 s: long enough for 1 Hz sources, short enough to see a stall."""
+STAMPS_MAX: Final = 512
+WAITS_MAX: Final = 512
+ERROR_LENGTH_MAX: Final = 500
+"""Longest error text in a report; the whole one is in the actor's log."""
+
+
+@dataclass(frozen=True, slots=True)
+class ActorStatistics:
+    """What an actor has done so far.
+
+    Attributes:
+        name: Name of the running actor.
+        state: "starting", "running", "done" (a once-actor that finished) or "stopped".
+        updates: Updates that committed.
+        skipped: States of trigger data that no update saw because a newer one came first.
+        failures: Updates that ended with an exception of their own.
+        refused: Attempts that ended outside the actor's code: lock not granted in time, lease
+            lost, shard away, viewed datum changed.  Each is tried again later.
+        unknown: Commits that were never answered and may stand (`CommitUnknownError`).
+        missed: Ticks of a source that never ran, or ran in vain.
+        last_error: Newest error as "Class: text", or the empty string.
+        rate_hz: Updates per second, over the last 5 s.
+        last_update_s: How long the newest update took, without the wait for its lock.
+        last_update_unix_s: When it ended, seconds since 1970 by the actor's clock; 0 if none.
+        lock_wait_p50_ms: Median wait for the lock over the newest 512 attempts.
+        lock_wait_p99_ms: 99th percentile of the same.
+    """
+
+    name: str = ""
+    state: str = "starting"
+    updates: int = 0
+    skipped: int = 0
+    failures: int = 0
+    refused: int = 0
+    unknown: int = 0
+    missed: int = 0
+    last_error: str = ""
+    rate_hz: float = 0.0
+    last_update_s: float = 0.0
+    last_update_unix_s: float = 0.0
+    lock_wait_p50_ms: float = 0.0
+    lock_wait_p99_ms: float = 0.0
+
+
+class RateMeter:
+    """Events per second over the last `RATE_WINDOW_NS`."""
+
+    __slots__ = ("_stamps_ns", "_start_ns")
+
+    def __init__(self, *, start_ns: int) -> None:
+        self._start_ns = start_ns
+        self._stamps_ns: deque[int] = deque(maxlen=STAMPS_MAX)
+
+    def count(self, now_ns: int) -> None:
+        """Count one event."""
+        self._stamps_ns.append(now_ns)
+
+    def rate_hz(self, now_ns: int) -> float:
+        """Return the rate as of `now_ns`; over the time since the start while that is shorter."""
+        since_ns = max(self._start_ns, now_ns - RATE_WINDOW_NS)
+        if len(self._stamps_ns) == STAMPS_MAX:
+            # A full ring reaches back less than the window: older events are unknown, not absent.
+            since_ns = max(since_ns, self._stamps_ns[0])
+        recent = sum(1 for stamp_ns in tuple(self._stamps_ns) if stamp_ns >= since_ns)
+        span_s = max(now_ns - since_ns, 1_000_000) / 1e9
+        return recent / span_s
+
+
+class ActorRecord:
+    """Collects what `ActorStatistics` shows.  One thread writes it, any may take a snapshot."""
+
+    __slots__ = (
+        "_failures",
+        "_last_error",
+        "_last_update_ns",
+        "_last_update_unix_ns",
+        "_missed",
+        "_name",
+        "_rate",
+        "_refused",
+        "_unknown",
+        "_updates",
+        "_waits_ns",
+        "skipped",
+        "state",
+    )
+
+    def __init__(self, name: str, *, now_ns: int) -> None:
+        self._name = name
+        self.state = "starting"
+        self.skipped = 0
+        self._updates = self._failures = self._refused = self._unknown = self._missed = 0
+        self._last_error = ""
+        self._last_update_ns = self._last_update_unix_ns = 0
+        self._rate = RateMeter(start_ns=now_ns)
+        self._waits_ns: deque[int] = deque(maxlen=WAITS_MAX)
+
+    def waited(self, wait_ns: int) -> None:
+        """Record how long a lock took to be granted or refused."""
+        self._waits_ns.append(wait_ns)
+
+    def updated(self, *, took_ns: int, now_ns: int, wall_ns: int) -> None:
+        """Record an update that committed."""
+        self._updates += 1
+        self._last_update_ns = took_ns
+        self._last_update_unix_ns = wall_ns
+        self._rate.count(now_ns)
+
+    def failed(self, error: BaseException) -> None:
+        """Record an update that ended with an exception of its own."""
+        self._failures += 1
+        self._keep(error)
+
+    def refused(self, error: BaseException, *, unknown: bool) -> None:
+        """Record an attempt that ended outside the actor's code."""
+        self._refused += 1
+        self._unknown += unknown
+        self._keep(error)
+
+    def missed(self, ticks: int) -> None:
+        """Record ticks of a source that did not run, or ran in vain."""
+        self._missed += ticks
+
+    def snapshot(self, now_ns: int) -> ActorStatistics:
+        """Return what was recorded so far."""
+        waits_ns = sorted(self._waits_ns)
+        return ActorStatistics(
+            name=self._name,
+            state=self.state,
+            updates=self._updates,
+            skipped=self.skipped,
+            failures=self._failures,
+            refused=self._refused,
+            unknown=self._unknown,
+            missed=self._missed,
+            last_error=self._last_error,
+            rate_hz=round(self._rate.rate_hz(now_ns), 3),
+            last_update_s=self._last_update_ns / 1e9,
+            last_update_unix_s=self._last_update_unix_ns / 1e9,
+            lock_wait_p50_ms=percentile(waits_ns, 0.50) / 1e6,
+            lock_wait_p99_ms=percentile(waits_ns, 0.99) / 1e6,
+        )
+
+    def _keep(self, error: BaseException) -> None:
+        self._last_error = f"{type(error).__name__}: {error}"[:ERROR_LENGTH_MAX]
+
+
+def percentile(ascending: list[int], part: float) -> int:
+    """Return the smallest entry that at least `part` of all entries do not exceed; 0 of none."""
+    if not ascending:
+        return 0
+    rank = -(-len(ascending) * round(part * 1000) // 1000)
+    return ascending[max(0, rank - 1)]
+
+
+def encode_reports(reports: list[ActorStatistics]) -> bytes:
+    """Return the reports of all actors of one session as msgpack."""
+    rows = [dataclasses.asdict(report) for report in reports]
+    encoded: bytes = msgpack.packb({"version": REPORT_VERSION, "actors": rows})
+    return encoded
+
+
+def decode_reports(report: bytes) -> tuple[ActorStatistics, ...]:
+    """Return what `encode_reports` packed; nothing of an empty report.
+
+    Fields that this version does not know are passed over, so that an older `enact actor ls`
+    still shows a newer actor.
+
+    Raises:
+        ProtocolError: These bytes are no actor report.
+    """
+    if not report:
+        return ()
+    blank = dataclasses.asdict(ActorStatistics())
+    try:
+        rows = msgpack.unpackb(report)["actors"]
+        return tuple(
+            ActorStatistics(
+                **{name: type(blank[name])(found) for name, found in row.items() if name in blank}
+            )
+            for row in rows
+        )
+    except (ValueError, TypeError, KeyError, AttributeError, msgpack.UnpackException) as error:
+        raise ProtocolError(
+            f"{len(report)} bytes {bytes(report[:16])!r}… are no actor report: {error}"
+        ) from error

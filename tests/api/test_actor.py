@@ -1,0 +1,163 @@
+"""What an actor class may declare, and what is refused when the class is made."""
+
+from __future__ import annotations
+
+import pytest
+
+from enact_dist.actor import Actor, Declaration
+from enact_dist.errors import MisuseError
+from enact_dist.terms import (
+    Aspect,
+    Context,
+    Entities,
+    Entity,
+    Read,
+    ReadEach,
+    View,
+    World,
+    Write,
+    WriteEach,
+)
+
+training, online = World("training"), World("online")
+PRODUCTS, SYSTEM = Entities("product/*"), Entity("system")
+SURFACE, FLAGS, COUNT = Aspect("surface", str), Aspect("flags", dict), Aspect("count", int)
+
+
+def declared(**attributes: object) -> Declaration:
+    """Make an actor class named `Sample` with these attributes and an update."""
+    attributes.setdefault("update", lambda _self, _lock: None)
+    return type("Sample", (Actor,), attributes).declaration
+
+
+def test_declaration_holds_requests_roles_and_triggers_when_the_class_is_made():
+    """The class attributes that are lock requests are the declared lock, in their order."""
+    reference, observed = View(training, PRODUCTS, SURFACE), View(online, PRODUCTS, SURFACE)
+    flags = Write(online, SYSTEM, FLAGS)
+
+    found = declared(reference=reference, observed=observed, flags=flags, triggers=[observed])
+
+    assert dict(found.requests) == {"reference": reference, "observed": observed, "flags": flags}
+    assert found.triggers == (observed,)
+    assert found.roles == ("training", "online")
+    assert found.per_entity
+
+
+def test_declaration_depends_on_no_entity_when_only_sets_and_single_entities_are_named():
+    """One run sees everything that an Each-request reads."""
+    views = ReadEach(training, Entities("view/*"), SURFACE)
+
+    found = declared(views=views, product=Write(training, SYSTEM, SURFACE), triggers=(views,))
+
+    assert not found.per_entity
+
+
+def test_declaration_is_inherited_and_overridden_by_attribute_name():
+    """A subclass has its base's requests; an attribute of the same name replaces one."""
+
+    class Base(Actor):
+        cloud = View(online, SYSTEM, SURFACE)
+        count = Write(online, SYSTEM, COUNT)
+
+    class Derived(Base):
+        cloud = View(training, SYSTEM, SURFACE)
+
+        def update(self, lock):
+            pass
+
+    assert set(Derived.declaration.requests) == {"cloud", "count"}
+    assert Derived.declaration.requests["cloud"].world.name == "training"
+
+
+def test_declaration_covers_an_entity_only_when_every_pattern_without_each_matches():
+    """An entity that one request cannot stand for triggers nothing."""
+    seen = View(online, Entities("**"), SURFACE)
+
+    found = declared(seen=seen, mark=Write(online, PRODUCTS, FLAGS), triggers=[seen])
+
+    assert found.covers(Entity("product/1"))
+    assert not found.covers(Entity("tray/1"))
+
+
+@pytest.mark.parametrize(
+    ("attributes", "message"),
+    [
+        pytest.param(
+            {"cloud": View(Context("online"), SYSTEM, SURFACE)},
+            r"Sample\.cloud names Context\('online'\).*roles such as World\(\"online\"\)",
+            id="context instead of role",
+        ),
+        pytest.param(
+            {"cloud": View(online, SYSTEM, SURFACE), "triggers": [View(online, SYSTEM, FLAGS)]},
+            r"Sample\.triggers\[0\].*no request of this class; it declares cloud",
+            id="undeclared trigger",
+        ),
+        pytest.param(
+            {"flags": Write(online, SYSTEM, FLAGS), "triggers": [Write(online, SYSTEM, FLAGS)]},
+            r"Sample\.triggers\[0\].*only a Read, View, ReadEach or ViewEach can trigger",
+            id="writing trigger",
+        ),
+        pytest.param(
+            {"cloud": View(online, SYSTEM, SURFACE), "triggers": "cloud"},
+            r"Sample\.triggers is 'cloud'",
+            id="text for triggers",
+        ),
+        pytest.param(
+            {
+                "cloud": View(online, SYSTEM, SURFACE),
+                "triggers": [View(online, SYSTEM, SURFACE)],
+                "every_s": 0.1,
+            },
+            "both triggers and every_s",
+            id="data and time",
+        ),
+        pytest.param(
+            {"flags": Write(online, SYSTEM, FLAGS), "every_s": 0.0},
+            r"Sample\.every_s is 0\.0",
+            id="no period",
+        ),
+        pytest.param(
+            {"flags": Write(online, SYSTEM, FLAGS), "every_s": "1"},
+            r"Sample\.every_s is '1'",
+            id="text for a period",
+        ),
+        pytest.param(
+            {"read": Read(online, SYSTEM, FLAGS), "write": Write(online, SYSTEM, FLAGS)},
+            "one datum with different accesses",
+            id="two accesses",
+        ),
+        pytest.param(
+            {
+                "seen": View(online, PRODUCTS, SURFACE),
+                "make": WriteEach(online, Entities("**"), SURFACE),
+                "triggers": [View(online, PRODUCTS, SURFACE)],
+            },
+            r"Sample\.make writes what Sample\.seen triggers on",
+            id="own trigger",
+        ),
+        pytest.param(
+            {"cloud": View(online, PRODUCTS, SURFACE), "every_s": 0.1},
+            r"Sample\.cloud.*has no triggers; name one entity, or use ViewEach",
+            id="pattern without trigger",
+        ),
+        pytest.param(
+            {
+                "seen": View(online, PRODUCTS, SURFACE),
+                "mark": Write(online, Entities("tray/*"), FLAGS),
+                "triggers": [View(online, PRODUCTS, SURFACE)],
+            },
+            r"Sample\.mark.*no entity that triggers through Sample\.seen.*WriteEach",
+            id="patterns apart",
+        ),
+        pytest.param({}, "declares no lock request", id="no request"),
+        pytest.param(
+            {"cloud": View(online, SYSTEM, SURFACE), "shared": [View(online, SYSTEM, SURFACE)]},
+            r"Sample\.shared\[0\].*only a Write or WriteEach",
+            id="shared read",
+        ),
+    ],
+)
+def test_declaration_is_refused_when_it_cannot_work(attributes: dict[str, object], message: str):
+    """Each impossible declaration is a `MisuseError` that names class and attribute."""
+    with pytest.raises(MisuseError, match=message):
+        declared(**attributes)

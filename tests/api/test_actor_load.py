@@ -1,0 +1,110 @@
+"""MODULE:CLASS and options made into actors; every mistake has its own words."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from enact_dist.actor import Actor
+from enact_dist.actor_load import load_actor, make_actor
+from enact_dist.errors import ConfigError
+from enact_dist.terms import Aspect, Entity, World, Write
+
+
+class Camera(Actor):
+    """An actor with one option of each kind."""
+
+    image = Write(World("online"), Entity("camera"), Aspect("image", int))
+    every_s = 0.1
+
+    def __init__(
+        self,
+        folder: Path,
+        count: int = 3,
+        *,
+        gain: float = 1.0,
+        raw: bool = False,
+        label: str = "front",
+        seed: int | None = None,
+    ) -> None:
+        if gain < 0:
+            raise ValueError(f"gain is {gain}; it must be >= 0")
+        self.options = (folder, count, gain, raw, label, seed)
+
+    def update(self, lock):
+        pass
+
+
+class Curve(Actor):
+    """An actor with an option that no text can give."""
+
+    image = Write(World("online"), Entity("camera"), Aspect("image", int))
+
+    def __init__(self, points: list[float]) -> None:
+        self.points = points
+
+    def update(self, lock):
+        pass
+
+
+@pytest.fixture(autouse=True)
+def importable(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let this module be found under the name `sample_actors`."""
+    monkeypatch.setitem(sys.modules, "sample_actors", sys.modules[__name__])
+
+
+def test_load_converts_each_option_by_its_annotation_when_given_as_text():
+    """int, float, bool, str, Path and `| None` are read from text."""
+    given = {"folder": "a/b", "count": "7", "gain": "0.5", "raw": "yes", "label": "3", "seed": "9"}
+
+    actor = load_actor("sample_actors:Camera", given)
+
+    assert isinstance(actor, Camera)
+    assert actor.options == (Path("a/b"), 7, 0.5, True, "3", 9)
+
+
+def test_load_takes_typed_values_and_defaults_when_given_from_toml():
+    """Numbers and truth values of a TOML file are taken as they are."""
+    actor = make_actor(Camera, {"folder": "a", "gain": 2, "raw": True, "seed": "none"})
+
+    assert isinstance(actor, Camera)
+    assert actor.options == (Path("a"), 3, 2.0, True, "front", None)
+
+
+@pytest.mark.parametrize(
+    ("target", "options", "message"),
+    [
+        ("sample_actors.Camera", {}, "write MODULE:CLASS"),
+        ("no_such_place.thing:Camera", {}, "no module no_such_place"),
+        ("sample_actors:Camra", {}, "no actor class.*did you mean 'Camera'"),
+        ("sample_actors:Path", {}, "no subclass of Actor"),
+        ("sample_actors:Camera", {}, "needs the option folder"),
+        ("sample_actors:Camera", {"foldr": "x"}, "no option 'foldr'.*did you mean 'folder'"),
+        ("sample_actors:Camera", {"folder": "x", "count": "3.5"}, "count.*'3.5'.*whole number"),
+        ("sample_actors:Camera", {"folder": "x", "count": True}, "count.*True.*whole number"),
+        ("sample_actors:Camera", {"folder": "x", "gain": "nan"}, "gain.*'nan'.*finite number"),
+        ("sample_actors:Camera", {"folder": "x", "raw": "maybe"}, "raw.*'maybe'.*true or false"),
+        ("sample_actors:Camera", {"folder": 3}, "folder.*3.*a path"),
+        ("sample_actors:Camera", {"folder": "x", "gain": "-1"}, "gain is -1.0"),
+        ("sample_actors:Curve", {"points": "1,2"}, r"annotated list\[float\]"),
+    ],
+)
+def test_load_names_what_is_wrong_when_an_actor_cannot_be_made(
+    target: str, options: dict[str, str], message: str
+):
+    """Each mistake is a `ConfigError` with the value and the remedy."""
+    with pytest.raises(ConfigError, match=message):
+        load_actor(target, options)
+
+
+def test_load_names_the_missing_library_when_a_module_needs_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """A module that is there but imports what is not installed says so."""
+    (tmp_path / "needs_much.py").write_text("import a_library_that_is_not_installed\n")
+    monkeypatch.syspath_prepend(tmp_path)
+
+    with pytest.raises(ConfigError, match="needs the module a_library_that_is_not_installed"):
+        load_actor("needs_much:Camera")

@@ -1,0 +1,90 @@
+"""What an actor reports: counters, rates, lock waits, and how it travels."""
+
+from __future__ import annotations
+
+import pytest
+
+from enact_dist.actor_report import (
+    ActorRecord,
+    ActorStatistics,
+    RateMeter,
+    decode_reports,
+    encode_reports,
+    percentile,
+)
+from enact_dist.errors import ProtocolError
+
+SECOND_NS = 1_000_000_000
+
+
+def test_rate_is_over_the_last_five_seconds_when_an_actor_runs_longer():
+    """Ten updates a second are 10 Hz, and 0 Hz five seconds after the last one."""
+    meter = RateMeter(start_ns=0)
+    for tick in range(200):
+        meter.count(tick * SECOND_NS // 10)
+
+    assert meter.rate_hz(20 * SECOND_NS) == pytest.approx(10.0)
+    assert meter.rate_hz(26 * SECOND_NS) == 0.0
+
+
+def test_rate_is_right_when_more_updates_came_than_are_kept():
+    """1,000 Hz is shown as 1,000 Hz though only 512 stamps are kept."""
+    meter = RateMeter(start_ns=0)
+    for tick in range(5_000):
+        meter.count(tick * SECOND_NS // 1_000)
+
+    assert meter.rate_hz(5 * SECOND_NS) == pytest.approx(1_000.0, rel=0.01)
+
+
+def test_rate_is_over_the_time_since_the_start_when_an_actor_is_young():
+    """Three updates in the first second are 3 Hz, not 0.6 Hz."""
+    meter = RateMeter(start_ns=0)
+    for tick in range(3):
+        meter.count(tick * SECOND_NS // 3)
+
+    assert meter.rate_hz(SECOND_NS) == pytest.approx(3.0)
+
+
+def test_percentile_is_the_nearest_rank_when_asked_for_a_part():
+    """Of 1…100 the median is 50 and the 99th percentile 99; of one entry it is that."""
+    ascending = list(range(1, 101))
+
+    assert [percentile(ascending, part) for part in (0.5, 0.99)] == [50, 99]
+    assert percentile([7], 0.99) == 7
+    assert percentile([], 0.5) == 0
+
+
+def test_record_counts_each_ending_of_an_update_apart():
+    """Own failures, refusals and unknown commits are three counters; the last error is kept."""
+    record = ActorRecord("fusion", now_ns=0)
+    record.waited(2_000_000)
+    record.updated(took_ns=30_000_000, now_ns=SECOND_NS, wall_ns=5 * SECOND_NS)
+    record.refused(TimeoutError("held by perception"), unknown=False)
+    record.refused(ConnectionError("no answer"), unknown=True)
+    record.failed(ValueError("empty cloud"))
+
+    found = record.snapshot(SECOND_NS)
+
+    assert (found.updates, found.failures, found.refused, found.unknown) == (1, 1, 2, 1)
+    assert found.last_error == "ValueError: empty cloud"
+    assert found.last_update_s == pytest.approx(0.03)
+    assert found.last_update_unix_s == pytest.approx(5.0)
+    assert found.lock_wait_p50_ms == pytest.approx(2.0)
+
+
+def test_reports_come_back_equal_when_encoded_and_decoded():
+    """All actors of one process travel in one report."""
+    reports = [
+        ActorStatistics(name="fusion", updates=3, rate_hz=9.5, last_error="ValueError: é"),
+        ActorStatistics(name="feedback", state="stopped"),
+    ]
+
+    assert decode_reports(encode_reports(reports)) == tuple(reports)
+    assert decode_reports(b"") == ()
+
+
+@pytest.mark.parametrize("report", [b"\xc1", b"\x93\x01\x02\x03", b"{}", b"\x81\xa6actors\x01"])
+def test_reports_are_refused_by_name_when_the_bytes_are_none(report: bytes):
+    """Bytes that are no report raise `ProtocolError`."""
+    with pytest.raises(ProtocolError, match="no actor report"):
+        decode_reports(report)
