@@ -1,0 +1,44 @@
+"""How long a client may believe in its locks: from sending times only, never from clocks compared.
+
+Each message of a session bears a counter, and the client remembers when it sent which.  An answer
+says the highest counter that had arrived, so the shard's lease began to run *after* that one was
+sent: ``until = sent(count_seen) + TTL``, less the drift that two clocks may have.  Using the time
+of arrival, or of the newest message sent, would believe too long.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from enact_dist.core.sessions import DRIFT_PER_CENT
+
+SENDINGS_KEPT: Final = 512
+"""Sending times remembered; older ones give no belief, which is safe."""
+
+
+def shortened_ns(duration_ns: int) -> int:
+    """Return a duration of the shard's clock as this host's clock may safely count it."""
+    return duration_ns * (100 - 2 * DRIFT_PER_CENT) // 100
+
+
+class Sendings:
+    """The session's message counter and when each message was sent (CLOCK_BOOTTIME, ns)."""
+
+    __slots__ = ("_sent", "count")
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._sent: dict[int, int] = {}
+
+    def next(self, now_ns: int) -> int:
+        """Return the counter for a message that is sent now."""
+        self.count += 1
+        self._sent[self.count] = now_ns
+        if len(self._sent) > SENDINGS_KEPT:
+            del self._sent[self.count - SENDINGS_KEPT]
+        return self.count
+
+    def believe_until_ns(self, count_seen: int, duration_ns: int) -> int:
+        """Return until when something granted for `duration_ns` may be believed in (0: not)."""
+        sent_ns = self._sent.get(count_seen)
+        return 0 if sent_ns is None else sent_ns + shortened_ns(duration_ns)

@@ -1,0 +1,260 @@
+"""The client half of a session: which epoch each shard is in, what is held, what may be believed.
+
+One `Client` per process, one lane per thread.  Rules a change must keep:
+
+  * A new epoch of a shard, or a session that it forgot, ends every lock with a grant there; only
+    then is the epoch acknowledged by `Hello` ("all my older grants here are dropped").
+  * The keep-alive names the lowest seq that each lane still cares for; a grant that the shard lists
+    no more, though it was there when the keep-alive was sent, is lost.
+  * A seq is used for one lock and never again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from enact_dist.core.beliefs import Sendings
+from enact_dist.core.datum import LockId
+from enact_dist.core.messages import (
+    Alive,
+    Answer,
+    EpochChanged,
+    Hello,
+    KeepAlive,
+    LaneView,
+    PlacementMap,
+    Welcome,
+)
+from enact_dist.core.multilock import MultiLock, Phase, Plan
+from enact_dist.core.placement import shard_of
+from enact_dist.terms import Access
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from enact_dist.core.messages import Item, Request
+
+
+@dataclass(slots=True)
+class Peer:
+    """What this client knows of one shard.
+
+    `acknowledged` is the epoch that a `Hello` has confirmed to the shard.
+    """
+
+    epoch: int = 0
+    acknowledged: int = -1
+
+
+class Client:
+    """The session of one process, over all shards."""
+
+    __slots__ = (
+        "_locks",
+        "_peers",
+        "_seqs",
+        "actor",
+        "host",
+        "observer",
+        "pid",
+        "placement",
+        "report",
+        "seen_stamp_ns",
+        "sendings",
+        "session",
+        "ttl_ns",
+    )
+
+    def __init__(
+        self,
+        session: str,
+        *,
+        ttl_ns: int,
+        actor: str = "",
+        host: str = "",
+        pid: int = 0,
+        observer: bool = False,
+    ) -> None:
+        self.session = session
+        self.ttl_ns = ttl_ns
+        self.actor, self.host, self.pid, self.observer = actor, host, pid, observer
+        self.placement = PlacementMap(0, (), ())
+        self.sendings = Sendings()
+        self.seen_stamp_ns = 0
+        self.report = b""
+        self._peers: dict[str, Peer] = {}
+        self._locks: dict[LockId, MultiLock] = {}
+        self._seqs: dict[int, int] = {}
+
+    # ---------------------------------------------------------------- shards
+
+    def _peer(self, shard: str) -> Peer:
+        peer = self._peers.get(shard)
+        if peer is None:
+            peer = self._peers[shard] = Peer()
+        return peer
+
+    def epoch(self, shard: str) -> int:
+        """Return the epoch that the shard was last known in (0: none)."""
+        return self._peer(shard).epoch
+
+    def needs_hello(self, shard: str) -> bool:
+        """Whether the shard does not know yet that we are in its epoch."""
+        peer = self._peer(shard)
+        return peer.epoch == 0 or peer.acknowledged != peer.epoch
+
+    def hello(self, shard: str) -> Hello:
+        """Return the greeting, which acknowledges the epoch that we know."""
+        return Hello(
+            self.session,
+            self.epoch(shard),
+            self.ttl_ns,
+            self.actor,
+            self.host,
+            self.pid,
+            self.observer,
+        )
+
+    def answered(self, shard: str, request: Request, answer: Answer, now_ns: int) -> bool:
+        """Take what concerns the session; return whether that was all of the answer."""
+        if isinstance(answer, Welcome) and isinstance(request, Hello):
+            self._welcomed(shard, request, answer)
+            return True
+        if isinstance(answer, EpochChanged):
+            self._epoch_changed(shard, answer.epoch)
+            return False
+        if isinstance(answer, Alive) and isinstance(request, KeepAlive):
+            self._alive(shard, request, answer)
+            return True
+        return False
+
+    def _welcomed(self, shard: str, request: Hello, answer: Welcome) -> None:
+        peer = self._peer(shard)
+        if answer.epoch < peer.epoch:
+            return  # an old answer
+        if answer.epoch != peer.epoch:
+            self._drop_grants(shard)
+            first = peer.epoch == 0
+            peer.epoch = answer.epoch
+            # The first Hello of a session leaves nothing older to be acknowledged.
+            peer.acknowledged = answer.epoch if first else -1
+        elif request.known_epoch == answer.epoch:
+            peer.acknowledged = answer.epoch
+        self.ttl_ns = min(self.ttl_ns, answer.ttl_ns)
+        self.learn_placement(answer.placement)
+
+    def _epoch_changed(self, shard: str, epoch: int) -> None:
+        peer = self._peer(shard)
+        if epoch < peer.epoch:
+            return
+        self._drop_grants(shard)
+        peer.epoch = epoch
+        peer.acknowledged = -1
+
+    def _drop_grants(self, shard: str) -> None:
+        for lock in list(self._locks.values()):
+            if any(part.shard == shard and part.token is not None for part in lock.parts):
+                lock.lose(f"shard {shard} restarted or forgot this session")
+
+    def learn_placement(self, placement: PlacementMap) -> None:
+        """Take over the shard's placement map; where shards differ, the newest answer counts."""
+        self.placement = placement
+
+    def saw_stamp(self, stamp_ns: int) -> None:
+        """Remember the largest stamp seen: later commits come after it everywhere."""
+        self.seen_stamp_ns = max(self.seen_stamp_ns, stamp_ns)
+
+    # ---------------------------------------------------------------- keep-alive
+
+    def keep_alive(self, shard: str, now_ns: int) -> Request:
+        """Return the next sign of life for a shard."""
+        if self.needs_hello(shard):
+            return self.hello(shard)
+        live: dict[int, int] = {lane: seq + 1 for lane, seq in self._seqs.items()}
+        for lock in self._locks:
+            live[lock.lane] = min(lock.seq, live[lock.lane])
+        view = tuple(LaneView(lane, seq) for lane, seq in live.items())
+        count = self.sendings.next(now_ns)
+        return KeepAlive(self.session, self.epoch(shard), count, view, self.report)
+
+    def _alive(self, shard: str, request: KeepAlive, answer: Alive) -> None:
+        if answer.epoch != self.epoch(shard):
+            return
+        self.saw_stamp(answer.stamp_ns)
+        left = {grant.lock: grant for grant in answer.grants}
+        believe = self.sendings.believe_until_ns
+        for lock in list(self._locks.values()):
+            for part in lock.parts:
+                if part.shard != shard or part.token is None:
+                    continue
+                grant = left.get(lock.lock)
+                if grant is not None and grant.token == part.token:
+                    part.until_ns = max(part.until_ns, believe(answer.count_seen, self.ttl_ns))
+                    part.hold_until_ns = max(
+                        part.hold_until_ns, believe(answer.count_seen, grant.hold_left_ns)
+                    )
+                elif part.granted_count < request.count and lock.phase in _GRANTS_COUNT:
+                    lock.lose(f"shard {shard} holds it for this session no more")
+
+    # ---------------------------------------------------------------- locks
+
+    def begin(
+        self, lane: int, plan: Plan, *, now_ns: int, wait_ns: int, hold_ns: int
+    ) -> MultiLock:
+        """Start a lock of one thread under a new seq."""
+        seq = self._seqs[lane] = self._seqs.get(lane, 0) + 1
+        lock = LockId(self.session, lane, seq)
+        multilock = MultiLock(self, lock, plan, now_ns + wait_ns, hold_ns)
+        if multilock.phase.busy:
+            self._locks[lock] = multilock
+        return multilock
+
+    def ended(self, lock: MultiLock) -> None:
+        """Forget a lock that rests; called by the lock itself."""
+        self._locks.pop(lock.lock, None)
+
+    def shards_in_use(self) -> list[str]:
+        """Return the shards that know this session, to keep it alive there."""
+        return [shard for shard, peer in self._peers.items() if peer.epoch]
+
+    def shards_of_locks(self) -> list[str]:
+        """Return the shards where some lock holds or asks for something now."""
+        return sorted({part.shard for lock in self._locks.values() for part in lock.parts})
+
+    def live_locks(self) -> list[MultiLock]:
+        """Return the locks that are not at rest."""
+        return list(self._locks.values())
+
+    def plan(self, items: Iterable[Item]) -> Plan:
+        """Split requested items by shard, in the one global order of acquisition.
+
+        A pattern goes to every shard.  Views ride with the locks where one shard has them all.
+        """
+        locks: dict[str, list[Item]] = {}
+        views: dict[str, list[Item]] = {}
+        every = [shard.name for shard in self.placement.shards]
+        for item in items:
+            access = Access(item.access)
+            shards = every if access.each else [shard_of(item.entity, self.placement)]
+            for shard in shards:
+                (locks if access.locks else views).setdefault(shard, []).append(item)
+        if len(locks) == 1:
+            only = next(iter(locks))
+            locks[only] += views.pop(only, [])
+        return Plan(
+            tuple((shard, tuple(locks[shard])) for shard in sorted(locks)),
+            tuple((shard, tuple(views[shard])) for shard in sorted(views)),
+        )
+
+    def assert_invariants(self) -> None:
+        """Assert the bookkeeping of all locks.  For tests and simulation."""
+        lanes = [lock.lane for lock in self._locks]
+        assert len(lanes) == len(set(lanes)), "two live locks in one lane"
+        for lock_id, lock in self._locks.items():
+            assert lock.lock == lock_id
+            assert lock.phase.busy or lock.phase is Phase.HELD, lock.phase
+            assert lock_id.seq <= self._seqs[lock_id.lane]
+
+
+_GRANTS_COUNT = frozenset((Phase.ACQUIRING, Phase.VIEWING, Phase.HELD))

@@ -1,0 +1,101 @@
+"""What a shard shows to people: holders, sessions, slots.  Reads state, changes none."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.core.lock_table import Mode
+from enact_dist.core.messages import (
+    Counter,
+    Holder,
+    SessionInfo,
+    Sessions,
+    SlotState,
+    Survey,
+    Surveyed,
+)
+from enact_dist.core.slots import state_of
+from enact_dist.terms import pattern_matches
+
+if TYPE_CHECKING:
+    from enact_dist.core.shard import Shard
+    from enact_dist.core.tenures import Tenure
+
+SLOTS_TOLD_MAX: Final = 16
+"""Slots of one lock that are listed by name."""
+WAITS_TOLD_MAX: Final = 16
+"""Locks that one waiter is shown to wait for."""
+
+_WORDS: Final = {Mode.S: "read", Mode.X: "write", Mode.SIX: "read all, write some"}
+
+
+def holder(shard: Shard, tenure: Tenure, *, now_ns: int) -> Holder:
+    """Describe one lock: who holds or awaits it, since when, and for whom it waits."""
+    session = shard.sessions.by_id.get(tenure.lock.session)
+    modes = {mode: None for mode in tenure.claim.wants.values() if mode in _WORDS}
+    named = [
+        f"{resource} ({_WORDS[mode]})"
+        for resource, mode in tenure.claim.wants.items()
+        if mode in _WORDS
+    ]
+    waits_for = shard.tenures.table.blockers(tenure.claim, count_max=WAITS_TOLD_MAX)
+    granted = tenure.token is not None
+    return Holder(
+        tenure.lock,
+        tenure.claim.ticket,
+        session.actor if session else "?",
+        session.host if session else "?",
+        session.pid if session else 0,
+        granted,
+        ", ".join(_WORDS[mode] for mode in modes),
+        now_ns - (tenure.granted_ns if granted else tenure.asked_ns),
+        max(0, session.lease_end_ns(now_ns) - now_ns) if session else 0,
+        max(0, tenure.hold_end_ns - now_ns) if granted else tenure.hold_ns,
+        tuple(named[:SLOTS_TOLD_MAX]),
+        tuple(claim.ticket for claim in waits_for),
+    )
+
+
+def sessions(shard: Shard, *, now_ns: int, wall_ns: int, born_ns: int) -> Sessions:
+    """Describe the sessions, the catalogue and the counters."""
+    return Sessions(
+        shard.settings.name,
+        shard.epoch,
+        not shard.sessions.in_grace(now_ns),
+        now_ns - born_ns,
+        wall_ns,
+        shard.slots.count,
+        shard.slots.bytes,
+        tuple(
+            SessionInfo(
+                session.session,
+                session.actor,
+                session.host,
+                session.pid,
+                max(0, session.lease_end_ns(now_ns) - now_ns),
+                session.token_present,
+                len(shard.tenures.by_session.get(session.session, {})),
+                session.report,
+            )
+            for session in shard.sessions
+        ),
+        tuple(shard.catalogue.worlds),
+        tuple(shard.catalogue.aspects.values()),
+        tuple(Counter(name, count) for name, count in sorted(shard.counters.items())),
+    )
+
+
+def surveyed(shard: Shard, message: Survey, *, stamp_ns: int) -> Surveyed:
+    """List the slots that match, null ones too, without their data."""
+    states: list[SlotState] = []
+    for column in shard.slots.columns():
+        if message.contexts and column.context not in message.contexts:
+            continue
+        if message.aspects and column.aspect not in message.aspects:
+            continue
+        for slot, content in shard.slots.matching(column, "**"):
+            if not message.patterns or any(
+                pattern_matches(pattern, slot.entity) for pattern in message.patterns
+            ):
+                states.append(state_of(slot, content, with_datum=False))
+    return Surveyed(shard.epoch, shard.commits.notice_number, stamp_ns, tuple(states))

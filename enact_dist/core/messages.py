@@ -1,0 +1,609 @@
+"""What client and shard say to each other.  Requests and answers, frozen, validated by `wire`.
+
+Each request is answered by exactly one of the answers named in its docstring, by `EpochChanged`
+(the shard does not know this session in this epoch) or by `Refused` (the request itself is wrong).
+No answer at all means *unknown*, never *not executed*.
+
+Field types are limited to those that `wire.frames` can carry: int, str, bytes, bool, None,
+tuples of these, NamedTuples and dataclasses of this module and of `core.datum`.
+Durations travel, points in time do not (except wall-clock stamps): clocks are never compared.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from enact_dist.core.datum import Datum, LockId, Position, Slot, Token
+
+# ---------------------------------------------------------------- parts
+
+
+class Item(NamedTuple):
+    """One line of a lock or view: `access` is an `enact_dist.terms.Access` number.
+
+    `entity` is a pattern where the access is one of the `…_EACH`.  `known` is the version that
+    the client still has from this epoch (0: none): an unchanged datum is not sent again.
+    """
+
+    access: int
+    context: str
+    entity: str
+    aspect: str
+    known: int = 0
+
+
+class SlotState(NamedTuple):
+    """The newest committed state of one slot.
+
+    `datum` is None when the slot is null (then `null_reason` says why), when the client knows
+    this version already (`same`), or when the datum is large and waits to be fetched (`large`).
+    `size` is the body's length in bytes in every case but null.
+    """
+
+    slot: Slot
+    version: int
+    stamp_ns: int
+    size: int
+    datum: Datum | None
+    same: bool
+    large: bool
+    null_reason: str
+
+
+class Holder(NamedTuple):
+    """Who holds or awaits a lock, for messages to people."""
+
+    lock: LockId
+    number: int
+    actor: str
+    host: str
+    pid: int
+    granted: bool
+    modes: str
+    age_ns: int
+    lease_left_ns: int
+    hold_left_ns: int
+    slots: tuple[str, ...]
+    waits_for: tuple[int, ...]
+
+
+class WriteItem(NamedTuple):
+    """One slot to set at commit; `datum` None writes null."""
+
+    slot: Slot
+    datum: Datum | None
+
+
+class SlotVersion(NamedTuple):
+    """A slot and one of its versions."""
+
+    slot: Slot
+    version: int
+
+
+class LaneView(NamedTuple):
+    """The lowest seq of a lane that its client still cares for."""
+
+    lane: int
+    seq: int
+
+
+class GrantLeft(NamedTuple):
+    """A live grant as the shard sees it."""
+
+    lock: LockId
+    token: Token
+    hold_left_ns: int
+
+
+class AspectEntry(NamedTuple):
+    """An aspect of the catalogue: its type's fingerprint and its durability ("" = unsaid)."""
+
+    name: str
+    fingerprint: str
+    durability: str
+
+
+class ShardEntry(NamedTuple):
+    """A shard of the cell and the endpoints at which it can be reached."""
+
+    name: str
+    endpoints: tuple[str, ...]
+
+
+class Pin(NamedTuple):
+    """Entities that a placement keeps on one shard, by name pattern."""
+
+    pattern: str
+    shard: str
+
+
+class PlacementMap(NamedTuple):
+    """Which shards there are and which entities are pinned; `version` names this state."""
+
+    version: int
+    shards: tuple[ShardEntry, ...]
+    pins: tuple[Pin, ...]
+
+
+class SessionInfo(NamedTuple):
+    """One session at a shard, for `enact actor ls` and `enact shard ls`."""
+
+    session: str
+    actor: str
+    host: str
+    pid: int
+    lease_left_ns: int
+    token_present: bool
+    locks: int
+    report: bytes
+
+
+class Counter(NamedTuple):
+    """One named statistic of a shard."""
+
+    name: str
+    value: int
+
+
+# ---------------------------------------------------------------- requests
+
+
+@dataclass(frozen=True, slots=True)
+class Hello:
+    """Open a session, or acknowledge an epoch.  Answer: `Welcome`.
+
+    `known_epoch` equal to the shard's epoch means: *all my older grants here are dropped*.
+    The client drops first and acknowledges after.  0 means that it knows none.
+    An observer never locks: it gets no durable session record.
+    """
+
+    session: str
+    known_epoch: int
+    ttl_ns: int
+    actor: str
+    host: str
+    pid: int
+    observer: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Register:
+    """Create world contexts and register aspects, idempotently.  Answer: `Registered`."""
+
+    session: str
+    worlds: tuple[str, ...]
+    aspects: tuple[AspectEntry, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Acquire:
+    """Ask for a set of locks at once, with views beside them.  Answer: `Granted`, `Waiting`,
+    `Stale` or `WrongShard`.
+
+    Idempotent: the same lock asked again finds its place in the queue or gets its grant again.
+    `wait_ns` is how long this one call may be parked (at most `WAIT_SLICE_NS_MAX`), not how long
+    the lock may take.  `count` is the session's message counter (see `KeepAlive`).
+    `seen_stamp_ns` is the largest commit stamp the client has seen.
+    """
+
+    lock: LockId
+    epoch: int
+    map_version: int
+    count: int
+    items: tuple[Item, ...]
+    wait_ns: int
+    hold_ns: int
+    seen_stamp_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class TakeView:
+    """Read committed data without a lock.  Answer: `Viewed` or `WrongShard`.
+
+    Large data stay fetchable for the lock id until it is released or overtaken by its lane.
+    """
+
+    lock: LockId
+    epoch: int
+    map_version: int
+    count: int
+    items: tuple[Item, ...]
+    seen_stamp_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Fetch:
+    """Ask for a part of a large datum that a grant or view named.  Answer: `Slice` or `Gone`."""
+
+    lock: LockId
+    epoch: int
+    slot: Slot
+    version: int
+    offset: int
+    length: int
+
+
+@dataclass(frozen=True, slots=True)
+class KeepAlive:
+    """Renew the session and say what is still wanted.  Answer: `Alive`.
+
+    The shard frees every grant and waiter of a lane below its `view`: a lost release or an orphan
+    grant ends here.  `count` increases with each message of the session; the client remembers when
+    it sent which, and believes in its locks from *sending* times only.
+    `report` is the actor's own statistics (msgpack), shown by `enact actor ls`.
+    """
+
+    session: str
+    epoch: int
+    count: int
+    view: tuple[LaneView, ...]
+    report: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Commit:
+    """Publish all writes of a lock and release it.  Answer: `Committed` or `Fenced`."""
+
+    lock: LockId
+    token: Token
+    writes: tuple[WriteItem, ...]
+    seen_stamp_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """Ask what became of a commit.  Answer: `OutcomeIs`."""
+
+    lock: LockId
+
+
+@dataclass(frozen=True, slots=True)
+class Validate:
+    """Is this lock still continuously held?  If so, release it.  Answer: `Valid` or `Fenced`."""
+
+    lock: LockId
+    token: Token
+
+
+@dataclass(frozen=True, slots=True)
+class Release:
+    """Give up a lock, its place in the queue and its pinned views.  Answer: `Released`, always."""
+
+    lock: LockId
+
+
+@dataclass(frozen=True, slots=True)
+class Goodbye:
+    """End a session.  Answer: `Released`."""
+
+    session: str
+
+
+@dataclass(frozen=True, slots=True)
+class AwaitStamp:
+    """Wait until all commits up to a stamp are visible.  Answer: `Reached` (maybe not yet)."""
+
+    stamp_ns: int
+    wait_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Survey:
+    """List slots without their data.  Answer: `Surveyed`.
+
+    Empty `contexts` or `aspects` mean all; `patterns` are entity patterns, empty means all.
+    """
+
+    contexts: tuple[str, ...]
+    patterns: tuple[str, ...]
+    aspects: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class ListLocks:
+    """List holders and waiters.  Answer: `Locks`."""
+
+
+@dataclass(frozen=True, slots=True)
+class ListSessions:
+    """List sessions, catalogue and counters of the shard.  Answer: `Sessions`."""
+
+
+@dataclass(frozen=True, slots=True)
+class Break:
+    """Take a lock away by its grant number, by hand.  Answer: `Broken`."""
+
+    number: int
+    reason: str
+
+
+# ---------------------------------------------------------------- answers
+
+
+@dataclass(frozen=True, slots=True)
+class Welcome:
+    """Who this shard is and what the cell looks like from here."""
+
+    shard: str
+    epoch: int
+    open: bool
+    ttl_ns: int
+    wall_ns: int
+    notice_number: int
+    placement: PlacementMap
+    worlds: tuple[str, ...]
+    aspects: tuple[AspectEntry, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Registered:
+    """The catalogue after registration."""
+
+    worlds: tuple[str, ...]
+    aspects: tuple[AspectEntry, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Granted:
+    """The lock is held.  `states`: every named slot, and every matching one of a pattern.
+
+    `count_seen` is the highest message counter that had arrived from the session; `hold_left_ns`
+    counts from when this was sent.  `stamp_ns` is the shard's hybrid logical time.
+    """
+
+    lock: LockId
+    token: Token
+    epoch: int
+    count_seen: int
+    hold_left_ns: int
+    stamp_ns: int
+    states: tuple[SlotState, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Waiting:
+    """Not yet granted; ask again.  `place` counts from 1, `blockers` are those in the way."""
+
+    lock: LockId
+    epoch: int
+    place: int
+    blockers: tuple[Holder, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Stale:
+    """This seq was granted before, or a newer one of its lane is known: take a new seq."""
+
+    lock: LockId
+    epoch: int
+
+
+@dataclass(frozen=True, slots=True)
+class Viewed:
+    """Committed data as of one moment of this shard."""
+
+    lock: LockId
+    epoch: int
+    stamp_ns: int
+    states: tuple[SlotState, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Slice:
+    """A part of a datum's body."""
+
+    slot: Slot
+    version: int
+    encoding: bytes
+    stamp_ns: int
+    total: int
+    offset: int
+    body: Datum
+    """Body bytes of this part, carried as the body of a datum without encoding."""
+
+
+@dataclass(frozen=True, slots=True)
+class Gone:
+    """The asked version is neither current nor pinned by this lock."""
+
+    slot: Slot
+    version: int
+
+
+@dataclass(frozen=True, slots=True)
+class Alive:
+    """The session is renewed; these are its live grants."""
+
+    epoch: int
+    count_seen: int
+    notice_number: int
+    stamp_ns: int
+    grants: tuple[GrantLeft, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Committed:
+    """All writes of the lock are visible."""
+
+    lock: LockId
+    position: Position
+    versions: tuple[SlotVersion, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Fenced:
+    """The lock is no longer held (or never was in this epoch); nothing was written."""
+
+    lock: LockId
+    cause: str
+
+
+@dataclass(frozen=True, slots=True)
+class OutcomeIs:
+    """What became of a commit: `kind` is one of `OUTCOME_*`."""
+
+    lock: LockId
+    epoch: int
+    kind: str
+    position: Position
+    versions: tuple[SlotVersion, ...]
+
+
+OUTCOME_COMMITTED = "committed"
+OUTCOME_PENDING = "pending"
+OUTCOME_UNSEEN = "unseen"
+OUTCOME_EXPIRED = "expired"
+
+
+@dataclass(frozen=True, slots=True)
+class Valid:
+    """The lock was held without interruption until now; it is released."""
+
+    lock: LockId
+
+
+@dataclass(frozen=True, slots=True)
+class Released:
+    """Nothing of the lock or session is left here."""
+
+
+@dataclass(frozen=True, slots=True)
+class Reached:
+    """Whether all commits up to the asked stamp are visible."""
+
+    reached: bool
+    stamp_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Surveyed:
+    """Slots without data, and the notice number up to which they are current."""
+
+    epoch: int
+    notice_number: int
+    stamp_ns: int
+    states: tuple[SlotState, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Locks:
+    """Holders and waiters, oldest first."""
+
+    epoch: int
+    holders: tuple[Holder, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Sessions:
+    """Sessions, catalogue and counters of a shard."""
+
+    shard: str
+    epoch: int
+    open: bool
+    uptime_ns: int
+    wall_ns: int
+    slots: int
+    bytes: int
+    sessions: tuple[SessionInfo, ...]
+    worlds: tuple[str, ...]
+    aspects: tuple[AspectEntry, ...]
+    counters: tuple[Counter, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Broken:
+    """Whether a lock of that number was live, and what it was."""
+
+    found: bool
+    holder: Holder | None
+
+
+@dataclass(frozen=True, slots=True)
+class EpochChanged:
+    """The shard is in this epoch and does not know the session there: drop, say Hello, go on."""
+
+    epoch: int
+
+
+@dataclass(frozen=True, slots=True)
+class WrongShard:
+    """The request was placed by another map than the shard's."""
+
+    placement: PlacementMap
+
+
+@dataclass(frozen=True, slots=True)
+class Refused:
+    """The request cannot be carried out as it is; `code` names the error class to raise."""
+
+    code: str
+    text: str
+
+
+# ---------------------------------------------------------------- notices (published, best effort)
+
+
+class Change(NamedTuple):
+    """One committed write, without its data."""
+
+    slot: Slot
+    version: int
+    stamp_ns: int
+    null: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Notice:
+    """What one commit changed; `number` counts notices of a shard's epoch without a gap."""
+
+    shard: str
+    epoch: int
+    number: int
+    changes: tuple[Change, ...]
+
+
+Request = (
+    Hello
+    | Register
+    | Acquire
+    | TakeView
+    | Fetch
+    | KeepAlive
+    | Commit
+    | Outcome
+    | Validate
+    | Release
+    | Goodbye
+    | AwaitStamp
+    | Survey
+    | ListLocks
+    | ListSessions
+    | Break
+)
+Answer = (
+    Welcome
+    | Registered
+    | Granted
+    | Waiting
+    | Stale
+    | Viewed
+    | Slice
+    | Gone
+    | Alive
+    | Committed
+    | Fenced
+    | OutcomeIs
+    | Valid
+    | Released
+    | Reached
+    | Surveyed
+    | Locks
+    | Sessions
+    | Broken
+    | EpochChanged
+    | WrongShard
+    | Refused
+)
+Message = Request | Answer | Notice

@@ -1,0 +1,424 @@
+"""The client half of one lock: acquire over shards in order, hold, validate, commit, give up.
+
+::
+
+    ACQUIRING ──> VIEWING ──> HELD ──> VALIDATING ──> COMMITTING ──> COMMITTED
+        │            │          │           │              │
+        └────────────┴──────────┴───────────┴──────────────┴──> LOST · TIMED_OUT · UNREACHABLE ·
+                                                                REFUSED · UNKNOWN · RELEASED
+
+Rules a change must keep
+  * Shards are acquired in one global order (by name), waiting at one at a time: waits-for edges
+    over shards only go up, so there is no deadlock.
+  * Reads on other shards are validated after the last grant and before the commit; every lock was
+    then held at the moment of the last grant (strict two-phase locking).
+  * No answer means unknown.  A commit without an answer is asked about (`Outcome`), never guessed.
+  * A `Stale` or lost lock never comes back under its seq.
+
+Writes on more than one shard need a prepared commit, which this version refuses (the API says so
+before anything is locked).
+"""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.core.messages import (
+    OUTCOME_COMMITTED,
+    OUTCOME_EXPIRED,
+    OUTCOME_PENDING,
+    Acquire,
+    Answer,
+    Commit,
+    Committed,
+    EpochChanged,
+    Fenced,
+    Granted,
+    Outcome,
+    OutcomeIs,
+    Refused,
+    Release,
+    Stale,
+    TakeView,
+    Valid,
+    Validate,
+    Viewed,
+    Waiting,
+    WrongShard,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from enact_dist.core.client import Client
+    from enact_dist.core.datum import LockId, Position, Token
+    from enact_dist.core.messages import Holder, Item, Request, SlotState, SlotVersion, WriteItem
+
+WAIT_SLICE_NS: Final = 900_000_000
+"""How long one call of a waiting lock is parked; below the shard's own limit of 1 s."""
+RETRY_NS_MIN: Final = 20_000_000
+RETRY_NS_MAX: Final = 300_000_000
+"""Pause after a call without an answer; doubles up to the second figure."""
+
+
+class Phase(enum.Enum):
+    """Where a lock is in its life; see the drawing above."""
+
+    ACQUIRING = "acquiring"
+    VIEWING = "viewing"
+    HELD = "held"
+    VALIDATING = "validating"
+    COMMITTING = "committing"
+    COMMITTED = "committed"
+    RELEASED = "released"
+    LOST = "lost"
+    TIMED_OUT = "timed out"
+    UNREACHABLE = "unreachable"
+    REFUSED = "refused"
+    MISPLACED = "misplaced"
+    UNKNOWN = "unknown"
+
+    @property
+    def busy(self) -> bool:
+        """Whether the lock has calls to make before it rests."""
+        return self in _BUSY
+
+
+_BUSY: Final = frozenset((Phase.ACQUIRING, Phase.VIEWING, Phase.VALIDATING, Phase.COMMITTING))
+
+
+@dataclass(slots=True, eq=False)
+class Part:
+    """What a lock holds, or asks for, at one shard.
+
+    Attributes:
+        items: Locks and, where this is the only part, views.
+        token: The grant's fencing number once granted.
+        granted_count: The session's message counter when the grant arrived.
+        until_ns: Until when the lease may be believed in (CLOCK_BOOTTIME).
+        hold_until_ns: Until when the hold limit leaves it.
+    """
+
+    shard: str
+    items: tuple[Item, ...]
+    token: Token | None = None
+    granted_count: int = 0
+    until_ns: int = 0
+    hold_until_ns: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """What one lock asks of which shard; both in the order of the shards' names.
+
+    A shard appears once in each.  Locks on several shards take their views afterwards.
+    """
+
+    locks: tuple[tuple[str, tuple[Item, ...]], ...]
+    views: tuple[tuple[str, tuple[Item, ...]], ...]
+
+
+@dataclass(slots=True, eq=False)
+class MultiLock:
+    """One lock of one thread.  Driven by `next_calls` and `answered`; time comes in as argument."""
+
+    client: Client
+    lock: LockId
+    plan: Plan
+    give_up_ns: int
+    hold_ns: int
+    phase: Phase = Phase.ACQUIRING
+    cause: str = ""
+    refusal: Refused | None = None
+    silent_shard: str = ""
+    blockers: tuple[Holder, ...] = ()
+    position: Position | None = None
+    versions: tuple[SlotVersion, ...] = ()
+    states: list[SlotState] = field(default_factory=list)
+    parts: list[Part] = field(default_factory=list)
+    sent_commit: bool = False
+    _views_left: dict[str, tuple[Item, ...]] = field(default_factory=dict)
+    _writer: str = ""
+    _writes: tuple[WriteItem, ...] = ()
+    _validate_left: dict[str, Part] = field(default_factory=dict)
+    _ask_outcome: bool = False
+    _retry_at_ns: int = 0
+    _retry_ns: int = RETRY_NS_MIN
+    _farewells: list[tuple[str, Request]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.parts = [Part(shard, items) for shard, items in self.plan.locks]
+        self._views_left = dict(self.plan.views)
+        self._advance()
+
+    # ---------------------------------------------------------------- what to send
+
+    def next_calls(self, now_ns: int) -> tuple[list[tuple[str, Request]], int]:
+        """Return the calls to make now, and until when to wait if there are none.
+
+        Every returned call must be followed by one `answered`.
+        """
+        if not self.phase.busy:
+            return [], 0
+        if now_ns >= self.give_up_ns and self._gives_up():
+            return [], 0
+        if now_ns < self._retry_at_ns:
+            return [], min(self._retry_at_ns, self.give_up_ns)
+        calls = self._calls(now_ns)
+        hellos = {
+            shard: self.client.hello(shard) for shard, _ in calls if self.client.needs_hello(shard)
+        }
+        return (list(hellos.items()) if hellos else calls), 0
+
+    def _calls(self, now_ns: int) -> list[tuple[str, Request]]:
+        if self.phase is Phase.ACQUIRING:
+            return [self._acquire(now_ns)]
+        if self.phase is Phase.VIEWING:
+            return [(shard, self._view(shard, now_ns)) for shard in self._views_left]
+        if self.phase is Phase.VALIDATING:
+            return [
+                (shard, Validate(self.lock, part.token))
+                for shard, part in self._validate_left.items()
+                if part.token is not None
+            ]
+        if self._ask_outcome:
+            return [(self._writer, Outcome(self.lock))]
+        token = self._part(self._writer).token
+        assert token is not None
+        self.sent_commit = True
+        seen_ns = self.client.seen_stamp_ns
+        return [(self._writer, Commit(self.lock, token, self._writes, seen_ns))]
+
+    def _acquire(self, now_ns: int) -> tuple[str, Request]:
+        part = next(part for part in self.parts if part.token is None)
+        left_ns = max(0, self.give_up_ns - now_ns)
+        last = part is self.parts[-1]
+        # The hold limit counts from the last grant; earlier ones must outlast the waiting too.
+        hold_ns = self.hold_ns if last else self.hold_ns + left_ns
+        return part.shard, Acquire(
+            self.lock,
+            self.client.epoch(part.shard),
+            self.client.placement.version,
+            self.client.sendings.next(now_ns),
+            part.items,
+            min(WAIT_SLICE_NS, left_ns),
+            hold_ns,
+            self.client.seen_stamp_ns,
+        )
+
+    def _view(self, shard: str, now_ns: int) -> Request:
+        return TakeView(
+            self.lock,
+            self.client.epoch(shard),
+            self.client.placement.version,
+            self.client.sendings.next(now_ns),
+            self._views_left[shard],
+            self.client.seen_stamp_ns,
+        )
+
+    def take_farewells(self) -> list[tuple[str, Request]]:
+        """Return releases to send without waiting for their answers; the shard needs none."""
+        farewells, self._farewells = self._farewells, []
+        return farewells
+
+    # ---------------------------------------------------------------- what came back
+
+    def answered(self, shard: str, request: Request, answer: Answer | None, now_ns: int) -> None:
+        """Take the answer to one call (None: unknown)."""
+        if answer is None:
+            self._silent(shard, request, now_ns)
+            return
+        if self.client.answered(shard, request, answer, now_ns):
+            return  # it was about the session, not about this lock
+        if self.silent_shard == shard:
+            self.silent_shard = ""
+        self._retry_ns = RETRY_NS_MIN
+        if isinstance(answer, Refused):
+            self._end(Phase.REFUSED)
+            self.refusal = answer
+        elif isinstance(answer, WrongShard):
+            self.client.learn_placement(answer.placement)
+            self._end(Phase.MISPLACED)
+        elif isinstance(answer, EpochChanged):
+            self._epoch_changed(request)
+        elif self.phase is Phase.ACQUIRING:
+            self._on_acquiring(shard, answer, now_ns)
+        elif self.phase is Phase.VIEWING and isinstance(answer, Viewed):
+            self._on_viewed(shard, answer)
+        elif self.phase is Phase.VALIDATING:
+            self._on_validating(shard, answer)
+        elif self.phase is Phase.COMMITTING:
+            self._on_committing(answer, now_ns)
+
+    def _silent(self, shard: str, request: Request, now_ns: int) -> None:
+        self.silent_shard = shard
+        if isinstance(request, Commit | Outcome):
+            self._ask_outcome = True
+        self._pause(now_ns)
+
+    def _pause(self, now_ns: int) -> None:
+        self._retry_at_ns = now_ns + self._retry_ns
+        self._retry_ns = min(2 * self._retry_ns, RETRY_NS_MAX)
+
+    def _epoch_changed(self, request: Request) -> None:
+        """The shard restarted or forgot the session; `client` has dropped our grants there."""
+        if isinstance(request, Commit | Outcome):
+            self._ask_outcome = True
+        # Otherwise: a first acquire or view is simply asked again after the new Hello; a lost
+        # grant has already ended this lock through `lose`.
+
+    def _on_acquiring(self, shard: str, answer: Answer, now_ns: int) -> None:
+        part = next((part for part in self.parts if part.token is None), None)
+        if part is None or part.shard != shard or getattr(answer, "lock", None) != self.lock:
+            return
+        if isinstance(answer, Granted):
+            if answer.epoch != self.client.epoch(shard):
+                return  # a grant of an epoch that is over
+            part.token = answer.token
+            part.granted_count = self.client.sendings.count
+            self.client.saw_stamp(answer.stamp_ns)
+            believe = self.client.sendings.believe_until_ns
+            part.until_ns = believe(answer.count_seen, self.client.ttl_ns)
+            part.hold_until_ns = believe(answer.count_seen, answer.hold_left_ns)
+            self.states += answer.states
+            self._advance()
+        elif isinstance(answer, Waiting):
+            self.blockers = answer.blockers
+            if now_ns >= self.give_up_ns:
+                self._gives_up()
+        elif isinstance(answer, Stale):
+            self.lose("its place in the queue was lost")
+
+    def _on_viewed(self, shard: str, answer: Viewed) -> None:
+        if answer.lock == self.lock and self._views_left.pop(shard, None) is not None:
+            self.client.saw_stamp(answer.stamp_ns)
+            self.states += answer.states
+            self._advance()
+
+    def _advance(self) -> None:
+        """Go on when everything of this phase has arrived."""
+        if self.phase is Phase.ACQUIRING and all(part.token is not None for part in self.parts):
+            self.phase = Phase.VIEWING
+        if self.phase is Phase.VIEWING and not self._views_left:
+            self.phase = Phase.HELD
+
+    # ---------------------------------------------------------------- holding
+
+    def valid(self, now_ns: int) -> bool:
+        """Whether the client may still believe that it holds every lock."""
+        return self.phase is Phase.HELD and all(
+            now_ns < min(part.until_ns, part.hold_until_ns) for part in self.parts
+        )
+
+    def lose(self, cause: str) -> None:
+        """A shard has ended this lock; give the rest back."""
+        if self.phase is Phase.COMMITTING or not (self.phase.busy or self.phase is Phase.HELD):
+            return
+        self.cause = cause
+        self._end(Phase.LOST)
+
+    def _part(self, shard: str) -> Part:
+        return next(part for part in self.parts if part.shard == shard)
+
+    def _gives_up(self) -> bool:
+        """The deadline has passed; return whether that ends the lock in this phase."""
+        if self.phase is Phase.COMMITTING:
+            self._end(Phase.UNKNOWN if self.sent_commit else Phase.UNREACHABLE)
+        elif self.phase is Phase.VALIDATING or self.silent_shard:
+            self._end(Phase.UNREACHABLE)
+        else:
+            self._end(Phase.TIMED_OUT)
+        return True
+
+    def _end(self, phase: Phase) -> None:
+        """Rest in `phase`; whatever may still be held or awaited is given back."""
+        self.phase = phase
+        if phase not in (Phase.COMMITTED, Phase.UNKNOWN):
+            touched = [part.shard for part in self.parts]
+            touched += [shard for shard, _ in self.plan.views if shard not in touched]
+            self._farewells += [(shard, Release(self.lock)) for shard in touched]
+        self.client.ended(self)
+
+    # ---------------------------------------------------------------- the end
+
+    def release(self) -> None:
+        """Give everything back without writing."""
+        if self.phase.busy or self.phase is Phase.HELD:
+            self._end(Phase.RELEASED)
+
+    def finish(
+        self, writes: Mapping[str, Sequence[WriteItem]], *, give_up_ns: int
+    ) -> None:
+        """Publish `writes` (by shard, at most one) if every lock is still held.
+
+        Ends in COMMITTED, LOST (nothing written), REFUSED, UNREACHABLE (nothing written) or
+        UNKNOWN.
+        """
+        assert len(writes) <= 1, "writes on several shards are refused before anything is locked"
+        if self.phase is not Phase.HELD:
+            return
+        self.give_up_ns = give_up_ns
+        self._retry_at_ns = 0
+        for shard, items in writes.items():
+            self._writer, self._writes = shard, tuple(items)
+        self._validate_left = {
+            part.shard: part for part in self.parts if part.shard != self._writer
+        }
+        self.phase = Phase.VALIDATING
+        self._after_validation()
+
+    def _after_validation(self) -> None:
+        if self._validate_left:
+            return
+        if self._writer:
+            self.phase = Phase.COMMITTING
+        else:
+            if not self.parts:
+                self._farewells += [(shard, Release(self.lock)) for shard in self._pinned_shards()]
+            self._end(Phase.COMMITTED)
+
+    def _pinned_shards(self) -> list[str]:
+        """Return the shards that keep large data of a lock of views alone."""
+        if not any(state.large for state in self.states):
+            return []
+        return [shard for shard, _ in self.plan.views]
+
+    def _on_validating(self, shard: str, answer: Answer) -> None:
+        if isinstance(answer, Valid) and answer.lock == self.lock:
+            self._validate_left.pop(shard, None)
+            self._after_validation()
+        elif isinstance(answer, Fenced) and answer.lock == self.lock:
+            self.lose(answer.cause)
+
+    def _on_committing(self, answer: Answer, now_ns: int) -> None:
+        if getattr(answer, "lock", None) != self.lock:
+            return
+        if isinstance(answer, Committed):
+            self._committed(answer.position, answer.versions)
+        elif isinstance(answer, Fenced):
+            self.cause = answer.cause
+            self._end(Phase.LOST)
+        elif isinstance(answer, OutcomeIs):
+            self._on_outcome(answer, now_ns)
+
+    def _on_outcome(self, answer: OutcomeIs, now_ns: int) -> None:
+        token = self._part(self._writer).token
+        assert token is not None
+        if answer.kind == OUTCOME_COMMITTED:
+            self._committed(answer.position, answer.versions)
+        elif answer.kind == OUTCOME_PENDING:
+            self._pause(now_ns)
+        elif answer.kind == OUTCOME_EXPIRED:
+            self._end(Phase.UNKNOWN)
+        elif answer.epoch == token.epoch:
+            self._ask_outcome = False  # it never arrived: send it (again)
+        else:
+            self.cause = "its shard restarted before the commit arrived"
+            self._end(Phase.LOST)
+
+    def _committed(self, position: Position, versions: tuple[SlotVersion, ...]) -> None:
+        self.position, self.versions = position, versions
+        self.client.saw_stamp(position.stamp_ns)
+        self._end(Phase.COMMITTED)

@@ -1,0 +1,167 @@
+"""What a shard asks its store to keep, and what the store gives back at start.
+
+A store has one duty: `Persist` is applied whole or not at all, in order, and reported done only
+when it survives what its durability promises.  Everything else is decided in the core.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from enact_dist.core.datum import Datum, LockId, Position, Slot
+from enact_dist.core.messages import AspectEntry, SlotVersion
+from enact_dist.terms import Durability
+
+
+@dataclass(frozen=True, slots=True)
+class SessionRecord:
+    """A session that may hold locks: after a restart the grace waits for it."""
+
+    session: str
+    ttl_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class SessionEnded:
+    """A session that said goodbye or stayed away: forget it, its outcomes after a while."""
+
+    session: str
+    wall_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class WorldRecord:
+    """A world context exists."""
+
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class AspectRecord:
+    """An aspect is registered (again)."""
+
+    entry: AspectEntry
+
+
+@dataclass(frozen=True, slots=True)
+class SlotRecord:
+    """The new state of a slot; replaces the one before.
+
+    `volatile` records only say that the slot exists: neither version nor datum is kept.
+    """
+
+    slot: Slot
+    version: int
+    stamp_ns: int
+    datum: Datum | None
+    null_reason: str
+    volatile: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class OutcomeRecord:
+    """What a lane's newest commit did; replaces the lane's one before."""
+
+    lock: LockId
+    position: Position
+    versions: tuple[SlotVersion, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class AuditRecord:
+    """An operator's act (a broken lock), kept for good."""
+
+    wall_ns: int
+    text: str
+
+
+Record = (
+    SessionRecord
+    | SessionEnded
+    | WorldRecord
+    | AspectRecord
+    | SlotRecord
+    | OutcomeRecord
+    | AuditRecord
+)
+
+
+@dataclass(slots=True)
+class Recovered:
+    """Everything a store held when it was opened.  `epoch` is already the new, durable one."""
+
+    epoch: int
+    sessions: list[SessionRecord] = field(default_factory=list)
+    worlds: list[str] = field(default_factory=list)
+    aspects: list[AspectEntry] = field(default_factory=list)
+    slots: list[SlotRecord] = field(default_factory=list)
+    outcomes: list[OutcomeRecord] = field(default_factory=list)
+
+
+# ---------------------------------------------------------------- effects of the shard
+
+
+@dataclass(frozen=True, slots=True)
+class Reply:
+    """Answer the request that came in under this handle."""
+
+    reply_to: int
+    answer: object
+
+
+@dataclass(frozen=True, slots=True)
+class Persist:
+    """Keep these records; report `Persisted(ticket)` when done (ticket 0: no report wanted)."""
+
+    ticket: int
+    records: tuple[Record, ...]
+    durability: Durability
+
+
+@dataclass(frozen=True, slots=True)
+class Publish:
+    """Publish a notice to whoever watches."""
+
+    notice: object
+
+
+@dataclass(frozen=True, slots=True)
+class Story:
+    """One line for the log: what the shard decided and about whom."""
+
+    event: str
+    text: str
+
+
+Effect = Reply | Persist | Publish | Story
+
+
+# ---------------------------------------------------------------- events that are no requests
+
+
+@dataclass(frozen=True, slots=True)
+class Persisted:
+    """The store has done what `Persist(ticket)` asked for."""
+
+    ticket: int
+
+
+@dataclass(frozen=True, slots=True)
+class SessionSeen:
+    """A session's liveliness token appeared or vanished."""
+
+    session: str
+    present: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Tick:
+    """Time has passed; the inbox was empty."""
+
+
+@dataclass(frozen=True, slots=True)
+class Drain:
+    """The shard is about to stop: grant nothing new, answer parked requests."""
+
+
+Event = Persisted | SessionSeen | Tick | Drain

@@ -1,0 +1,207 @@
+"""Sessions: who is alive, what each lane did last, and what a restart waits for.
+
+A session is one process of a client.  Its lease runs while its keep-alives arrive or its
+liveliness token is seen:  ``max(last keep-alive + TTL, token last seen + TTL / 2)``.  The token is
+kept alive by the transport's native threads, so a client whose interpreter is busy for half a
+minute keeps its lease, while a stopped or unplugged one loses it.
+
+A late expiry is always allowed, an early one never: when the shard itself stood still, every
+deadline moves by as much (`stalled`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+    from enact_dist.core.datum import LockId, Token
+    from enact_dist.core.messages import Hello
+    from enact_dist.core.records import OutcomeRecord, SessionRecord
+
+LANES_MAX: Final = 1024
+"""Threads of one process that may hold locks; bounds the outcome table."""
+SESSIONS_MAX: Final = 10_000
+"""Sessions of one shard; a cell has some dozens."""
+DRIFT_PER_CENT: Final = 1
+"""Assumed bound on the rate error between two hosts' monotonic clocks (a crystal has 0.01 %)."""
+IDLE_TTLS: Final = 4
+"""After so many TTLs without a sign of life a session is forgotten."""
+
+
+@dataclass(slots=True)
+class Lane:
+    """What one thread of a client did: bounds exactly-once to one entry per thread.
+
+    Attributes:
+        top: Highest seq that asked for a lock here; each seq is granted at most once.
+        outcome: What its newest commit did.
+        validated: The newest lock whose reads were found intact, with its token.
+        ended: The newest lock that the shard took away, with the cause.
+    """
+
+    top: int = 0
+    outcome: OutcomeRecord | None = None
+    validated: tuple[LockId, Token] | None = None
+    ended: tuple[LockId, str] | None = None
+
+
+@dataclass(slots=True)
+class Session:
+    """One client process as a shard sees it.
+
+    `acknowledged` says that it has dropped all grants of earlier epochs; until every recovered
+    session has, or their leases must have run out, a restarted shard grants nothing.
+    `present` says that it has said hello in this epoch.
+    """
+
+    session: str
+    ttl_ns: int
+    renewed_ns: int
+    actor: str = ""
+    host: str = ""
+    pid: int = 0
+    observer: bool = False
+    present: bool = False
+    acknowledged: bool = False
+    durable: bool = False
+    count_seen: int = 0
+    report: bytes = b""
+    token_present: bool = False
+    token_seen_ns: int | None = None
+    lanes: dict[int, Lane] = field(default_factory=dict)
+
+    def lease_end_ns(self, now_ns: int) -> int:
+        """Return when the lease ends if no further sign of life comes."""
+        by_message = self.renewed_ns + self.ttl_ns
+        if self.token_seen_ns is None:
+            return by_message
+        seen_ns = now_ns if self.token_present else self.token_seen_ns
+        return max(by_message, seen_ns + self.ttl_ns // 2)
+
+    def lane(self, lane: int) -> Lane:
+        """Return the lane, made on first use."""
+        found = self.lanes.get(lane)
+        if found is None:
+            found = self.lanes[lane] = Lane()
+        return found
+
+
+class SessionTable:
+    """All sessions of one shard, and the grace after a restart."""
+
+    __slots__ = ("_retired", "_tokens", "by_id", "grace_end_ns")
+
+    def __init__(
+        self,
+        recovered: Iterable[SessionRecord],
+        *,
+        outcomes: Iterable[OutcomeRecord] = (),
+        now_ns: int,
+    ) -> None:
+        self.by_id: dict[str, Session] = {}
+        self._tokens: dict[str, bool] = {}
+        self._retired: dict[str, dict[int, Lane]] = {}
+        for record in recovered:
+            self.by_id[record.session] = Session(
+                record.session, record.ttl_ns, renewed_ns=now_ns, durable=True
+            )
+        for outcome in outcomes:
+            session = self.by_id.get(outcome.lock.session)
+            lanes = (
+                session.lanes
+                if session is not None
+                else self._retired.setdefault(outcome.lock.session, {})
+            )
+            lanes[outcome.lock.lane] = Lane(outcome=outcome)
+        longest_ns = max((session.ttl_ns for session in self.by_id.values()), default=0)
+        self.grace_end_ns = now_ns + longest_ns * (100 + 2 * DRIFT_PER_CENT) // 100
+
+    def __iter__(self) -> Iterator[Session]:
+        return iter(self.by_id.values())
+
+    def in_grace(self, now_ns: int) -> bool:
+        """Whether grants of an earlier epoch may still be believed in somewhere."""
+        return now_ns < self.grace_end_ns
+
+    def end_grace_if_all_acknowledged(self, now_ns: int) -> None:
+        """End the grace early: nobody can still believe in an older grant."""
+        if now_ns < self.grace_end_ns and all(
+            session.acknowledged for session in self if session.durable
+        ):
+            self.grace_end_ns = now_ns
+
+    def hello(self, message: Hello, *, epoch: int, ttl_ns: int, now_ns: int) -> tuple[Session, bool]:
+        """Open or refresh a session; say also whether it needs a durable record first.
+
+        Only the exact epoch counts as an acknowledgement of it.
+        """
+        session = self.by_id.get(message.session)
+        if session is None:
+            session = Session(message.session, ttl_ns, renewed_ns=now_ns, acknowledged=True)
+            session.lanes = self._retired.pop(message.session, {})
+            self.by_id[message.session] = session
+            if message.session in self._tokens:
+                session.token_present = self._tokens.pop(message.session)
+                session.token_seen_ns = now_ns
+        session.renewed_ns = max(session.renewed_ns, now_ns)
+        session.present = True
+        session.actor, session.host, session.pid = message.actor, message.host, message.pid
+        session.observer = message.observer
+        if message.known_epoch == epoch:
+            session.acknowledged = True
+        return session, not message.observer and not session.durable
+
+    def known(self, session: str) -> Session | None:
+        """Return the session if it has said hello in this epoch."""
+        found = self.by_id.get(session)
+        return found if found is not None and found.present else None
+
+    def token_seen(self, session: str, present: bool, *, now_ns: int) -> None:
+        """Note that a session's liveliness token appeared or vanished."""
+        found = self.by_id.get(session)
+        if found is None:
+            self._tokens.pop(session, None)
+            if present and len(self._tokens) < SESSIONS_MAX:
+                self._tokens[session] = True
+            return
+        if present or found.token_present:
+            found.token_seen_ns = now_ns
+        found.token_present = present
+
+    def stalled(self, gap_ns: int) -> None:
+        """Move every deadline by the time that the shard itself stood still."""
+        self.grace_end_ns += gap_ns
+        for session in self:
+            session.renewed_ns += gap_ns
+            if session.token_seen_ns is not None:
+                session.token_seen_ns += gap_ns
+
+    def idle(self, now_ns: int) -> list[Session]:
+        """Return sessions that have shown no sign of life for `IDLE_TTLS` TTLs."""
+        if self.in_grace(now_ns):
+            return []
+        return [
+            session
+            for session in self
+            if now_ns - session.lease_end_ns(now_ns) > IDLE_TTLS * session.ttl_ns
+        ]
+
+    def lanes_of(self, session: str) -> dict[int, Lane] | None:
+        """Return the lanes of a session, also of one that ended a while ago."""
+        found = self.by_id.get(session)
+        return found.lanes if found is not None else self._retired.get(session)
+
+    def forget(self, session: str) -> None:
+        """Drop a session; what its lanes did last stays known for late questions."""
+        found = self.by_id.pop(session, None)
+        if found is None:
+            return
+        if found.token_present and len(self._tokens) < SESSIONS_MAX:
+            self._tokens[session] = True
+        if found.lanes:
+            self._retired[session] = found.lanes
+            while len(self._retired) > SESSIONS_MAX:
+                del self._retired[next(iter(self._retired))]

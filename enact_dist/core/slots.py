@@ -1,0 +1,173 @@
+"""The world contexts of one shard: slots, their newest committed states, and the catalogue.
+
+The map itself (ENACT 3.2) is `SlotMap`: (context, entity, aspect) to a version and a datum or
+null.  Every committed write adds one to the version; a deleted slot keeps its version and never
+reuses one.  Versions of volatile slots start again after a restart, so a version is only
+comparable within one epoch of the shard.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.core.datum import Column, Datum, Slot
+from enact_dist.core.messages import AspectEntry, SlotState
+from enact_dist.terms import Access, Durability, NullReason, pattern_matches
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+    from enact_dist.core.messages import Item
+    from enact_dist.core.records import SlotRecord
+
+INLINE_BYTES_MAX: Final = 64 * 1024
+"""Data up to this size travel with the grant; larger ones are fetched when they are read."""
+
+
+@dataclass(frozen=True, slots=True)
+class Content:
+    """The committed state of one slot; replaced, never changed."""
+
+    version: int
+    stamp_ns: int
+    datum: Datum | None
+    null_reason: NullReason
+
+
+NOTHING: Final = Content(0, 0, None, NullReason.NEVER_SET)
+
+
+class SlotMap:
+    """All slots of one shard by context and aspect."""
+
+    __slots__ = ("_columns", "bytes", "count")
+
+    def __init__(self, recovered: Iterable[SlotRecord]) -> None:
+        self._columns: dict[Column, dict[str, Content]] = {}
+        self.count = 0
+        self.bytes = 0
+        for record in recovered:
+            if record.volatile:
+                self.set(record.slot, Content(0, 0, None, NullReason.LOST))
+            else:
+                reason = NullReason[record.null_reason] if record.null_reason else NullReason.DELETED
+                self.set(
+                    record.slot, Content(record.version, record.stamp_ns, record.datum, reason)
+                )
+
+    def __getitem__(self, slot: Slot) -> Content:
+        column = self._columns.get(Column(slot.context, slot.aspect))
+        return NOTHING if column is None else column.get(slot.entity, NOTHING)
+
+    def exists(self, slot: Slot) -> bool:
+        """Whether the slot was ever written or is known to have been."""
+        column = self._columns.get(Column(slot.context, slot.aspect))
+        return column is not None and slot.entity in column
+
+    def set(self, slot: Slot, content: Content) -> None:
+        """Put a new committed state in place of the old one."""
+        column = self._columns.setdefault(Column(slot.context, slot.aspect), {})
+        old = column.get(slot.entity)
+        if old is None:
+            self.count += 1
+        elif old.datum is not None:
+            self.bytes -= old.datum.size
+        if content.datum is not None:
+            self.bytes += content.datum.size
+        column[slot.entity] = content
+
+    def matching(self, column: Column, pattern: str) -> Iterator[tuple[Slot, Content]]:
+        """Yield the slots of a column whose entity the pattern covers, null ones too."""
+        for entity, content in self._columns.get(column, {}).items():
+            if pattern_matches(pattern, entity):
+                yield Slot(column.context, entity, column.aspect), content
+
+    def columns(self) -> Iterator[Column]:
+        """Yield every (context, aspect) that has slots."""
+        yield from self._columns
+
+    def states(self, items: Iterable[Item]) -> list[SlotState]:
+        """Return what a grant or view shows of `items`: slots in order, patterns expanded."""
+        found: list[SlotState] = []
+        for item in items:
+            if Access(item.access).each:
+                column = Column(item.context, item.aspect)
+                found += [
+                    state_of(slot, content)
+                    for slot, content in self.matching(column, item.entity)
+                    if content.datum is not None
+                ]
+            else:
+                slot = Slot(item.context, item.entity, item.aspect)
+                found.append(state_of(slot, self[slot], known=item.known))
+        return found
+
+
+def state_of(
+    slot: Slot, content: Content, *, known: int = 0, with_datum: bool = True
+) -> SlotState:
+    """Return what travels of a slot: its datum where that is small and not known already."""
+    datum = content.datum
+    if datum is None:
+        return SlotState(
+            slot, content.version, content.stamp_ns, 0, None, False, False, content.null_reason.name
+        )
+    same = with_datum and known == content.version > 0
+    large = datum.size > INLINE_BYTES_MAX
+    if same or not with_datum:
+        shown = None
+    else:
+        shown = replace(datum, body=b"", size=0) if large else datum
+    return SlotState(
+        slot, content.version, content.stamp_ns, datum.size, shown, same, large and not same, ""
+    )
+
+
+class Catalogue:
+    """World contexts and aspects that this shard knows."""
+
+    __slots__ = ("_configured", "aspects", "worlds")
+
+    def __init__(
+        self,
+        *,
+        configured: Iterable[AspectEntry],
+        recovered: Iterable[AspectEntry],
+        worlds: Iterable[str],
+    ) -> None:
+        self._configured = {entry.name: entry for entry in configured}
+        self.aspects: dict[str, AspectEntry] = {}
+        self.worlds: dict[str, None] = dict.fromkeys(worlds)
+        for entry in recovered:
+            self.aspects[entry.name] = self._with_configured(entry)
+
+    def _with_configured(self, entry: AspectEntry) -> AspectEntry:
+        """Let the cell's configuration decide the durability."""
+        configured = self._configured.get(entry.name)
+        durability = configured.durability if configured else ""
+        durability = durability or entry.durability or Durability.DURABLE.value
+        return entry._replace(durability=durability)
+
+    def register(self, entry: AspectEntry) -> tuple[AspectEntry, bool] | str:
+        """Register an aspect; return its entry and whether it is new, or why it is refused."""
+        wanted = self._with_configured(entry)
+        known = self.aspects.get(entry.name)
+        if known is None:
+            self.aspects[entry.name] = wanted
+            return wanted, True
+        if known.fingerprint != wanted.fingerprint:
+            return (
+                f"aspect {entry.name!r} is registered with datum type {known.fingerprint}, and was"
+                f" now asked with {wanted.fingerprint}; use the registered type or another name"
+            )
+        if entry.durability and known.durability != wanted.durability:
+            return (
+                f"aspect {entry.name!r} is registered as {known.durability}, and was now asked as"
+                f" {wanted.durability}; state one durability in cell.toml or in Aspect(…)"
+            )
+        return known, False
+
+    def durability(self, aspect: str) -> Durability:
+        """Return what a commit of this (registered) aspect survives."""
+        return Durability(self.aspects[aspect].durability)

@@ -1,0 +1,276 @@
+"""Tenures: the life of each lock at one shard, from its place in the queue to its end.
+
+::
+
+    Acquire ──> waiting ──> granted ──> committing ──> (gone)
+                   │           │
+                   └───────────┴── released · superseded · not wanted any more ·
+                                   lease ended · held too long · broken ──> (gone, cause kept)
+
+Rules a change must keep
+  * A token is given once and never again; `Commit` and `Validate` compare it (the fence).
+  * A tenure that is committing ends only by its commit: no expiry, no release, no break.
+  * A grant names the data as of the moment it is sent; large ones stay fetchable by pins.
+  * Every parked request is answered, at the latest when its slice of waiting ends.
+"""
+
+from __future__ import annotations
+
+import heapq
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.core.datum import Column, Datum, LockId, Slot, Token
+from enact_dist.core.lock_table import Claim, LockTable, Mode, Resource, join
+from enact_dist.core.messages import Acquire, Granted, Item, Waiting
+from enact_dist.core.records import Effect, Reply, Story
+from enact_dist.core.slots import SlotMap
+from enact_dist.terms import Access, pattern_matches
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator
+
+    from enact_dist.core.messages import Holder, SlotState
+    from enact_dist.core.sessions import SessionTable
+
+WAIT_SLICE_NS_MAX: Final = 1_000_000_000
+"""Longest time one request is parked; a client that still waits asks again (long poll)."""
+HOLD_NS_MAX: Final = 24 * 3600 * 1_000_000_000
+"""Nobody holds a lock longer than a day without asking for it anew."""
+STALE_ENDS_MAX: Final = 1024
+"""Entries of ended locks that the deadline heaps may hold before they are swept."""
+BLOCKERS_TOLD_MAX: Final = 8
+"""How many of those in the way a waiter is told about."""
+
+
+@dataclass(slots=True, eq=False)
+class Tenure:
+    """One lock at this shard."""
+
+    lock: LockId
+    claim: Claim
+    items: tuple[Item, ...]
+    hold_ns: int
+    asked_ns: int
+    token: Token | None = None
+    granted_ns: int = 0
+    hold_end_ns: int = 0
+    committing: bool = False
+    parked: int | None = None
+    pins: dict[tuple[Slot, int], Datum] = field(default_factory=dict)
+
+    def covers(self, slot: Slot) -> bool:
+        """Whether this lock may write `slot`."""
+        if self.claim.wants.get(slot) is Mode.X:
+            return True
+        return any(
+            item.access == Access.WRITE_EACH
+            and (item.context, item.aspect) == (slot.context, slot.aspect)
+            and pattern_matches(item.entity, slot.entity)
+            for item in self.items
+        )
+
+
+def wants_of(items: Iterable[Item]) -> dict[Resource, Mode]:
+    """Return which resources a set of requested items uses, and how."""
+    wants: dict[Resource, Mode] = {}
+    for item in items:
+        access = Access(item.access)
+        if not access.locks:
+            continue
+        column = Column(item.context, item.aspect)
+        if access.each:
+            wants[column] = join(wants.get(column), Mode.X if access.writes else Mode.S)
+        else:
+            slot = Slot(item.context, item.entity, item.aspect)
+            wants[slot] = join(wants.get(slot), Mode.X if access.writes else Mode.S)
+            wants[column] = join(wants.get(column), Mode.IX if access.writes else Mode.IS)
+    return wants
+
+
+class Tenures:
+    """All tenures of one shard."""
+
+    __slots__ = (
+        "_epoch",
+        "_granted",
+        "_hold_ends",
+        "_parked_ends",
+        "_sessions",
+        "_slots",
+        "by_lock",
+        "by_session",
+        "count",
+        "describe",
+        "table",
+    )
+
+    def __init__(
+        self, *, epoch: int, slots: SlotMap, sessions: SessionTable, count: Callable[[str], None]
+    ) -> None:
+        self._epoch = epoch
+        self._slots = slots
+        self._sessions = sessions
+        self._granted = 0
+        self._hold_ends: list[tuple[int, LockId]] = []
+        self._parked_ends: list[tuple[int, int, LockId]] = []
+        self.table = LockTable()
+        self.by_lock: dict[LockId, Tenure] = {}
+        self.by_session: dict[str, dict[LockId, Tenure]] = {}
+        self.count = count
+        self.describe: Callable[[Tenure, int], Holder]
+
+    def of_session(self, session: str) -> list[Tenure]:
+        """Return the tenures of one session."""
+        return list(self.by_session.get(session, {}).values())
+
+    def enqueue(self, message: Acquire, *, now_ns: int) -> Tenure:
+        """Give a new lock its place in the queue."""
+        claim = self.table.enqueue(message.lock, wants_of(message.items))
+        hold_ns = min(message.hold_ns, HOLD_NS_MAX)
+        tenure = Tenure(message.lock, claim, message.items, hold_ns, asked_ns=now_ns)
+        self.by_lock[message.lock] = tenure
+        self.by_session.setdefault(message.lock.session, {})[message.lock] = tenure
+        return tenure
+
+    def park(self, tenure: Tenure, *, reply_to: int, wait_ns: int, now_ns: int) -> Iterator[Effect]:
+        """Keep a waiter's request until the grant or the end of its slice."""
+        if tenure.parked is not None:
+            yield self.waiting(tenure, now_ns)
+        tenure.parked = reply_to
+        wait_ns = max(0, min(wait_ns, WAIT_SLICE_NS_MAX))
+        if not wait_ns:
+            yield self.waiting(tenure, now_ns)
+        else:
+            if len(self._parked_ends) > 2 * len(self.by_lock) + STALE_ENDS_MAX:
+                self._parked_ends = [
+                    end
+                    for end in self._parked_ends
+                    if (found := self.by_lock.get(end[2])) is not None and found.parked == end[1]
+                ]
+                heapq.heapify(self._parked_ends)
+            heapq.heappush(self._parked_ends, (now_ns + wait_ns, reply_to, tenure.lock))
+
+    def waiting(self, tenure: Tenure, now_ns: int) -> Effect:
+        """Answer a parked request: not yet, and who is in the way."""
+        assert tenure.parked is not None
+        blockers = self.table.blockers(tenure.claim, count_max=BLOCKERS_TOLD_MAX)
+        holders = tuple(
+            self.describe(self.by_lock[claim.lock], now_ns)
+            for claim in blockers
+            if claim.lock in self.by_lock
+        )
+        reply_to, tenure.parked = tenure.parked, None
+        place = self.table.place(tenure.claim)
+        return Reply(reply_to, Waiting(tenure.lock, self._epoch, place, holders))
+
+    def grant_ready(self, *, now_ns: int, stamp_ns: int) -> Iterator[Effect]:
+        """Grant whatever may be granted; to be called after each change, outside the grace."""
+        for claim in self.table.take_ready():
+            tenure = self.by_lock[claim.lock]
+            self._granted += 1
+            tenure.token = Token(self._epoch, self._granted)
+            tenure.granted_ns = now_ns
+            tenure.hold_end_ns = now_ns + tenure.hold_ns
+            if len(self._hold_ends) > 2 * len(self.by_lock) + STALE_ENDS_MAX:
+                self._hold_ends = [end for end in self._hold_ends if end[1] in self.by_lock]
+                heapq.heapify(self._hold_ends)
+            heapq.heappush(self._hold_ends, (tenure.hold_end_ns, tenure.lock))
+            self.count("locks_granted")
+            if tenure.parked is not None:
+                reply_to, tenure.parked = tenure.parked, None
+                yield Reply(reply_to, self.granted(tenure, now_ns=now_ns, stamp_ns=stamp_ns))
+            elif now_ns > tenure.asked_ns:
+                # Nobody is listening right now: the client's next call fetches the grant, or its
+                # keep-alive gives it back.
+                self.count("grants_without_listener")
+
+    def granted(self, tenure: Tenure, *, now_ns: int, stamp_ns: int) -> Granted:
+        """Return the grant with its data as of now."""
+        assert tenure.token is not None
+        states = self._slots.states(tenure.items)
+        tenure.pins = self.pins_of(states)
+        session = self._sessions.by_id[tenure.lock.session]
+        return Granted(
+            tenure.lock,
+            tenure.token,
+            self._epoch,
+            session.count_seen,
+            max(0, tenure.hold_end_ns - now_ns),
+            stamp_ns,
+            tuple(states),
+        )
+
+    def pins_of(self, states: Iterable[SlotState]) -> dict[tuple[Slot, int], Datum]:
+        """Return the large data that `states` promise, to keep them fetchable."""
+        pins = {}
+        for state in states:
+            if state.large:
+                datum = self._slots[state.slot].datum
+                assert datum is not None
+                pins[state.slot, state.version] = datum
+        return pins
+
+    def remove(self, tenure: Tenure, *, now_ns: int) -> Iterator[Effect]:
+        """End a tenure; who waited for it becomes ready (see `grant_ready`)."""
+        if tenure.parked is not None:
+            yield self.waiting(tenure, now_ns)
+        self.table.remove(tenure.lock)
+        del self.by_lock[tenure.lock]
+        of_session = self.by_session[tenure.lock.session]
+        del of_session[tenure.lock]
+        if not of_session:
+            del self.by_session[tenure.lock.session]
+
+    def take_away(self, tenure: Tenure, cause: str, *, now_ns: int) -> Iterator[Effect]:
+        """End a tenure against its holder's will, remembering why for its next message."""
+        assert not tenure.committing
+        session = self._sessions.by_id.get(tenure.lock.session)
+        if session is not None and tenure.token is not None:
+            session.lane(tenure.lock.lane).ended = (tenure.lock, cause)
+        yield Story("lock.taken", f"{tenure.lock}: {cause}")
+        yield from self.remove(tenure, now_ns=now_ns)
+
+    def end_slices(self, now_ns: int) -> Iterator[Effect]:
+        """Answer the parked requests whose slice of waiting is over."""
+        while self._parked_ends and self._parked_ends[0][0] <= now_ns:
+            _, reply_to, lock = heapq.heappop(self._parked_ends)
+            tenure = self.by_lock.get(lock)
+            if tenure is not None and tenure.parked == reply_to:
+                yield self.waiting(tenure, now_ns)
+
+    def held_too_long(self, now_ns: int) -> list[Tenure]:
+        """Return the tenures whose hold limit is over, committing ones left out."""
+        over = []
+        while self._hold_ends and self._hold_ends[0][0] <= now_ns:
+            _, lock = heapq.heappop(self._hold_ends)
+            tenure = self.by_lock.get(lock)
+            if tenure is None or tenure.token is None or tenure.committing:
+                continue
+            if tenure.hold_end_ns > now_ns:
+                heapq.heappush(self._hold_ends, (tenure.hold_end_ns, lock))
+            else:
+                over.append(tenure)
+        return over
+
+    def stalled(self, gap_ns: int) -> None:
+        """Move every hold limit by the time that the shard itself stood still."""
+        for tenure in self.by_lock.values():
+            tenure.hold_end_ns += gap_ns
+
+    def next_deadline_ns(self) -> int | None:
+        """Return when the next slice or hold limit ends."""
+        heads = [heap[0][0] for heap in (self._hold_ends, self._parked_ends) if heap]
+        return min(heads, default=None)
+
+    def assert_invariants(self) -> None:
+        """Assert I1, I8 and the bookkeeping over all tenures.  For tests and simulation."""
+        self.table.assert_invariants()
+        assert self.by_lock.keys() == self.table.claims.keys()
+        tokens = [tenure.token for tenure in self.by_lock.values() if tenure.token is not None]
+        assert len(tokens) == len(set(tokens))
+        for tenure in self.by_lock.values():
+            assert tenure.claim.granted == (tenure.token is not None), tenure
+            assert not tenure.committing or tenure.token is not None
+            assert not (tenure.claim.granted and tenure.parked is not None)
+            assert self.by_session[tenure.lock.session][tenure.lock] is tenure

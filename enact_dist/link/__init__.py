@@ -1,0 +1,1 @@
+"""Threads, sockets, files and clocks: everything that touches the world outside."""

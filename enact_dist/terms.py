@@ -1,0 +1,400 @@
+"""The paper's nouns: entity, aspect, lock request, null.  Values without behaviour.
+
+==================  =====================================================  =====================
+paper (ENACT 3)     here                                                   departure
+==================  =====================================================  =====================
+entity e_i          `Entity("tray/package/3")`                             the name is the identity:
+                                                                           pointers cannot travel
+set E_a             `Entities("tray/package/*")`                           entities come at run time
+                                                                           (4.2 against 3.1)
+aspect a_j, D_j     `Aspect("surface", Surface)`                           carries the datum type
+null                `NULL` with a `NullReason`                             says why nothing is known
+lock request        `Read`, `Write`, `View` and their `…Each`              may name several contexts
+==================  =====================================================  =====================
+
+Requests are values: two that name the same context, entity, aspect and access are equal.
+"""
+
+from __future__ import annotations
+
+import enum
+import re
+import secrets
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, NoReturn, TypeVar
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+T = TypeVar("T")
+
+NAME_LENGTH_MAX: Final = 200
+"""Longest name of an entity, aspect or world context; keeps every key of the wire below 1 kB."""
+
+_SEGMENT = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.\-]*\Z")
+_PATTERN_SEGMENT = re.compile(r"(?:\*\*|[A-Za-z0-9_*][A-Za-z0-9_.\-*]*)\Z")
+
+
+def checked_name(kind: str, name: object, *, slashes: bool) -> str:
+    """Return `name` if it may name a `kind`, else raise `ValueError` with what is wrong.
+
+    Args:
+        kind: What is named, for the message ("entity", "aspect", "world context").
+        name: The candidate.
+        slashes: Whether the name is a slash path.
+
+    Raises:
+        ValueError: Not a string, empty, too long, or a character outside ``A-Z a-z 0-9 _ . -``.
+    """
+    if not isinstance(name, str) or not name:
+        raise ValueError(f"a name of {kind} is a non-empty string, not {name!r}")
+    if len(name) > NAME_LENGTH_MAX:
+        raise ValueError(
+            f"the name of {kind} {name[:40]!r}… has {len(name)} characters; at most {NAME_LENGTH_MAX}"
+        )
+    for segment in name.split("/") if slashes else [name]:
+        if not _SEGMENT.match(segment):
+            raise ValueError(
+                f"{name!r} cannot name a {kind}: {segment!r} must be letters, digits, '_', '.' or '-'"
+                " and start with a letter, digit or '_'"
+                + ("; segments are separated by single slashes" if slashes else "")
+            )
+    return name
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Entity:
+    """An object of interest, known by its name, an immutable slash path (ENACT 3.1).
+
+    Raises:
+        ValueError: The name is not a slash path of letters, digits, ``_ . -``.
+    """
+
+    name: str
+
+    def __post_init__(self) -> None:
+        checked_name("entity", self.name, slashes=True)
+
+    @staticmethod
+    def fresh(prefix: str) -> Entity:
+        """Return an entity whose name nobody else has: `prefix`/ and 64 random bits.
+
+        Names replace the paper's heap addresses (3.3), which were unique for the same purpose.
+        """
+        return Entity(f"{prefix}/{secrets.token_hex(8)}")
+
+    def __str__(self) -> str:
+        return self.name
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Entities:
+    """A set of entities, written as a name pattern (the paper's E_a).
+
+    ``*`` inside a segment matches any characters but the slash; a segment ``**`` matches any
+    number of whole segments, also none.
+
+    Raises:
+        ValueError: A segment holds a character that no entity name can have.
+    """
+
+    pattern: str
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.pattern, str) or not self.pattern:
+            raise ValueError(f"a pattern of entities is a non-empty string, not {self.pattern!r}")
+        if len(self.pattern) > NAME_LENGTH_MAX:
+            raise ValueError(f"pattern {self.pattern[:40]!r}… is longer than {NAME_LENGTH_MAX}")
+        for segment in self.pattern.split("/"):
+            if not _PATTERN_SEGMENT.match(segment):
+                raise ValueError(
+                    f"{self.pattern!r} is no pattern of entities: segment {segment!r} must be"
+                    " letters, digits, '_', '.', '-', '*', or '**' alone"
+                )
+
+    def matches(self, entity: Entity) -> bool:
+        """Say whether the pattern covers `entity`."""
+        return pattern_matches(self.pattern, entity.name)
+
+    def __str__(self) -> str:
+        return self.pattern
+
+
+_compiled: dict[str, re.Pattern[str]] = {}
+_COMPILED_MAX = 4096
+
+
+def pattern_matches(pattern: str, name: str) -> bool:
+    """Say whether the entity pattern `pattern` covers the entity name `name`."""
+    found = _compiled.get(pattern)
+    if found is None:
+        if len(_compiled) >= _COMPILED_MAX:
+            _compiled.clear()
+        found = _compiled[pattern] = re.compile(_pattern_source(pattern))
+    return found.match(name) is not None
+
+
+def patterns_overlap(one: str, other: str) -> bool:
+    """Say whether two entity patterns could cover one name; never wrongly no.
+
+    Compares segment by segment: two segments with a star are taken to overlap when neither the
+    texts before the first star nor those after the last one contradict each other.
+    """
+    return _segments_overlap(one.split("/"), other.split("/"))
+
+
+def _segments_overlap(one: list[str], other: list[str]) -> bool:
+    if not one or not other:
+        return all(segment == "**" for segment in one + other)
+    if "**" in (one[0], other[0]):
+        deep, flat = (one, other) if one[0] == "**" else (other, one)
+        return _segments_overlap(deep[1:], flat) or _segments_overlap(deep, flat[1:])
+    return _segment_overlaps(one[0], other[0]) and _segments_overlap(one[1:], other[1:])
+
+
+def _segment_overlaps(one: str, other: str) -> bool:
+    if "*" not in one:
+        return pattern_matches(other, one) if "*" in other else one == other
+    if "*" not in other:
+        return pattern_matches(one, other)
+    heads, tails = (one.split("*")[0], other.split("*")[0]), (one.split("*")[-1], other.split("*")[-1])
+    shortest_head, shortest_tail = min(map(len, heads)), min(map(len, tails))
+    same_head = heads[0][:shortest_head] == heads[1][:shortest_head]
+    same_tail = not shortest_tail or tails[0][-shortest_tail:] == tails[1][-shortest_tail:]
+    return same_head and same_tail
+
+
+def _pattern_source(pattern: str) -> str:
+    segments = pattern.split("/")
+    source = ""
+    for index, segment in enumerate(segments):
+        last = index == len(segments) - 1
+        if segment == "**":
+            source += r"(?:[^/]+(?:/[^/]+)*)?" if last else r"(?:[^/]+/)*"
+        else:
+            source += "[^/]*".join(re.escape(part) for part in segment.split("*"))
+            source += "" if last else "/"
+    # "a/**" also covers "a" itself: the separator before a final "**" is optional.
+    if len(segments) > 1 and segments[-1] == "**":
+        tail = r"(?:[^/]+(?:/[^/]+)*)?"
+        source = source[: -len(tail) - 1] + rf"(?:/{tail})?" if source[-len(tail) - 1] == "/" else source
+    return source + r"\Z"
+
+
+class Durability(enum.Enum):
+    """What a reported commit of an aspect survives."""
+
+    DURABLE = "durable"
+    """`kill -9` and power loss: on disk before the answer."""
+    OS = "os"
+    """`kill -9`, not power loss: with the operating system before the answer."""
+    VOLATILE = "volatile"
+    """Neither: in memory only, for data that the next camera frame replaces."""
+
+
+@dataclass(frozen=True, slots=True)
+class Aspect(Generic[T]):
+    """A property class of entities with the type of its data (the paper's a_j with D_j).
+
+    Args:
+        name: Letters, digits, ``_ . -``.
+        datum_type: `int`, `float`, `bool`, `str`, `bytes`, `list`, `dict`, `numpy.ndarray`, a
+            frozen dataclass of these, or a type with a registered codec.
+        durability: What a commit of this aspect survives; ``None`` leaves it to `cell.toml`
+            (there: `durable` unless written otherwise).  `cell.toml` wins over this argument.
+
+    Raises:
+        ValueError: The name is not allowed.
+    """
+
+    name: str
+    datum_type: type[T]
+    durability: Durability | None = None
+
+    def __post_init__(self) -> None:
+        checked_name("aspect", self.name, slashes=False)
+
+    def __str__(self) -> str:
+        return self.name
+
+
+class NullReason(enum.Enum):
+    """Why a world context does not know a datum."""
+
+    NEVER_SET = "never set"
+    DELETED = "deleted"
+    EXPIRED = "expired"
+    LOST = "lost: the aspect is volatile and its shard restarted"
+    OUTSIDE_RETENTION = "outside retention"
+
+
+class Null:
+    """The type of `NULL`, which stands for *no datum* where one is printed or passed on."""
+
+    __slots__ = ()
+    _only: ClassVar[Null | None] = None
+
+    def __new__(cls) -> Null:
+        """Return the one instance."""
+        if cls._only is None:
+            cls._only = super().__new__(cls)
+        return cls._only
+
+    def __bool__(self) -> bool:
+        return False
+
+    def __repr__(self) -> str:
+        return "NULL"
+
+
+NULL: Final = Null()
+
+
+class Access(enum.IntEnum):
+    """What a lock request asks for; the numbers travel on the wire."""
+
+    READ = 1
+    WRITE = 2
+    VIEW = 3
+    READ_EACH = 4
+    WRITE_EACH = 5
+    VIEW_EACH = 6
+
+    @property
+    def each(self) -> bool:
+        """Whether the request names a pattern of entities."""
+        return self >= Access.READ_EACH
+
+    @property
+    def locks(self) -> bool:
+        """Whether the request holds a lock until the block ends."""
+        return self not in (Access.VIEW, Access.VIEW_EACH)
+
+    @property
+    def writes(self) -> bool:
+        """Whether the request allows to set a datum."""
+        return self in (Access.WRITE, Access.WRITE_EACH)
+
+
+class Context:
+    """Anything that names a world context: a `WorldContext` of a cell, or a `World` role."""
+
+    __slots__ = ("name",)
+
+    def __init__(self, name: str) -> None:
+        self.name = checked_name("world context", name, slashes=False)
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.name!r})"
+
+
+class World(Context):
+    """A role that an actor class names and that is bound to a world context when the actor runs."""
+
+    __slots__ = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class LockRequest(Generic[T]):
+    """One line of a lock: which datum, and what for.  Use its subclasses.
+
+    Args:
+        world: The world context; in an actor class, a `World` role.
+        entity: The entity; in an actor class also a pattern, standing for the triggering entity.
+        aspect: The aspect.
+
+    Raises:
+        TypeError: The arguments are not in that order or not of these types.
+    """
+
+    world: Context
+    entity: Entity | Entities
+    aspect: Aspect[T]
+    access: ClassVar[Access]
+
+    def __post_init__(self) -> None:
+        allowed = Entities if self.access.each else (Entity, Entities)
+        for name, wanted in (("world", Context), ("entity", allowed), ("aspect", Aspect)):
+            found = getattr(self, name)
+            if not isinstance(found, wanted):
+                raise TypeError(
+                    f"{type(self).__name__}(world, entity, aspect): {name} is {found!r}, which is"
+                    f" no {getattr(wanted, '__name__', 'Entity or Entities')}"
+                )
+
+    @property
+    def address(self) -> tuple[str, str, str]:
+        """Names of the context, of the entity (or pattern) and of the aspect."""
+        return self.world.name, str(self.entity), self.aspect.name
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, LockRequest):
+            return NotImplemented
+        return self.access == other.access and self.address == other.address
+
+    def __hash__(self) -> int:
+        return hash((self.access, self.address))
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({'/'.join(self.address[:2])} {self.address[2]})"
+
+
+class Read(LockRequest[T]):
+    """Shared lock on one datum, held until the block ends."""
+
+    __slots__ = ()
+    access = Access.READ
+
+
+class Write(LockRequest[T]):
+    """Exclusive lock on one datum; fetched only if it is read before it is overwritten."""
+
+    __slots__ = ()
+    access = Access.WRITE
+
+
+class View(LockRequest[T]):
+    """The newest committed datum as of the grant, without holding any lock."""
+
+    __slots__ = ()
+    access = Access.VIEW
+
+
+class LockRequestEach(LockRequest[T]):
+    """A lock request over all entities of a pattern; the matching set is part of it."""
+
+    __slots__ = ()
+
+
+class ReadEach(LockRequestEach[T]):
+    """Shared lock on an aspect of all matching entities, those yet to come included."""
+
+    __slots__ = ()
+    access = Access.READ_EACH
+
+
+class ViewEach(LockRequestEach[T]):
+    """The newest committed data of all matching entities, without holding any lock."""
+
+    __slots__ = ()
+    access = Access.VIEW_EACH
+
+
+class WriteEach(LockRequestEach[T]):
+    """Exclusive lock on an aspect of all matching entities: look, then create, is safe."""
+
+    __slots__ = ()
+    access = Access.WRITE_EACH
+
+
+def refuse_duplicates(requests: Iterable[LockRequest[Any]]) -> NoReturn | None:
+    """Raise `ValueError` when one datum is named twice with different accesses."""
+    seen: dict[tuple[str, str, str], LockRequest[Any]] = {}
+    for request in requests:
+        first = seen.setdefault(request.address, request)
+        if first.access is not request.access:
+            raise ValueError(
+                f"{first!r} and {request!r} name one datum with different accesses;"
+                " ask once, with the stronger access"
+            )
+    return None
