@@ -14,7 +14,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from actors.geometry.depth import metres, points_grid
 from actors.geometry.files import InputFileError
+from actors.geometry.poses import inverse, moved
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -22,7 +24,6 @@ if TYPE_CHECKING:
 
     import numpy.typing as npt
 
-    from actors.geometry.calibration import Intrinsics
     from actors.geometry.recordings import RecordedFrame
 
 UNITS: Final = {0.1: "tenths of millimetres", 0.2: "fifths of millimetres (TUM)", 10.0: "cm"}
@@ -39,9 +40,7 @@ FRAMES_COMPARED_MAX: Final = 40
 """Frames looked at, evenly spread, so that a long recording costs no more than a short one."""
 
 
-def check_agreement(
-    directory: Path, frames: Sequence[RecordedFrame], intrinsics: Intrinsics
-) -> None:
+def check_agreement(directory: Path, frames: Sequence[RecordedFrame]) -> None:
     """Refuse depth in a unit, or poses of a kind, that contradict each other.
 
     Says nothing when no two views are near enough to be compared.
@@ -49,7 +48,6 @@ def check_agreement(
     Args:
         directory: The recording, for the message.
         frames: With depth in what should be millimetres.
-        intrinsics: Of the depth images.
 
     Raises:
         InputFileError: Another unit fits much better, the poses fit when inverted, or nothing
@@ -59,13 +57,13 @@ def check_agreement(
     if pair is None:
         return
     poses = pair[0].world_from_camera, pair[1].world_from_camera
-    inverse = np.linalg.inv(poses[0]), np.linalg.inv(poses[1])
-    now = _disagreement(pair, poses, intrinsics, scale=1.0)
+    inverted = inverse(poses[0]), inverse(poses[1])
+    now = _disagreement(pair, poses, scale=1.0)
     if np.isnan(now) or now <= DISAGREEMENT_NORMAL:
         return
     between = f"frames {pair[0].name} and {pair[1].name} disagree by {now:.1%}"
-    others = [(_disagreement(pair, poses, intrinsics, scale=s), s) for s in UNITS]
-    others.append((_disagreement(pair, inverse, intrinsics, scale=1.0), 0.0))
+    others = [(_disagreement(pair, poses, scale=s), s) for s in UNITS]
+    others.append((_disagreement(pair, inverted, scale=1.0), 0.0))
     then, scale = min((other for other in others if not np.isnan(other[0])), default=(now, 1.0))
     if then < 0.6 * now and scale > 0.0:
         raise InputFileError(
@@ -99,7 +97,7 @@ def _widest_near_pair(
     """
     step = max(1, len(frames) // FRAMES_COMPARED_MAX)
     chosen = frames[::step]
-    depth_m = [float(np.median(f.depth_mm[f.depth_mm > 0])) / 1000.0 for f in chosen]
+    depth_m = [frame.median_m for frame in chosen]
     best, best_baseline_m = None, 0.005
     for (i, a), (j, b) in combinations(enumerate(chosen), 2):
         same_way = a.world_from_camera[:3, 2] @ b.world_from_camera[:3, 2] > np.cos(np.radians(25))
@@ -113,29 +111,20 @@ def _widest_near_pair(
 def _disagreement(
     pair: tuple[RecordedFrame, RecordedFrame],
     poses: tuple[npt.NDArray[Any], npt.NDArray[Any]],
-    intrinsics: Intrinsics,
     *,
     scale: float,
 ) -> float:
     """Return the median relative difference of depth, first view carried to the second."""
-    here, there = (frame.depth_mm * (scale / 1000.0) for frame in pair)
-    v, u = np.mgrid[0 : intrinsics.height : 6, 0 : intrinsics.width : 6].reshape(2, -1)
-    z = here[v, u]
-    u, v, z = u[z > 0], v[z > 0], z[z > 0]
-    point = np.stack(
-        [
-            (u - intrinsics.cx) / intrinsics.fx * z,
-            (v - intrinsics.cy) / intrinsics.fy * z,
-            z,
-            np.ones_like(z),
-        ]
-    )
-    x, y, z = (np.linalg.inv(poses[1]) @ poses[0] @ point)[:3]
+    camera = pair[0].depth.acquisition.camera
+    here = points_grid(metres(pair[0].depth.depth_mm) * np.float32(scale), camera)[::6, ::6]
+    there = pair[1].depth.depth_mm * (scale / 1000.0)
+    point_m = here[np.isfinite(here).all(axis=2)]
+    x, y, z = moved(point_m, inverse(poses[1]) @ poses[0]).T
     front = z > 1e-6
     x, y, z = x[front], y[front], z[front]
-    column = np.rint(x / z * intrinsics.fx + intrinsics.cx)
-    row = np.rint(y / z * intrinsics.fy + intrinsics.cy)
-    inside = (column >= 0) & (row >= 0) & (column < intrinsics.width) & (row < intrinsics.height)
+    column = np.rint(x / z * camera.fx_px + camera.cx_px)
+    row = np.rint(y / z * camera.fy_px + camera.cy_px)
+    inside = (column >= 0) & (row >= 0) & (column < camera.width_px) & (row < camera.height_px)
     seen = there[row[inside].astype(int), column[inside].astype(int)]
     difference = np.abs(z[inside] - seen)[seen > 0] / seen[seen > 0]
     return float(np.median(difference)) if difference.size >= 100 else float("nan")

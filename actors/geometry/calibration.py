@@ -8,13 +8,13 @@ Open3D's own readers accept a mirrored or scaled matrix without a word; these do
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from actors.geometry.files import InputFileError, existing_file
+from actors.geometry.shapes import Camera
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -28,24 +28,7 @@ TRAVEL_M_MAX: Final = 1000.0
 """A camera that travels further than this in one recording was logged in millimetres."""
 
 
-@dataclass(frozen=True, slots=True)
-class Intrinsics:
-    """A pinhole camera without distortion, in pixels; z forward, x right, y down."""
-
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-
-    @property
-    def matrix(self) -> npt.NDArray[np.float64]:
-        """The camera matrix K, (3, 3)."""
-        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
-
-
-def read_intrinsics(path: Path) -> Intrinsics:
+def read_intrinsics(path: Path) -> Camera:
     """Read a pinhole camera as Open3D and Redwood store it.
 
     Args:
@@ -70,17 +53,17 @@ def read_intrinsics(path: Path) -> Intrinsics:
         ) from error
     if k[0, 2] == 0.0 and k[1, 2] == 0.0:
         k = k.T
-    camera = Intrinsics(width, height, *(float(v) for v in (k[0, 0], k[1, 1], k[0, 2], k[1, 2])))
+    fx, fy, cx, cy = (float(value) for value in (k[0, 0], k[1, 1], k[0, 2], k[1, 2]))
     sound = np.array_equal(k[2], (0.0, 0.0, 1.0)) and k[1, 0] == 0.0 and abs(k[0, 1]) < 1e-6
-    inside = 0.0 < camera.cx < width and 0.0 < camera.cy < height
-    if not (sound and inside and camera.fx > 0.0 and camera.fy > 0.0):
+    inside = 0.0 < cx < width and 0.0 < cy < height
+    if not (sound and inside and fx > 0.0 and fy > 0.0):
         raise InputFileError(
             path,
             asked="a pinhole camera with positive focal lengths and its centre in the image",
             found=f"matrix {k.tolist()} for {width} x {height} pixels",
             remedy="check fx, fy, cx, cy (in pixels, no skew)",
         )
-    return camera
+    return Camera(width, height, fx, fy, cx, cy)
 
 
 def read_trajectory(path: Path) -> npt.NDArray[np.float64]:

@@ -18,6 +18,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from actors.geometry.open3d_on_use import open3d
+
 if TYPE_CHECKING:
     import numpy.typing as npt
 
@@ -165,8 +167,7 @@ def without_large_planes(
     Returns:
         What is left, (M, 3), and how many planes went.
     """
-    import open3d as o3d
-
+    o3d = open3d()
     planes = 0
     while planes < PLANES_MAX and len(points_m) > 100:
         o3d.utility.random.seed(planes)
@@ -234,9 +235,9 @@ class _Described:
     """A thinned cloud with what matching needs of it: features, tree, Open3D cloud."""
 
     def __init__(self, points_m: Points, voxel_m: float) -> None:
-        import open3d as o3d
         from scipy.spatial import cKDTree
 
+        o3d = open3d()
         self.points_m = points_m
         self.voxel_m = voxel_m
         self.cloud = _cloud(points_m)
@@ -245,8 +246,7 @@ class _Described:
             for radius, count in ((3.0 * voxel_m, 30), (6.0 * voxel_m, 100))
         )
         self.cloud.estimate_normals(near)
-        registration: Any = o3d.pipelines.registration  # its stub asks for more than it needs
-        feature = registration.compute_fpfh_feature(self.cloud, wide)
+        feature = o3d.pipelines.registration.compute_fpfh_feature(self.cloud, wide)
         self.features = np.asarray(feature.data).T.copy()
         self.tree = cKDTree(points_m)
 
@@ -306,9 +306,7 @@ def _upright(model: _Described, scene: _Described) -> Pose:
 
 def _refined(model: _Described, scene: _Described, pose: Pose) -> Pose:
     """Sharpen a pose by ICP, point to plane, from coarse to fine."""
-    import open3d as o3d
-
-    registration = o3d.pipelines.registration
+    registration = open3d().pipelines.registration
     for reach in (5.0, 2.0):
         pose = registration.registration_icp(
             model.cloud,
@@ -344,7 +342,6 @@ def _closeness(model: _Described, scene: _Described, pose: Pose, tolerance_m: fl
 
 
 def _cloud(points_m: Points) -> Any:  # Open3D has no types
-    import open3d as o3d
-
+    o3d = open3d()
     # float32 here would cost half a second per 300,000 points: converted one by one.
     return o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points_m.astype(np.float64)))

@@ -15,6 +15,7 @@ import numpy as np
 
 from actors.geometry.cloud_headers import checked_header
 from actors.geometry.files import InputFileError, existing_file
+from actors.geometry.open3d_on_use import open3d
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -122,8 +123,7 @@ def _decoded(
     path: Path, *, mesh: bool
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.uint8] | None, bool]:
     """Return points, colours or None, and whether they were drawn on a mesh."""
-    import open3d as o3d
-
+    o3d = open3d()
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         if mesh:
             read = o3d.io.read_triangle_mesh(path)

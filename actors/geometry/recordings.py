@@ -21,14 +21,17 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from actors.geometry.agreement import check_agreement
-from actors.geometry.calibration import Intrinsics, read_intrinsics, read_trajectory
+from actors.geometry.calibration import read_intrinsics, read_trajectory
 from actors.geometry.files import InputFileError, existing_file
+from actors.geometry.shapes import Acquisition, DepthFrame
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
     import numpy.typing as npt
+
+    from actors.geometry.shapes import Camera
 
     Image = npt.NDArray[Any]
 
@@ -53,23 +56,32 @@ class RecordedFrame:
 
     Attributes:
         name: File name of the depth image.
-        depth_mm: Distance along the optical axis, uint16, (H, W); 0 where nothing was measured.
+        depth: Depth in millimetres with camera and pose, world frame of the trajectory.
         colour: RGB, uint8, (H, W, 3), registered to the depth image.
-        world_from_camera: Rigid pose of the camera, metres, (4, 4).
     """
 
     name: str
-    depth_mm: Image
-    colour: Image
-    world_from_camera: npt.NDArray[np.float64]
+    depth: DepthFrame
+    colour: npt.NDArray[np.uint8]
+
+    @property
+    def world_from_camera(self) -> npt.NDArray[np.float64]:
+        """Pose of the camera, (4, 4), metres."""
+        return self.depth.acquisition.world_from_camera
+
+    @property
+    def median_m(self) -> float:
+        """Median of what was measured, metres along the optical axis."""
+        depth_mm = self.depth.depth_mm
+        return float(np.median(depth_mm[depth_mm > 0])) / 1000.0
 
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """A checked recording: at least one frame, all of the size of the intrinsics."""
+    """A checked recording: at least one frame, all of one camera."""
 
     frames: tuple[RecordedFrame, ...]
-    intrinsics: Intrinsics
+    camera: Camera
 
 
 def read_recording(directory: Path) -> Recording:
@@ -100,18 +112,17 @@ def read_recording(directory: Path) -> Recording:
             found=f"{len(poses)} poses",
             remedy="images and trajectory are of different recordings, or frames are missing",
         )
-    intrinsics = read_intrinsics(_intrinsics_file(directory))
+    camera = read_intrinsics(_intrinsics_file(directory))
     frames = tuple(
         RecordedFrame(
             depth_file.name,
-            read_depth(depth_file, intrinsics),
-            read_colour(colour_file, intrinsics),
-            pose,
+            DepthFrame(read_depth(depth_file, camera), Acquisition(camera, pose)),
+            read_colour(colour_file, camera),
         )
         for (colour_file, depth_file), pose in zip(pairs, poses, strict=True)
     )
-    check_agreement(directory, frames, intrinsics)
-    return Recording(frames, intrinsics)
+    check_agreement(directory, frames)
+    return Recording(frames, camera)
 
 
 def paired_images(directory: Path) -> list[tuple[Path, Path]]:
@@ -155,7 +166,7 @@ def paired_images(directory: Path) -> list[tuple[Path, Path]]:
     return pairs
 
 
-def read_depth(path: Path, intrinsics: Intrinsics) -> Image:
+def read_depth(path: Path, camera: Camera) -> Image:
     """Read one depth image, uint16 millimetres, (H, W).
 
     Raises:
@@ -175,7 +186,7 @@ def read_depth(path: Path, intrinsics: Intrinsics) -> Image:
             if floats
             else "export the raw depth, not a picture of it",
         )
-    _check_size(path, depth, intrinsics)
+    _check_size(path, depth, camera)
     measured = depth[depth > 0]
     if measured.size == 0:
         raise InputFileError(
@@ -192,14 +203,14 @@ def read_depth(path: Path, intrinsics: Intrinsics) -> Image:
     return depth
 
 
-def read_colour(path: Path, intrinsics: Intrinsics) -> Image:
+def read_colour(path: Path, camera: Camera) -> Image:
     """Read one colour image as RGB, uint8, (H, W, 3).
 
     Raises:
         InputFileError: Unreadable or of another size.
     """
     colour = _decoded(path, "a colour image (JPEG or PNG)", colour=True)
-    _check_size(path, colour, intrinsics)
+    _check_size(path, colour, camera)
     return np.ascontiguousarray(colour[:, :, ::-1])
 
 
@@ -306,13 +317,13 @@ def _decoded(path: Path, asked: str, *, colour: bool) -> Image:
     return np.asarray(image)
 
 
-def _check_size(path: Path, image: Image, intrinsics: Intrinsics) -> None:
+def _check_size(path: Path, image: Image, camera: Camera) -> None:
     """Refuse an image that is not of the size of the camera."""
     height, width = image.shape[:2]
-    if (width, height) != (intrinsics.width, intrinsics.height):
+    if (width, height) != (camera.width_px, camera.height_px):
         raise InputFileError(
             path,
-            asked=f"{intrinsics.width} x {intrinsics.height} pixels, as the intrinsics say",
+            asked=f"{camera.width_px} x {camera.height_px} pixels, as the intrinsics say",
             found=f"{width} x {height} pixels",
             remedy="register colour to depth at one size, or use the intrinsics of this size",
         )
