@@ -8,7 +8,6 @@ surface; a direct run does both in a row.  Open3D is loaded on the first call.
 
 from __future__ import annotations
 
-import io
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
@@ -180,37 +179,6 @@ def residual(
     )
     distance_m = scene.compute_distance(points_m.astype(np.float32)).numpy()
     return Residual(float(np.median(distance_m)), float(np.quantile(distance_m, 0.95)))
-
-
-def ply_bytes(surface: ColouredSurface) -> bytes:
-    """Encode a surface as binary PLY: float32 positions and normals, colours, triangles.
-
-    Made here rather than by Open3D so that the file can be written whole or not at all.
-    """
-    vertex = np.empty(
-        len(surface.vertices_m), [("place", "<f4", 3), ("normal", "<f4", 3), ("colour", "u1", 3)]
-    )
-    vertex["place"], vertex["normal"] = surface.vertices_m, surface.normals
-    vertex["colour"] = surface.colours
-    face = np.empty(len(surface.triangles), [("count", "u1"), ("corner", "<i4", 3)])
-    face["count"], face["corner"] = 3, surface.triangles
-    names = [f"property float {name}" for name in ("x", "y", "z", "nx", "ny", "nz")]
-    names += [f"property uchar {name}" for name in ("red", "green", "blue")]
-    header = [
-        "ply",
-        "format binary_little_endian 1.0",
-        "comment metres, world frame of the recording",
-        f"element vertex {len(vertex)}",
-        *names,
-        f"element face {len(face)}",
-        "property list uchar int vertex_indices",
-        "end_header",
-    ]
-    content = io.BytesIO()
-    content.write(("\n".join(header) + "\n").encode("ascii"))
-    content.write(vertex.tobytes())
-    content.write(face.tobytes())
-    return content.getvalue()
 
 
 def _matrix(camera: Camera) -> Floats:
