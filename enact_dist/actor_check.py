@@ -5,6 +5,7 @@ Reported are (error: `enact up` refuses; warning: it starts):
 =======  ===================  ===================================================================
 level    kind                 what
 =======  ===================  ===================================================================
+error    no such actor        a class, option or period of `cell.toml` that cannot be used
 error    unbound role         a role that no world context is bound to
 error    unknown role         a binding for a role that the actor does not have
 error    unknown world        a world context that the cell does not list
@@ -14,9 +15,10 @@ error    own trigger          an actor that, as bound, writes what triggers it
 error    two writers          two actors that write one slot, not both declaring it as `shared`
 warning  unwritten trigger    a trigger that no actor writes: only a write from outside runs it
 warning  unwritten read       a reading request for data that no actor writes
+warning  unused aspect        `cell.toml` configures an aspect that no actor names: misspelt?
 =======  ===================  ===================================================================
 
-"World contexts" and "aspects" are checked only where the cell lists any.  What a patterned write
+World contexts and aspects are checked only against a list that is given.  What a patterned write
 without `Each` can reach is narrowed by what triggers its actor only as far as the pattern says.
 """
 
@@ -26,11 +28,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 from enact_dist.actor import same_data
+from enact_dist.actor_load import check_every_s, load_class, read_options
+from enact_dist.config_table import suggestion
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
     from enact_dist.actor import Actor, Declared
+    from enact_dist.config_types import CellConfig
 
 Level = Literal["error", "warning"]
 
@@ -120,6 +125,51 @@ def check_actors(
         *_writers(uses),
         *_unwritten(uses, initial),
     ]
+    return _ordered(findings)
+
+
+def check_cell(config: CellConfig, *, initial: Collection[str] = ()) -> tuple[Finding, ...]:
+    """Check all actors that a `cell.toml` configures: that they load, and `check_actors`.
+
+    No actor is made; only its module is imported.  The file's list of aspects names those whose
+    durability differs, so an aspect that it does not list is no finding.
+
+    Args:
+        config: The cell.
+        initial: Names of aspects that are written from outside (`init`, other programs).
+    """
+    findings: list[Finding] = []
+    actors: list[ActorDeclaration] = []
+    for actor in config.actors:
+        try:
+            actor_class = load_class(actor.class_path)
+            actors.append(ActorDeclaration(actor.name, actor_class, actor.worlds))
+            read_options(actor_class, actor.options)
+            if actor.every_s is not None:
+                check_every_s(actor_class, actor.every_s)
+        except Exception as error:  # noqa: BLE001 (importing a module can raise anything)
+            findings.append(Finding("error", "no such actor", (actor.name,), str(error)))
+    findings += check_actors(actors, worlds=config.worlds, initial=initial)
+    named = {
+        request.aspect.name
+        for actor in actors
+        for request in actor.actor_class.declaration.requests.values()
+    }
+    for entry in config.aspects if len(actors) == len(config.actors) and actors else ():
+        if entry.name not in named:
+            findings.append(
+                Finding(
+                    "warning",
+                    "unused aspect",
+                    (),
+                    f"{config.path} configures the aspect {entry.name}, which no actor of the cell"
+                    f" reads or writes{suggestion(entry.name, named)}",
+                )
+            )
+    return _ordered(findings)
+
+
+def _ordered(findings: Iterable[Finding]) -> tuple[Finding, ...]:
     return tuple(sorted(findings, key=lambda finding: finding.level != "error"))
 
 

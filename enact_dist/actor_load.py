@@ -6,7 +6,6 @@ read.  Everything wrong is a `ConfigError` that names the parameter, the text an
 
 from __future__ import annotations
 
-import difflib
 import importlib
 import inspect
 import math
@@ -15,14 +14,17 @@ import typing
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.actor import Actor
-from enact_dist.errors import ConfigError
+from enact_dist.actor import Actor, check_period
+from enact_dist.config_table import suggestion
+from enact_dist.errors import ConfigError, MisuseError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Mapping
 
-OptionValue = str | int | float | bool
-"""An option as a command line (text) or a TOML file (text, number, truth value) gives it."""
+    from enact_dist.config_types import ActorConfig
+
+Option = int | float | bool | str | Path | None
+"""An option as an actor's `__init__` gets it."""
 
 _TRUTH: Final = {"true": True, "yes": True, "1": True, "false": False, "no": False, "0": False}
 _WANTED: Final[Mapping[object, str]] = {
@@ -73,12 +75,12 @@ def load_class(target: str) -> type[Actor]:
         kind = "no actor class" if found is None else f"{found!r}, which is no subclass of Actor"
         raise ConfigError(
             f"{module_name} has {kind} under the name {class_name!r}; its actors:"
-            f" {', '.join(actors) or 'none'}{_suggestion(class_name, actors)}"
+            f" {', '.join(actors) or 'none'}{suggestion(class_name, actors)}"
         )
     return found
 
 
-def load_actor(target: str, options: Mapping[str, OptionValue] | None = None) -> Actor:
+def load_actor(target: str, options: Mapping[str, object] | None = None) -> Actor:
     """Make the actor that `target` names, its options read by the annotations of `__init__`.
 
     ::
@@ -96,11 +98,52 @@ def load_actor(target: str, options: Mapping[str, OptionValue] | None = None) ->
     return make_actor(load_class(target), options or {})
 
 
-def make_actor(actor_class: type[Actor], options: Mapping[str, OptionValue]) -> Actor:
+def configured_actor(config: ActorConfig) -> Actor:
+    """Make an actor as `cell.toml` configures it, its period included.
+
+    Raises:
+        ConfigError: See `load_actor`; a period for an actor that data trigger.
+        MisuseError: The class declares something that cannot work.
+    """
+    actor = load_actor(config.class_path, config.options)
+    if config.every_s is not None:
+        check_every_s(type(actor), config.every_s)
+        actor.every_s = config.every_s
+    return actor
+
+
+def check_every_s(actor_class: type[Actor], every_s: float) -> None:
+    """Raise `ConfigError` unless an actor of this class can be given this period."""
+    name = actor_class.__name__
+    if actor_class.declaration.triggers:
+        raise ConfigError(
+            f"every_s = {every_s!r} for actor {name}, which is triggered by data; leave it out"
+        )
+    try:
+        check_period(name, every_s)
+    except MisuseError as error:
+        raise ConfigError(str(error)) from None
+
+
+def make_actor(actor_class: type[Actor], options: Mapping[str, object]) -> Actor:
     """Make an actor of a class from options.
 
     Raises:
         ConfigError: An unknown, missing or unreadable option, or `__init__` refused a value.
+    """
+    arguments = read_options(actor_class, options)
+    try:
+        return actor_class(**arguments)
+    except ValueError as error:
+        name = actor_class.__name__
+        raise ConfigError(f"actor {name} refuses its options {dict(options)}: {error}") from error
+
+
+def read_options(actor_class: type[Actor], options: Mapping[str, object]) -> dict[str, Option]:
+    """Read options by the annotations of an actor class's `__init__`.
+
+    Raises:
+        ConfigError: An unknown, missing or unreadable option.
     """
     parameters = {
         name: parameter
@@ -112,7 +155,7 @@ def make_actor(actor_class: type[Actor], options: Mapping[str, OptionValue]) -> 
         if option not in parameters:
             raise ConfigError(
                 f"actor {name} has no option {option!r}; it has"
-                f" {', '.join(parameters) or 'none'}{_suggestion(option, parameters)}"
+                f" {', '.join(parameters) or 'none'}{suggestion(option, parameters)}"
             )
     missing = [
         option
@@ -122,19 +165,13 @@ def make_actor(actor_class: type[Actor], options: Mapping[str, OptionValue]) -> 
     if missing:
         raise ConfigError(f"actor {name} needs the option {', '.join(missing)}")
     hints = typing.get_type_hints(actor_class.__init__)
-    arguments = {
+    return {
         option: read_option(f"option {option} of actor {name}", value, hints.get(option, str))
         for option, value in options.items()
     }
-    try:
-        return actor_class(**arguments)
-    except ValueError as error:
-        raise ConfigError(f"actor {name} refuses its options {dict(options)}: {error}") from error
 
 
-def read_option(
-    where: str, value: OptionValue, annotation: object
-) -> int | float | bool | str | Path | None:
+def read_option(where: str, value: object, annotation: object) -> Option:
     """Return `value` as the type that `annotation` asks for.
 
     Args:
@@ -161,7 +198,7 @@ def read_option(
     return read
 
 
-def _read(value: OptionValue, kind: object) -> int | float | bool | str | Path | None:
+def _read(value: object, kind: object) -> Option:
     if kind is bool:
         return value if isinstance(value, bool) else _TRUTH.get(str(value).lower())
     if isinstance(value, bool):
@@ -170,6 +207,8 @@ def _read(value: OptionValue, kind: object) -> int | float | bool | str | Path |
         if not isinstance(value, str):
             return None
         return value if kind is str else Path(value).expanduser()
+    if not isinstance(value, (int, float, str)):
+        return None
     try:
         number = int(value, 0) if kind is int and isinstance(value, str) else float(value)
     except ValueError:
@@ -177,8 +216,3 @@ def _read(value: OptionValue, kind: object) -> int | float | bool | str | Path |
     if not math.isfinite(number) or (kind is int and number != int(number)):
         return None
     return int(number) if kind is int else number
-
-
-def _suggestion(name: str, known: Iterable[str]) -> str:
-    close = difflib.get_close_matches(name, list(known), n=1)
-    return f"; did you mean {close[0]!r}?" if close else ""

@@ -90,14 +90,26 @@ class PendingTriggers:
         waiting.states[slot] = state
         return True
 
-    def vanished(self, source: int, entity: Entity) -> None:
-        """Take note that a trigger datum became null: there is nothing to run for.
+    def vanished(
+        self, source: int, entity: Entity, state: Hashable, *, in_set: bool = False
+    ) -> bool:
+        """Take note that a trigger datum is null.
 
-        A run that also waits for another trigger datum still happens.
+        Where the trigger looks at one datum there is nothing left to run for; a run that also
+        waits for another trigger datum still happens.  Where it looks at a set (`in_set`), the
+        set has changed, if the datum was known to be in it.
+
+        Returns:
+            Whether this was news.
         """
         slot = (source, entity.name)
-        self._seen.pop(slot, None)
+        if slot not in self._seen:
+            return False
+        if in_set:
+            return self.changed(source, entity, state)
+        del self._seen[slot]
         self.skipped += self._withdraw(slot)
+        return True
 
     def used(self, source: int, entity: Entity, state: Hashable) -> None:
         """Take note that an update that just ended has seen this state already.

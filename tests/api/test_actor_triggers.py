@@ -96,7 +96,7 @@ def test_pending_drops_a_run_when_its_only_datum_became_null():
     pending = PendingTriggers(per_entity=True)
     pending.changed(0, A, 1)
 
-    pending.vanished(0, A)
+    pending.vanished(0, A, 9)
 
     assert taken(pending) == []
     assert pending.skipped == 1
@@ -108,7 +108,19 @@ def test_pending_keeps_a_run_when_only_one_of_two_data_became_null():
     pending.changed(0, A, 1)
     pending.changed(1, A, 1)
 
-    pending.vanished(0, A)
+    pending.vanished(0, A, 9)
+
+    assert taken(pending) == ["view/a"]
+
+
+def test_pending_runs_a_set_again_when_one_of_its_data_became_null():
+    """The set has changed; a null that was never in it changes nothing."""
+    pending = PendingTriggers(per_entity=False)
+    pending.changed(0, A, 1)
+    taken(pending)
+
+    pending.vanished(0, A, 2, in_set=True)
+    pending.vanished(0, B, 1, in_set=True)
 
     assert taken(pending) == ["view/a"]
 
@@ -118,7 +130,7 @@ def test_pending_runs_again_when_a_null_datum_was_set_to_its_old_state():
     pending = PendingTriggers(per_entity=True)
     pending.changed(0, A, 1)
     taken(pending)
-    pending.vanished(0, A)
+    pending.vanished(0, A, 9)
 
     pending.changed(0, A, 1)
 

@@ -1,0 +1,172 @@
+"""What is found wrong with the actors of a cell before any of them runs."""
+
+from __future__ import annotations
+
+import pytest
+
+from enact_dist.actor import Actor
+from enact_dist.actor_check import ActorDeclaration, Finding, check_actors
+from enact_dist.terms import Aspect, Entities, Entity, View, ViewEach, World, Write, WriteEach
+
+training, online = World("training"), World("online")
+VIEWS, PRODUCTS = Entities("view/*"), Entities("product/*")
+CLOUD, SURFACE, FLAGS = Aspect("cloud", str), Aspect("surface", str), Aspect("flags", dict)
+SYSTEM = Entity("system")
+
+
+def idle(_self: Actor, _lock: object) -> None:
+    """Do nothing: these classes are only looked at."""
+
+
+class Camera(Actor):
+    """Writes clouds."""
+
+    cloud = WriteEach(online, VIEWS, CLOUD)
+    every_s = 0.1
+    update = idle
+
+
+class Reconstruction(Actor):
+    """Clouds to surfaces."""
+
+    cloud = View(online, VIEWS, CLOUD)
+    surface = Write(online, VIEWS, SURFACE)
+    triggers = (cloud,)
+    update = idle
+
+
+class Alarm(Actor):
+    """Looks at all surfaces and writes flags."""
+
+    surfaces = ViewEach(online, VIEWS, SURFACE)
+    flags = Write(online, SYSTEM, FLAGS)
+    triggers = (surfaces,)
+    update = idle
+
+
+class PoliteAlarm(Alarm):
+    """An alarm that keeps what others flagged."""
+
+    shared = (Alarm.flags,)
+
+
+BOUND = {"online": "online"}
+
+
+def check(*classes: type[Actor], **options: object) -> tuple[Finding, ...]:
+    """Check a cell of these actors, each named after its class and bound to `online`."""
+    actors = [
+        ActorDeclaration(f"{actor_class.__name__.lower()}{index}", actor_class, BOUND)
+        for index, actor_class in enumerate(classes)
+    ]
+    return check_actors(actors, **options)
+
+
+def only(findings: tuple[Finding, ...]) -> Finding:
+    """Return the one finding."""
+    assert len(findings) == 1, findings
+    return findings[0]
+
+
+def test_check_finds_nothing_when_a_cell_is_sound():
+    """Every trigger has a writer and every slot one writer."""
+    assert check(Camera, Reconstruction, Alarm, worlds=["online"]) == ()
+
+
+def test_check_finds_two_writers_when_patterns_of_one_context_overlap():
+    """Two actors that can write one slot are an error that names both requests."""
+    found = only(check(Camera, Reconstruction, Alarm, Alarm))
+
+    assert (found.level, found.kind) == ("error", "two writers")
+    assert found.actors == ("alarm2", "alarm3")
+    assert "alarm2.flags (Write online/system flags)" in found.text
+
+
+def test_check_accepts_two_writers_when_both_say_shared():
+    """Writers that keep each other's datum are no finding; one alone that says so is one."""
+    assert check(Camera, Reconstruction, PoliteAlarm, PoliteAlarm) == ()
+    assert only(check(Camera, Reconstruction, Alarm, PoliteAlarm)).kind == "two writers"
+
+
+def test_check_accepts_two_writers_when_bound_to_different_contexts():
+    """The same class may run once per world context."""
+    actors = [
+        ActorDeclaration("one", Camera, {"online": "online"}),
+        ActorDeclaration("two", Camera, {"online": "training"}),
+    ]
+
+    assert check_actors(actors) == ()
+
+
+def test_check_warns_when_nobody_writes_a_trigger_or_a_read():
+    """A trigger without a writer never runs unless something outside writes it."""
+
+    class Reader(Actor):
+        cloud = View(online, VIEWS, CLOUD)
+        model = View(online, SYSTEM, SURFACE)
+        triggers = (cloud,)
+        update = idle
+
+    found = check(Reader)
+
+    assert [(finding.level, finding.kind) for finding in found] == [
+        ("warning", "unwritten trigger"),
+        ("warning", "unwritten read"),
+    ]
+    assert check(Reader, initial=["cloud", "surface"]) == ()
+
+
+def test_check_finds_an_unknown_aspect_when_the_cell_lists_its_aspects():
+    """A misspelt aspect is an error that lists those that exist."""
+    found = only(
+        check(Camera, Reconstruction, aspects=["clouds", "surface"], initial=["cloud"])[:1]
+    )
+
+    assert (found.level, found.kind) == ("error", "unknown aspect")
+    assert "it lists clouds, surface" in found.text
+
+
+@pytest.mark.parametrize(
+    ("worlds", "kind"),
+    [
+        ({}, "unbound role"),
+        ({"online": "onlin"}, "unknown world"),
+        ({"online": "online", "training": "online"}, "unknown role"),
+    ],
+)
+def test_check_finds_what_is_wrong_when_roles_are_bound_wrongly(worlds: dict[str, str], kind: str):
+    """Each wrong binding is an error of its own kind."""
+    actors = [ActorDeclaration("camera", Camera, worlds)]
+
+    found = only(check_actors(actors, worlds=["online"]))
+
+    assert (found.level, found.kind, found.actors) == ("error", kind, ("camera",))
+
+
+def test_check_finds_an_own_trigger_when_two_roles_are_one_context():
+    """An actor that copies between roles must not be bound to copy a context onto itself."""
+
+    class Copy(Actor):
+        source = View(online, VIEWS, CLOUD)
+        target = Write(training, VIEWS, CLOUD)
+        triggers = (source,)
+        update = idle
+
+    actors = [ActorDeclaration("copy", Copy, {"online": "one", "training": "one"})]
+
+    assert only(check_actors(actors)).kind == "own trigger"
+
+
+def test_check_finds_two_types_when_one_aspect_name_has_two():
+    """An aspect's datum type is one for the whole cell."""
+
+    class Counting(Actor):
+        cloud = View(online, VIEWS, Aspect("cloud", int))
+        triggers = (cloud,)
+        update = idle
+
+    found = only(check(Camera, Counting))
+
+    assert (found.level, found.kind) == ("error", "two types")
+    assert "str" in found.text
+    assert "int" in found.text
