@@ -38,10 +38,13 @@ class CloudHeader:
     Attributes:
         points: Points or vertices.
         faces: Faces, 0 for a cloud.
+        eye_m: Where the one camera stood that took the cloud, if the file says so: an organised
+            PCD (rows and columns of an image) with its VIEWPOINT.
     """
 
     points: int
-    faces: int
+    faces: int = 0
+    eye_m: tuple[float, float, float] | None = None
 
 
 def checked_header(path: Path, *, asked: str) -> CloudHeader:
@@ -90,7 +93,7 @@ def _pcd(path: Path, start: bytes) -> tuple[CloudHeader, int, int, str]:
             fields[words[0]] = words[1:]
     if not {"x", "y", "z"} <= set(fields["FIELDS"]):
         raise ValueError(f"fields {' '.join(fields['FIELDS'])} without x, y, z")
-    header = CloudHeader(int(fields["POINTS"][0]), 0)
+    header = CloudHeader(int(fields["POINTS"][0]), eye_m=_eye(fields))
     counts = [int(count) for count in fields.get("COUNT", ["1"] * len(fields["SIZE"]))]
     sizes = [int(size) for size in fields["SIZE"]]
     point_bytes = sum(size * count for size, count in zip(sizes, counts, strict=True))
@@ -108,6 +111,14 @@ def _pcd(path: Path, start: bytes) -> tuple[CloudHeader, int, int, str]:
         case other:
             raise ValueError(f"data are {other!r}")
     return header, need, have, "bytes"
+
+
+def _eye(fields: dict[str, list[str]]) -> tuple[float, float, float] | None:
+    """Return the camera position of an organised PCD."""
+    if int(fields.get("HEIGHT", ["1"])[0]) <= 1:
+        return None
+    x, y, z = (float(word) for word in fields.get("VIEWPOINT", ["0", "0", "0"])[:3])
+    return x, y, z
 
 
 def _ply(path: Path, start: bytes) -> tuple[CloudHeader, int, int, str]:

@@ -148,7 +148,7 @@ def draw_bodies(
     if ground_z_m is not None:
         floor = _add_floor(scene, hits, (eye, rays), ground_z_m)
     body = hits.seen & ~floor
-    light = _lighting(scene, hits, eye, np.random.default_rng(seed))
+    light = _lighting(scene, hits, view.world_from_camera, np.random.default_rng(seed))
     light = _smoothed(light, hits, fine.shape)
     picture = background(fine.shape).reshape(-1, 3)
     if floor.any():
@@ -255,13 +255,16 @@ def _corner_normals(vertices: Floats, triangles: npt.NDArray[np.int64]) -> Float
     return np.asarray(corner, np.float32)
 
 
-def _lighting(scene: _Scene, hits: _Hits, eye: Floats, random: np.random.Generator) -> Floats:
+def _lighting(
+    scene: _Scene, hits: _Hits, world_from_camera: Floats, random: np.random.Generator
+) -> Floats:
     """Return the light that falls on every sample, 1 for a well-lit surface, (N,)."""
     lit = np.flatnonzero(hits.seen)
-    place = hits.place[lit] + hits.normal[lit] * (2e-3 * scene.span_m)
+    place = hits.place[lit] + hits.normal[lit] * (3e-3 * scene.span_m)
     normal = hits.normal[lit]
-    centre = (scene.low + scene.high) / 2.0
-    lamp = _lamp_direction(eye - centre)
+    right, down, forward = world_from_camera[:3, :3].T.astype(np.float32)
+    # Over the left shoulder of who looks: right for any world, also one whose z is not up.
+    lamp = _unit(-0.8 * forward - 0.55 * right - 0.75 * down)
     lamp_light, sky_light = (np.zeros(len(lit), np.float32) for _ in range(2))
     for _ in range(LAMP_RAYS):
         towards = lamp + LAMP_RADIUS * random.standard_normal((len(lit), 3), np.float32)
@@ -272,19 +275,10 @@ def _lighting(scene: _Scene, hits: _Hits, eye: Floats, random: np.random.Generat
         towards = random.standard_normal((len(lit), 3), np.float32)
         towards = _unit(normal + 0.98 * _unit(towards))
         # The sky is brighter above than at the horizon, which gives upright faces their shape.
-        sky_light += scene.is_free(place, towards) * (0.78 + 0.22 * towards[:, 2])
+        sky_light += scene.is_free(place, towards) * (0.78 - 0.22 * (towards @ down))
     light = np.zeros(len(hits.seen), np.float32)
     light[lit] = 0.62 * lamp_light / LAMP_RAYS + 0.55 * sky_light / SKY_RAYS
     return light
-
-
-def _lamp_direction(towards_eye: Floats) -> Floats:
-    """Return the direction of the lamp: over the left shoulder of who looks, (3,)."""
-    out = towards_eye / np.linalg.norm(towards_eye)
-    left = np.cross(out, [0.0, 0.0, 1.0])
-    left /= np.linalg.norm(left) + 1e-9
-    lamp = 0.55 * out + 0.55 * left + np.array([0.0, 0.0, 1.0])
-    return np.asarray(lamp / np.linalg.norm(lamp), np.float32)
 
 
 def _smoothed(light: Floats, hits: _Hits, shape: tuple[int, int]) -> Floats:

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 INK: Final = (38, 44, 52)
 PAPER: Final = (255, 255, 255)
 ALARM: Final = (226, 61, 40)
+GOOD: Final = (22, 163, 102)
+BACKDROP: Final = (244, 246, 248)
 GAP_PX: Final = 12
 CAPTION_PX: Final = 34
 
@@ -138,6 +140,35 @@ def tiles(
         down = top + head + (height - picture.shape[0]) // 2
         right = left + (width - picture.shape[1]) // 2
         sheet[down : down + picture.shape[0], right : right + picture.shape[1]] = picture
+    return sheet
+
+
+def bars(
+    rows: Sequence[tuple[str, float]], *, size_px: tuple[int, int], threshold: float | None = None
+) -> Picture:
+    """Draw a horizontal bar for each value between 0 and 1, the first one in green.
+
+    Args:
+        rows: Label and value, best first.
+        size_px: Width and height; rows that do not fit are left out.
+        threshold: A value marked by an upright line.
+    """
+    import cv2
+
+    width, height = size_px
+    sheet = np.full((height, width, 3), BACKDROP, np.uint8)
+    left, right, step = int(0.34 * width), int(0.88 * width), 46
+    for number, (label, value) in enumerate(rows[: max(1, (height - 40) // step)]):
+        top = 24 + number * step
+        end = left + round((right - left) * float(np.clip(value, 0.0, 1.0)))
+        colour = GOOD if number == 0 else (168, 178, 190)
+        cv2.rectangle(sheet, (left, top), (right, top + 24), (226, 230, 235), cv2.FILLED)
+        cv2.rectangle(sheet, (left, top), (end, top + 24), colour, cv2.FILLED)
+        sheet = with_label(sheet, label, (12, top - 1), height_px=17, paper=None)
+        sheet = with_label(sheet, f"{value:.2f}", (right + 4, top - 1), height_px=17, paper=None)
+        if threshold is not None:
+            mark = left + round((right - left) * threshold)
+            cv2.line(sheet, (mark, top - 4), (mark, top + 28), ALARM, 1, cv2.LINE_AA)
     return sheet
 
 

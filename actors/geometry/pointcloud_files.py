@@ -42,12 +42,14 @@ class CloudFile:
         colours: RGB, uint8, (N, 3), or None.
         left_out: Points of the file that were not finite.
         from_mesh: Whether the points were drawn on triangles.
+        eye_m: Where the camera stood, if one took the whole cloud and the file says so, (3,).
     """
 
     points_m: npt.NDArray[np.float64]
     colours: npt.NDArray[np.uint8] | None
     left_out: int
     from_mesh: bool
+    eye_m: npt.NDArray[np.float64] | None
 
 
 def read_cloud(path: Path, *, asked: str = "a point cloud (PCD or PLY)") -> CloudFile:
@@ -92,7 +94,11 @@ def read_cloud(path: Path, *, asked: str = "a point cloud (PCD or PLY)") -> Clou
         )
     _check_span(path, kept, asked)
     return CloudFile(
-        kept, colours[finite] if colours is not None else None, int((~finite).sum()), from_mesh
+        points_m=kept,
+        colours=colours[finite] if colours is not None else None,
+        left_out=int((~finite).sum()),
+        from_mesh=from_mesh,
+        eye_m=np.array(header.eye_m) if header.eye_m is not None else None,
     )
 
 
