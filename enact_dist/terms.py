@@ -21,7 +21,7 @@ import enum
 import re
 import secrets
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, Self, TypeVar
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -50,13 +50,14 @@ def checked_name(kind: str, name: object, *, slashes: bool) -> str:
         raise ValueError(f"a name of {kind} is a non-empty string, not {name!r}")
     if len(name) > NAME_LENGTH_MAX:
         raise ValueError(
-            f"the name of {kind} {name[:40]!r}… has {len(name)} characters; at most {NAME_LENGTH_MAX}"
+            f"the name of {kind} {name[:40]!r}… has {len(name)} characters;"
+            f" at most {NAME_LENGTH_MAX}"
         )
     for segment in name.split("/") if slashes else [name]:
         if not _SEGMENT.match(segment):
             raise ValueError(
-                f"{name!r} cannot name a {kind}: {segment!r} must be letters, digits, '_', '.' or '-'"
-                " and start with a letter, digit or '_'"
+                f"{name!r} cannot name a {kind}: {segment!r} must be letters, digits, '_', '.' or"
+                " '-' and start with a letter, digit or '_'"
                 + ("; segments are separated by single slashes" if slashes else "")
             )
     return name
@@ -157,7 +158,8 @@ def _segment_overlaps(one: str, other: str) -> bool:
         return pattern_matches(other, one) if "*" in other else one == other
     if "*" not in other:
         return pattern_matches(one, other)
-    heads, tails = (one.split("*")[0], other.split("*")[0]), (one.split("*")[-1], other.split("*")[-1])
+    heads = (one.split("*")[0], other.split("*")[0])
+    tails = (one.split("*")[-1], other.split("*")[-1])
     shortest_head, shortest_tail = min(map(len, heads)), min(map(len, tails))
     same_head = heads[0][:shortest_head] == heads[1][:shortest_head]
     same_tail = not shortest_tail or tails[0][-shortest_tail:] == tails[1][-shortest_tail:]
@@ -177,7 +179,8 @@ def _pattern_source(pattern: str) -> str:
     # "a/**" also covers "a" itself: the separator before a final "**" is optional.
     if len(segments) > 1 and segments[-1] == "**":
         tail = r"(?:[^/]+(?:/[^/]+)*)?"
-        source = source[: -len(tail) - 1] + rf"(?:/{tail})?" if source[-len(tail) - 1] == "/" else source
+        if source[-len(tail) - 1] == "/":
+            source = source[: -len(tail) - 1] + rf"(?:/{tail})?"
     return source + r"\Z"
 
 
@@ -232,13 +235,14 @@ class Null:
     """The type of `NULL`, which stands for *no datum* where one is printed or passed on."""
 
     __slots__ = ()
-    _only: ClassVar[Null | None] = None
+    _only: ClassVar[Any] = None
 
-    def __new__(cls) -> Null:
+    def __new__(cls) -> Self:
         """Return the one instance."""
         if cls._only is None:
             cls._only = super().__new__(cls)
-        return cls._only
+        only: Self = cls._only
+        return only
 
     def __bool__(self) -> bool:
         return False
@@ -339,21 +343,27 @@ class LockRequest(Generic[T]):
         return f"{type(self).__name__}({'/'.join(self.address[:2])} {self.address[2]})"
 
 
-class Read(LockRequest[T]):
+class LockRequestOne(LockRequest[T]):
+    """A lock request for the datum of one entity."""
+
+    __slots__ = ()
+
+
+class Read(LockRequestOne[T]):
     """Shared lock on one datum, held until the block ends."""
 
     __slots__ = ()
     access = Access.READ
 
 
-class Write(LockRequest[T]):
+class Write(LockRequestOne[T]):
     """Exclusive lock on one datum; fetched only if it is read before it is overwritten."""
 
     __slots__ = ()
     access = Access.WRITE
 
 
-class View(LockRequest[T]):
+class View(LockRequestOne[T]):
     """The newest committed datum as of the grant, without holding any lock."""
 
     __slots__ = ()
@@ -387,7 +397,7 @@ class WriteEach(LockRequestEach[T]):
     access = Access.WRITE_EACH
 
 
-def refuse_duplicates(requests: Iterable[LockRequest[Any]]) -> NoReturn | None:
+def refuse_duplicates(requests: Iterable[LockRequest[Any]]) -> None:
     """Raise `ValueError` when one datum is named twice with different accesses."""
     seen: dict[tuple[str, str, str], LockRequest[Any]] = {}
     for request in requests:
@@ -397,4 +407,3 @@ def refuse_duplicates(requests: Iterable[LockRequest[Any]]) -> NoReturn | None:
                 f"{first!r} and {request!r} name one datum with different accesses;"
                 " ask once, with the stronger access"
             )
-    return None

@@ -199,9 +199,7 @@ class Client:
 
     # ---------------------------------------------------------------- locks
 
-    def begin(
-        self, lane: int, plan: Plan, *, now_ns: int, wait_ns: int, hold_ns: int
-    ) -> MultiLock:
+    def begin(self, lane: int, plan: Plan, *, now_ns: int, wait_ns: int, hold_ns: int) -> MultiLock:
         """Start a lock of one thread under a new seq."""
         seq = self._seqs[lane] = self._seqs.get(lane, 0) + 1
         lock = LockId(self.session, lane, seq)

@@ -28,6 +28,7 @@ from enact_dist.core.messages import (
     OUTCOME_PENDING,
     OUTCOME_UNSEEN,
     Change,
+    Changed,
     Commit,
     Committed,
     EpochChanged,
@@ -149,6 +150,13 @@ class Commits:
             yield Reply(reply_to, refusal)
             return
         assert tenure is not None
+        moved = next((e for e in message.expects if self._slots[e.slot].version != e.version), None)
+        if moved is not None:
+            self._count("commits_changed")
+            yield from self._tenures.remove(tenure, now_ns=now_ns)
+            found = self._slots[moved.slot].version
+            yield Reply(reply_to, Changed(message.lock, moved.slot, found))
+            return
         stamp_ns = self._stamps.next(seen_ns=message.seen_stamp_ns, wall_ns=wall_ns)
         outcome = OutcomeRecord(
             message.lock,

@@ -18,7 +18,7 @@ from enact_dist.core.slots import state_of
 from enact_dist.terms import pattern_matches
 
 if TYPE_CHECKING:
-    from enact_dist.core.shard import Shard
+    from enact_dist.core.shard_state import ShardState
     from enact_dist.core.tenures import Tenure
 
 SLOTS_TOLD_MAX: Final = 16
@@ -29,16 +29,16 @@ WAITS_TOLD_MAX: Final = 16
 _WORDS: Final = {Mode.S: "read", Mode.X: "write", Mode.SIX: "read all, write some"}
 
 
-def holder(shard: Shard, tenure: Tenure, *, now_ns: int) -> Holder:
+def holder(state: ShardState, tenure: Tenure, *, now_ns: int) -> Holder:
     """Describe one lock: who holds or awaits it, since when, and for whom it waits."""
-    session = shard.sessions.by_id.get(tenure.lock.session)
+    session = state.sessions.by_id.get(tenure.lock.session)
     modes = {mode: None for mode in tenure.claim.wants.values() if mode in _WORDS}
     named = [
         f"{resource} ({_WORDS[mode]})"
         for resource, mode in tenure.claim.wants.items()
         if mode in _WORDS
     ]
-    waits_for = shard.tenures.table.blockers(tenure.claim, count_max=WAITS_TOLD_MAX)
+    waits_for = state.tenures.table.blockers(tenure.claim, count_max=WAITS_TOLD_MAX)
     granted = tenure.token is not None
     return Holder(
         tenure.lock,
@@ -56,16 +56,17 @@ def holder(shard: Shard, tenure: Tenure, *, now_ns: int) -> Holder:
     )
 
 
-def sessions(shard: Shard, *, now_ns: int, wall_ns: int, born_ns: int) -> Sessions:
+def sessions(state: ShardState) -> Sessions:
     """Describe the sessions, the catalogue and the counters."""
+    now_ns = state.now_ns
     return Sessions(
-        shard.settings.name,
-        shard.epoch,
-        not shard.sessions.in_grace(now_ns),
-        now_ns - born_ns,
-        wall_ns,
-        shard.slots.count,
-        shard.slots.bytes,
+        state.settings.name,
+        state.epoch,
+        not state.sessions.in_grace(now_ns),
+        now_ns - state.born_ns,
+        state.wall_ns,
+        state.slots.count,
+        state.slots.bytes,
         tuple(
             SessionInfo(
                 session.session,
@@ -74,28 +75,28 @@ def sessions(shard: Shard, *, now_ns: int, wall_ns: int, born_ns: int) -> Sessio
                 session.pid,
                 max(0, session.lease_end_ns(now_ns) - now_ns),
                 session.token_present,
-                len(shard.tenures.by_session.get(session.session, {})),
+                len(state.tenures.by_session.get(session.session, {})),
                 session.report,
             )
-            for session in shard.sessions
+            for session in state.sessions
         ),
-        tuple(shard.catalogue.worlds),
-        tuple(shard.catalogue.aspects.values()),
-        tuple(Counter(name, count) for name, count in sorted(shard.counters.items())),
+        tuple(state.catalogue.worlds),
+        tuple(state.catalogue.aspects.values()),
+        tuple(Counter(name, count) for name, count in sorted(state.counters.items())),
     )
 
 
-def surveyed(shard: Shard, message: Survey, *, stamp_ns: int) -> Surveyed:
+def surveyed(state: ShardState, message: Survey, *, stamp_ns: int) -> Surveyed:
     """List the slots that match, null ones too, without their data."""
     states: list[SlotState] = []
-    for column in shard.slots.columns():
+    for column in state.slots.columns():
         if message.contexts and column.context not in message.contexts:
             continue
         if message.aspects and column.aspect not in message.aspects:
             continue
-        for slot, content in shard.slots.matching(column, "**"):
+        for slot, content in state.slots.matching(column, "**"):
             if not message.patterns or any(
                 pattern_matches(pattern, slot.entity) for pattern in message.patterns
             ):
                 states.append(state_of(slot, content, with_datum=False))
-    return Surveyed(shard.epoch, shard.commits.notice_number, stamp_ns, tuple(states))
+    return Surveyed(state.epoch, state.commits.notice_number, stamp_ns, tuple(states))

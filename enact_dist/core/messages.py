@@ -5,7 +5,8 @@ Each request is answered by exactly one of the answers named in its docstring, b
 No answer at all means *unknown*, never *not executed*.
 
 Field types are limited to those that `wire.frames` can carry: int, str, bytes, bool, None,
-tuples of these, NamedTuples and dataclasses of this module and of `core.datum`.
+tuples of these, NamedTuples and dataclasses of this module and of `core.datum`.  The whole protocol
+stands in this one file, long as it is, so that a reader has it on one page.
 Durations travel, points in time do not (except wall-clock stamps): clocks are never compared.
 """
 
@@ -179,8 +180,9 @@ class Register:
 
 @dataclass(frozen=True, slots=True)
 class Acquire:
-    """Ask for a set of locks at once, with views beside them.  Answer: `Granted`, `Waiting`,
-    `Stale` or `WrongShard`.
+    """Ask for a set of locks at once, with views beside them.
+
+    Answer: `Granted`, `Waiting`, `Stale` or `WrongShard`.
 
     Idempotent: the same lock asked again finds its place in the queue or gets its grant again.
     `wait_ns` is how long this one call may be parked (at most `WAIT_SLICE_NS_MAX`), not how long
@@ -244,12 +246,16 @@ class KeepAlive:
 
 @dataclass(frozen=True, slots=True)
 class Commit:
-    """Publish all writes of a lock and release it.  Answer: `Committed` or `Fenced`."""
+    """Publish all writes of a lock and release it.  Answer: `Committed`, `Fenced` or `Changed`.
+
+    Every slot of `expects` must still be at that version.
+    """
 
     lock: LockId
     token: Token
     writes: tuple[WriteItem, ...]
     seen_stamp_ns: int
+    expects: tuple[SlotVersion, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -441,6 +447,15 @@ class Fenced:
 
 
 @dataclass(frozen=True, slots=True)
+class Changed:
+    """An expected slot has moved on to this version; nothing was written, the lock is released."""
+
+    lock: LockId
+    slot: Slot
+    version: int
+
+
+@dataclass(frozen=True, slots=True)
 class OutcomeIs:
     """What became of a commit: `kind` is one of `OUTCOME_*`."""
 
@@ -594,6 +609,7 @@ Answer = (
     | Alive
     | Committed
     | Fenced
+    | Changed
     | OutcomeIs
     | Valid
     | Released

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import enum
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from enact_dist.core.messages import (
     OUTCOME_COMMITTED,
@@ -31,6 +31,7 @@ from enact_dist.core.messages import (
     OUTCOME_PENDING,
     Acquire,
     Answer,
+    Changed,
     Commit,
     Committed,
     EpochChanged,
@@ -74,6 +75,7 @@ class Phase(enum.Enum):
     COMMITTED = "committed"
     RELEASED = "released"
     LOST = "lost"
+    CHANGED = "changed"
     TIMED_OUT = "timed out"
     UNREACHABLE = "unreachable"
     REFUSED = "refused"
@@ -109,6 +111,14 @@ class Part:
     hold_until_ns: int = 0
 
 
+class Reading(NamedTuple):
+    """What a grant or view showed of one slot, and in which epoch of which shard."""
+
+    shard: str
+    epoch: int
+    state: SlotState
+
+
 @dataclass(frozen=True, slots=True)
 class Plan:
     """What one lock asks of which shard; both in the order of the shards' names.
@@ -136,12 +146,13 @@ class MultiLock:
     blockers: tuple[Holder, ...] = ()
     position: Position | None = None
     versions: tuple[SlotVersion, ...] = ()
-    states: list[SlotState] = field(default_factory=list)
+    states: list[Reading] = field(default_factory=list)
     parts: list[Part] = field(default_factory=list)
     sent_commit: bool = False
     _views_left: dict[str, tuple[Item, ...]] = field(default_factory=dict)
     _writer: str = ""
     _writes: tuple[WriteItem, ...] = ()
+    _expects: tuple[SlotVersion, ...] = ()
     _validate_left: dict[str, Part] = field(default_factory=dict)
     _ask_outcome: bool = False
     _retry_at_ns: int = 0
@@ -189,7 +200,7 @@ class MultiLock:
         assert token is not None
         self.sent_commit = True
         seen_ns = self.client.seen_stamp_ns
-        return [(self._writer, Commit(self.lock, token, self._writes, seen_ns))]
+        return [(self._writer, Commit(self.lock, token, self._writes, seen_ns, self._expects))]
 
     def _acquire(self, now_ns: int) -> tuple[str, Request]:
         part = next(part for part in self.parts if part.token is None)
@@ -282,7 +293,7 @@ class MultiLock:
             believe = self.client.sendings.believe_until_ns
             part.until_ns = believe(answer.count_seen, self.client.ttl_ns)
             part.hold_until_ns = believe(answer.count_seen, answer.hold_left_ns)
-            self.states += answer.states
+            self.states += [Reading(shard, answer.epoch, state) for state in answer.states]
             self._advance()
         elif isinstance(answer, Waiting):
             self.blockers = answer.blockers
@@ -294,7 +305,7 @@ class MultiLock:
     def _on_viewed(self, shard: str, answer: Viewed) -> None:
         if answer.lock == self.lock and self._views_left.pop(shard, None) is not None:
             self.client.saw_stamp(answer.stamp_ns)
-            self.states += answer.states
+            self.states += [Reading(shard, answer.epoch, state) for state in answer.states]
             self._advance()
 
     def _advance(self) -> None:
@@ -349,18 +360,23 @@ class MultiLock:
             self._end(Phase.RELEASED)
 
     def finish(
-        self, writes: Mapping[str, Sequence[WriteItem]], *, give_up_ns: int
+        self,
+        writes: Mapping[str, Sequence[WriteItem]],
+        *,
+        give_up_ns: int,
+        expects: Sequence[SlotVersion] = (),
     ) -> None:
         """Publish `writes` (by shard, at most one) if every lock is still held.
 
-        Ends in COMMITTED, LOST (nothing written), REFUSED, UNREACHABLE (nothing written) or
-        UNKNOWN.
+        `expects` are viewed versions, on the writing shard, that must still be the newest.
+        Ends in COMMITTED, LOST, CHANGED, REFUSED, UNREACHABLE (nothing written) or UNKNOWN.
         """
         assert len(writes) <= 1, "writes on several shards are refused before anything is locked"
         if self.phase is not Phase.HELD:
             return
         self.give_up_ns = give_up_ns
         self._retry_at_ns = 0
+        self._expects = tuple(expects)
         for shard, items in writes.items():
             self._writer, self._writes = shard, tuple(items)
         self._validate_left = {
@@ -381,7 +397,7 @@ class MultiLock:
 
     def _pinned_shards(self) -> list[str]:
         """Return the shards that keep large data of a lock of views alone."""
-        if not any(state.large for state in self.states):
+        if not any(reading.state.large or reading.state.same for reading in self.states):
             return []
         return [shard for shard, _ in self.plan.views]
 
@@ -400,6 +416,9 @@ class MultiLock:
         elif isinstance(answer, Fenced):
             self.cause = answer.cause
             self._end(Phase.LOST)
+        elif isinstance(answer, Changed):
+            self.cause = f"{answer.slot} moved on to version {answer.version}"
+            self._end(Phase.CHANGED)
         elif isinstance(answer, OutcomeIs):
             self._on_outcome(answer, now_ns)
 

@@ -133,7 +133,9 @@ class SessionTable:
         ):
             self.grace_end_ns = now_ns
 
-    def hello(self, message: Hello, *, epoch: int, ttl_ns: int, now_ns: int) -> tuple[Session, bool]:
+    def hello(
+        self, message: Hello, *, epoch: int, ttl_ns: int, now_ns: int
+    ) -> tuple[Session, bool]:
         """Open or refresh a session; say also whether it needs a durable record first.
 
         Only the exact epoch counts as an acknowledgement of it.
@@ -147,7 +149,6 @@ class SessionTable:
                 session.token_present = self._tokens.pop(message.session)
                 session.token_seen_ns = now_ns
         session.renewed_ns = max(session.renewed_ns, now_ns)
-        session.present = True
         session.actor, session.host, session.pid = message.actor, message.host, message.pid
         session.observer = message.observer
         if message.known_epoch == epoch:

@@ -51,7 +51,9 @@ class SlotMap:
             if record.volatile:
                 self.set(record.slot, Content(0, 0, None, NullReason.LOST))
             else:
-                reason = NullReason[record.null_reason] if record.null_reason else NullReason.DELETED
+                reason = (
+                    NullReason[record.null_reason] if record.null_reason else NullReason.DELETED
+                )
                 self.set(
                     record.slot, Content(record.version, record.stamp_ns, record.datum, reason)
                 )
@@ -104,9 +106,7 @@ class SlotMap:
         return found
 
 
-def state_of(
-    slot: Slot, content: Content, *, known: int = 0, with_datum: bool = True
-) -> SlotState:
+def state_of(slot: Slot, content: Content, *, known: int = 0, with_datum: bool = True) -> SlotState:
     """Return what travels of a slot: its datum where that is small and not known already."""
     datum = content.datum
     if datum is None:

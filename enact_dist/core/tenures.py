@@ -202,10 +202,10 @@ class Tenures:
         )
 
     def pins_of(self, states: Iterable[SlotState]) -> dict[tuple[Slot, int], Datum]:
-        """Return the large data that `states` promise, to keep them fetchable."""
+        """Return the data that `states` name without carrying, to keep them fetchable."""
         pins = {}
         for state in states:
-            if state.large:
+            if state.large or state.same:
                 datum = self._slots[state.slot].datum
                 assert datum is not None
                 pins[state.slot, state.version] = datum

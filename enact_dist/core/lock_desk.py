@@ -1,0 +1,174 @@
+"""Locks at the shard's door: acquire, view, fetch, release."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.core.datum import Datum, LockId
+from enact_dist.core.messages import (
+    Acquire,
+    Answer,
+    EpochChanged,
+    Fetch,
+    Gone,
+    Refused,
+    Release,
+    Released,
+    Slice,
+    Stale,
+    TakeView,
+    Viewed,
+    WrongShard,
+)
+from enact_dist.core.records import Effect, Reply
+from enact_dist.core.sessions import LANES_MAX, Session
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from enact_dist.core.messages import Item
+    from enact_dist.core.shard_state import ShardState
+
+ITEMS_MAX: Final = 4096
+"""Requests in one lock or view."""
+WAITERS_MAX: Final = 100_000
+"""Locks, granted or waiting, at one shard."""
+
+
+class LockDesk:
+    """Everything about who gets which lock, and the data that come with it."""
+
+    def __init__(self, state: ShardState) -> None:
+        self._state = state
+
+    def on_acquire(self, message: Acquire, reply_to: int) -> Iterator[Effect]:
+        """Queue a lock, or return to one that is queued or granted already."""
+        session = self._state.session_in_epoch(message.lock.session, message.epoch)
+        refusal = self._placement_or_items_refused(session, message.map_version, message.items)
+        if refusal is not None or session is None:
+            yield Reply(reply_to, refusal or EpochChanged(self._state.epoch))
+            return
+        if session.observer:
+            yield Reply(reply_to, Refused("protocol", "an observer session cannot lock"))
+            return
+        session.renewed_ns = max(session.renewed_ns, self._state.now_ns)
+        session.count_seen = max(session.count_seen, message.count)
+        tenure = self._state.tenures.by_lock.get(message.lock)
+        if tenure is None:
+            lane = session.lanes.get(message.lock.lane)
+            if lane is None and len(session.lanes) >= LANES_MAX:
+                yield Reply(reply_to, Refused("overload", f"{LANES_MAX} lanes in one session"))
+                return
+            lane = lane or session.lane(message.lock.lane)
+            if message.lock.seq <= lane.top:
+                self._state.count("stale")
+                yield Reply(reply_to, Stale(message.lock, self._state.epoch))
+                return
+            yield from self._supersede(message.lock)
+            lane.top = message.lock.seq
+            tenure = self._state.tenures.enqueue(message, now_ns=self._state.now_ns)
+            yield from self._state.grant_ready()
+        if tenure.token is not None:
+            granted = self._state.tenures.granted(
+                tenure, now_ns=self._state.now_ns, stamp_ns=self._state.stamp(message.seen_stamp_ns)
+            )
+            yield Reply(reply_to, granted)
+        else:
+            self._state.count("lock_waits")
+            yield from self._state.tenures.park(
+                tenure, reply_to=reply_to, wait_ns=message.wait_ns, now_ns=self._state.now_ns
+            )
+
+    def _supersede(self, lock: LockId) -> Iterator[Effect]:
+        """A newer lock of a lane ends the older ones: their release was lost."""
+        for tenure in self._state.tenures.of_session(lock.session):
+            older = tenure.lock.lane == lock.lane and tenure.lock.seq < lock.seq
+            if older and not tenure.committing:
+                self._state.count("superseded")
+                yield from self._state.tenures.take_away(
+                    tenure, "a newer lock of its thread", now_ns=self._state.now_ns
+                )
+        for pinned in [pinned for pinned in self._state.pins if pinned[:2] == lock[:2]]:
+            if pinned.seq < lock.seq:
+                del self._state.pins[pinned]
+
+    def _placement_or_items_refused(
+        self, session: Session | None, map_version: int, items: tuple[Item, ...]
+    ) -> Answer | None:
+        if session is None:
+            return EpochChanged(self._state.epoch)
+        if map_version != self._state.settings.placement.version:
+            self._state.count("wrong_shard")
+            return WrongShard(self._state.settings.placement)
+        if len(items) > ITEMS_MAX:
+            return Refused("value", f"{len(items)} requests in one lock; at most {ITEMS_MAX}")
+        if len(self._state.tenures.by_lock) >= WAITERS_MAX:
+            return Refused("overload", f"{WAITERS_MAX} locks are held or awaited here")
+        for item in items:
+            if item.context not in self._state.catalogue.worlds:
+                known = ", ".join(sorted(self._state.catalogue.worlds)) or "none"
+                return Refused(
+                    "unknown_world", f"no world context {item.context!r} here; known: {known}"
+                )
+            if item.aspect not in self._state.catalogue.aspects:
+                return Refused("unknown_aspect", f"aspect {item.aspect!r} is not registered here")
+        return None
+
+    def on_take_view(self, message: TakeView, reply_to: int) -> Iterator[Effect]:
+        """Show committed data without a lock."""
+        session = self._state.session_in_epoch(message.lock.session, message.epoch)
+        refusal = self._placement_or_items_refused(session, message.map_version, message.items)
+        if refusal is not None or session is None:
+            yield Reply(reply_to, refusal or EpochChanged(self._state.epoch))
+            return
+        session.count_seen = max(session.count_seen, message.count)
+        states = self._state.slots.states(message.items)
+        pins = self._state.tenures.pins_of(states)
+        if pins:
+            self._state.pins[message.lock] = pins
+        stamp_ns = self._state.stamp(message.seen_stamp_ns)
+        yield Reply(reply_to, Viewed(message.lock, self._state.epoch, stamp_ns, tuple(states)))
+
+    def on_fetch(self, message: Fetch, reply_to: int) -> Iterator[Effect]:
+        """Hand out a part of a large datum that a lock pins, or that is current."""
+        if self._state.session_in_epoch(message.lock.session, message.epoch) is None:
+            yield Reply(reply_to, EpochChanged(self._state.epoch))
+            return
+        datum = self._pinned(message)
+        if datum is None:
+            self._state.count("fetches_gone")
+            yield Reply(reply_to, Gone(message.slot, message.version))
+            return
+        length = min(message.length, self._state.settings.fetch_bytes_max)
+        body = memoryview(datum.body)[message.offset : message.offset + length]
+        part = Datum(b"", body, len(body))
+        self._state.count("bytes_fetched", len(body))
+        yield Reply(
+            reply_to,
+            Slice(
+                message.slot,
+                message.version,
+                datum.encoding,
+                datum.stamp_ns,
+                datum.size,
+                message.offset,
+                part,
+            ),
+        )
+
+    def _pinned(self, message: Fetch) -> Datum | None:
+        tenure = self._state.tenures.by_lock.get(message.lock)
+        key = (message.slot, message.version)
+        for pins in (tenure.pins if tenure else {}, self._state.pins.get(message.lock, {})):
+            if key in pins:
+                return pins[key]
+        content = self._state.slots[message.slot]
+        return content.datum if content.version == message.version else None
+
+    def on_release(self, message: Release, reply_to: int) -> Iterator[Effect]:
+        """Give up a lock, its place and its pins; always answered."""
+        tenure = self._state.tenures.by_lock.get(message.lock)
+        if tenure is not None and not tenure.committing:
+            yield from self._state.tenures.remove(tenure, now_ns=self._state.now_ns)
+        self._state.pins.pop(message.lock, None)
+        yield Reply(reply_to, Released())

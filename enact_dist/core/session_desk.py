@@ -1,0 +1,204 @@
+"""Sessions at the shard's door: hello, catalogue, keep-alive, goodbye, expiry."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.core.messages import (
+    Alive,
+    Answer,
+    EpochChanged,
+    Goodbye,
+    GrantLeft,
+    Hello,
+    KeepAlive,
+    Refused,
+    Register,
+    Registered,
+    Released,
+    Welcome,
+)
+from enact_dist.core.records import (
+    AspectRecord,
+    Effect,
+    Persist,
+    Record,
+    Reply,
+    SessionEnded,
+    SessionRecord,
+    SessionSeen,
+    Story,
+    WorldRecord,
+)
+from enact_dist.core.sessions import SESSIONS_MAX
+from enact_dist.terms import Durability, checked_name
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from enact_dist.core.shard_state import ShardState
+
+TTL_NS_MIN: Final = 100_000_000
+"""Leases shorter than this would be lost to ordinary scheduling delays."""
+
+
+class SessionDesk:
+    """Everything about who is alive.  Negative tickets of the store are this desk's own."""
+
+    def __init__(self, state: ShardState) -> None:
+        self._state = state
+        self._answers_after: dict[int, list[tuple[int, Answer]]] = {}
+        self._recording: dict[str, int] = {}
+        self._ticket = 0
+
+    @property
+    def waits_for_store(self) -> bool:
+        """Whether an answer waits for its record to be durable."""
+        return bool(self._answers_after)
+
+    def on_hello(self, message: Hello, reply_to: int) -> Iterator[Effect]:
+        """Open a session, or take its acknowledgement of this epoch."""
+        known = self._state.sessions.by_id.get(message.session)
+        if known is None and len(self._state.sessions.by_id) >= SESSIONS_MAX:
+            yield Reply(reply_to, Refused("overload", f"{SESSIONS_MAX} sessions are open"))
+            return
+        ttl_ns = max(TTL_NS_MIN, min(message.ttl_ns, self._state.settings.ttl_ns_max))
+        session, unrecorded = self._state.sessions.hello(
+            message, epoch=self._state.epoch, ttl_ns=ttl_ns, now_ns=self._state.now_ns
+        )
+        self._state.shortest_ttl_ns = min(self._state.shortest_ttl_ns, session.ttl_ns)
+        self._state.sessions.end_grace_if_all_acknowledged(self._state.now_ns)
+        welcome = Welcome(
+            self._state.settings.name,
+            self._state.epoch,
+            not self._state.sessions.in_grace(self._state.now_ns),
+            session.ttl_ns,
+            self._state.wall_ns,
+            self._state.commits.notice_number,
+            self._state.settings.placement,
+            tuple(self._state.catalogue.worlds),
+            tuple(self._state.catalogue.aspects.values()),
+        )
+        recording = self._recording.get(session.session)
+        if recording is not None:
+            self._answers_after[recording].append((reply_to, welcome))
+        elif unrecorded:
+            # A session that a restart would not know could lose its grants without the grace, so
+            # it may do nothing before its record is durable.
+            record = SessionRecord(session.session, session.ttl_ns)
+            yield from self._answer_when_durable(reply_to, welcome, (record,))
+            self._recording[session.session] = self._ticket
+        else:
+            session.present = True
+            yield Reply(reply_to, welcome)
+
+    def _answer_when_durable(
+        self, reply_to: int, answer: Answer, records: tuple[Record, ...]
+    ) -> Iterator[Effect]:
+        self._ticket -= 1
+        self._answers_after[self._ticket] = [(reply_to, answer)]
+        yield Persist(self._ticket, records, Durability.DURABLE)
+
+    def persisted(self, ticket: int) -> Iterator[Effect]:
+        """The records of one of this desk's answers are durable: answer."""
+        for session, recording in list(self._recording.items()):
+            if recording == ticket:
+                del self._recording[session]
+                found = self._state.sessions.by_id.get(session)
+                if found is not None:
+                    found.durable = found.present = True
+        for reply_to, answer in self._answers_after.pop(ticket):
+            yield Reply(reply_to, answer)
+
+    def on_register(self, message: Register, reply_to: int) -> Iterator[Effect]:
+        """Create world contexts and register aspects, all or none."""
+        records: list[Record] = []
+        for name in message.worlds:
+            try:
+                checked_name("world context", name, slashes=False)
+            except ValueError as error:
+                yield Reply(reply_to, Refused("value", str(error)))
+                return
+            if name not in self._state.catalogue.worlds:
+                records.append(WorldRecord(name))
+        for entry in message.aspects:
+            registered = self._state.catalogue.register(entry)
+            if isinstance(registered, str):
+                yield Reply(reply_to, Refused("datum_type", registered))
+                return
+            if registered[1]:
+                records.append(AspectRecord(registered[0]))
+        self._state.catalogue.worlds.update(dict.fromkeys(message.worlds))
+        answer = Registered(
+            tuple(self._state.catalogue.worlds), tuple(self._state.catalogue.aspects.values())
+        )
+        if records:
+            yield from self._answer_when_durable(reply_to, answer, tuple(records))
+        else:
+            yield Reply(reply_to, answer)
+
+    def on_keep_alive(self, message: KeepAlive, reply_to: int) -> Iterator[Effect]:
+        """Renew a session and free what it does not want any more."""
+        session = self._state.session_in_epoch(message.session, message.epoch)
+        if session is None:
+            yield Reply(reply_to, EpochChanged(self._state.epoch))
+            return
+        session.renewed_ns = max(session.renewed_ns, self._state.now_ns)
+        session.count_seen = max(session.count_seen, message.count)
+        session.report = message.report or session.report
+        lowest = {view.lane: view.seq for view in message.view}
+        for tenure in self._state.tenures.of_session(message.session):
+            if tenure.lock.seq < lowest.get(tenure.lock.lane, 0) and not tenure.committing:
+                self._state.count("orphans_freed")
+                yield Story("lock.orphan", f"{tenure.lock} is not wanted any more")
+                yield from self._state.tenures.remove(tenure, now_ns=self._state.now_ns)
+        for lock in [lock for lock in self._state.pins if lock.session == message.session]:
+            if lock.seq < lowest.get(lock.lane, 0):
+                del self._state.pins[lock]
+        grants = tuple(
+            GrantLeft(tenure.lock, tenure.token, max(0, tenure.hold_end_ns - self._state.now_ns))
+            for tenure in self._state.tenures.of_session(message.session)
+            if tenure.token is not None
+        )
+        yield Reply(
+            reply_to,
+            Alive(
+                self._state.epoch,
+                session.count_seen,
+                self._state.commits.notice_number,
+                self._state.stamp(),
+                grants,
+            ),
+        )
+
+    def on_goodbye(self, message: Goodbye, reply_to: int) -> Iterator[Effect]:
+        """End a session at its own wish."""
+        yield from self.end(message.session, "its session said goodbye")
+        yield Reply(reply_to, Released())
+
+    def end(self, session: str, cause: str) -> Iterator[Effect]:
+        """End a session: free its locks, forget its pins, keep its outcomes."""
+        found = self._state.sessions.by_id.get(session)
+        if found is None:
+            return
+        tenures = self._state.tenures.of_session(session)
+        for tenure in tenures:
+            if not tenure.committing:
+                yield from self._state.tenures.take_away(tenure, cause, now_ns=self._state.now_ns)
+        self._state.drop_pins(session)
+        self._state.sessions.forget(session)
+        self._state.sessions.end_grace_if_all_acknowledged(self._state.now_ns)
+        if found.durable:
+            yield Persist(0, (SessionEnded(session, self._state.wall_ns),), Durability.OS)
+
+    def on_session_seen(self, message: SessionSeen, _: int) -> Iterator[Effect]:
+        """Note that a liveliness token appeared or vanished."""
+        self._state.sessions.token_seen(message.session, message.present, now_ns=self._state.now_ns)
+        if not message.present:
+            # Its waiters lose their place: a lock must not be granted to a dead process while
+            # living ones wait.  A client that was only cut off asks again with the same id.
+            for tenure in self._state.tenures.of_session(message.session):
+                if tenure.token is None:
+                    self._state.count("waiters_dropped")
+                    yield from self._state.tenures.remove(tenure, now_ns=self._state.now_ns)
+                    self._state.forget_top(tenure.lock)

@@ -1,0 +1,137 @@
+"""The parts of one shard that its desks work on, and the few acts that they share.
+
+`ShardState` decides nothing by itself; `Shard` sets its time before each message and hands it to
+the desk that the message is for.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.core import inspection
+from enact_dist.core.commits import Commits
+from enact_dist.core.messages import AspectEntry, PlacementMap
+from enact_dist.core.sessions import Session, SessionTable
+from enact_dist.core.slots import Catalogue, SlotMap
+from enact_dist.core.stamps import Stamps
+from enact_dist.core.tenures import Tenure, Tenures
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from enact_dist.core.datum import Datum, LockId, Slot
+    from enact_dist.core.messages import Holder
+    from enact_dist.core.records import Effect, Recovered
+
+FETCH_BYTES_MAX: Final = 4 << 20
+"""Largest part of a datum in one answer, so that small answers never wait long behind it."""
+
+
+@dataclass(frozen=True, slots=True)
+class ShardSettings:
+    """What a shard is told by its cell.
+
+    Attributes:
+        name: The shard's name.
+        placement: All shards of the cell; the shard itself is one of them.
+        worlds: World contexts that exist from the start.
+        aspects: Aspects whose durability the cell decides; their fingerprints may be empty.
+        ttl_ns_max: Longest lease a session may ask for.
+        fetch_bytes_max: Largest part of a datum in one answer.
+    """
+
+    name: str
+    placement: PlacementMap
+    worlds: tuple[str, ...] = ()
+    aspects: tuple[AspectEntry, ...] = ()
+    ttl_ns_max: int = 60_000_000_000
+    fetch_bytes_max: int = FETCH_BYTES_MAX
+
+
+class ShardState:
+    """Slots, sessions, locks and commits of one shard at one moment.
+
+    Attributes:
+        now_ns: Monotonic time of the message being handled.
+        wall_ns: Wall clock at that moment; for stamps only.
+        pins: Data that a view without a lock keeps fetchable.
+        shortest_ttl_ns: Of all sessions; bounds how often the shard must look at the time.
+        draining: The shard is about to stop and grants nothing.
+    """
+
+    def __init__(
+        self, settings: ShardSettings, recovered: Recovered, *, now_ns: int, wall_ns: int
+    ) -> None:
+        self.settings = settings
+        self.epoch = recovered.epoch
+        self.now_ns, self.wall_ns, self.born_ns = now_ns, wall_ns, now_ns
+        self.draining = False
+        self.counters: dict[str, int] = {}
+        self.pins: dict[LockId, dict[tuple[Slot, int], Datum]] = {}
+        self.slots = SlotMap(recovered.slots)
+        self.catalogue = Catalogue(
+            configured=settings.aspects,
+            recovered=recovered.aspects,
+            worlds=(*settings.worlds, *recovered.worlds),
+        )
+        self.sessions = SessionTable(recovered.sessions, outcomes=recovered.outcomes, now_ns=now_ns)
+        self.shortest_ttl_ns = min(
+            (session.ttl_ns for session in self.sessions), default=settings.ttl_ns_max
+        )
+        stamps = [record.stamp_ns for record in recovered.slots]
+        stamps += [record.position.stamp_ns for record in recovered.outcomes]
+        self.stamps = Stamps(max(stamps, default=0))
+        self.tenures = Tenures(
+            epoch=self.epoch, slots=self.slots, sessions=self.sessions, count=self.count
+        )
+        self.tenures.describe = self.describe
+        self.commits = Commits(
+            shard=settings.name,
+            epoch=self.epoch,
+            slots=self.slots,
+            catalogue=self.catalogue,
+            sessions=self.sessions,
+            tenures=self.tenures,
+            stamps=self.stamps,
+            count=self.count,
+        )
+
+    def count(self, name: str, count: int = 1) -> None:
+        """Add to one of the shard's statistics."""
+        self.counters[name] = self.counters.get(name, 0) + count
+
+    def session_in_epoch(self, session: str, epoch: int) -> Session | None:
+        """Return the session if it and the client's idea of the epoch are current."""
+        if epoch != self.epoch:
+            self.count("epoch_refusals")
+            return None
+        return self.sessions.known(session)
+
+    def grant_ready(self) -> Iterator[Effect]:
+        """Grant whatever may be granted now."""
+        if not self.draining and not self.sessions.in_grace(self.now_ns):
+            yield from self.tenures.grant_ready(now_ns=self.now_ns, stamp_ns=self.stamp())
+
+    def stamp(self, seen_ns: int = 0) -> int:
+        """Return the present, after everything that an honest client has seen."""
+        if seen_ns > self.stamps.last_ns and not self.stamps.too_far_ahead(
+            seen_ns, wall_ns=self.wall_ns
+        ):
+            self.stamps.last_ns = seen_ns
+        return self.stamps.now(wall_ns=self.wall_ns)
+
+    def drop_pins(self, session: str) -> None:
+        """Forget everything that a session's views keep."""
+        for lock in [lock for lock in self.pins if lock.session == session]:
+            del self.pins[lock]
+
+    def forget_top(self, lock: LockId) -> None:
+        """Let a lock that never was granted be asked for again under the same seq."""
+        session = self.sessions.by_id.get(lock.session)
+        if session is not None and session.lane(lock.lane).top == lock.seq:
+            session.lane(lock.lane).top = lock.seq - 1
+
+    def describe(self, tenure: Tenure, now_ns: int) -> Holder:
+        """Describe one lock for people."""
+        return inspection.holder(self, tenure, now_ns=now_ns)

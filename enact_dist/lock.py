@@ -1,0 +1,475 @@
+"""The lock: a set of data held at once, given back when its `with` block ends (ENACT 3.3, RAII).
+
+::
+
+    with Lock(Read(online, piece, MESH), Write(online, bench, CONTACTS)) as lock: ...
+
+Clean exit publishes all writes at once; an exception publishes nothing.  One lock per thread; the
+requests may name several world contexts and shards.  Departures from the paper: the request itself
+is the index (no order-coupled list), data are immutable values, and a lock is a lease.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator, MutableMapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeVar, overload
+
+from enact_dist.core.datum import Datum, Slot
+from enact_dist.core.messages import SlotVersion, WriteItem
+from enact_dist.core.multilock import Phase
+from enact_dist.errors import (
+    LockHeldError,
+    LockReleasedError,
+    MisuseError,
+    ReadonlyError,
+)
+from enact_dist.reading import EachData, Readings, check_requested, slot_of
+from enact_dist.terms import Access, Entity, refuse_duplicates
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from types import TracebackType
+
+    from enact_dist.core.datum import Position
+    from enact_dist.core.multilock import MultiLock
+    from enact_dist.session import Session
+    from enact_dist.terms import (
+        Aspect,
+        LockRequest,
+        LockRequestEach,
+        LockRequestOne,
+        View,
+        Write,
+        WriteEach,
+    )
+
+T = TypeVar("T")
+
+HOLD_S_MAX = 24 * 3600.0
+_thread = threading.local()
+
+
+def refuse_inside_lock(what: str) -> None:
+    """Raise `LockHeldError` if this thread holds a lock: `what` waits, and so could wait for it."""
+    held: Lock | None = getattr(_thread, "lock", None)
+    if held is not None:
+        raise LockHeldError(
+            f"{what} inside a lock would hold and wait; this thread holds {held!r};"
+            " leave its block first"
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class LockStatistics:
+    """What a lock went through.
+
+    Attributes:
+        granted: Whether it was granted.
+        waited_s: From asking to the grant.
+        held_s: From the grant to the end of the block, or until now.
+        shards: The shards that it locked.
+        fetched: How many data were decoded.
+    """
+
+    granted: bool
+    waited_s: float
+    held_s: float
+    shards: tuple[str, ...]
+    fetched: int
+
+
+class Lock:
+    """A set of data, granted at once or not at all.
+
+    Args:
+        requests: What to read, write and view; of one cell, of any of its contexts and shards.
+            Writes must lie on one shard in this version.
+        wait_s: How long to wait for the grant.
+        hold_s: How long it may be held at most after the grant.
+
+    Entering raises:
+        LockTimeoutError: Not granted within `wait_s`; nothing is held.
+        LockHeldError: This thread holds a lock already.
+        ShardUnreachableError: A shard does not answer.
+
+    Leaving raises (after a clean block):
+        LeaseLostError: The lock was lost meanwhile; nothing was written.
+        ChangedError: An expected view has moved on; nothing was written.
+        CommitUnknownError: The commit was sent and never answered.
+
+    Attributes:
+        position: Where the commit stands in time, after the block; None before or without writes.
+        entity: In an actor's `update`, the entity that triggered it.
+    """
+
+    def __init__(
+        self, *requests: LockRequest[Any], wait_s: float = 10.0, hold_s: float = 60.0
+    ) -> None:
+        if not requests:
+            raise MisuseError("a lock of nothing: name at least one request")
+        if not wait_s >= 0.0:
+            raise MisuseError(f"wait_s is {wait_s!r}; it must be 0 or more seconds")
+        if not 0.0 < hold_s <= HOLD_S_MAX:
+            raise MisuseError(f"hold_s is {hold_s!r}; it must lie in (0, {HOLD_S_MAX:g}] seconds")
+        self._session = session_of(requests)
+        try:
+            refuse_duplicates(requests)
+        except ValueError as error:
+            raise MisuseError(str(error)) from None
+        self._requests = {request: request for request in requests}
+        self._wait_s, self._hold_s = wait_s, hold_s
+        self._lock: MultiLock | None = None
+        self._over = False
+        self._readings: Readings
+        self._writes: dict[Slot, Datum | None] = {}
+        self._expects: dict[Slot, SlotVersion] = {}
+        self._entity: Entity | None = None
+        self._asked_s = self._granted_s = self._ended_s = 0.0
+        self.position: Position | None = None
+
+    # ---------------------------------------------------------------- the block
+
+    def __enter__(self) -> Lock:
+        if self._lock is not None:
+            raise LockReleasedError(f"{self!r} was used already; make a new lock")
+        refuse_inside_lock("a second lock")
+        self._session.client.check_usable()
+        aspects = {request.aspect.name: request.aspect for request in self._requests}
+        self._session.register_aspects(aspects.values())
+        _thread.lock = self
+        self._asked_s = time.monotonic()
+        try:
+            self._lock = self._session.client.acquire(
+                [self._session.item_of(request) for request in self._requests],
+                wait_s=self._wait_s,
+                hold_s=self._hold_s,
+                check_plan=self._check_one_writing_shard,
+            )
+        except BaseException:
+            _thread.lock = None
+            raise
+        self._granted_s = time.monotonic()
+        self._readings = Readings(
+            self._session.client, self._session.cache, self._lock.lock, self._lock.states, self._use
+        )
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        assert self._lock is not None
+        _thread.lock = None
+        self._over = True
+        self._ended_s = time.monotonic()
+        client = self._session.client
+        if client.forked:
+            return
+        if kind is not None:
+            client.release(self._lock)
+            return
+        client.finish(self._lock, self._writes_by_shard(), tuple(self._expects.values()))
+        self.position = self._lock.position
+
+    def _check_one_writing_shard(self) -> None:
+        slots = [slot_of(r) for r in self._requests if r.access is Access.WRITE]
+        self._session.refuse_several_shards(slots)
+
+    def _writes_by_shard(self) -> dict[str, list[WriteItem]]:
+        """Return the writes by shard; expectations alone are a commit without writes."""
+        by_shard: dict[str, list[WriteItem]] = {}
+        for slot in self._expects:
+            by_shard.setdefault(self._session.shard_of(slot), [])
+        for slot, datum in self._writes.items():
+            by_shard.setdefault(self._session.shard_of(slot), []).append(WriteItem(slot, datum))
+        return by_shard
+
+    def _use(self) -> None:
+        """Raise unless the block is running and the lock not known to be lost."""
+        if self._lock is None or self._over:
+            raise LockReleasedError(f"{self!r} is used outside its `with` block")
+        if self._lock.phase is not Phase.HELD:
+            self.check()
+
+    # ---------------------------------------------------------------- data
+
+    @overload
+    def __getitem__(self, request: WriteEach[T]) -> WritableEach[T]: ...
+    @overload
+    def __getitem__(self, request: LockRequestEach[T]) -> Mapping[Entity, T]: ...
+    @overload
+    def __getitem__(self, request: LockRequestOne[T]) -> T: ...
+    def __getitem__(self, request: LockRequest[Any]) -> Any:
+        """Return the datum; for a pattern, the data by entity.
+
+        Raises:
+            NullDatumError: The world context does not know it.
+            NotRequestedError: The lock did not ask for it.
+            LeaseLostError: The lock is lost.
+        """
+        self._check(request)
+        if request.access is Access.WRITE_EACH:
+            return WritableEach(self, self._readings, request)
+        if request.access.each:
+            return EachData(self._readings, request)
+        slot = slot_of(request)
+        if slot in self._writes:
+            return self._written(slot, request.aspect)
+        return self._readings.value(slot, request.aspect)
+
+    @overload
+    def get(self, request: LockRequestOne[T]) -> T | None: ...
+    @overload
+    def get(self, request: LockRequestOne[T], default: T) -> T: ...
+    def get(self, request: LockRequestOne[T], default: T | None = None) -> T | None:
+        """Return the datum, or `default` where the world context does not know it."""
+        self._check(request)
+        slot = slot_of(request)
+        if self._is_null(slot):
+            return default
+        return self[request]
+
+    def _is_null(self, slot: Slot) -> bool:
+        if slot in self._writes:
+            return self._writes[slot] is None
+        state = self._readings.state(slot)
+        return state is None or bool(state.null_reason)
+
+    def _written(self, slot: Slot, aspect: Aspect[T]) -> T:
+        from enact_dist.reading import null_error
+        from enact_dist.wire.payload import decode_datum
+
+        datum = self._writes[slot]
+        if datum is None:
+            raise null_error(slot, None)
+        value: T = decode_datum(datum, aspect.datum_type)
+        return value
+
+    def __setitem__(self, request: Write[T], datum: T) -> None:
+        """Set the datum when the block ends cleanly; see `put`."""
+        self.put(request, datum)
+
+    def put(self, request: Write[T], datum: T, *, stamp_ns: int = 0) -> None:
+        """Set the datum when the block ends cleanly.
+
+        Args:
+            request: A `Write` of this lock.
+            datum: A value of the aspect's type; arrays are copied.
+            stamp_ns: When it was captured, nanoseconds since 1970; 0 where that has no meaning.
+
+        Raises:
+            ReadonlyError: The request does not allow writing.
+            DatumTypeError: The datum is not of the aspect's type.
+        """
+        self._check_writable(request)
+        self._put(slot_of(request), request.aspect, datum, stamp_ns=stamp_ns)
+
+    def _put(self, slot: Slot, aspect: Aspect[T], datum: T, *, stamp_ns: int = 0) -> None:
+        from enact_dist.wire.payload import encode_datum
+
+        self._session.refuse_several_shards([*self._writes, slot])
+        self._writes[slot] = encode_datum(datum, aspect.datum_type, stamp_ns=stamp_ns)
+
+    def __delitem__(self, request: Write[Any]) -> None:
+        """Write null when the block ends cleanly."""
+        self._check_writable(request)
+        self._delete(slot_of(request))
+
+    def _delete(self, slot: Slot) -> None:
+        self._session.refuse_several_shards([*self._writes, slot])
+        self._writes[slot] = None
+
+    def expect(self, view: View[Any]) -> None:
+        """Let the commit fail with `ChangedError` if the viewed slot has moved on by then.
+
+        The slot must lie on the shard where this lock writes (or, in a lock that writes nothing,
+        reads).  Expectations over shards need the prepared commit, which this version lacks.
+
+        Raises:
+            MisuseError: Not a `View` of this lock, or on another shard.
+        """
+        self._check(view)
+        assert self._lock is not None
+        if view.access is not Access.VIEW:
+            raise MisuseError(f"{view!r} is held or a pattern; only a View can be expected")
+        slot = slot_of(view)
+        shard = self._session.shard_of(slot)
+        if shard not in {part.shard for part in self._lock.parts}:
+            raise MisuseError(f"{view!r} lies on shard {shard}, where this lock holds nothing")
+        self._session.refuse_several_shards([*self._writes, *self._expects, slot])
+        state = self._readings.state(slot)
+        self._expects[slot] = SlotVersion(slot, state.version if state is not None else 0)
+
+    def _check(self, request: LockRequest[Any]) -> None:
+        if self._lock is None or self._over:
+            raise LockReleasedError(f"{self!r} is used outside its `with` block")
+        check_requested(request, self._requests, "lock")
+        self._use()
+
+    def _check_writable(self, request: LockRequest[Any]) -> None:
+        self._check(request)
+        if request.access is Access.WRITE_EACH:
+            raise MisuseError(f"set one entity at a time: lock[{request!r}][entity] = …")
+        if request.access is not Access.WRITE:
+            raise ReadonlyError(
+                f"{request!r} does not allow writing; ask with Write(…) instead of"
+                f" {type(request).__name__}(…)"
+            )
+
+    # ---------------------------------------------------------------- state
+
+    @property
+    def entity(self) -> Entity:
+        """The entity that triggered this update of an actor.
+
+        Raises:
+            MisuseError: The lock was not made for a triggering entity.
+        """
+        if self._entity is None:
+            raise MisuseError(f"{self!r} was not made by a trigger, so no entity triggered it")
+        return self._entity
+
+    def version(self, request: LockRequestOne[Any]) -> int:
+        """Return the version of the datum as granted (0: never set)."""
+        self._check(request)
+        state = self._readings.state(slot_of(request))
+        return state.version if state is not None else 0
+
+    def stamp_ns(self, request: LockRequestOne[Any]) -> int:
+        """Return when the datum was captured, as its writer said (0: not said)."""
+        self._check(request)
+        slot = slot_of(request)
+        return 0 if self._is_null(slot) else self._readings.datum(slot).stamp_ns
+
+    def valid(self) -> bool:
+        """Whether this process may still believe that it holds the lock; asks nobody."""
+        return self._lock is not None and not self._over and self._session.client.valid(self._lock)
+
+    def check(self) -> None:
+        """Make sure that the lock is held, asking its shards where belief has run out.
+
+        Raises:
+            LeaseLostError: It is lost.
+            LockReleasedError: The block is not running.
+            ShardUnreachableError: A shard does not answer, so nobody can say.
+        """
+        if self._lock is None or self._over:
+            raise LockReleasedError(f"{self!r} is used outside its `with` block")
+        self._session.client.check(self._lock)
+
+    @property
+    def token(self) -> tuple[tuple[str, int, int], ...]:
+        """Fencing numbers (shard, epoch, number), for outside devices that compare them.
+
+        Of two grants of one shard the later one has the larger (epoch, number).
+        """
+        parts = self._lock.parts if self._lock is not None else []
+        return tuple((p.shard, p.token.epoch, p.token.number) for p in parts if p.token)
+
+    def statistics(self) -> LockStatistics:
+        """Return what the lock went through so far."""
+        granted = self._lock is not None
+        end_s = self._ended_s or time.monotonic()
+        return LockStatistics(
+            granted=granted,
+            waited_s=self._granted_s - self._asked_s if granted else 0.0,
+            held_s=end_s - self._granted_s if granted else 0.0,
+            shards=tuple(part.shard for part in self._lock.parts) if self._lock else (),
+            fetched=self._readings.decoded if granted else 0,
+        )
+
+    def __repr__(self) -> str:
+        return f"Lock({', '.join(map(repr, self._requests))})"
+
+
+class WritableEach(EachData[T], MutableMapping[Entity, T]):
+    """The data of a `WriteEach` by entity; assigning one publishes it when the block ends.
+
+    Assigning to an entity that did not exist creates it: the pattern is locked, so nobody else
+    could have.
+    """
+
+    def __init__(self, lock: Lock, readings: Readings, request: LockRequest[T]) -> None:
+        super().__init__(readings, request)
+        self._lock = lock
+        for slot, datum in lock._writes.items():  # noqa: SLF001 - one class in two parts
+            if (slot.context, slot.aspect) == (request.address[0], request.address[2]):
+                self._note(Entity(slot.entity), slot, null=datum is None)
+
+    def _note(self, entity: Entity, slot: Slot, *, null: bool) -> None:
+        if null:
+            self._slots.pop(entity, None)
+        else:
+            self._slots[entity] = slot
+
+    def _slot(self, entity: Entity) -> Slot:
+        context, pattern, aspect = self._request.address
+        if not isinstance(entity, Entity):
+            raise MisuseError(f"a pattern's data are set by Entity, not by {entity!r}")
+        from enact_dist.terms import pattern_matches
+
+        if not pattern_matches(pattern, entity.name):
+            raise MisuseError(f"{entity.name!r} does not match {pattern!r}, which is locked")
+        return Slot(context, entity.name, aspect)
+
+    def __getitem__(self, entity: Entity) -> T:
+        slot = self._slots.get(entity)
+        if slot is None:
+            raise KeyError(entity)
+        if slot in self._lock._writes:  # noqa: SLF001
+            return self._lock._written(slot, self._request.aspect)  # noqa: SLF001
+        return super().__getitem__(entity)
+
+    def __setitem__(self, entity: Entity, datum: T) -> None:
+        self.put(entity, datum)
+
+    def put(self, entity: Entity, datum: T, *, stamp_ns: int = 0) -> None:
+        """Set one entity's datum when the block ends cleanly; see `Lock.put`."""
+        slot = self._slot(entity)
+        self._lock._use()  # noqa: SLF001
+        self._lock._put(slot, self._request.aspect, datum, stamp_ns=stamp_ns)  # noqa: SLF001
+        self._note(entity, slot, null=False)
+
+    def __delitem__(self, entity: Entity) -> None:
+        if entity not in self._slots:
+            raise KeyError(entity)
+        slot = self._slot(entity)
+        self._lock._use()  # noqa: SLF001
+        self._lock._delete(slot)  # noqa: SLF001
+        self._note(entity, slot, null=True)
+
+    def __iter__(self) -> Iterator[Entity]:
+        return iter(list(self._slots))
+
+
+def session_of(requests: tuple[LockRequest[Any], ...]) -> Session:
+    """Return the one cell session that all requests belong to.
+
+    Raises:
+        MisuseError: A request names an unbound role, or two cells are mixed.
+    """
+    from enact_dist.terms import LockRequest
+
+    sessions: list[Session] = []
+    for request in requests:
+        if not isinstance(request, LockRequest):
+            raise MisuseError(f"{request!r} is no lock request; use Read, Write, View or …Each")
+        session = getattr(request.world, "session", None)
+        if session is None:
+            raise MisuseError(
+                f"{request!r} names {request.world!r}, which is a role and not a world context of"
+                " a cell; use cell.world(name), or run the actor with its roles bound"
+            )
+        if not request.access.each and not isinstance(request.entity, Entity):
+            raise MisuseError(
+                f"{request!r} names a pattern; outside an actor use {type(request).__name__}Each"
+            )
+        sessions.append(session)
+    if any(session is not sessions[0] for session in sessions):
+        raise MisuseError("one lock names world contexts of two connections; connect once")
+    return sessions[0]

@@ -1,0 +1,77 @@
+"""What a cell's handles share: the client, the datum cache, names turned into protocol items."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from enact_dist.core.messages import AspectEntry, Item
+from enact_dist.core.placement import shard_of
+from enact_dist.errors import MisuseError
+from enact_dist.link.fetching import DatumCache
+from enact_dist.wire.fingerprint import fingerprint
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from enact_dist.core.datum import Slot
+    from enact_dist.link.client import CellClient
+    from enact_dist.terms import Aspect, LockRequest
+
+
+class Session:
+    """One connection of this process to a cell, behind `Cell`, `WorldContext` and `Lock`."""
+
+    def __init__(self, client: CellClient) -> None:
+        self.client = client
+        self.cache = DatumCache()
+        self._entries: dict[int, tuple[Aspect[Any], AspectEntry]] = {}
+
+    def register_aspects(self, aspects: Iterable[Aspect[Any]]) -> None:
+        """Make sure that all shards know these aspects with these datum types.
+
+        Raises:
+            DatumTypeError: A shard knows one with another type.
+        """
+        self.client.register(aspects=[self._entry(aspect) for aspect in aspects])
+
+    def _entry(self, aspect: Aspect[Any]) -> AspectEntry:
+        """Return the aspect's catalogue entry; computed once per aspect object."""
+        known = self._entries.get(id(aspect))
+        if known is None or known[0] is not aspect:
+            durability = aspect.durability.value if aspect.durability is not None else ""
+            entry = AspectEntry(aspect.name, fingerprint(aspect.datum_type), durability)
+            known = self._entries[id(aspect)] = (aspect, entry)
+        return known[1]
+
+    def shard_of(self, slot: Slot) -> str:
+        """Return the name of the shard that owns the slot."""
+        return shard_of(slot.entity, self.client.core.placement)
+
+    def item_of(self, request: LockRequest[Any]) -> Item:
+        """Return the protocol's line for a request, with the version that the cache holds."""
+        context, entity, aspect = request.address
+        if request.access.each:
+            return Item(int(request.access), context, entity, aspect)
+        from enact_dist.core.datum import Slot
+
+        slot = Slot(context, entity, aspect)
+        shard = self.shard_of(slot)
+        known = self.cache.version(slot, shard, self.client.core.epoch(shard))
+        return Item(int(request.access), context, entity, aspect, known)
+
+    def refuse_several_shards(self, slots: Iterable[Slot]) -> None:
+        """Raise if writes to `slots` would lie on more than one shard.
+
+        Raises:
+            MisuseError: They do; the message names the shards and a remedy.
+        """
+        shards: dict[str, Slot] = {}
+        for slot in slots:
+            shards.setdefault(self.shard_of(slot), slot)
+        if len(shards) > 1:
+            named = ", ".join(f"{slot.entity}/{slot.aspect} on {s}" for s, slot in shards.items())
+            raise MisuseError(
+                f"one lock writes on {len(shards)} shards ({named}); this version commits on one"
+                " shard at a time: pin these entities to one shard ([placement] in cell.toml) or"
+                " write them in separate locks"
+            )

@@ -1,0 +1,206 @@
+"""A watch: what is there now, then every change in order, none missed unknowingly.
+
+Notices are small, best effort and numbered without a gap per shard and epoch.  A number that is
+skipped, a number that a keep-alive knows and no notice brought, or a new epoch means that some
+were missed: the watch then lists the slots again and yields one change per slot that moved, whose
+`gap` says how many versions were skipped.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.core.datum import Position, Slot
+from enact_dist.core.messages import Notice, Survey, Surveyed
+from enact_dist.errors import ShardUnreachableError
+from enact_dist.terms import Entities, Entity, pattern_matches
+
+if TYPE_CHECKING:
+    from types import TracebackType
+
+    from enact_dist.core.messages import SlotState
+    from enact_dist.link.client import CellClient
+
+POLL_S: Final = 0.1
+"""How often a quiet watch looks whether it missed the last notices; also how soon `close` acts."""
+RESYNC_S: Final = 1.0
+"""How long one attempt to list the slots of a shard again may take."""
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """One slot has a new state.
+
+    Attributes:
+        entity: The entity.
+        aspect: Name of the aspect.
+        version: The slot's version; starts again for volatile aspects when their shard restarts.
+        position: Where the commit stands in time.
+        gap: How many versions of this slot were skipped before this one.
+        null: Whether the slot is null now.
+    """
+
+    entity: Entity
+    aspect: str
+    version: int
+    position: Position
+    gap: int
+    null: bool
+
+
+@dataclass(slots=True)
+class _Following:
+    """What is known of one shard's notices: all up to `number` of `epoch` are accounted for."""
+
+    epoch: int = -1
+    number: int = 0
+    listed: bool = False
+
+
+class Watch:
+    """An iterator of `Change`; also a context manager.  One thread at a time may iterate."""
+
+    def __init__(
+        self, client: CellClient, context: str, pattern: str, aspects: tuple[str, ...]
+    ) -> None:
+        self._client = client
+        self._context, self._pattern = context, str(Entities(pattern))
+        self._aspects = aspects
+        self._known: dict[Slot, tuple[int, int]] = {}
+        self._following: dict[str, _Following] = {}
+        self._pending: deque[Change] = deque()
+        self._closed = threading.Event()
+        self._missed = 0
+        # Subscribed before the first listing, so that nothing falls between the two.
+        self._feed = client.subscribe()
+        try:
+            for shard in client.shards():
+                self._following[shard] = _Following()
+                self._list_again(shard, timeout_s=10.0)
+        except BaseException:
+            self._feed.close()
+            raise
+
+    @property
+    def missed(self) -> int:
+        """How many versions were skipped so far, over all slots."""
+        return self._missed
+
+    def next(self, timeout_s: float | None = None) -> Change | None:
+        """Return the next change, or None when there is none in time or the watch is closed.
+
+        Args:
+            timeout_s: How long to wait; None waits until `close`.
+        """
+        deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
+        while not self._closed.is_set():
+            if self._pending:
+                return self._pending.popleft()
+            wait_s = POLL_S
+            if deadline_s is not None:
+                wait_s = min(wait_s, deadline_s - time.monotonic())
+                if wait_s < 0:
+                    return None
+            notice = self._feed.get(timeout_s=wait_s)
+            if notice is not None:
+                self._take(notice)
+            else:
+                self._look_for_missed_tail()
+        return None
+
+    def _take(self, notice: Notice) -> None:
+        following = self._following.get(notice.shard)
+        if following is None:
+            return
+        same_epoch = notice.epoch == following.epoch
+        if notice.epoch < following.epoch or (same_epoch and notice.number <= following.number):
+            return
+        if not same_epoch or notice.number > following.number + 1:
+            self._try_list_again(notice.shard)
+            return
+        following.number = notice.number
+        for slot, version, stamp_ns, null in notice.changes:
+            if self._covers(slot):
+                self._note(notice.shard, slot, version, stamp_ns, null=null)
+
+    def _covers(self, slot: Slot) -> bool:
+        return (
+            slot.context == self._context
+            and (not self._aspects or slot.aspect in self._aspects)
+            and pattern_matches(self._pattern, slot.entity)
+        )
+
+    def _look_for_missed_tail(self) -> None:
+        """Compare with what the keep-alives know; they come every quarter of a TTL."""
+        for shard, following in self._following.items():
+            epoch, number = self._client.notice_numbers.get(shard, (0, 0))
+            if epoch > following.epoch or (epoch == following.epoch and number > following.number):
+                self._try_list_again(shard)
+
+    def _try_list_again(self, shard: str) -> None:
+        try:
+            self._list_again(shard, timeout_s=RESYNC_S)
+        except ShardUnreachableError:
+            # It stays behind what the keep-alives will say, so this comes round again.
+            self._following[shard].epoch = -1
+
+    def _list_again(self, shard: str, *, timeout_s: float) -> None:
+        request = Survey((self._context,), (self._pattern,), self._aspects)
+        answer = self._client.call(shard, request, timeout_s=timeout_s)
+        if not isinstance(answer, Surveyed):
+            return
+        states: list[SlotState] = sorted(answer.states, key=lambda state: state.stamp_ns)
+        for state in states:
+            null = bool(state.null_reason)
+            if null and state.slot not in self._known:
+                continue
+            self._note(shard, state.slot, state.version, state.stamp_ns, null=null)
+        self._following[shard] = _Following(answer.epoch, answer.notice_number, listed=True)
+
+    def _note(self, shard: str, slot: Slot, version: int, stamp_ns: int, *, null: bool) -> None:
+        """Add a change unless it is known.
+
+        A state is known by version and stamp: durable slots keep both over a restart of their
+        shard, volatile ones start counting again with a later stamp.
+        """
+        known = self._known.get(slot)
+        if known == (version, stamp_ns):
+            return
+        if known is None:
+            gap = version - 1 if self._following[shard].listed else 0
+        else:
+            gap = version - known[0] - 1 if version > known[0] else version - 1
+        gap = max(0, gap)
+        self._known[slot] = (version, stamp_ns)
+        self._missed += gap
+        position = Position(stamp_ns, shard)
+        self._pending.append(Change(Entity(slot.entity), slot.aspect, version, position, gap, null))
+
+    def close(self) -> None:
+        """End the watch; a `next` that waits returns None within 0.1 s."""
+        self._closed.set()
+        self._feed.close()
+
+    def __iter__(self) -> Watch:
+        return self
+
+    def __next__(self) -> Change:
+        change = self.next()
+        if change is None:
+            raise StopIteration
+        return change
+
+    def __enter__(self) -> Watch:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()

@@ -1,0 +1,256 @@
+"""A world context as its user sees it: initial data, views without locks, watches, listings.
+
+A world context W maps (entity, aspect) to a datum or null (ENACT 3.2); `WorldContext` is the
+handle, the map itself lies on the shards.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeVar, overload
+
+from enact_dist.core.datum import Position
+from enact_dist.core.messages import Survey, Surveyed
+from enact_dist.errors import MisuseError, NullDatumError, ProtocolError
+from enact_dist.lock import Lock, refuse_inside_lock, session_of
+from enact_dist.reading import EachData, Readings, check_requested, null_error, slot_of
+from enact_dist.terms import Aspect, Context, Entities, Entity, NullReason, View, Write
+from enact_dist.watch import Watch
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from enact_dist.core.messages import Item, SlotState
+    from enact_dist.session import Session
+    from enact_dist.terms import LockRequest, LockRequestEach, LockRequestOne
+
+T = TypeVar("T")
+
+VIEW_WAIT_S = 10.0
+"""How long a view waits for its shards before they count as unreachable."""
+
+
+@dataclass(frozen=True, slots=True)
+class SlotInfo:
+    """One slot of a world context, without its datum.
+
+    Attributes:
+        size_bytes: Length of the datum's buffers; 0 for null and for plain numbers.
+        null_reason: Why it is null, or the empty string.
+        shard: Where it lies.
+    """
+
+    entity: Entity
+    aspect: str
+    version: int
+    position: Position
+    size_bytes: int
+    null_reason: str
+    shard: str
+
+
+class WorldContext(Context):
+    """A named map from (entity, aspect) to a datum; made by `Cell.world`."""
+
+    __slots__ = ("session",)
+
+    def __init__(self, name: str, session: Session) -> None:
+        super().__init__(name)
+        self.session = session
+
+    def init(self, entity: Entity, aspect: Aspect[T], datum: T) -> bool:
+        """Set a datum if none was ever set; from here on only through a lock (ENACT 3.3).
+
+        Args:
+            entity: The entity; it exists from here on.
+            aspect: The aspect.
+            datum: The initial value; arrays are copied, as nobody can take them away in Python.
+
+        Returns:
+            Whether this call set it; False leaves the datum that was there.
+
+        Raises:
+            LockHeldError: This thread holds a lock.
+            DatumTypeError: The datum is not of the aspect's type.
+        """
+        refuse_inside_lock("init")
+        request = Write(self, entity, aspect)
+        with Lock(request) as lock:
+            if lock.version(request) > 0 and lock.get(request) is not None:
+                return False
+            lock[request] = datum
+        return True
+
+    def view(self, *requests: LockRequest[Any]) -> Snapshot:
+        """Read committed data without a lock.
+
+        All data of one shard are of one moment.  Over several shards they need not be of one cut
+        in this version; a lock with `Read`s is.
+
+        Args:
+            requests: `View`s and `ViewEach`es of this cell.
+
+        Raises:
+            LockHeldError: This thread holds a lock; name the views in it instead.
+            MisuseError: A request locks.
+        """
+        refuse_inside_lock("view")
+        return take_snapshot(requests)
+
+    def watch(self, entities: Entities | Entity | str, *aspects: Aspect[Any]) -> Watch:
+        """Follow the changes of matching slots: what is there now, then every change in order.
+
+        Args:
+            entities: A pattern or one entity.
+            aspects: Which aspects; none means all.
+
+        Raises:
+            LockHeldError: This thread holds a lock.
+        """
+        refuse_inside_lock("watch")
+        self.session.client.check_usable()
+        if aspects:
+            self.session.register_aspects(aspects)
+        names = tuple(aspect.name for aspect in aspects)
+        return Watch(self.session.client, self.name, str(entities), names)
+
+    def survey(
+        self, entities: Entities | str = "**", aspects: tuple[str, ...] = ()
+    ) -> tuple[SlotInfo, ...]:
+        """List the slots that match, null ones too, without their data.
+
+        Raises:
+            ShardUnreachableError: A shard does not answer.
+        """
+        client = self.session.client
+        request = Survey((self.name,), (str(Entities(str(entities))),), tuple(aspects))
+        shards = client.shards()
+        found = []
+        answers = client.call_all([(shard, request) for shard in shards])
+        for shard, answer in zip(shards, answers, strict=True):
+            if not isinstance(answer, Surveyed):
+                raise ProtocolError(f"{type(answer).__name__} came as the answer to Survey")
+            found += [_info(state, shard) for state in answer.states]
+        return tuple(sorted(found, key=lambda info: (info.entity, info.aspect)))
+
+    def entities(self, pattern: Entities | str = "**") -> tuple[Entity, ...]:
+        """Return the entities that have some datum here."""
+        infos = self.survey(pattern)
+        return tuple(sorted({info.entity for info in infos if not info.null_reason}))
+
+    def raw(self, entity: Entity, aspect: str) -> object:
+        """Return a datum without knowing its Python type: dataclasses come as dicts.
+
+        Raises:
+            NullDatumError: It is null.
+            MisuseError: No such aspect is registered.
+        """
+        from enact_dist.wire.payload import decode_untyped
+
+        if aspect not in self.session.client.aspect_entries():
+            self.session.client.greet()
+        known = self.session.client.aspect_entries()
+        if aspect not in known:
+            raise MisuseError(
+                f"no aspect {aspect!r} is registered; known: {', '.join(sorted(known)) or 'none'}"
+            )
+        request = View(self, entity, Aspect(aspect, object))
+        snapshot = take_snapshot((request,), register=False)
+        return decode_untyped(snapshot.encoded(request))
+
+
+def _info(state: SlotState, shard: str) -> SlotInfo:
+    reason = NullReason[state.null_reason].value if state.null_reason else ""
+    return SlotInfo(
+        Entity(state.slot.entity),
+        state.slot.aspect,
+        state.version,
+        Position(state.stamp_ns, shard),
+        state.size,
+        reason,
+        shard,
+    )
+
+
+def take_snapshot(requests: tuple[LockRequest[Any], ...], *, register: bool = True) -> Snapshot:
+    """Take a view of `requests`; large data are fetched before this returns."""
+    if not requests:
+        raise MisuseError("a view of nothing: name at least one View or ViewEach")
+    session = session_of(requests)
+    session.client.check_usable()
+    for request in requests:
+        if request.access.locks:
+            raise MisuseError(f"{request!r} locks; view(…) takes View and ViewEach, or use Lock(…)")
+    if register:
+        aspects = {request.aspect.name: request.aspect for request in requests}
+        session.register_aspects(aspects.values())
+    items: list[Item] = [session.item_of(request) for request in requests]
+    client = session.client
+    lock = client.acquire(items, wait_s=VIEW_WAIT_S, hold_s=VIEW_WAIT_S, check_plan=lambda: None)
+    readings = Readings(client, session.cache, lock.lock, lock.states, lambda: None)
+    try:
+        for reading in lock.states:
+            if reading.state.large or reading.state.same:
+                readings.keep(reading.state.slot)
+    except BaseException:
+        client.release(lock)
+        raise
+    client.finish(lock, {})
+    return Snapshot(readings, requests)
+
+
+class Snapshot:
+    """Data as of one view, indexed by the requests it was made with."""
+
+    def __init__(self, readings: Readings, requests: tuple[LockRequest[Any], ...]) -> None:
+        self._readings = readings
+        self._requests = {request: request for request in requests}
+
+    @overload
+    def __getitem__(self, request: LockRequestEach[T]) -> Mapping[Entity, T]: ...
+    @overload
+    def __getitem__(self, request: LockRequestOne[T]) -> T: ...
+    def __getitem__(self, request: LockRequest[Any]) -> Any:
+        """Return the datum; for a pattern, the data by entity.
+
+        Raises:
+            NullDatumError: The world context does not know it.
+            NotRequestedError: The view did not ask for it.
+        """
+        check_requested(request, self._requests, "view")
+        if request.access.each:
+            return EachData(self._readings, request)
+        return self._readings.value(slot_of(request), request.aspect)
+
+    @overload
+    def get(self, request: LockRequestOne[T]) -> T | None: ...
+    @overload
+    def get(self, request: LockRequestOne[T], default: T) -> T: ...
+    def get(self, request: LockRequestOne[T], default: T | None = None) -> T | None:
+        """Return the datum, or `default` where the world context does not know it."""
+        try:
+            return self[request]
+        except NullDatumError:
+            return default
+
+    def version(self, request: LockRequestOne[Any]) -> int:
+        """Return the version of the viewed datum (0: never set)."""
+        check_requested(request, self._requests, "view")
+        state = self._readings.state(slot_of(request))
+        return state.version if state is not None else 0
+
+    def encoded(self, request: LockRequest[Any]) -> Any:
+        """Return the encoded datum of one request.
+
+        Raises:
+            NullDatumError: The world context does not know it.
+        """
+        check_requested(request, self._requests, "view")
+        slot = slot_of(request)
+        state = self._readings.state(slot)
+        if state is None or state.null_reason:
+            raise null_error(slot, state)
+        return self._readings.datum(slot)
+
+    def __repr__(self) -> str:
+        return f"Snapshot({', '.join(map(repr, self._requests))})"
