@@ -1,0 +1,18 @@
+"""Pure functions on arrays for the actors: no entity, no aspect, no lock, no clock.
+
+======================  ==========================================================
+shapes                  what the arrays mean: cloud, surface, depth image, camera
+poses                   rigid transforms, 4x4, named `to_from_of`
+depth                   depth image <-> points, filters, the sensor's spread
+rendering               surface -> depth image as a camera would see it
+reconstruction          one view's cloud -> triangles and planar patches
+fusion                  all views of a product -> one complete surface
+registration            where a known surface lies in a cloud of the tray
+segmentation            what is new on the tray, piece by piece
+deviation               render and compare: missing, extra, moved, deformed
+======================  ==========================================================
+
+Rules a change must keep: metres, right-handed, z up (cameras: z forward, x right, y down);
+`tray_from_product` carries points of the product frame into the tray frame; nothing here imports
+enact_dist, and Open3D loads on the first call that needs it.
+"""

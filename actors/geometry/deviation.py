@@ -1,0 +1,231 @@
+"""Compare a place of the tray with what should stand there: missing, extra, moved, deformed.
+
+what is new -> register the trained surface -> render it into the sensor -> compare pixel by pixel
+(median 5, mean 7x7, limit from the sensor's spread, a band along edges left out) -> largest blob
+
+Rules a change must keep: depth is the only evidence; limits carry the numbers they come from;
+what an overhead sensor cannot see (a dent in a side, one below `Limits` on top) is not claimed.
+
+Source: ENACT 4.2 (deviation detection actor).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from actors.geometry.depth import mean_known, median_known, metres, spread_m
+from actors.geometry.poses import yaw_between, yaw_of
+from actors.geometry.registration import register
+from actors.geometry.rendering import render_depth
+from actors.geometry.segmentation import Piece, new_pieces, pixel_area_m2
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
+
+    from actors.geometry.shapes import DepthFrame, Surface
+
+    Pose = npt.NDArray[np.float64]
+    Image = npt.NDArray[np.float32]
+    Mask = npt.NDArray[np.bool_]
+
+VERDICTS: Final = ("ok", "missing", "extra", "moved", "deformed")
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Where a difference becomes a deviation.
+
+    Attributes:
+        depth_spreads: Of the sensor's spread at the pixel, part of the limit of a depth difference.
+        depth_m: The other part: what model and registration are off on a flat face, metres.
+        slope_m: What registration is off in the plane, metres; counts by the model's slope.
+        edge_px: Width of the band along outlines that is left out.
+        deformed_m2: Least area of a deformation, square metres.
+        extra_m2: Least area of a foreign object outside the band, square metres.
+        moved_m: Largest shift of a package in its place, metres.
+        turned_rad: Largest turn.
+        present_share: Share of the product's area that must have come for it to be there.
+    """
+
+    depth_spreads: float = 1.0
+    depth_m: float = 0.0009
+    slope_m: float = 0.001
+    edge_px: int = 9
+    deformed_m2: float = 0.0003
+    extra_m2: float = 0.0003
+    moved_m: float = 0.010
+    turned_rad: float = float(np.deg2rad(8.0))
+    present_share: float = 0.35
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Finding:
+    """What was found at a place.
+
+    Attributes:
+        verdict: One of `VERDICTS`; of several the first that applies in that order.
+        deviation_mm: deformed: 95th percentile of the depth difference over the blob; moved: the
+            shift; missing: height of what is not there; extra: height of what is too much.
+        area_mm2: Area of the deviating region.
+        shift_mm: Distance of the registered from the planned position.
+        turn_deg: Yaw of the registered against the planned pose.
+        tray_from_product: Registered pose, (4, 4); the planned one if missing.
+        region: (H, W) bool, the deviating pixels.
+    """
+
+    verdict: str
+    deviation_mm: float
+    area_mm2: float
+    shift_mm: float
+    turn_deg: float
+    tray_from_product: Pose
+    region: Mask
+
+
+def inspect_place(
+    frame: DepthFrame,
+    before_mm: npt.NDArray[np.uint16],
+    surface: Surface,
+    planned: Pose,
+    *,
+    limits: Limits | None = None,
+) -> Finding:
+    """Judge what has come onto the tray since an earlier image.
+
+    Args:
+        frame: The image now; its world is the tray frame.
+        before_mm: (H, W) uint16, the image before the package came, millimetres.
+        surface: The trained product, product frame.
+        planned: tray_from_product as planned, (4, 4).
+        limits: Where a difference becomes a deviation; the calibrated ones when absent.
+
+    Returns:
+        The verdict with its evidence.
+    """
+    limits = limits or Limits()
+    pieces = new_pieces(frame, before_mm)
+    area_m2 = np.nan_to_num(pixel_area_m2(frame))
+    expected = render_depth([(surface, planned)], frame.acquisition)
+    product_m2 = float(_areas_of(expected, frame).sum())
+    if not pieces or pieces[0].area_m2 < limits.present_share * product_m2:
+        return _missing(expected, before_mm, frame, planned)
+    pose = register(pieces[0].cloud, surface, planned).tray_from_product
+    shift_m = float(np.hypot(*(pose[:2, 3] - planned[:2, 3])))
+    turn = yaw_between(yaw_of(planned), yaw_of(pose))
+    rendered = render_depth([(surface, pose)], frame.acquisition)
+    foreign = _foreign(pieces, np.isfinite(rendered), limits)
+    difference, limit_m = depth_difference(frame, rendered, limits)
+    with np.errstate(invalid="ignore"):
+        bent = _largest_blob(np.abs(difference) > limit_m, area_m2)
+    bent_m2 = float(area_m2[bent].sum())
+
+    def finding(verdict: str, deviation_m: float, region: Mask) -> Finding:
+        return Finding(
+            verdict=verdict,
+            deviation_mm=1000.0 * deviation_m,
+            area_mm2=1e6 * float(area_m2[region].sum()),
+            shift_mm=1000.0 * shift_m,
+            turn_deg=float(np.rad2deg(turn)),
+            tray_from_product=pose,
+            region=region,
+        )
+
+    if area_m2[foreign].sum() >= limits.extra_m2:
+        height = metres(before_mm)[foreign] - metres(frame.depth_mm)[foreign]
+        return finding("extra", float(np.nanpercentile(height, 95)), foreign)
+    if shift_m > limits.moved_m or abs(turn) > limits.turned_rad:
+        return finding("moved", shift_m, np.isfinite(rendered))
+    if bent_m2 >= limits.deformed_m2:
+        return finding("deformed", float(np.percentile(np.abs(difference[bent]), 95)), bent)
+    return finding("ok", 0.0, np.zeros_like(bent))
+
+
+def depth_difference(frame: DepthFrame, rendered_m: Image, limits: Limits) -> tuple[Image, Image]:
+    """Compare an image with a rendered surface, away from edges.
+
+    Args:
+        frame: The image.
+        rendered_m: (H, W) float32, the surface as it should look, metres, NaN beside it.
+        limits: Band along edges, and the parts of the limit.
+
+    Returns:
+        Smoothed difference, metres, positive where the object is nearer than it should be, NaN
+        where no statement is possible; and the limit of its absolute value, metres. (H, W) float32.
+    """
+    import cv2
+
+    raw = rendered_m - metres(frame.depth_mm)
+    smooth = mean_known(median_known(raw, 5), 7)
+    inside = _shrunk(np.isfinite(rendered_m), limits.edge_px)
+    smooth[~inside] = np.nan
+    if inside.any():
+        # Two calibrations (arm and overhead) disagree by up to a millimetre in height.
+        smooth -= np.float32(np.clip(np.nanmedian(smooth[inside]), -0.001, 0.001))
+    filled = np.nan_to_num(rendered_m).astype(np.float32)
+    slope = np.hypot(cv2.Sobel(filled, cv2.CV_32F, 1, 0), cv2.Sobel(filled, cv2.CV_32F, 0, 1)) / 8.0
+    pixel_m = rendered_m / frame.acquisition.camera.fx_px
+    slope_limit = limits.slope_m * slope / pixel_m
+    limit = limits.depth_spreads * spread_m(rendered_m) + limits.depth_m + slope_limit
+    return smooth, limit.astype(np.float32)
+
+
+def _missing(
+    expected_m: Image, before_mm: npt.NDArray[np.uint16], frame: DepthFrame, planned: Pose
+) -> Finding:
+    region = np.isfinite(expected_m)
+    height = metres(before_mm)[region] - expected_m[region]
+    return Finding(
+        verdict="missing",
+        deviation_mm=1000.0 * float(np.nanpercentile(height, 95)) if region.any() else 0.0,
+        area_mm2=1e6 * float(_areas_of(expected_m, frame).sum()),
+        shift_mm=0.0,
+        turn_deg=0.0,
+        tray_from_product=planned,
+        region=region,
+    )
+
+
+def _foreign(pieces: list[Piece], product: Mask, limits: Limits) -> Mask:
+    """Return the pixels of all pieces that lie outside the product and its edge band."""
+    beside = ~_grown(product, limits.edge_px)
+    every = np.any([piece.mask for piece in pieces], axis=0)
+    return np.asarray(every & beside)
+
+
+def _largest_blob(mask: Mask, area_m2: Image) -> Mask:
+    """Return the connected part of a mask that covers the largest area."""
+    from scipy.ndimage import label
+
+    labels, count = label(mask)
+    if count == 0:
+        return np.zeros_like(mask)
+    areas = np.bincount(labels.ravel(), area_m2.ravel())
+    areas[0] = 0.0
+    return np.asarray(labels == areas.argmax())
+
+
+def _areas_of(depth_m: Image, frame: DepthFrame) -> Image:
+    camera = frame.acquisition.camera
+    return np.nan_to_num(depth_m) ** 2 / (camera.fx_px * camera.fy_px)
+
+
+def _shrunk(mask: Mask, reach_px: int) -> Mask:
+    import cv2
+
+    return np.asarray(cv2.erode(mask.astype(np.uint8), _disc(reach_px)) > 0)
+
+
+def _grown(mask: Mask, reach_px: int) -> Mask:
+    import cv2
+
+    return np.asarray(cv2.dilate(mask.astype(np.uint8), _disc(reach_px)) > 0)
+
+
+def _disc(reach_px: int) -> npt.NDArray[np.uint8]:
+    import cv2
+
+    size = 2 * reach_px + 1
+    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)), np.uint8)

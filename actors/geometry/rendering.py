@@ -1,0 +1,108 @@
+"""A surface as a depth camera without noise would see it.
+
+Rules a change must keep: depth along the optical axis (not along the ray); nothing behind the
+camera; Open3D loads on the first call.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from actors.geometry.open3d_on_use import open3d
+from actors.geometry.poses import inverse, moved
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    import numpy.typing as npt
+
+    from actors.geometry.shapes import Acquisition, Camera, Surface
+
+
+@lru_cache(maxsize=8)
+def _directions(
+    shape: tuple[int, int], focal_px: tuple[float, float], centre_px: tuple[float, float]
+) -> npt.NDArray[np.float32]:
+    """Return the ray of every pixel with z = 1, (H, W, 3), so that its length is the depth."""
+    rows, columns = np.meshgrid(
+        np.arange(shape[0], dtype=np.float32), np.arange(shape[1], dtype=np.float32), indexing="ij"
+    )
+    rays = np.ones((*shape, 3), np.float32)
+    rays[..., 0] = (columns - centre_px[0]) / focal_px[0]
+    rays[..., 1] = (rows - centre_px[1]) / focal_px[1]
+    rays.setflags(write=False)
+    return rays
+
+
+def directions(camera: Camera) -> npt.NDArray[np.float32]:
+    """Return the viewing ray of every pixel, z = 1, (H, W, 3) float32, camera frame, read-only."""
+    return _directions(camera.shape, (camera.fx_px, camera.fy_px), (camera.cx_px, camera.cy_px))
+
+
+def ray_scene(vertices_m: npt.NDArray[np.floating], triangles: npt.NDArray[np.integer]) -> Any:
+    """Return an Open3D scene of one mesh for ray casting and distances.
+
+    Args:
+        vertices_m: (N, 3), metres.
+        triangles: (M, 3), vertex numbers.
+    """
+    o3d = open3d()
+
+    scene = o3d.t.geometry.RaycastingScene()
+    # Open3D may write to memory it was given read-only: it gets its own copies.
+    scene.add_triangles(
+        o3d.core.Tensor(np.array(vertices_m, np.float32)),
+        o3d.core.Tensor(np.array(triangles, np.uint32)),
+    )
+    return scene
+
+
+def render_depth(
+    placed: Sequence[tuple[Surface, npt.NDArray[np.float64]]],
+    acquisition: Acquisition,
+    *,
+    window: tuple[slice, slice] | None = None,
+) -> npt.NDArray[np.float32]:
+    """Return the depth image of surfaces in the world.
+
+    Args:
+        placed: Surfaces and, for each, world_from_surface (4, 4).
+        acquisition: Camera and pose.
+        window: Rows and columns to render; the whole image when absent.
+
+    Returns:
+        (H, W) float32, metres along the optical axis, NaN where nothing is hit; of the window's
+        size when there is one.
+    """
+    rays = directions(acquisition.camera)[window or slice(None)]
+    depth_m = np.full(rays.shape[:2], np.nan, np.float32)
+    if placed and depth_m.size:
+        camera_from_world = inverse(acquisition.world_from_camera)
+        vertices, triangles, first = [], [], 0
+        for surface, world_from_surface in placed:
+            vertices.append(moved(surface.vertices_m, camera_from_world @ world_from_surface))
+            triangles.append(surface.triangles + first)
+            first += len(surface.vertices_m)
+        depth_m = cast(ray_scene(np.concatenate(vertices), np.concatenate(triangles)), rays)
+    return depth_m
+
+
+def cast(scene: Any, rays: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """Return the distance to the first hit along rays from the origin, in units of their length.
+
+    Args:
+        scene: From `ray_scene`, in the frame of the rays.
+        rays: (H, W, 3) float32.
+
+    Returns:
+        (H, W) float32, NaN where nothing is hit.
+    """
+    o3d = open3d()
+
+    full = np.zeros((*rays.shape[:2], 6), np.float32)
+    full[..., 3:] = rays
+    hit = scene.cast_rays(o3d.core.Tensor(full))["t_hit"].numpy()
+    return np.where(np.isfinite(hit), hit, np.float32(np.nan)).astype(np.float32)

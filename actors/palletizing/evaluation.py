@@ -1,0 +1,192 @@
+"""Score the geometry of error monitoring on simulated packages, without any world context.
+
+    python -m actors.palletizing.evaluation --packages 200 --seed 1
+
+prints the confusion matrix, the errors of pose and depth, the times, and the blob areas of sound
+packages that `Limits.deformed_m2` is calibrated on.  RESULTS
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections import Counter
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from actors.geometry.deviation import VERDICTS, Finding, Limits, inspect_place
+from actors.geometry.fusion import fuse_views
+from actors.geometry.reconstruction import reconstruct_view
+from actors.geometry.segmentation import product_on_plate
+from actors.palletizing.simulation.packages import (
+    KINDS,
+    PLACES,
+    VERDICT_OF_KIND,
+    Package,
+    Truth,
+    make_package,
+    package_sequence,
+)
+from actors.palletizing.simulation.sensors import SimulatedOrbitSensor, SimulatedTraySensor
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from actors.geometry.shapes import Surface
+    from actors.palletizing.sensor import OrbitSensor
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Case:
+    """One simulated package and what was found.
+
+    Attributes:
+        package: With the truth.
+        finding: With the verdict.
+        check_s: Time of the check.
+    """
+
+    package: Package
+    finding: Finding
+    check_s: float
+
+    @property
+    def correct(self) -> bool:
+        """Whether the verdict is the one that the truth asks for."""
+        return self.finding.verdict == VERDICT_OF_KIND[self.package.truth.kind]
+
+    @property
+    def pose_error_mm(self) -> float:
+        """Distance of the registered from the true position, millimetres."""
+        found, true = self.finding.tray_from_product, self.package.placed
+        return 1000.0 * float(np.hypot(*(found[:2, 3] - true[:2, 3])))
+
+
+def train(product: str, sensor: OrbitSensor) -> Surface:
+    """Return the complete surface of a product from an orbit around it.
+
+    Args:
+        product: Name of the product on the plate.
+        sensor: Eye-in-hand depth sensor.
+    """
+    frames = list(sensor.orbit(product))
+    views = [reconstruct_view(product_on_plate(f), f.acquisition.camera) for f in frames]
+    return fuse_views(views, [frame.acquisition for frame in frames])
+
+
+def judge(
+    packages: Sequence[Package],
+    models: Mapping[str, Surface],
+    *,
+    seed: int,
+    limits: Limits | None = None,
+) -> list[Case]:
+    """Inspect a sequence of packages, one per stop, and keep what was found.
+
+    Args:
+        packages: The sequence.
+        models: Trained surface of each product.
+        seed: Seed of the sensor's noise.
+        limits: Of the inspection; the calibrated ones when absent.
+    """
+    sensor = SimulatedTraySensor(packages, seed=seed)
+    empty_mm = sensor.capture_empty().depth_mm
+    cases, before_mm = [], empty_mm
+    for stop, package in enumerate(packages):
+        if stop % len(PLACES) == 0:
+            before_mm = empty_mm
+        frame = sensor.capture(stop)
+        start = time.perf_counter()
+        finding = inspect_place(
+            frame, before_mm, models[package.product], package.planned, limits=limits
+        )
+        cases.append(Case(package, finding, time.perf_counter() - start))
+        before_mm = frame.depth_mm
+    return cases
+
+
+def graded(
+    kind: str, amount: float, count: int, *, seed: int, products: Sequence[str]
+) -> list[Package]:
+    """Return packages that all have one kind and amount of deviation.
+
+    Args:
+        kind: See `Truth`.
+        amount: See `Truth`.
+        count: How many.
+        seed: Seed of all else.
+        products: Products that come in turn.
+    """
+    return [
+        make_package(
+            stop,
+            products[stop % len(products)],
+            Truth(kind, amount),
+            np.random.default_rng([seed, 11, stop]),
+        )
+        for stop in range(count)
+    ]
+
+
+def confusion(cases: Sequence[Case]) -> str:
+    """Return the confusion matrix as text: true kinds down, verdicts across."""
+    counts = Counter((case.package.truth.kind, case.finding.verdict) for case in cases)
+    lines = ["truth     " + "".join(f"{verdict:>10}" for verdict in VERDICTS)]
+    for kind in ("ok", *KINDS):
+        row = [counts[kind, verdict] for verdict in VERDICTS]
+        if sum(row):
+            lines.append(f"{kind:<10}" + "".join(f"{count or '.':>10}" for count in row))
+    return "\n".join(lines)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Train, judge, print; return 0."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--packages", type=int, default=100)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--products", default="milk_carton,meal_tray,yoghurt_cup")
+    parser.add_argument("--graded", action="store_true", help="also dents of 2 to 20 mm and others")
+    options = parser.parse_args(argv)
+    products = options.products.split(",")
+    start = time.perf_counter()
+    models = {name: train(name, SimulatedOrbitSensor(seed=options.seed)) for name in products}
+    print(f"training: {(time.perf_counter() - start) / len(products):.1f} s per product")
+    packages = package_sequence(options.packages, seed=options.seed, products=products)
+    cases = judge(packages, models, seed=options.seed)
+    print(confusion(cases))
+    for case in cases:
+        if not case.correct:
+            print(f"wrong: {case.package.product} {case.package.truth} -> {case.finding.verdict}")
+    errors = [case.pose_error_mm for case in cases if case.package.truth.kind == "ok"]
+    times = [case.check_s for case in cases]
+    print(f"correct {np.mean([case.correct for case in cases]):.1%}")
+    print(
+        f"position of sound packages: median {np.median(errors):.2f} mm,"
+        f" p95 {np.percentile(errors, 95):.2f} mm"
+    )
+    print(f"check: median {np.median(times):.2f} s, longest {max(times):.2f} s")
+    sound = graded("ok", 0.0, options.packages, seed=options.seed, products=products)
+    tight = judge(sound, models, seed=options.seed, limits=Limits(deformed_m2=1e-9))
+    areas = sorted(case.finding.area_mm2 for case in tight if case.finding.verdict == "deformed")
+    print(f"blobs of {len(sound)} sound packages, mm2: {[round(area) for area in areas[-10:]]}")
+    if options.graded:
+        for kind, amounts in {
+            "dent": (2, 3, 4, 5, 8, 12, 20),
+            "bulge": (3, 5, 8),
+            "crush": (5, 10, 20),
+            "moved": (8, 12, 20, 40),
+        }.items():
+            for amount in amounts:
+                packages = graded(kind, amount, 24, seed=options.seed, products=products)
+                found = Counter(
+                    case.finding.verdict for case in judge(packages, models, seed=options.seed)
+                )
+                print(f"{kind} {amount}: {dict(found)}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,214 @@
+"""A seeded sequence of food packages on the tray, with the truth about each.
+
+A package is planned for one place of the tray and arrives there with a small error of the robot;
+now and then it is dented, bulged, crushed, displaced, absent, or something else lies beside it.
+
+Rules a change must keep: the sequence is a function of the seed; packages never penetrate each
+other; the truth stays in here (the demo's score is its only reader).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from actors.geometry.poses import moved, on_tray
+from actors.palletizing.simulation.products import box_mesh, product_mesh
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    import numpy.typing as npt
+
+    Mesh = tuple[npt.NDArray[np.float64], npt.NDArray[np.int32]]
+
+PLACES: Final = tuple((x, y) for y in (-0.15, 0.15) for x in (-0.315, -0.105, 0.105, 0.315))
+"""Centres of the places of one tray, metres, in the order they are filled."""
+
+JITTER_M: Final = 0.003
+JITTER_RAD: Final = np.deg2rad(1.5)
+"""Largest error of a sound placement."""
+
+DEVIATING_SHARE: Final = 0.5
+"""Far more than a real line has, so that a short demonstration shows every kind."""
+
+KINDS: Final = ("dent", "bulge", "crush", "moved", "missing", "extra")
+"""True deviations; dent, bulge and crush are what the verdict calls deformed."""
+
+VERDICT_OF_KIND: Final = {
+    "ok": "ok",
+    "dent": "deformed",
+    "bulge": "deformed",
+    "crush": "deformed",
+    "moved": "moved",
+    "missing": "missing",
+    "extra": "extra",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """What really is the matter with a package.
+
+    Attributes:
+        kind: "ok" or one of `KINDS`.
+        amount: Depth of a dent or bulge in mm, loss of height by a crush in %, shift in mm, else 0.
+    """
+
+    kind: str
+    amount: float
+
+    def __str__(self) -> str:
+        unit = {"dent": " mm", "bulge": " mm", "crush": " %", "moved": " mm"}.get(self.kind)
+        return self.kind if unit is None else f"{self.kind} {self.amount:.0f}{unit}"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Package:
+    """One simulated package at one place.
+
+    Attributes:
+        product: Name of the product.
+        planned: tray_from_product as planned, (4, 4).
+        placed: tray_from_product as it came to lie, (4, 4).
+        truth: What is the matter with it.
+        shape: Vertices (N, 3) in the product frame and triangles (M, 3); no vertices if missing.
+        extra: A foreign object in the tray frame, like `shape`; no vertices if there is none.
+    """
+
+    product: str
+    planned: npt.NDArray[np.float64]
+    placed: npt.NDArray[np.float64]
+    truth: Truth
+    shape: Mesh
+    extra: Mesh
+
+    def meshes(self) -> list[Mesh]:
+        """Return what of it lies on the tray, in the tray frame."""
+        vertices, triangles = self.shape
+        placed = [(moved(vertices, self.placed), triangles)]
+        return [mesh for mesh in (*placed, self.extra) if len(mesh[0])]
+
+
+def package_sequence(
+    count: int, *, seed: int, products: Sequence[str] = ("milk_carton", "meal_tray")
+) -> list[Package]:
+    """Return the packages of a run, one per stop of the conveyor.
+
+    Args:
+        count: How many packages.
+        seed: Seed of everything random about them.
+        products: Products that come in turn.
+    """
+    sequence: list[Package] = []
+    for stop in range(count):
+        random = np.random.default_rng([seed, 7, stop])
+        truth = _draw_truth(random)
+        sequence.append(make_package(stop, products[stop % len(products)], truth, random))
+    return sequence
+
+
+def on_the_tray(packages: Sequence[Package], stop: int) -> Sequence[Package]:
+    """Return what lies on the tray at a stop; an empty tray replaces a full one."""
+    return packages[stop - stop % len(PLACES) : stop + 1]
+
+
+def planned_pose(stop: int) -> npt.NDArray[np.float64]:
+    """Return tray_from_product of the package of a stop as planned: along y, heads alternating."""
+    x, y = PLACES[stop % len(PLACES)]
+    return on_tray(x, y, np.pi / 2.0 if y < 0.0 else -np.pi / 2.0)
+
+
+def make_package(stop: int, product: str, truth: Truth, random: np.random.Generator) -> Package:
+    """Return a package with a given truth; where and how exactly is drawn at random.
+
+    Args:
+        stop: Number of the stop, gives the place.
+        product: Name of the product.
+        truth: Kind and amount of the deviation.
+        random: Source of all else.
+    """
+    planned = planned_pose(stop)
+    jitter = random.uniform(-1.0, 1.0, 3) * [JITTER_M, JITTER_M, JITTER_RAD]
+    placed = planned @ on_tray(*jitter)
+    if truth.kind == "moved":
+        placed = _shift(truth.amount / 1000.0, random) @ placed
+    vertices, triangles = product_mesh(product)
+    shape = (deformed(vertices, truth, random), triangles)
+    nothing = (np.empty((0, 3)), np.empty((0, 3), np.int32))
+    return Package(
+        product=product,
+        planned=planned,
+        placed=placed,
+        truth=truth,
+        shape=nothing if truth.kind == "missing" else shape,
+        extra=_foreign_object(vertices, placed, random) if truth.kind == "extra" else nothing,
+    )
+
+
+def deformed(
+    vertices_m: npt.NDArray[np.float64], truth: Truth, random: np.random.Generator
+) -> npt.NDArray[np.float64]:
+    """Return the vertices of a product after a dent, a bulge or a crush; else unchanged.
+
+    Args:
+        vertices_m: (N, 3), metres, product frame.
+        truth: Kind and amount.
+        random: Gives where and how wide: a dent has a radius (one sigma) of 14 to 22 mm.
+    """
+    height = vertices_m[:, 2].max()
+    relative = vertices_m[:, 2] / height
+    bent = np.array(vertices_m)
+    if truth.kind in ("dent", "bulge"):
+        half = np.abs(vertices_m[relative > 0.9, :2]).max(axis=0)
+        centre = random.uniform(-0.5, 0.5, 2) * half
+        sigma = random.uniform(0.014, 0.022)
+        distance2 = ((vertices_m[:, :2] - centre) ** 2).sum(axis=1)
+        depth = truth.amount / 1000.0 * np.exp(-distance2 / (2.0 * sigma**2))
+        sign = -1.0 if truth.kind == "dent" else 1.0
+        bent[:, 2] += sign * depth * np.clip((relative - 0.3) / 0.4, 0.0, 1.0)
+    elif truth.kind == "crush":
+        loss = truth.amount / 100.0
+        bent[:, 2] *= 1.0 - loss
+        bent[:, :2] *= 1.0 + 0.3 * loss * np.sin(np.pi * relative)[:, None]
+    return bent
+
+
+def _draw_truth(random: np.random.Generator) -> Truth:
+    if random.random() >= DEVIATING_SHARE:
+        return Truth("ok", 0.0)
+    kind = KINDS[int(random.integers(len(KINDS)))]
+    ranges = {
+        "dent": (5.0, 20.0),
+        "bulge": (5.0, 15.0),
+        "crush": (10.0, 25.0),
+        "moved": (20.0, 40.0),
+    }
+    low, high = ranges.get(kind, (0.0, 0.0))
+    return Truth(kind, float(random.uniform(low, high)))
+
+
+def _shift(length_m: float, random: np.random.Generator) -> npt.NDArray[np.float64]:
+    """A shift in the tray plane, mostly along y: neighbours in x are 85 mm away at most."""
+    angle = random.uniform(0.0, 2.0 * np.pi)
+    return on_tray(length_m * np.cos(angle), length_m * np.sin(angle), 0.0)
+
+
+def _foreign_object(
+    vertices_m: npt.NDArray[np.float64],
+    placed: npt.NDArray[np.float64],
+    random: np.random.Generator,
+) -> Mesh:
+    """A block of 50 x 40 x 30 mm that lies 12 to 25 mm beside the package, towards its end."""
+    half = vertices_m[:, :2].max(axis=0)
+    side = 1.0 if random.random() < 0.5 else -1.0
+    gap = random.uniform(0.012, 0.025)
+    beside = on_tray(
+        float(random.uniform(-0.3, 0.3) * half[0]),
+        float(side * (half[1] + gap + 0.032)),
+        float(random.uniform(-0.4, 0.4)),
+    )
+    vertices, triangles = box_mesh((0.050, 0.040, 0.030))
+    return moved(vertices, placed @ beside), triangles

@@ -1,0 +1,129 @@
+"""SIMULATED depth sensors: ray casting of the true shapes, then the noise of `noise`.
+
+Rules a change must keep: an image depends on the seed and on what it shows only, so that two
+sensors of one seed see the same; acquisition poses are off by what a robot is off.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from actors.geometry.poses import inverse, looking_at, moved, small_motion
+from actors.geometry.rendering import cast, directions, ray_scene
+from actors.geometry.shapes import VGA, Acquisition, DepthFrame
+from actors.palletizing.simulation.noise import sensed
+from actors.palletizing.simulation.packages import Package, on_the_tray
+from actors.palletizing.simulation.products import box_mesh, product_mesh
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    import numpy.typing as npt
+
+    Mesh = tuple[npt.NDArray[np.float64], npt.NDArray[np.int32]]
+
+OVERHEAD_M: Final = 0.95
+"""Height of the overhead sensor above the tray."""
+
+ORBIT_M: Final = 0.45
+"""Distance of the eye-in-hand sensor from the product."""
+
+ORBIT_VIEWS: Final = ((8, 30.0), (5, 60.0), (1, 89.0))
+"""Rings of the orbit: how many views at which elevation, degrees."""
+
+ROBOT_SPREAD_M: Final = 0.0004
+"""Repeatability and hand-eye calibration of the robot, metres per axis."""
+
+ROBOT_SPREAD_RAD: Final = 0.0015
+"""The same as rotation per axis: 0.7 mm at the distance of the orbit."""
+
+
+class SimulatedTraySensor:
+    """Depth sensor 0.95 m above the tray that sees a given sequence of packages.
+
+    Args:
+        packages: What comes, one package per stop.
+        seed: Seed of the noise.
+    """
+
+    def __init__(self, packages: Sequence[Package], *, seed: int) -> None:
+        self._packages = packages
+        self._seed = seed
+        self._acquisition = Acquisition(
+            VGA, looking_at(np.array([0.0, 0.0, OVERHEAD_M]), np.zeros(3))
+        )
+
+    def capture_empty(self) -> DepthFrame:
+        """Return an image of the tray with nothing on it."""
+        return self._capture([], np.random.default_rng([self._seed, 0]))
+
+    def capture(self, stop: int) -> DepthFrame:
+        """Return an image of the tray with the packages of this tray up to the stop's own."""
+        visible = on_the_tray(self._packages, stop)
+        return self._capture(visible, np.random.default_rng([self._seed, 1, stop]))
+
+    def _capture(self, visible: Sequence[Package], random: np.random.Generator) -> DepthFrame:
+        meshes = [*_tray(), *(mesh for package in visible for mesh in package.meshes())]
+        return _capture(meshes, self._acquisition, self._acquisition, random)
+
+
+class SimulatedOrbitSensor:
+    """Depth sensor in the hand of a robot that orbits a product on a plate.
+
+    Args:
+        seed: Seed of the noise and of the robot's inaccuracy.
+    """
+
+    def __init__(self, *, seed: int) -> None:
+        self._seed = seed
+
+    def orbit(self, product: str) -> Iterator[DepthFrame]:
+        """Yield 14 images of a product; the reported poses differ a little from the true ones."""
+        mesh = product_mesh(product)
+        random = np.random.default_rng([self._seed, *product.encode()])
+        centre = np.array([0.0, 0.0, mesh[0][:, 2].max() / 2.0])
+        plate = _moved(box_mesh((0.6, 0.6, 0.02)), [0.0, 0.0, -0.02])
+        for views, elevation_deg in ORBIT_VIEWS:
+            for number in range(views):
+                turn = 2.0 * np.pi * (number + elevation_deg / 90.0) / views
+                rise = np.deg2rad(elevation_deg)
+                offset = np.array(
+                    [np.cos(turn) * np.cos(rise), np.sin(turn) * np.cos(rise), np.sin(rise)]
+                )
+                reported = looking_at(centre + ORBIT_M * offset, centre)
+                error = random.standard_normal(6) * np.repeat([ROBOT_SPREAD_RAD, ROBOT_SPREAD_M], 3)
+                true = reported @ small_motion(error)
+                yield _capture(
+                    [mesh, plate], Acquisition(VGA, true), Acquisition(VGA, reported), random
+                )
+
+
+def _capture(
+    meshes: Sequence[Mesh],
+    true: Acquisition,
+    reported: Acquisition,
+    random: np.random.Generator,
+) -> DepthFrame:
+    vertices = np.concatenate([mesh[0] for mesh in meshes])
+    first = np.cumsum([0] + [len(mesh[0]) for mesh in meshes])
+    triangles = np.concatenate(
+        [mesh[1] + start for mesh, start in zip(meshes, first, strict=False)]
+    )
+    scene: Any = ray_scene(moved(vertices, inverse(true.world_from_camera)), triangles)
+    return DepthFrame(sensed(cast(scene, directions(true.camera)), random), reported)
+
+
+def _tray() -> list[Mesh]:
+    """A sheet of metal with a rim of 8 mm, and the floor 120 mm below it."""
+    sheet = _moved(box_mesh((0.90, 0.64, 0.002)), [0.0, 0.0, -0.002])
+    floor = _moved(box_mesh((3.0, 3.0, 0.01)), [0.0, 0.0, -0.13])
+    long_side, short_side = box_mesh((0.90, 0.004, 0.010)), box_mesh((0.004, 0.64, 0.010))
+    rim = [_moved(long_side, [0.0, y, -0.002]) for y in (-0.32, 0.32)]
+    rim += [_moved(short_side, [x, 0.0, -0.002]) for x in (-0.45, 0.45)]
+    return [sheet, floor, *rim]
+
+
+def _moved(mesh: Mesh, offset_m: Sequence[float]) -> Mesh:
+    return mesh[0] + np.asarray(offset_m), mesh[1]
