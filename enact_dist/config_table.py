@@ -1,0 +1,159 @@
+"""One table of a configuration file, read key by key with types, lines and suggestions.
+
+Every `take_…` names the key, what was asked and what was found.  `refuse_unknown` comes first:
+a misspelt key must not end as a silent default.
+"""
+
+from __future__ import annotations
+
+import difflib
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, NoReturn, TypeVar
+
+from enact_dist.errors import ConfigError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Mapping
+
+    from enact_dist.config_lines import LineLocator, Path
+
+T = TypeVar("T")
+
+_TOML_NAMES: Final = {
+    bool: "a boolean",
+    int: "an integer",
+    float: "a float",
+    str: "a string",
+    list: "an array",
+    dict: "a table",
+}
+
+
+def suggestion(found: str, known: Iterable[str]) -> str:
+    """Return ``"; did you mean 'x'?"`` when one of `known` is close to `found`, else nothing."""
+    close = difflib.get_close_matches(found, list(known), n=1)
+    return f"; did you mean {close[0]!r}?" if close else ""
+
+
+def kind_name(value: object) -> str:
+    """Return what TOML calls the type of `value`, with its article."""
+    return _TOML_NAMES.get(type(value), "a date or time")
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """Where a configuration comes from: for messages only."""
+
+    path: str
+    locator: LineLocator
+
+    def refuse(self, where: Path, problem: str) -> NoReturn:
+        """Raise `ConfigError` about the value at `where`."""
+        line = self.locator.line(where)
+        raise ConfigError(f"{self.path}, line {line}: {problem}", path=self.path, line=line)
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """A table of the file: its values, its place and the source they stand in."""
+
+    values: Mapping[str, object]
+    where: Path
+    source: Source
+
+    @property
+    def title(self) -> str:
+        """The table as the file writes it: ``[shards.left]``."""
+        name = ".".join(str(part) for part in self.where if isinstance(part, str))
+        return f"[{name}]" if name else "the file"
+
+    def refuse(self, key: str, problem: str) -> NoReturn:
+        """Raise `ConfigError` about `key` of this table, or about the table where it is absent."""
+        where = (*self.where, key) if key in self.values else self.where
+        self.source.refuse(where, problem)
+
+    def refuse_unknown(self, *known: str) -> None:
+        """Raise `ConfigError` for the first key that is none of `known`."""
+        for key in self.values:
+            if key not in known:
+                self.refuse(
+                    key,
+                    f"unknown key {key!r} in {self.title}{suggestion(key, known)}"
+                    f" (known here: {', '.join(sorted(known))})",
+                )
+
+    def take_str(self, key: str, default: str | None = None) -> str:
+        """Return the non-empty string at `key`; without `default` the key is required."""
+        value = self._take(key, str, default)
+        if not value and value != default:
+            self.refuse(key, f"{key!r} in {self.title} is an empty string")
+        return value
+
+    def take_float(self, key: str, default: float, *, low: float, high: float) -> float:
+        """Return the number at `key`, `low` <= it <= `high`."""
+        found = self.values.get(key, default)
+        if isinstance(found, bool) or not isinstance(found, int | float):
+            self.refuse(key, f"{key!r} in {self.title} is a number, not {_shown(found)}")
+        if not low <= found <= high:
+            self.refuse(
+                key, f"{key!r} in {self.title} must lie between {low:g} and {high:g}, not {found!r}"
+            )
+        return float(found)
+
+    def take_strings(self, key: str, default: tuple[str, ...] = ()) -> tuple[str, ...]:
+        """Return the strings at `key`; one bare string counts as a list of one."""
+        found = self.values.get(key, list(default))
+        items = [found] if isinstance(found, str) else found
+        if not isinstance(items, list):
+            self.refuse(key, f"{key!r} in {self.title} is an array of strings, not {_shown(found)}")
+        for index, item in enumerate(items):
+            if not isinstance(item, str) or not item:
+                where = (*self.where, key, index)
+                self.source.refuse(
+                    where, f"{key!r} in {self.title} is an array of strings, not {_shown(item)}"
+                )
+        return tuple(items)
+
+    def take_table(self, key: str) -> Table:
+        """Return the table at `key`, an empty one when it is absent."""
+        found = self.values.get(key, {})
+        if not isinstance(found, dict):
+            self.refuse(key, f"{key!r} in {self.title} is a table, not {_shown(found)}")
+        return Table(found, (*self.where, key), self.source)
+
+    def take_tables(self, key: str) -> Iterator[Table]:
+        """Yield the tables of the array of tables at `key`."""
+        found = self.values.get(key, [])
+        if not isinstance(found, list):
+            self.refuse(key, f"{key!r} is an array of tables ([[{key}]]), not {_shown(found)}")
+        for index, item in enumerate(found):
+            where = (*self.where, key, index)
+            if not isinstance(item, dict):
+                self.source.refuse(where, f"{key!r} holds tables ([[{key}]]), not {_shown(item)}")
+            yield Table(item, where, self.source)
+
+    def named_tables(self) -> Iterator[tuple[str, Table]]:
+        """Yield name and table of each child of a table of tables, in the order of the file."""
+        for name in self.values:
+            yield name, self.take_table(name)
+
+    def checked(self, key: str, make: Callable[[], T]) -> T:
+        """Return `make()`; its `ValueError` becomes a `ConfigError` about `key`."""
+        try:
+            return make()
+        except ValueError as error:
+            self.refuse(key, str(error))
+
+    def _take(self, key: str, kind: type[T], default: T | None) -> T:
+        found = self.values.get(key, default)
+        if found is None:
+            self.refuse(key, f"{self.title} needs the key {key!r}")
+        if not isinstance(found, kind):
+            wanted = _TOML_NAMES[kind]
+            self.refuse(key, f"{key!r} in {self.title} is {wanted}, not {_shown(found)}")
+        return found
+
+
+def _shown(value: object) -> str:
+    text = repr(value)
+    return f"{kind_name(value)} ({text if len(text) <= 60 else text[:59] + '…'})"

@@ -1,0 +1,160 @@
+"""What a cell consists of, as frozen values: the result of reading a `cell.toml`.
+
+`enact_dist.config` reads them; everything else only looks at them.
+"""
+
+from __future__ import annotations
+
+import json
+import zlib
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.core.messages import AspectEntry, Pin, PlacementMap, ShardEntry
+from enact_dist.errors import ConfigError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from enact_dist.core.shard import ShardSettings
+    from enact_dist.terms import Durability
+
+TTL_S_DEFAULT: Final = 2.0
+"""Session TTL in seconds: a dead holder blocks others that long; shorter needs a quiet network."""
+
+CARRIER_DEFAULT: Final = "zenoh"
+
+
+@dataclass(frozen=True, slots=True)
+class ShardConfig:
+    """One shard daemon.
+
+    Attributes:
+        name: Its name in the cell.
+        listen: Endpoints it opens (``tcp/0.0.0.0:7447``).
+        advertise: Endpoints at which others reach it; those of `listen` unless written.
+        folder: Its data folder, absolute, or ``None`` to keep everything in memory.
+        host: Host name of the machine it runs on; empty: wherever `enact up` is called.
+    """
+
+    name: str
+    listen: tuple[str, ...]
+    advertise: tuple[str, ...]
+    folder: Path | None
+    host: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class AspectConfig:
+    """What the cell fixes about an aspect.
+
+    Attributes:
+        name: Name of the aspect.
+        durability: What its commits survive; wins over the actors' own word.
+    """
+
+    name: str
+    durability: Durability
+
+
+@dataclass(frozen=True, slots=True)
+class ActorConfig:
+    """One actor process.
+
+    Attributes:
+        name: Its name in the cell.
+        class_path: ``package.module:Class``.
+        worlds: Role of the actor class to world context of the cell.
+        options: Keyword arguments of the class, as TOML gives them.
+        every_s: Period in seconds that replaces the one of a source, or ``None``.
+        host: Host name of the machine it runs on; empty: wherever `enact up` is called.
+    """
+
+    name: str
+    class_path: str
+    worlds: Mapping[str, str]
+    options: Mapping[str, object]
+    every_s: float | None = None
+    host: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class CellConfig:
+    """A whole cell.
+
+    Attributes:
+        path: The file it was read from, absolute.
+        name: Name of the cell; part of every key on the network.
+        ttl_s: Session TTL in seconds.
+        carrier: How messages travel between processes.
+        data_folder: Where shards without a `folder` of their own keep theirs, or ``None``.
+        worlds: World contexts that exist from the start.
+        shards: At least one, in the order of the file.
+        pins: Entities kept on one shard; the first pin that matches wins.
+        aspects: Aspects whose durability is fixed here.
+        actors: Actors of the cell, in the order of the file.
+    """
+
+    path: Path
+    name: str
+    ttl_s: float
+    carrier: str
+    data_folder: Path | None
+    worlds: tuple[str, ...]
+    shards: tuple[ShardConfig, ...]
+    pins: tuple[Pin, ...] = ()
+    aspects: tuple[AspectConfig, ...] = ()
+    actors: tuple[ActorConfig, ...] = ()
+
+    @property
+    def ttl_ns(self) -> int:
+        """Session TTL in nanoseconds."""
+        return round(self.ttl_s * 1e9)
+
+    def shard(self, name: str) -> ShardConfig:
+        """Return the shard called `name`.
+
+        Raises:
+            ConfigError: The cell has none of that name.
+        """
+        for shard in self.shards:
+            if shard.name == name:
+                return shard
+        known = ", ".join(shard.name for shard in self.shards)
+        raise ConfigError(
+            f"{self.path}: the cell {self.name} has no shard {name!r}; it has {known}",
+            path=str(self.path),
+        )
+
+    def placement_map(self) -> PlacementMap:
+        """Return the shards with their advertised endpoints, and the pins.
+
+        The version is a checksum of what decides where an entity lives, the shard names and the
+        pins in order: the same file has the same version on every host and after every restart,
+        and an endpoint that differs between hosts does not make their maps disagree.
+        """
+        text = json.dumps([sorted(shard.name for shard in self.shards), self.pins])
+        version = zlib.crc32(text.encode()) & 0x7FFF_FFFF
+        shards = tuple(ShardEntry(shard.name, shard.advertise) for shard in self.shards)
+        return PlacementMap(version, shards, self.pins)
+
+    def aspect_entries(self) -> tuple[AspectEntry, ...]:
+        """Return the aspects with their durability and no fingerprint: any type may register."""
+        return tuple(AspectEntry(entry.name, "", entry.durability.value) for entry in self.aspects)
+
+    def shard_settings(self, name: str) -> ShardSettings:
+        """Return what the core of shard `name` has to know.
+
+        Raises:
+            ConfigError: The cell has none of that name.
+        """
+        from enact_dist.core.shard import ShardSettings
+
+        return ShardSettings(
+            name=self.shard(name).name,
+            placement=self.placement_map(),
+            worlds=self.worlds,
+            aspects=self.aspect_entries(),
+            ttl_ns_max=self.ttl_ns,
+        )
