@@ -1,0 +1,71 @@
+"""The seam between a client and its shards: move one request and its answer.
+
+A carrier decides nothing.  Rules that each one keeps:
+
+- No answer (None) means *unknown*, never *not executed*: requests are idempotent, ask again.
+- Many threads may use one carrier at once; a slow answer to one never delays another.
+- It belongs to the process that opened it; after a fork it raises `MisuseError` in the child.
+- It never blocks the interpreter's exit, even when nobody closed it.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Protocol
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from enact_dist.core.messages import Answer, Notice, Request, ShardEntry
+
+
+class NoticeFeed(Protocol):
+    """Notices of all shards of a cell as they come; best effort, gaps are told by their numbers."""
+
+    @property
+    def dropped(self) -> int:
+        """How many notices were thrown away because nobody took them in time."""
+
+    def get(self, timeout_s: float | None) -> Notice | None:
+        """Return the next notice; None after `timeout_s` without one, or once closed.
+
+        `timeout_s` None waits until a notice comes or `close` is called.
+        """
+
+    def close(self) -> None:
+        """End the feed and wake whoever waits in `get`; twice is harmless."""
+
+
+class Carrier(Protocol):
+    """Moves requests to shards and brings back their answers."""
+
+    def request(self, shard: str, message: Request, *, timeout_s: float) -> Answer | None:
+        """Send one request and return its answer, or None if there was none in time.
+
+        None may come at once, where the shard is known to be away; whoever asks again pauses.
+
+        Raises:
+            ProtocolError: The peer sent what this version cannot read, or two daemons answered.
+            MisuseError: The carrier is closed or was opened before a fork.
+        """
+
+    def request_all(
+        self, requests: Sequence[tuple[str, Request]], *, timeout_s: float
+    ) -> list[Answer | None]:
+        """Send all requests before waiting for the first answer; answers in the same order.
+
+        Raises:
+            ProtocolError: As `request`.
+            MisuseError: As `request`.
+        """
+
+    def subscribe(self) -> NoticeFeed:
+        """Open a feed of the notices of all shards, those of shards added later included."""
+
+    def add_endpoints(self, entries: Sequence[ShardEntry]) -> None:
+        """Connect to further shards; those already in reach stay as they are."""
+
+    def endpoint_of(self, shard: str) -> str:
+        """Return where the shard is expected, for messages to people."""
+
+    def close(self) -> None:
+        """End all connections and pending calls (they return None); twice is harmless."""

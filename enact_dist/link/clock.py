@@ -1,0 +1,64 @@
+"""This host's clocks, in integer nanoseconds; the one place where they are read.
+
+==============  ==========================================  ====================================
+clock           runs while the host is suspended            for
+==============  ==========================================  ====================================
+`monotonic_ns`  no: leases end later, which is safe         the shard's deadlines
+`boottime_ns`   yes: a client believes less, which is safe  a client's belief in its locks
+`wall_ns`       yes, and is set by people                   stamps only, never a decision on leases
+==============  ==========================================  ====================================
+
+Times of two hosts are never compared; only durations travel.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Protocol
+
+
+def monotonic_ns() -> int:
+    """Return the time since an arbitrary start that stands still in suspend."""
+    return time.monotonic_ns()
+
+
+def boottime_ns() -> int:
+    """Return the time since boot, suspend included (Linux; elsewhere `monotonic_ns`)."""
+    return _boottime_ns()
+
+
+def _boottime_ns() -> int:
+    return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+
+
+if not hasattr(time, "CLOCK_BOOTTIME"):
+    _boottime_ns = time.monotonic_ns
+
+
+def wall_ns() -> int:
+    """Return the time since 1970-01-01 UTC as this host has it."""
+    return time.time_ns()
+
+
+class Clock(Protocol):
+    """The two clocks of a shard; a test may put its own in their place."""
+
+    def monotonic_ns(self) -> int:
+        """Return a time that never goes back."""
+
+    def wall_ns(self) -> int:
+        """Return the time since 1970, for stamps."""
+
+
+class SystemClock:
+    """The clocks of this host."""
+
+    __slots__ = ()
+
+    def monotonic_ns(self) -> int:
+        """Return this host's monotonic time."""
+        return time.monotonic_ns()
+
+    def wall_ns(self) -> int:
+        """Return this host's wall clock, since 1970."""
+        return time.time_ns()

@@ -1,0 +1,128 @@
+"""The carrier of `local()`: the shard lives in this process, a call is a function call.
+
+Nothing is encoded and nothing copied; data are immutable, so both sides may hold them.  The
+session's token is present as long as the process is, exactly as over a network.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from typing import TYPE_CHECKING
+
+from enact_dist.core.records import SessionSeen
+from enact_dist.errors import MisuseError, ShardUnreachableError
+from enact_dist.link.notices import NoticeQueue
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from enact_dist.core.messages import Answer, Request, ShardEntry
+    from enact_dist.link.host import ShardHost
+
+
+class _Call:
+    """One answer on its way; most are there before anybody waits."""
+
+    __slots__ = ("answer", "done")
+
+    def __init__(self) -> None:
+        self.answer: Answer | None = None
+        self.done = threading.Lock()  # a bare lock wakes in half the time of an Event
+        self.done.acquire()
+
+    def __call__(self, answer: Answer) -> None:
+        self.answer = answer
+        self.done.release()
+
+
+class EmbeddedCarrier:
+    """Calls the one shard of this process.  See `Carrier` for the methods.
+
+    Args:
+        host: The shard; it is not closed with the carrier.
+        session: The session whose token is shown as present until `close`.
+    """
+
+    def __init__(self, host: ShardHost, session: str) -> None:
+        self._host = host
+        self._session = session
+        self._pid = os.getpid()
+        self._closed = False
+        self._feeds: list[NoticeQueue] = []
+        host.event(SessionSeen(session, present=True))
+
+    def request(self, shard: str, message: Request, *, timeout_s: float) -> Answer | None:
+        """Call the shard; None if it is parked for longer than `timeout_s` or has failed.
+
+        Raises:
+            ShardUnreachableError: `shard` is not the shard of this process.
+            MisuseError: The carrier is closed or was opened before a fork.
+        """
+        call = self._begin(shard, message)
+        call.done.acquire(timeout=max(0.0, timeout_s))
+        return call.answer
+
+    def request_all(
+        self, requests: Sequence[tuple[str, Request]], *, timeout_s: float
+    ) -> list[Answer | None]:
+        """Make all calls, then wait for those that are parked.
+
+        Raises:
+            ShardUnreachableError: As `request`.
+            MisuseError: As `request`.
+        """
+        calls = [self._begin(shard, message) for shard, message in requests]
+        deadline_s = time.monotonic() + timeout_s
+        for call in calls:
+            call.done.acquire(timeout=max(0.0, deadline_s - time.monotonic()))
+        return [call.answer for call in calls]
+
+    def _begin(self, shard: str, message: Request) -> _Call:
+        self._check_usable()
+        if shard != self._host.name:
+            raise ShardUnreachableError(
+                f"shard {shard} is not in this process; the only one here is {self._host.name}",
+                shard=shard,
+                endpoint="this process",
+            )
+        call = _Call()
+        if self._host.ended:
+            call.done.release()
+        else:
+            self._host.submit(message, call)
+        return call
+
+    def _check_usable(self) -> None:
+        if self._pid != os.getpid():
+            raise MisuseError(
+                f"this cell runs inside process {self._pid} and cannot be used in process"
+                f" {os.getpid()}, which was forked from it; open one there, or use a shard daemon"
+            )
+        if self._closed:
+            raise MisuseError("the connection to this cell is closed; open it again")
+
+    def subscribe(self) -> NoticeQueue:
+        """Open a feed of the shard's notices."""
+        self._check_usable()
+        feed = NoticeQueue()
+        feed.on_close = self._host.watch(feed.put)
+        self._feeds.append(feed)
+        return feed
+
+    def add_endpoints(self, entries: Sequence[ShardEntry]) -> None:
+        """Do nothing: there is no other shard."""
+
+    def endpoint_of(self, shard: str) -> str:
+        """Return where the shard is."""
+        return f"this process, for shard {shard}"
+
+    def close(self) -> None:
+        """End the session's token and all feeds; twice is harmless."""
+        if self._closed or self._pid != os.getpid():
+            return
+        self._closed = True
+        for feed in self._feeds:
+            feed.close()
+        self._host.event(SessionSeen(self._session, present=False))

@@ -1,0 +1,306 @@
+"""Runs one pure shard among threads: the only place that holds a `Shard` and may call it.
+
+::
+
+    transport ── submit(request, reply) ─┐
+    store thread ── persisted ───────────┤ mutex │── Shard.handle ── effects ──┐
+    timer thread ── Tick ────────────────┘                                     │
+              reply(answer)  ◄── Reply │ StoreThread ◄── Persist │ watchers ◄── Publish
+
+A transport needs `submit` and nothing else; the shard cannot tell which one a message came by.
+Rules that a change must keep:
+
+- The thread that brings an event handles it, under the mutex, and performs its effects before it
+  lets go: no further thread stands between a request and its answer, and notices leave in order.
+- A reply callback must not block and must not call back into the host.
+- Before a `Tick` the inboxes are drained: a renewal that has arrived counts before its expiry.
+- If the store or the core fails, nothing is answered any more: whatever was not acknowledged may
+  be lost, whatever was is on disk.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import deque
+from typing import TYPE_CHECKING, Final, cast
+
+from enact_dist.core.messages import Acquire, AwaitStamp, Hello
+from enact_dist.core.records import (
+    Drain,
+    Persist,
+    Persisted,
+    Publish,
+    Recovered,
+    Reply,
+    Tick,
+)
+from enact_dist.core.shard import Shard, ShardSettings
+from enact_dist.link.clock import Clock, SystemClock
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from enact_dist.core.messages import Answer, Notice, Request
+    from enact_dist.core.records import Effect, Event
+    from enact_dist.link.store import Store
+    from enact_dist.link.store_thread import StoreThread
+
+TICK_S_MAX: Final = 0.1
+"""The timer wakes at least so often: bounds by how much an expiry may be late."""
+TICK_S_MIN: Final = 0.001
+"""The timer rests at least so long; deadlines of many locks then share one tick."""
+FLUSH_S: Final = 1.5
+"""How long a closing host waits for its store; a drain has to be over within 2 s."""
+
+_log = logging.getLogger("enact.shard")
+
+
+def open_host(
+    settings: ShardSettings,
+    folder: Path | None,
+    *,
+    clock: Clock | None = None,
+    on_failure: Callable[[Exception], None] | None = None,
+) -> ShardHost:
+    """Open a shard's folder and run the shard; without a folder nothing outlives the process.
+
+    Raises:
+        StoreError: The folder is in use, unreadable or corrupt.
+    """
+    clock = clock or SystemClock()
+    wall_ns = clock.wall_ns()
+    if folder is None:
+        # Nothing remembers the epoch before: milliseconds tell two starts within a second apart.
+        store, recovered = None, Recovered(epoch=wall_ns // 1_000_000)
+    else:
+        from enact_dist.link.store import open_store
+
+        store, recovered = open_store(folder, unix_s=wall_ns // 1_000_000_000)
+    shard = Shard(settings, recovered, now_ns=clock.monotonic_ns(), wall_ns=wall_ns)
+    return ShardHost(shard, store=store, clock=clock, on_failure=on_failure)
+
+
+class ShardHost:
+    """One shard with its mutex, its store thread and its timer.  Thread-safe.
+
+    Args:
+        shard: The shard; nobody else calls it from now on.
+        store: Where its records go; None keeps nothing beyond this process.
+        clock: Read under the mutex, so the shard's time never goes back.
+        on_failure: Called once, from whichever thread, when the store or the core has failed;
+            the host is dead then and answers nobody.
+    """
+
+    def __init__(
+        self,
+        shard: Shard,
+        *,
+        store: Store | None = None,
+        clock: Clock | None = None,
+        on_failure: Callable[[Exception], None] | None = None,
+    ) -> None:
+        self._shard = shard
+        self._clock: Clock = clock or SystemClock()
+        self._on_failure = on_failure
+        self._mutex = threading.RLock()  # reentrant for `count` in reply callbacks only
+        self._replies: dict[int, Callable[[Answer], None]] = {}
+        self._handles = 0
+        self._kept_at_once: deque[int] = deque()
+        self._watchers: tuple[Callable[[Notice], None], ...] = ()
+        self._inboxes: tuple[Callable[[], None], ...] = ()
+        self._failure: Exception | None = None
+        self._ended = False
+        self._wake = threading.Condition(threading.Lock())
+        self._look_again = False
+        self._store = store
+        self._store_thread = self._start_store(store) if store is not None else None
+        self._timer = threading.Thread(target=self._keep_time, name="enact-timer", daemon=True)
+        self._timer.start()
+
+    def _start_store(self, store: Store) -> StoreThread:
+        from enact_dist.link.store_thread import StoreThread
+
+        return StoreThread(store, self._persisted, self._fail)
+
+    # ---------------------------------------------------------------- for transports
+
+    @property
+    def name(self) -> str:
+        """The shard's name."""
+        return self._shard.settings.name
+
+    @property
+    def epoch(self) -> int:
+        """The shard's epoch, new with every start."""
+        return self._shard.epoch
+
+    @property
+    def ended(self) -> bool:
+        """Whether nobody is answered any more."""
+        return self._ended
+
+    @property
+    def failure(self) -> Exception | None:
+        """What killed the host, or None while it lives."""
+        return self._failure
+
+    def submit(self, message: Request, reply: Callable[[Answer], None]) -> None:
+        """Hand a request to the shard; `reply` is called once, now or later, from any thread.
+
+        It is never called when the host ends or fails first: no answer means *unknown*.
+        """
+        with self._mutex:
+            if self._ended:
+                return
+            self._handles += 1
+            self._replies[self._handles] = reply
+            self._handle(message, self._handles)
+            self._look_at_clock_for(message)
+
+    def event(self, event: Event) -> None:
+        """Hand an event to the shard (a session's token appeared, for example)."""
+        with self._mutex:
+            if not self._ended:
+                self._handle(event, 0)
+
+    def count(self, name: str, amount: int = 1) -> None:
+        """Add to a counter of the shard that `ListSessions` shows; reply callbacks may, too."""
+        with self._mutex:
+            counters = self._shard.counters
+            counters[name] = counters.get(name, 0) + amount
+
+    def watch(self, watcher: Callable[[Notice], None]) -> Callable[[], None]:
+        """Call `watcher` with each notice, in order; return the function that ends it."""
+        with self._mutex:
+            self._watchers = (*self._watchers, watcher)
+        return lambda: self._unwatch(watcher)
+
+    def _unwatch(self, watcher: Callable[[Notice], None]) -> None:
+        with self._mutex:
+            self._watchers = tuple(other for other in self._watchers if other is not watcher)
+
+    def add_inbox(self, drain: Callable[[], None]) -> None:
+        """Call `drain` before each tick; it submits what its transport has received already."""
+        self._inboxes = (*self._inboxes, drain)
+
+    # ---------------------------------------------------------------- messages in, effects out
+
+    def _handle(self, message: Request | Event, handle: int) -> None:
+        """Let the shard decide and do what it says.  The mutex is held."""
+        try:
+            self._perform(self._decide(message, handle))
+            while self._kept_at_once:
+                self._perform(self._decide(Persisted(self._kept_at_once.popleft()), 0))
+        except Exception as failure:  # noqa: BLE001 - half a decision must not be served
+            _log.exception("the shard failed on %s", type(message).__name__)
+            self._end_failed(failure)
+
+    def _decide(self, message: Request | Event, handle: int) -> list[Effect]:
+        clock = self._clock
+        return self._shard.handle(
+            message, reply_to=handle, now_ns=clock.monotonic_ns(), wall_ns=clock.wall_ns()
+        )
+
+    def _perform(self, effects: list[Effect]) -> None:
+        for effect in effects:
+            if isinstance(effect, Reply):
+                reply = self._replies.pop(effect.reply_to, None)
+                if reply is not None:
+                    reply(cast("Answer", effect.answer))
+            elif isinstance(effect, Persist):
+                self._persist(effect)
+            elif isinstance(effect, Publish):
+                for watcher in self._watchers:
+                    watcher(cast("Notice", effect.notice))
+            else:
+                _log.info("%s: %s", effect.event, effect.text, extra={"event": effect.event})
+
+    def _persist(self, effect: Persist) -> None:
+        if self._store_thread is not None:
+            self._store_thread.submit(effect)
+        elif effect.ticket:
+            self._kept_at_once.append(effect.ticket)
+
+    def _persisted(self, tickets: list[int]) -> None:
+        """Take the store thread's word that these are kept."""
+        with self._mutex:
+            for ticket in tickets:
+                if ticket and not self._failure:
+                    self._handle(Persisted(ticket), 0)
+
+    def _fail(self, failure: Exception) -> None:
+        with self._mutex:
+            self._end_failed(failure)
+
+    def _end_failed(self, failure: Exception) -> None:
+        if self._failure is not None:
+            return
+        self._failure = failure
+        self._ended = True
+        self._replies.clear()
+        _log.critical("shard %s stops: %s", self.name, failure)
+        if self._on_failure is not None:
+            self._on_failure(failure)
+
+    # ---------------------------------------------------------------- time
+
+    def tick(self) -> int:
+        """Take what has arrived, then let time pass; return when the next tick is due, in ns."""
+        for drain in self._inboxes:
+            drain()
+        with self._mutex:
+            if not self._ended:
+                self._handle(Tick(), 0)
+            return self._shard.next_deadline_ns()
+
+    def _keep_time(self) -> None:
+        while not self._ended:
+            wait_s = (self.tick() - self._clock.monotonic_ns()) / 1e9
+            with self._wake:
+                if not self._look_again:
+                    self._wake.wait(min(max(wait_s, TICK_S_MIN), TICK_S_MAX))
+                self._look_again = False
+
+    def _look_at_clock_for(self, message: Request) -> None:
+        """Wake the timer if this request, not answered yet, ends before the timer looks again."""
+        soon_ns = TICK_S_MAX * 1e9
+        if isinstance(message, Hello):
+            begins_soon = message.ttl_ns // 8 < soon_ns
+        elif isinstance(message, Acquire | AwaitStamp):
+            begins_soon = message.wait_ns < soon_ns and self._handles in self._replies
+        else:
+            begins_soon = False
+        if begins_soon:
+            self._wake_timer()
+
+    def _wake_timer(self) -> None:
+        with self._wake:
+            self._look_again = True
+            self._wake.notify()
+
+    # ---------------------------------------------------------------- end
+
+    def drain(self) -> None:
+        """Grant nothing new and answer whoever is parked; may be called again."""
+        self.event(Drain())
+
+    @property
+    def idle(self) -> bool:
+        """Whether a drained shard may stop without anybody losing a lock or a commit."""
+        with self._mutex:
+            return self._ended or self._shard.idle
+
+    def close(self) -> None:
+        """Keep what is on its way to the store, then end; twice is harmless."""
+        if self._store_thread is not None:
+            self._store_thread.close()
+        with self._mutex:
+            self._ended = True
+            self._replies.clear()
+        self._wake_timer()
+        if threading.current_thread() is not self._timer:
+            self._timer.join(FLUSH_S)
+        if self._store is not None:
+            self._store.close()

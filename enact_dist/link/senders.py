@@ -1,0 +1,198 @@
+"""Who sends an answer: the thread that made it, or the client's own sender.
+
+Sending to a client that does not read can block until its connection is given up.  So that this
+delays nobody else, the dispatcher sends by itself only while a client has less than
+`OUTSTANDING_BYTES_MAX` outstanding: that much fits into the connection's buffers, the call returns
+at once, and no other thread has to be woken (30 us of a 200 us round trip).  Everything beyond
+goes, in order, to a thread of that client alone.
+
+Nobody tells a shard that an answer was read.  But a request that arrives *after* the answer was
+sent proves that its client lives and reads.  Requests that waited in the inbox prove nothing, so a
+new burst starts only when the inbox was seen empty (`new_burst`), and a client's outstanding bytes
+count anew with its first request in a new burst (`heard`).
+
+Every queue is bounded; what does not fit is dropped and counted.  A dropped answer is *unknown* to
+the client, which asks again.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, Protocol
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+OUTSTANDING_BYTES_MAX: Final = 64 << 10
+"""What a client may have outstanding before its own sender takes over: one transport batch."""
+QUEUED_ANSWERS_MAX: Final = 1024
+"""Answers that wait for one client; a client has some calls per thread in flight."""
+QUEUED_BYTES_MAX: Final = 256 << 20
+"""Bytes of data that wait for one client."""
+CLIENTS_MAX: Final = 16_384
+"""Clients whose outstanding bytes are remembered; more than sessions of a shard."""
+SENDERS_MAX: Final = 256
+"""Sender threads of one shard; each client that fetches large data at the moment needs one."""
+IDLE_S: Final = 2.0
+"""A sender without work ends after so long; the next large answer starts one anew."""
+ANSWER_OVERHEAD_BYTES: Final = 256
+"""What an answer is counted with beside its data."""
+
+
+class Parcel(Protocol):
+    """An answer on its way to one client."""
+
+    @property
+    def size(self) -> int:
+        """Estimated length in bytes."""
+
+    def send(self) -> None:
+        """Send it; may block while the client does not read.  Never raises."""
+
+    def drop(self) -> None:
+        """Give it up: the client is left without an answer.  Never raises."""
+
+
+@dataclass(slots=True)
+class _Account:
+    """What one client has outstanding, and its sender while there is one."""
+
+    burst: int
+    bytes: int = 0
+    sender: _Sender | None = None
+
+
+class Senders:
+    """Sends the answers of one shard.  Thread-safe.
+
+    Args:
+        count: Called with the name and amount of what was dropped.
+    """
+
+    def __init__(self, count: Callable[[str, int], None]) -> None:
+        self._count = count
+        self._accounts: dict[str, _Account] = {}
+        self._mutex = threading.Lock()
+        self._burst = 0
+        self._senders = 0
+        self._closed = False
+
+    def new_burst(self) -> None:
+        """Note that the inbox was empty: what comes now was sent after all earlier answers."""
+        self._burst += 1
+
+    def heard(self, client: str) -> None:
+        """Note a request of `client`: it lives, what it was sent in earlier bursts was read."""
+        account = self._accounts.get(client)
+        if account is not None and account.burst != self._burst:
+            account.burst = self._burst
+            account.bytes = 0
+
+    def send(self, client: str, parcel: Parcel) -> None:
+        """Send `parcel` here and now, or leave it to the client's own sender."""
+        with self._mutex:
+            account = self._account_of(client)
+            account.bytes += parcel.size + ANSWER_OVERHEAD_BYTES
+            idle = account.sender is None or account.sender.idle
+            direct = idle and account.bytes < OUTSTANDING_BYTES_MAX
+            queued = direct or self._queue(account, parcel)
+        if direct:
+            parcel.send()
+        elif not queued:
+            parcel.drop()
+            self._count("answers_dropped", 1)
+
+    def _account_of(self, client: str) -> _Account:
+        account = self._accounts.get(client)
+        if account is None:
+            if len(self._accounts) >= CLIENTS_MAX:
+                idle = next((c for c, a in self._accounts.items() if a.sender is None), None)
+                if idle is not None:
+                    del self._accounts[idle]
+            account = self._accounts[client] = _Account(self._burst)
+        return account
+
+    def _queue(self, account: _Account, parcel: Parcel) -> bool:
+        if self._closed:
+            return False
+        if account.sender is None:
+            if self._senders >= SENDERS_MAX:
+                return False
+            self._senders += 1
+            account.sender = _Sender(lambda sender: self._idle(account, sender))
+        return account.sender.put(parcel)
+
+    def _idle(self, account: _Account, sender: _Sender) -> bool:
+        """Let a sender go that has nothing to do; say no if a parcel came meanwhile."""
+        with self._mutex:
+            if not sender.idle:
+                return False
+            account.sender = None
+            self._senders -= 1
+            return True
+
+    def close(self) -> None:
+        """Send nothing more by threads; what waits is dropped, a blocked call ends by itself."""
+        with self._mutex:
+            self._closed = True
+            senders = [account.sender for account in self._accounts.values() if account.sender]
+        for sender in senders:
+            sender.close()
+
+
+class _Sender:
+    """One client's own thread, alive while there is something to send."""
+
+    def __init__(self, may_end: Callable[[_Sender], bool]) -> None:
+        self._may_end = may_end
+        self._parcels: deque[Parcel] = deque()
+        self._bytes = 0
+        self._in_hand = 0
+        self._changed = threading.Condition(threading.Lock())
+        self._closed = False
+        threading.Thread(target=self._run, name="enact-sender", daemon=True).start()
+
+    @property
+    def idle(self) -> bool:
+        """Whether nothing waits and nothing is being sent."""
+        return not self._parcels and not self._in_hand
+
+    def put(self, parcel: Parcel) -> bool:
+        """Queue a parcel; False if there are too many."""
+        with self._changed:
+            full = len(self._parcels) >= QUEUED_ANSWERS_MAX or self._bytes >= QUEUED_BYTES_MAX
+            if full or self._closed:
+                return False
+            self._parcels.append(parcel)
+            self._bytes += parcel.size
+            self._changed.notify()
+        return True
+
+    def close(self) -> None:
+        """Drop what waits and end once the parcel in hand is sent or given up."""
+        with self._changed:
+            self._closed = True
+            parcels = list(self._parcels)
+            self._parcels.clear()
+            self._changed.notify()
+        for parcel in parcels:
+            parcel.drop()
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                if not self._changed.wait_for(lambda: self._parcels or self._closed, IDLE_S):
+                    parcel = None
+                elif self._closed:
+                    return
+                else:
+                    self._in_hand = 1
+                    parcel = self._parcels.popleft()
+                    self._bytes -= parcel.size
+            if parcel is not None:
+                parcel.send()
+                self._in_hand = 0
+            elif self._may_end(self):
+                return

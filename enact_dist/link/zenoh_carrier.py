@@ -1,0 +1,397 @@
+"""The carrier between processes and hosts: one Zenoh query per request.
+
+A client holds one Zenoh session per place it connects to: the endpoints it was given, and one for
+each shard it learns of later, because a running session takes no new endpoints.  Each session
+carries the client's liveliness token, so each shard sees the token over its own link and for as
+long as that link lives.  Sessions share their threads; one more costs 0.3 MB.
+
+Rules that a change must keep:
+
+- Channels only, no Python callbacks: a library that holds the interpreter lock for half a minute
+  would stall Zenoh's receiving thread, and with it the token (measured).
+- Control calls travel at a high priority, data beside them at a lower one, so that a keep-alive
+  never queues behind a mesh; `Fetch` is asked with DROP, which its answer inherits: a slow reader
+  loses an answer instead of its connection.
+- A query without a reply, or with the error "Timeout", is *unknown*.  Two replies to one query
+  mean two daemons under one name: that is an alarm.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+import time
+from collections import deque
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final, cast, get_args
+
+import zenoh
+
+from enact_dist.core.messages import Answer, AwaitStamp, Commit, Fetch, Notice
+from enact_dist.errors import MisuseError, ProtocolError, ShardUnreachableError
+from enact_dist.link.notices import NoticeQueue
+from enact_dist.link.zenoh_config import QUEUED_MAX, close_session, keep_after_fork, open_session
+from enact_dist.wire.frames import decode_frame, encode_frame
+from enact_dist.wire.keys import notice_key, parse_request_key, request_key, token_key, verb_of
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from enact_dist.core.messages import Request, ShardEntry
+
+_log = logging.getLogger("enact.link")
+_ANSWERS: Final = frozenset(get_args(Answer))
+CONTROL_BYTES_MAX: Final = 16 << 10
+"""Requests with more data than this leave the control priority to the others."""
+CONNECT_S: Final = 5.0
+"""How long opening a carrier waits for a first connection."""
+POLL_S: Final = 0.005
+"""How often a carrier being opened looks for a connection."""
+REACH_S: Final = 0.3
+"""How long a shard has to show that it is already in reach."""
+UNCHECKED_MAX: Final = 256
+"""Answered queries that are still watched for a second reply."""
+
+_NONE = zenoh.ConsolidationMode.NONE
+_BLOCK, _DROP = zenoh.CongestionControl.BLOCK, zenoh.CongestionControl.DROP
+_CONTROL, _DATA, _BULK = (
+    zenoh.Priority.INTERACTIVE_HIGH,
+    zenoh.Priority.DATA,
+    zenoh.Priority.DATA_LOW,
+)
+
+
+@dataclass(slots=True)
+class _Link:
+    """One Zenoh session of the carrier with its token and subscriptions."""
+
+    session: zenoh.Session
+    endpoints: tuple[str, ...]
+    token: zenoh.LivelinessToken
+    subscribers: list[zenoh.Subscriber] = field(default_factory=list)
+
+
+class ZenohCarrier:
+    """Reaches the shards of a cell over Zenoh.  See `Carrier` for the methods; thread-safe.
+
+    Args:
+        cell: The cell's name.
+        session: Whose liveliness token is held for the life of the carrier.
+        actor: Stands in the key of every request.
+        endpoints: Where to connect first; one that answers is enough.
+        ttl_s: The session's lease; a link counts as lost after half of it.
+        connect_s: How long to wait for the first connection.
+
+    Raises:
+        ShardUnreachableError: Nothing could be connected.
+        ConfigError: An endpoint cannot be read.
+        MisuseError: This process was forked from one that is connected.
+    """
+
+    def __init__(
+        self,
+        cell: str,
+        session: str,
+        actor: str,
+        endpoints: Sequence[str],
+        *,
+        ttl_s: float,
+        connect_s: float = CONNECT_S,
+    ) -> None:
+        self._cell = cell
+        self._session = session
+        self._actor = actor or "client"
+        self._lease_s = ttl_s / 2
+        self._pid = os.getpid()
+        self._closed = False
+        self._mutex = threading.Lock()
+        self._links: list[_Link] = []
+        self._link_of: dict[str, _Link] = {}
+        self._endpoints_of: dict[str, tuple[str, ...]] = {}
+        self._feeds: list[NoticeQueue] = []
+        self._threads: list[threading.Thread] = []
+        self._keys: dict[tuple[str, type], str] = {}
+        self._unchecked: deque[zenoh.Handler[zenoh.Reply]] = deque(maxlen=UNCHECKED_MAX)
+        keep_after_fork(self)
+        first = self._open_link(tuple(endpoints))
+        if not _wait_connected(first.session, connect_s):
+            self.close()
+            raise ShardUnreachableError(
+                f"nobody answers at {', '.join(endpoints)} (waited {connect_s:g} s); is the shard"
+                " running there? (enact shard run, enact doctor)",
+                endpoint=", ".join(endpoints),
+            )
+
+    # ---------------------------------------------------------------- requests
+
+    def request(self, shard: str, message: Request, *, timeout_s: float) -> Answer | None:
+        """Send one request and return its answer, or None if there was none in time.
+
+        Raises:
+            ProtocolError: An answer cannot be read, or two daemons answer for one shard.
+            MisuseError: The carrier is closed or was opened before a fork.
+        """
+        self._check_usable()
+        return self._receive(shard, self._send(shard, message, timeout_s))
+
+    def request_all(
+        self, requests: Sequence[tuple[str, Request]], *, timeout_s: float
+    ) -> list[Answer | None]:
+        """Send all requests before waiting for the first answer; answers in the same order.
+
+        Raises:
+            ProtocolError: As `request`.
+            MisuseError: As `request`.
+        """
+        self._check_usable()
+        sent = [(shard, self._send(shard, message, timeout_s)) for shard, message in requests]
+        return [self._receive(shard, replies) for shard, replies in sent]
+
+    def _send(
+        self, shard: str, message: Request, timeout_s: float
+    ) -> zenoh.Handler[zenoh.Reply] | None:
+        link = self._link_of.get(shard) or self._links[0]
+        header, payload = encode_frame(message)
+        priority, congestion = _CONTROL, _BLOCK
+        if isinstance(message, Fetch):
+            priority, congestion = _BULK, _DROP
+        elif isinstance(message, Commit) and payload and len(payload) > CONTROL_BYTES_MAX:
+            priority = _DATA
+        try:
+            return link.session.get(
+                self._key(shard, message),
+                payload=payload,
+                attachment=header,
+                timeout=max(timeout_s, 0.001),
+                consolidation=_NONE,
+                priority=priority,
+                congestion_control=congestion,
+            )
+        except zenoh.ZError:  # closed meanwhile by another thread
+            return None
+
+    def _key(self, shard: str, message: Request) -> str:
+        known = (shard, type(message))
+        key = self._keys.get(known)
+        if key is None:
+            key = request_key(self._cell, shard, verb_of(message), self._actor)
+            self._keys[known] = key
+        return key
+
+    def _receive(self, shard: str, replies: zenoh.Handler[zenoh.Reply] | None) -> Answer | None:
+        if replies is None:
+            return None
+        try:
+            sample = replies.recv().ok
+        except zenoh.ZError:  # ended without a reply
+            return None
+        if sample is None:  # the error that stands for a timeout
+            return None
+        self._check_answered_once(shard)
+        self._unchecked.append(replies)
+        return _answer_in(sample, shard)
+
+    def _check_answered_once(self, shard: str) -> None:
+        """Look whether earlier queries got a second reply; that they end costs no waiting then."""
+        try:
+            earlier = self._unchecked.popleft()
+        except IndexError:
+            return
+        try:
+            second = earlier.try_recv()
+        except zenoh.ZError:  # ended, as it should
+            return
+        if second is not None and second.ok is not None:
+            key = str(second.ok.key_expr)
+            _log.warning("two answers to one request: %s", key)
+            raise ProtocolError(
+                f"two daemons answer as one shard ({key}); stop one of them (enact shard ls)"
+            )
+
+    def _check_usable(self) -> None:
+        if self._pid != os.getpid():
+            raise MisuseError(
+                f"this connection belongs to process {self._pid}, from which this one"
+                f" ({os.getpid()}) was forked; start it with the 'spawn' method"
+            )
+        if self._closed:
+            raise MisuseError("the connection to this cell is closed; connect again")
+
+    # ---------------------------------------------------------------- links
+
+    def add_endpoints(self, entries: Sequence[ShardEntry]) -> None:
+        """Connect to further shards; those already in reach stay as they are.
+
+        Raises:
+            ConfigError: An endpoint cannot be read.
+            MisuseError: The carrier is closed or was opened before a fork.
+        """
+        self._check_usable()
+        for name, endpoints in entries:
+            self._endpoints_of[name] = endpoints
+            if name in self._link_of or not endpoints:
+                continue
+            link = self._link_reaching(name, endpoints) or self._open_link(endpoints)
+            self._link_of[name] = link
+
+    def _link_reaching(self, shard: str, endpoints: Sequence[str]) -> _Link | None:
+        """Return the link that leads to `shard` already, perhaps by another of its addresses."""
+        for link in self._links:
+            if set(link.endpoints) & set(endpoints):
+                return link
+        if len(self._links) == 1:
+            ask = AwaitStamp(0, 0)
+            if self.request(shard, ask, timeout_s=REACH_S) is not None:
+                return self._links[0]
+        return None
+
+    def _open_link(self, endpoints: tuple[str, ...]) -> _Link:
+        session = open_session(connect=endpoints, lease_s=self._lease_s)
+        token = session.liveliness().declare_token(token_key(self._cell, self._session))
+        link = _Link(session, endpoints, token)
+        with self._mutex:
+            self._links.append(link)
+            for feed in self._feeds:
+                self._feed(link, feed)
+        return link
+
+    def endpoint_of(self, shard: str) -> str:
+        """Return where the shard is expected, for messages to people."""
+        endpoints = self._endpoints_of.get(shard) or self._links[0].endpoints
+        return ", ".join(endpoints)
+
+    # ---------------------------------------------------------------- notices
+
+    def subscribe(self) -> NoticeQueue:
+        """Open a feed of the notices of all shards, those of shards added later included."""
+        self._check_usable()
+        feed = NoticeQueue()
+        with self._mutex:
+            self._feeds.append(feed)
+            ends = [self._feed(link, feed) for link in self._links]
+        feed.on_close = lambda: self._unsubscribe(feed, ends)
+        return feed
+
+    def _feed(self, link: _Link, feed: NoticeQueue) -> zenoh.Subscriber:
+        subscriber = link.session.declare_subscriber(
+            notice_key(self._cell, "*"), zenoh.handlers.RingChannel(QUEUED_MAX)
+        )
+        link.subscribers.append(subscriber)
+        thread = threading.Thread(
+            target=_pump, args=(subscriber.handler, feed), name="enact-notices", daemon=True
+        )
+        self._threads.append(thread)
+        thread.start()
+        return subscriber
+
+    def _unsubscribe(self, feed: NoticeQueue, subscribers: list[zenoh.Subscriber]) -> None:
+        with self._mutex:
+            if feed in self._feeds:
+                self._feeds.remove(feed)
+        if self._closed or self._pid != os.getpid():
+            return
+        for subscriber in subscribers:
+            subscriber.undeclare()
+
+    # ---------------------------------------------------------------- end
+
+    def close(self) -> None:
+        """End all connections and pending calls (they return None); twice is harmless."""
+        if self._closed or self._pid != os.getpid():
+            return
+        self._closed = True
+        for feed in list(self._feeds):
+            feed.close()
+        for link in self._links:
+            close_session(link.session)
+        for thread in self._threads:
+            thread.join(1.0)
+
+
+def _pump(notices: zenoh.Handler[zenoh.Sample], feed: NoticeQueue) -> None:
+    """Move notices from Zenoh's channel into a feed until the subscription ends."""
+    while True:
+        try:
+            sample = notices.recv()
+        except zenoh.ZError:
+            return
+        try:
+            message = decode_frame(_bytes(sample.attachment), _bytes(sample.payload))
+        except ProtocolError as error:
+            _log.warning("a notice cannot be read: %s", error)
+            continue
+        if isinstance(message, Notice):
+            feed.put(message)
+
+
+def _bytes(payload: zenoh.ZBytes | None) -> bytes:
+    """Copy out of Zenoh's buffer: a small piece of it kept would pin 64 KiB."""
+    return bytes(payload) if payload is not None else b""
+
+
+def _answer_in(sample: zenoh.Sample, shard: str) -> Answer:
+    answer = decode_frame(_bytes(sample.attachment), _bytes(sample.payload))
+    if type(answer) not in _ANSWERS:
+        raise ProtocolError(f"shard {shard} answered with a {type(answer).__name__}")
+    return cast("Answer", answer)
+
+
+def _wait_connected(session: zenoh.Session, wait_s: float) -> bool:
+    """Wait until the session has a peer; False if it has none after `wait_s`."""
+    deadline_s = time.monotonic() + wait_s
+    while not session.info.peers_zid():
+        if time.monotonic() > deadline_s:
+            return False
+        time.sleep(POLL_S)
+    return True
+
+
+# ---------------------------------------------------------------- discovery
+
+
+@dataclass(frozen=True, slots=True)
+class FoundShard:
+    """A shard that answers somewhere, and the cell that it belongs to."""
+
+    cell: str
+    shard: str
+
+
+def find_shards(endpoints: Sequence[str], *, timeout_s: float) -> tuple[FoundShard, ...]:
+    """Ask who is there: shards that answer at one of `endpoints`; empty if nobody does.
+
+    Returns as soon as everybody connected has answered.
+
+    Raises:
+        ConfigError: An endpoint cannot be read.
+    """
+    session = open_session(connect=endpoints, lease_s=max(timeout_s, 0.2))
+    try:
+        if not _wait_connected(session, timeout_s):
+            return ()
+        deadline_s = time.monotonic() + timeout_s
+        found: set[FoundShard] = set()
+        while not found and time.monotonic() < deadline_s:
+            found = _ask_who(session, timeout_s)
+        return tuple(sorted(found, key=lambda shard: (shard.cell, shard.shard)))
+    finally:
+        close_session(session)
+
+
+def _ask_who(session: zenoh.Session, timeout_s: float) -> set[FoundShard]:
+    question = AwaitStamp(0, 0)
+    header, payload = encode_frame(question)
+    replies = session.get(
+        request_key("*", "*", verb_of(question), "anyone"),
+        payload=payload,
+        attachment=header,
+        timeout=timeout_s,
+        consolidation=_NONE,
+        priority=_CONTROL,
+        congestion_control=_BLOCK,
+    )
+    keys = [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
+    if not keys:
+        time.sleep(POLL_S)  # connected, but what the peer serves is not known yet
+    return {FoundShard(*parse_request_key(key)[:2]) for key in keys}

@@ -1,0 +1,160 @@
+"""How Zenoh is set up here, and what its sessions need around them.
+
+Everybody is a peer: a shard listens, a client connects to each shard it uses (Zenoh 1.10 does not
+relay between peers).  Reasons for the settings, measured with 1.10 on a loopback:
+
+- Multicast and gossip off: with them `open` takes 0.5 s and strangers join.
+- Zenoh's shared memory off: it falls back silently, so that no figure means anything.
+- Link lease = TTL / 2: the token of a stopped process has to vanish before its lease ends.
+- `wait_before_close` 0.3 s: a client that stops reading is given up after that, not after 5 s.
+- `max_wait_before_drop_fragments` 2 s: slices of a large datum over a slow network are not
+  dropped after 50 ms; only senders of their own ever wait for it.
+- Reconnection every 50 ms: a restarted shard is back in use after 0.1 s, not 1 s.
+
+Sessions must be closed before the interpreter ends (it hangs otherwise), and must never be closed
+or freed in a forked child (that hangs too): `close_session` and `keep_after_fork` see to both.
+"""
+
+from __future__ import annotations
+
+import atexit
+import ctypes
+import json
+import os
+import weakref
+from typing import TYPE_CHECKING, Final
+
+import zenoh
+
+from enact_dist.errors import ConfigError, LinkError, MisuseError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+QUEUED_MAX: Final = 65_536
+"""Messages in a channel between Zenoh and Python: the network thread must not wait for Python."""
+MESSAGE_BYTES_MAX: Final = (1 << 30) + (32 << 20)
+"""Longest message: the largest datum with its header (`enact_dist.wire.limits`)."""
+CONNECT_WAIT_MS: Final = 50
+"""How long `open` may wait for a connection; where there is none it goes on trying behind."""
+TRANSPORTS_MAX: Final = 10_000
+"""Connections of one shard; as many as sessions."""
+
+
+def session_config(
+    *, listen: Sequence[str] = (), connect: Sequence[str] = (), lease_s: float
+) -> zenoh.Config:
+    """Return the settings of a session.
+
+    Args:
+        listen: Endpoints to listen at ("tcp/0.0.0.0:7447"); clients have none.
+        connect: Endpoints to connect to, and to connect to again whenever a link is lost.
+        lease_s: After so long without a sign of life of this process, a peer drops the link.
+
+    Raises:
+        ConfigError: Zenoh does not understand an endpoint.
+    """
+    retry = {"period_init_ms": 50, "period_max_ms": 50, "period_increase_factor": 1}
+    congestion = {
+        "drop": {"wait_before_drop": 1_000, "max_wait_before_drop_fragments": 2_000_000},
+        "block": {"wait_before_close": 300_000},
+    }
+    settings: dict[str, object] = {
+        "mode": "peer",
+        "listen/endpoints": list(listen),
+        "connect/endpoints": list(connect),
+        "connect/retry": retry,
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "scouting/delay": CONNECT_WAIT_MS,
+        "transport/shared_memory/enabled": False,
+        "transport/unicast/max_sessions": TRANSPORTS_MAX,
+        "transport/link/tx/lease": max(1, round(lease_s * 1e3)),
+        "transport/link/tx/keep_alive": 4,
+        "transport/link/tx/queue/congestion_control": congestion,
+        "transport/link/rx/max_message_size": MESSAGE_BYTES_MAX,
+    }
+    config = zenoh.Config()
+    for key, value in settings.items():
+        try:
+            config.insert_json5(key, json.dumps(value))
+        except zenoh.ZError:
+            raise ConfigError(
+                f"{key} = {value!r} cannot be used; an endpoint looks like 'tcp/host:7447'"
+            ) from None
+    return config
+
+
+def open_session(
+    *, listen: Sequence[str] = (), connect: Sequence[str] = (), lease_s: float
+) -> zenoh.Session:
+    """Open a session; whoever opens one closes it.
+
+    Raises:
+        ConfigError: An endpoint cannot be read.
+        LinkError: An endpoint to listen at is in use, or not of this host.
+        MisuseError: This process was forked from one that had a session open.
+    """
+    if any(pid != os.getpid() for pid, _ in _open_sessions):
+        raise MisuseError(
+            "this process was forked from one that is connected, where Zenoh cannot work; start it"
+            " with the 'spawn' method, or connect only after the fork"
+        )
+    config = session_config(listen=listen, connect=connect, lease_s=lease_s)
+    try:
+        session = zenoh.open(config)
+    except zenoh.ZError as error:
+        raise _open_error(error, listen) from None
+    _open_sessions.append((os.getpid(), session))
+    return session
+
+
+def _open_error(error: zenoh.ZError, listen: Sequence[str]) -> LinkError:
+    text = str(error)
+    endpoint = next((endpoint for endpoint in listen if endpoint in text), ", ".join(listen))
+    if "in use" in text:
+        return LinkError(
+            f"endpoint {endpoint} is in use by another process of this host; stop it or listen"
+            " elsewhere"
+        )
+    if "assign requested address" in text:
+        return LinkError(f"endpoint {endpoint} is no address of this host; listen at one that is")
+    return LinkError(f"cannot open {endpoint or 'a Zenoh session'}: {_reason(error)}")
+
+
+def _reason(error: zenoh.ZError) -> str:
+    """Return the reason without the places in Zenoh's source."""
+    return str(error).split(" at /")[0].replace("[", "").strip()
+
+
+_open_sessions: list[tuple[int, zenoh.Session]] = []
+_owners: weakref.WeakSet[object] = weakref.WeakSet()
+
+
+def close_session(session: zenoh.Session) -> None:
+    """Close a session of `open_session`; calls that wait on it end without an answer."""
+    mine = (os.getpid(), session)
+    if mine in _open_sessions:
+        _open_sessions.remove(mine)
+        session.close()
+
+
+def keep_after_fork(owner: object) -> None:
+    """Never free `owner` in a forked child: it holds a session or what one has declared."""
+    _owners.add(owner)
+
+
+def _after_fork() -> None:
+    """Make the parent's sessions immortal in a forked child: freeing one there never returns."""
+    for kept in (*_open_sessions, *_owners):
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(kept))
+
+
+def _at_exit() -> None:
+    """Close what was left open: the interpreter would wait for it for ever."""
+    for _, session in list(_open_sessions):
+        close_session(session)
+
+
+os.register_at_fork(after_in_child=_after_fork)
+atexit.register(_at_exit)
