@@ -1,0 +1,55 @@
+"""The longest of everything that `wire` reads or writes, each with its reason.
+
+A limit is checked before memory is taken: what a peer claims is compared with what it sent.
+Rule to keep: raising a limit is compatible, lowering one makes stored data unreadable.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from enact_dist.terms import NAME_LENGTH_MAX
+
+FRAME_VERSION: Final = 1
+"""Version of the frames; both ends must speak the same."""
+DATUM_VERSION: Final = 1
+"""Version of the encoding of data; these are stored, so old versions stay readable."""
+
+ALIGNMENT: Final = 64
+"""Bodies and buffers start at multiples of this: a cache line, and the widest vector register."""
+
+HEADER_BYTES_MAX: Final = 16 << 20
+"""Longest frame header: 100,000 surveyed slots, or 4096 writes with whole encodings."""
+BODY_BYTES_MAX: Final = 1 << 30
+"""Largest body of one datum."""
+PAYLOAD_BYTES_MAX: Final = BODY_BYTES_MAX + (16 << 20)
+"""Longest frame payload: one largest body, or many small ones with their padding."""
+
+NAME_CHARACTERS_MAX: Final = NAME_LENGTH_MAX
+"""Longest name of a context, entity, aspect, shard, session, actor or host."""
+TEXT_BYTES_MAX: Final = 64 << 10
+"""Longest string of a header that is no name: causes, endpoints, fingerprints, reasons."""
+REPORT_BYTES_MAX: Final = 64 << 10
+"""Longest report of an actor: each keep-alive carries it."""
+ITEMS_MAX: Final = 4096
+"""Most lines of one lock and most writes of one commit: a shard serves them in one step."""
+ENTRIES_MAX: Final = 1 << 18
+"""Most entries of any other list of a header; the header's length bounds them earlier."""
+INTEGER_MAX: Final = (1 << 63) - 1
+"""Largest integer of a header: what a signed 64-bit column of a store holds."""
+
+ENCODING_BYTES_MAX: Final = 4096
+"""Longest tree that stays in a datum's encoding; a longer one moves into its body."""
+TREE_BYTES_MAX: Final = 16 << 20
+"""Longest tree of a datum: what is larger belongs into arrays."""
+INLINE_BYTES_MAX: Final = 256
+"""Longest text or bytes inside a tree; longer ones become buffers of the body."""
+DEPTH_MAX: Final = 32
+"""Deepest nesting of a datum."""
+DIMENSIONS_MAX: Final = 32
+"""Most dimensions of an array (numpy 1 has 32, numpy 2 has 64)."""
+FIELDS_MAX: Final = 1024
+"""Most fields of a structured dtype, nested ones counted."""
+
+SMALL_BODY_BYTES: Final = 64 << 10
+"""Bodies below this are copied out of a received payload, so that they do not keep it alive."""

@@ -1,0 +1,202 @@
+"""What a datum type looks like: the one reading of Python annotations, for all of `wire`.
+
+===========================================  =========================================
+annotation                                   shape
+===========================================  =========================================
+`int` `float` `bool` `str` `bytes`           `Plain`
+`list`, `dict`, `object`                     `Plain` (any plain values, nested)
+`list[X]`, `dict[str, X]`, `dict[int, X]`    `ListOf`, `DictOf`
+`tuple[X, ...]`, `tuple[X, Y]`               `TupleOf`
+`X | None`                                   `OptionalOf`
+`numpy.ndarray`, `NDArray[…]`                `ArrayOf`
+a frozen dataclass                           `RecordOf`
+a type with a registered codec               `CodecOf`
+===========================================  =========================================
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import types
+import typing
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from enact_dist.errors import DatumTypeError
+from enact_dist.wire.codecs import Codec, codec_of
+from enact_dist.wire.limits import DEPTH_MAX
+
+
+@dataclass(frozen=True, slots=True)
+class Plain:
+    """One of the types that msgpack knows; `object` stands for any of them."""
+
+    kind: type
+
+
+@dataclass(frozen=True, slots=True)
+class ArrayOf:
+    """A numpy array; `dtype` None takes any."""
+
+    dtype: np.dtype[Any] | None
+
+
+@dataclass(frozen=True, slots=True)
+class ListOf:
+    """A list of one shape."""
+
+    each: Shape
+
+
+@dataclass(frozen=True, slots=True)
+class DictOf:
+    """A dict with keys `str` or `int`."""
+
+    key: type
+    each: Shape
+
+
+@dataclass(frozen=True, slots=True)
+class TupleOf:
+    """A tuple: of any length of one shape, or of these shapes in order."""
+
+    parts: tuple[Shape, ...]
+    repeated: bool
+
+
+@dataclass(frozen=True, slots=True)
+class OptionalOf:
+    """A shape or None."""
+
+    inner: Shape
+
+
+@dataclass(frozen=True, slots=True)
+class RecordOf:
+    """A frozen dataclass with its fields in order."""
+
+    kind: type
+    fields: tuple[tuple[str, Shape], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class CodecOf:
+    """A type with a registered codec."""
+
+    codec: Codec
+
+
+Shape = Plain | ArrayOf | ListOf | DictOf | TupleOf | OptionalOf | RecordOf | CodecOf
+
+_PLAIN: Final = (int, float, bool, str, bytes, list, dict, object)
+_known: dict[Any, Shape] = {}
+
+
+def shape_of(datum_type: Any) -> Shape:
+    """Return the shape of a datum type; computed once per type.
+
+    Raises:
+        DatumTypeError: The type cannot be a datum; the message says which part and why.
+    """
+    try:
+        known = _known.get(datum_type)
+    except TypeError:
+        known = None
+    if known is None:
+        known = _shape(datum_type, _name(datum_type), depth=0)
+        if not _has_late_codec(known):
+            _known[datum_type] = known
+    return known
+
+
+def _has_late_codec(shape: Shape) -> bool:
+    return isinstance(shape, CodecOf)  # a codec may be registered anew, so it is looked up
+
+
+def _shape(hint: Any, where: str, *, depth: int) -> Shape:
+    if depth > DEPTH_MAX:
+        raise DatumTypeError(f"{where} is nested deeper than {DEPTH_MAX}")
+    codec = codec_of(hint)
+    if codec is not None:
+        return CodecOf(codec)
+    if hint is Any or hint in _PLAIN:
+        return Plain(object if hint is Any else hint)
+    if hint is np.ndarray:
+        return ArrayOf(None)
+    if dataclasses.is_dataclass(hint) and isinstance(hint, type):
+        return _record(hint, where, depth=depth)
+    return _generic(hint, where, depth=depth)
+
+
+def _generic(hint: Any, where: str, *, depth: int) -> Shape:
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin is np.ndarray:
+        return ArrayOf(_dtype_of(arguments))
+    if origin is list:
+        return ListOf(_shape(arguments[0], f"{where}[]", depth=depth + 1))
+    if origin is dict:
+        if arguments[0] not in (str, int):
+            raise DatumTypeError(f"{where}: keys of a dict are str or int, not {arguments[0]!r}")
+        return DictOf(arguments[0], _shape(arguments[1], f"{where}[]", depth=depth + 1))
+    if origin is tuple:
+        repeated = len(arguments) == 2 and arguments[1] is Ellipsis  # noqa: PLR2004
+        parts = arguments[:1] if repeated else arguments
+        shapes = tuple(_shape(part, f"{where}[]", depth=depth + 1) for part in parts)
+        return TupleOf(shapes, repeated)
+    if origin in (types.UnionType, typing.Union):
+        others = [part for part in arguments if part is not types.NoneType]
+        if len(others) == 1 and len(arguments) == 2:  # noqa: PLR2004
+            return OptionalOf(_shape(others[0], where, depth=depth + 1))
+    raise DatumTypeError(
+        f"{where}: {_name(hint)} cannot be part of a datum; use int, float, bool, str, bytes, list,"
+        " dict, tuple, X | None, numpy.ndarray, frozen dataclasses of these, or register_codec()"
+    )
+
+
+def _record(kind: type, where: str, *, depth: int) -> RecordOf:
+    if not kind.__dataclass_params__.frozen:  # type: ignore[attr-defined]  # is a dataclass
+        raise DatumTypeError(
+            f"{where}: dataclass {kind.__qualname__} is not frozen; data are immutable values:"
+            " write @dataclass(frozen=True)"
+        )
+    try:
+        hints = typing.get_type_hints(kind)
+    except NameError as error:
+        raise DatumTypeError(f"{where}: an annotation cannot be resolved: {error}") from None
+    return RecordOf(
+        kind,
+        tuple(
+            (field.name, _shape(hints[field.name], f"{where}.{field.name}", depth=depth + 1))
+            for field in dataclasses.fields(kind)
+        ),
+    )
+
+
+def _dtype_of(arguments: tuple[Any, ...]) -> np.dtype[Any] | None:
+    """Return the dtype that `NDArray[np.float64]` names, or None where it leaves it open."""
+    inner = typing.get_args(arguments[1]) if len(arguments) > 1 else ()
+    if not inner or not isinstance(inner[0], type) or not issubclass(inner[0], np.generic):
+        return None
+    if inner[0] in _ABSTRACT:
+        return None
+    return np.dtype(inner[0])
+
+
+_ABSTRACT: Final = (
+    np.generic,
+    np.number,
+    np.integer,
+    np.signedinteger,
+    np.unsignedinteger,
+    np.inexact,
+    np.floating,
+    np.complexfloating,
+    np.flexible,
+    np.character,
+)
+
+
+def _name(hint: Any) -> str:
+    return getattr(hint, "__qualname__", None) or repr(hint)
