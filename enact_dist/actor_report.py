@@ -13,11 +13,14 @@ from __future__ import annotations
 import dataclasses
 from collections import deque
 from dataclasses import dataclass
-from typing import Final
+from typing import TYPE_CHECKING, Any, Final
 
 import msgpack
 
 from enact_dist.errors import ProtocolError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
 
 REPORT_VERSION: Final = 1
 RATE_WINDOW_NS: Final = 5_000_000_000
@@ -187,24 +190,40 @@ def encode_reports(reports: list[ActorStatistics]) -> bytes:
 def decode_reports(report: bytes) -> tuple[ActorStatistics, ...]:
     """Return what `encode_reports` packed; nothing of an empty report.
 
-    Fields that this version does not know are passed over, so that an older `enact actor ls`
-    still shows a newer actor.
-
     Raises:
         ProtocolError: These bytes are no actor report.
     """
     if not report:
         return ()
+    try:
+        found = msgpack.unpackb(report)
+    except (ValueError, msgpack.UnpackException) as error:
+        raise ProtocolError(
+            f"{len(report)} bytes {bytes(report[:16])!r}… are no actor report: {error}"
+        ) from error
+    return read_reports(found)
+
+
+def read_reports(report: Mapping[str, object]) -> tuple[ActorStatistics, ...]:
+    """Return the reports in an unpacked one, such as `ActorInfo.report`; nothing of an empty one.
+
+    Fields that this version does not know are passed over, so that an older `enact actor ls`
+    still shows a newer actor.
+
+    Raises:
+        ProtocolError: This is no actor report.
+    """
+    if report == {}:
+        return ()
+    rows: Any
     blank = dataclasses.asdict(ActorStatistics())
     try:
-        rows = msgpack.unpackb(report)["actors"]
+        rows = report["actors"]
         return tuple(
             ActorStatistics(
                 **{name: type(blank[name])(found) for name, found in row.items() if name in blank}
             )
             for row in rows
         )
-    except (ValueError, TypeError, KeyError, AttributeError, msgpack.UnpackException) as error:
-        raise ProtocolError(
-            f"{len(report)} bytes {bytes(report[:16])!r}… are no actor report: {error}"
-        ) from error
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise ProtocolError(f"{str(report)[:80]} is no actor report: {error}") from error

@@ -1,0 +1,161 @@
+"""An actor with its roles bound to the world contexts of a cell, and the locks it then takes.
+
+A declared request names a role and maybe a pattern; a bound one names a world context and, where
+the pattern stands for the triggering entity, that entity.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from enact_dist.actor import Actor, Declared, same_data, stands_for_trigger
+from enact_dist.actor_lock import ActorLock
+from enact_dist.errors import MisuseError
+from enact_dist.terms import Entities, Entity, refuse_duplicates
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from enact_dist.cell import Cell
+    from enact_dist.terms import Aspect
+    from enact_dist.world import WorldContext
+
+
+@dataclass(frozen=True, slots=True)
+class Watched:
+    """What one watch follows for an actor: one pattern of one world context.
+
+    `triggers` are the aspects by name, each with the indices of the triggers that it feeds.
+    """
+
+    context: WorldContext
+    entities: Entities
+    aspects: tuple[Aspect[Any], ...]
+    triggers: Mapping[str, tuple[int, ...]]
+
+
+class BoundActor:
+    """An actor, its cell, and which world context each role stands for.
+
+    Args:
+        actor: The actor.
+        cell: Where its world contexts are.
+        worlds: Role → name of a world context; None binds each role to the context of its name.
+
+    Raises:
+        MisuseError: `update` is not defined, a role is unbound or unknown, or roles bound to one
+            context make the actor write what triggers it or ask for a datum in two ways.
+        UnknownWorldError: The cell has no world context of such a name.
+    """
+
+    __slots__ = ("actor", "cell", "contexts", "declaration")
+
+    def __init__(self, actor: Actor, cell: Cell, worlds: Mapping[str, str] | None = None) -> None:
+        if not isinstance(actor, Actor) or type(actor).update is Actor.update:
+            raise MisuseError(
+                f"{actor!r} is no actor that can run; make an instance of a subclass of Actor that"
+                " defines update(self, lock)"
+            )
+        self.actor = actor
+        self.cell = cell
+        self.declaration = actor.declaration
+        names = self._names(worlds)
+        self.contexts = {role: cell.world(name) for role, name in names.items()}
+        self._check(names)
+
+    def lock(self, entity: Entity | None, *, wait_s: float | None = None) -> ActorLock:
+        """Return the lock of one update, not yet taken.
+
+        Args:
+            entity: The triggering entity; None for a source or an actor that runs once.
+            wait_s: How long to wait for it; None: as long as the actor says.
+        """
+        bound = {
+            declared: self._bound(declared, entity)
+            for declared in self.declaration.requests.values()
+        }
+        return ActorLock(
+            bound,
+            entity=entity,
+            wait_s=self.actor.wait_s if wait_s is None else wait_s,
+            hold_s=self.actor.hold_s,
+        )
+
+    def check_usable(self) -> None:
+        """Raise `MisuseError` if the cell was closed, or belongs to a parent process."""
+        for context in self.contexts.values():
+            context.session.client.check_usable()
+
+    def watched(self) -> tuple[Watched, ...]:
+        """Return what must be watched to see every change of a trigger datum."""
+        groups: dict[tuple[str, str], list[int]] = {}
+        triggers = self.declaration.triggers
+        for index, trigger in enumerate(triggers):
+            context = self.contexts[trigger.world.name].name
+            groups.setdefault((context, str(trigger.entity)), []).append(index)
+        watched = []
+        for (_, pattern), indices in groups.items():
+            aspects = {triggers[index].aspect.name: triggers[index].aspect for index in indices}
+            watched.append(
+                Watched(
+                    self.contexts[triggers[indices[0]].world.name],
+                    Entities(pattern),
+                    tuple(aspects.values()),
+                    {
+                        name: tuple(i for i in indices if triggers[i].aspect.name == name)
+                        for name in aspects
+                    },
+                )
+            )
+        return tuple(watched)
+
+    def _bound(self, declared: Declared, entity: Entity | None) -> Declared:
+        named: Entity | Entities = declared.entity
+        if stands_for_trigger(declared):
+            if entity is None:
+                raise MisuseError(
+                    f"{self.declaration.name_of(declared)} stands for the triggering entity, and"
+                    " there is none"
+                )
+            named = entity
+        return type(declared)(self.contexts[declared.world.name], named, declared.aspect)
+
+    def _names(self, worlds: Mapping[str, str] | None) -> dict[str, str]:
+        roles = self.declaration.roles
+        if worlds is None:
+            return {role: role for role in roles}
+        name = self.declaration.actor
+        for role in worlds:
+            if role not in roles:
+                raise MisuseError(f"{name} has no role {role!r}; it has {', '.join(roles)}")
+        for role in roles:
+            if role not in worlds:
+                raise MisuseError(
+                    f"role {role!r} of {name} is bound to no world context; bind it with --world"
+                    f" {role}=NAME; the cell has {', '.join(self.cell.worlds()) or 'none'}"
+                )
+        return {role: worlds[role] for role in roles}
+
+    def _check(self, names: Mapping[str, str]) -> None:
+        """Check again what the class checked by role: two roles may be one world context."""
+        declaration = self.declaration
+        requests = declaration.requests.values()
+        by_context = [
+            type(request)(self.contexts[request.world.name], request.entity, request.aspect)
+            for request in requests
+        ]
+        try:
+            refuse_duplicates(by_context)
+        except ValueError as error:
+            raise MisuseError(f"{declaration.actor} bound to {dict(names)}: {error}") from None
+        for trigger in declaration.triggers:
+            for request in requests:
+                same_world = names[request.world.name] == names[trigger.world.name]
+                if request.access.writes and same_world and same_data(request, trigger):
+                    raise MisuseError(
+                        f"{declaration.name_of(request)} writes what"
+                        f" {declaration.name_of(trigger)} triggers on, because both roles are"
+                        f" bound to {names[trigger.world.name]}: each update would cause the next"
+                        " one; bind them to different world contexts"
+                    )

@@ -1,0 +1,176 @@
+"""How changes reach a running actor: one watch per trigger pattern, each on a thread of its own.
+
+A watch blocks, and an update must not wait for one; so each watch has a thread that only fills
+the actor's inbox.  A watch whose shard is away is opened again with growing pauses; its snapshot
+then repeats what is known, which `PendingTriggers` passes over.
+"""
+
+from __future__ import annotations
+
+import logging
+import random
+import threading
+from typing import TYPE_CHECKING, Self
+
+from enact_dist.actor_triggers import BackOff, PendingTriggers, Trigger
+from enact_dist.errors import LinkError
+from enact_dist.link.clock import monotonic_ns
+
+if TYPE_CHECKING:
+    from collections.abc import Hashable, Iterator, Mapping
+
+    from enact_dist.actor_binding import BoundActor, Watched
+    from enact_dist.terms import Entity
+    from enact_dist.watch import Change, Watch
+
+log = logging.getLogger("enact.actor")
+
+
+class Inbox:
+    """`PendingTriggers` that the watching threads fill and the actor's thread empties."""
+
+    def __init__(self, *, per_entity: bool) -> None:
+        self._pending = PendingTriggers(per_entity=per_entity)
+        self._filled = threading.Condition()
+        self._error: Exception | None = None
+
+    @property
+    def skipped(self) -> int:
+        """States that no update saw, so far."""
+        return self._pending.skipped
+
+    def changed(self, source: int, entity: Entity, state: Hashable, *, missed: int = 0) -> None:
+        """Take note of a change; `missed` states before it were lost on the way."""
+        with self._filled:
+            self._pending.skipped += missed
+            if self._pending.changed(source, entity, state):
+                self._filled.notify_all()
+
+    def vanished(self, source: int, entity: Entity, state: Hashable, *, in_set: bool) -> None:
+        """Take note that a trigger datum is null."""
+        with self._filled:
+            if self._pending.vanished(source, entity, state, in_set=in_set):
+                self._filled.notify_all()
+
+    def used(self, states: Mapping[tuple[int, Entity], Hashable]) -> None:
+        """Take note of the states that an update that just ended has seen already."""
+        with self._filled:
+            for (source, entity), state in states.items():
+                self._pending.used(source, entity, state)
+
+    def postpone(self, trigger: Trigger, due_ns: int) -> None:
+        """Put a refused run back until `due_ns`."""
+        with self._filled:
+            self._pending.postpone(trigger, due_ns)
+
+    def fail(self, error: Exception) -> None:
+        """Let the actor's thread raise what ended a watch for good."""
+        with self._filled:
+            self._error = error
+            self._filled.notify_all()
+
+    def take(self, wait_s: float) -> Trigger | None:
+        """Return the next run that is due, waiting at most `wait_s` for one; else None.
+
+        Raises:
+            Exception: What ended a watch for good.
+        """
+        until_ns = monotonic_ns() + round(wait_s * 1e9)
+        with self._filled:
+            while True:
+                if self._error is not None:
+                    raise self._error
+                now_ns = monotonic_ns()
+                if trigger := self._pending.take(now_ns):
+                    return trigger
+                due_ns = self._pending.due_ns()
+                wake_ns = until_ns if due_ns is None else min(due_ns, until_ns)
+                if now_ns >= until_ns:
+                    return None
+                self._filled.wait((wake_ns - now_ns) / 1e9)
+
+
+class Watching:
+    """All watches of one actor while it runs; a context manager.
+
+    Args:
+        bound: The actor.
+        inbox: Where its changes go.
+    """
+
+    def __init__(self, bound: BoundActor, inbox: Inbox) -> None:
+        self._bound = bound
+        self._inbox = inbox
+        self._over = threading.Event()
+        self._guard = threading.Lock()
+        self._open: list[Watch] = []
+        self._threads = [
+            threading.Thread(
+                target=self._follow,
+                args=(watched,),
+                name=f"watch {watched.context.name}/{watched.entities}",
+                daemon=True,
+            )
+            for watched in bound.watched()
+        ]
+
+    def __enter__(self) -> Self:
+        for thread in self._threads:
+            thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with self._guard:
+            self._over.set()
+            opened = tuple(self._open)
+        for watch in opened:
+            watch.close()
+        for thread in self._threads:
+            thread.join()
+
+    def _follow(self, watched: Watched) -> None:
+        refused = 0
+        while not self._over.is_set():
+            try:
+                for change in self._changes(watched):
+                    refused = 0
+                    self._note(watched, change)
+            except LinkError as error:
+                wait_s = BackOff().wait_s(refused, random.random())  # noqa: S311 (spreads retries)
+                refused += 1
+                log.warning(
+                    "watch of %s in %s broke, again in %.2f s: %s",
+                    watched.entities,
+                    watched.context.name,
+                    wait_s,
+                    error,
+                )
+                self._over.wait(wait_s)
+            except Exception as error:  # noqa: BLE001 (raised again in the actor's thread)
+                if not self._over.is_set():
+                    self._inbox.fail(error)
+                return
+
+    def _changes(self, watched: Watched) -> Iterator[Change]:
+        with watched.context.watch(watched.entities, *watched.aspects) as watch:
+            with self._guard:
+                if self._over.is_set():
+                    return
+                self._open.append(watch)
+            try:
+                yield from watch
+            finally:
+                with self._guard:
+                    self._open.remove(watch)
+
+    def _note(self, watched: Watched, change: Change) -> None:
+        declaration = self._bound.declaration
+        if not declaration.covers(change.entity):
+            return
+        state = (change.version, change.position.stamp_ns)
+        for index in watched.triggers.get(str(change.aspect), ()):
+            if change.null:
+                in_set = declaration.triggers[index].access.each
+                self._inbox.vanished(index, change.entity, state, in_set=in_set)
+            else:
+                self._inbox.changed(index, change.entity, state, missed=change.gap)

@@ -1,0 +1,86 @@
+"""The lock of one update: indexed by what the actor class declares.
+
+`update` says `lock[self.observed]`; the lock itself is made of bound requests, which name a world
+context instead of a role and the triggering entity instead of a pattern.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from enact_dist.lock import Lock
+from enact_dist.reading import slot_of
+from enact_dist.terms import Entity, LockRequest, World
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+T = TypeVar("T")
+
+
+class ActorLock(Lock):
+    """A lock that translates the requests of an actor class into its own.
+
+    Only requests that name a role are translated: by name alone a role `online` that is bound to
+    the context `training` could not be told from the context `online`.
+
+    Args:
+        bound: Each declared request with what it stands for in this update.
+        entity: The triggering entity, if there is one.
+        wait_s: As for `Lock`.
+        hold_s: As for `Lock`.
+    """
+
+    def __init__(
+        self,
+        bound: Mapping[LockRequest[Any], LockRequest[Any]],
+        *,
+        entity: Entity | None,
+        wait_s: float,
+        hold_s: float,
+    ) -> None:
+        super().__init__(*bound.values(), wait_s=wait_s, hold_s=hold_s)
+        self._entity = entity
+        self._bound = bound
+
+    def _own(self, request: Any) -> Any:
+        if isinstance(request, LockRequest) and isinstance(request.world, World):
+            return self._bound.get(request, request)
+        return request
+
+    def granted_states(self, declared: LockRequest[Any]) -> dict[Entity, tuple[int, int]]:
+        """Return version and commit stamp (ns) of what a declared request showed at the grant."""
+        request = self._own(declared)
+        slots = self._readings.matching(request) if request.access.each else [slot_of(request)]
+        states = {slot: self._readings.state(slot) for slot in slots}
+        return {
+            Entity(slot.entity): (state.version, state.stamp_ns)
+            for slot, state in states.items()
+            if state is not None
+        }
+
+    def __getitem__(self, request: LockRequest[Any]) -> Any:
+        return super().__getitem__(self._own(request))
+
+    def get(self, request: LockRequest[Any], default: Any = None) -> Any:
+        """`Lock.get` of a declared request."""
+        return super().get(self._own(request), default)
+
+    def put(self, request: LockRequest[T], datum: T, *, stamp_ns: int = 0) -> None:
+        """`Lock.put` of a declared request."""
+        super().put(self._own(request), datum, stamp_ns=stamp_ns)
+
+    def __delitem__(self, request: LockRequest[Any]) -> None:
+        super().__delitem__(self._own(request))
+
+    def expect(self, view: LockRequest[Any]) -> None:
+        """`Lock.expect` of a declared request."""
+        super().expect(self._own(view))
+
+    def version(self, request: LockRequest[Any]) -> int:
+        """`Lock.version` of a declared request."""
+        return super().version(self._own(request))
+
+    def stamp_ns(self, request: LockRequest[Any]) -> int:
+        """`Lock.stamp_ns` of a declared request."""
+        return super().stamp_ns(self._own(request))

@@ -1,0 +1,265 @@
+"""Runs one actor in one thread: trigger → lock → update → commit → report.
+
+What happens with an error:
+
+========================================  =====================================================
+error                                     the run
+========================================  =====================================================
+`LockTimeoutError` not granted            tried again for the same entity after a growing pause,
+`LeaseLostError` granted, then lost       without end: nothing is wrong with the actor, and the
+`ChangedError` expected view moved on     trigger must not be lost
+`LinkError` shard away
+`CommitUnknownError` may stand            the same: the new update reads what stands (`unknown`)
+any other exception                       counted, logged, kept as last error; run again when the
+                                          entity changes
+========================================  =====================================================
+
+A source takes its next tick instead of trying again; an actor that runs once tries again after
+the first kind, and after the second it is over.  `KeyboardInterrupt` and the like end the run.
+"""
+
+from __future__ import annotations
+
+import logging
+import random
+import threading
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, ClassVar, Final
+from weakref import WeakKeyDictionary
+
+from enact_dist.actor import Actor, check_period
+from enact_dist.actor_binding import BoundActor
+from enact_dist.actor_inbox import Inbox, Watching
+from enact_dist.actor_report import ActorRecord, ActorStatistics, encode_reports
+from enact_dist.actor_triggers import BackOff, FixedRate
+from enact_dist.errors import (
+    ChangedError,
+    CommitUnknownError,
+    LeaseLostError,
+    LinkError,
+    LockTimeoutError,
+    MisuseError,
+)
+from enact_dist.link.clock import monotonic_ns, wall_ns
+
+if TYPE_CHECKING:
+    from enact_dist.actor_lock import ActorLock
+    from enact_dist.cell import Cell
+    from enact_dist.terms import Entity
+
+OnError = Callable[["Entity | None", Exception], None]
+"""Told of each error of a run, with the triggering entity; called in the actor's thread."""
+
+REFUSALS: Final = (
+    LockTimeoutError,
+    LeaseLostError,
+    ChangedError,
+    CommitUnknownError,
+    LinkError,
+)
+"""Errors of an attempt that are not the actor's fault."""
+
+STOP_LOOK_S: Final = 0.1
+"""An idle actor looks at `stop` this often; an `Event` and a `Condition` cannot be awaited both."""
+
+REPORT_EVERY_NS: Final = 1_000_000_000
+
+log = logging.getLogger("enact.actor")
+
+
+def run_actor(
+    actor: Actor,
+    cell: Cell,
+    worlds: Mapping[str, str] | None = None,
+    *,
+    stop: threading.Event,
+    name: str = "",
+    wait_s: float | None = None,
+    on_error: OnError | None = None,
+) -> ActorStatistics:
+    """Run an actor in this thread until `stop` is set, or until a once-actor is done.
+
+    `stop` lets the update that is running finish and commit; an attempt that waits for its lock
+    ends after its `wait_s` at the latest.
+
+    Args:
+        actor: The actor; a fresh instance, run once.
+        cell: Where its world contexts are.
+        worlds: Role → name of a world context; None binds each role to the context of its name.
+        stop: Set from another thread or a signal handler to end the run.
+        name: Name in logs and reports; by default the class's.
+        wait_s: How long an attempt waits for its lock; None: as long as the actor says.
+        on_error: Told of each error beside the log.
+
+    Returns:
+        What the actor did.
+
+    Raises:
+        MisuseError: The actor cannot be bound like this, or the cell was closed under it.
+        UnknownWorldError: The cell has no such world context.
+    """
+    return ActorRun(
+        actor, cell, worlds, stop=stop, name=name, wait_s=wait_s, on_error=on_error
+    ).run()
+
+
+class ActorRun:
+    """One run of one actor.  `statistics` may be asked from any thread."""
+
+    def __init__(
+        self,
+        actor: Actor,
+        cell: Cell,
+        worlds: Mapping[str, str] | None = None,
+        *,
+        stop: threading.Event,
+        name: str = "",
+        wait_s: float | None = None,
+        on_error: OnError | None = None,
+    ) -> None:
+        self._bound = BoundActor(actor, cell, worlds)
+        self._actor = actor
+        self._every_s = actor.every_s
+        self._stop = stop
+        self._wait_s = wait_s
+        self._on_error = on_error
+        self._inbox = Inbox(per_entity=self._bound.declaration.per_entity)
+        self._back_off = BackOff()
+        self.name = name or type(actor).__name__
+        self._record = ActorRecord(self.name, now_ns=monotonic_ns())
+        self._board = ReportBoard.of(cell)
+        self._reported_ns = 0
+        if self._every_s is not None:
+            check_period(self.name, self._every_s)
+            if self._bound.declaration.triggers:
+                raise MisuseError(f"{self.name} has triggers and every_s; it can have only one")
+
+    def statistics(self) -> ActorStatistics:
+        """Return what the actor has done so far."""
+        self._record.skipped = self._inbox.skipped
+        return self._record.snapshot(monotonic_ns())
+
+    def run(self) -> ActorStatistics:
+        """Run until stopped or done; see `run_actor`."""
+        self._actor.start()
+        try:
+            self._record.state = "running"
+            self._report(now=True)
+            if self._bound.declaration.triggers:
+                self._run_triggered()
+            elif self._every_s is not None:
+                self._run_source(self._every_s)
+            else:
+                self._run_once()
+        finally:
+            if self._record.state == "running":
+                self._record.state = "stopped"
+            self._report(now=True)
+            self._actor.stop()
+        return self.statistics()
+
+    def _run_triggered(self) -> None:
+        with Watching(self._bound, self._inbox):
+            while not self._stop.is_set():
+                trigger = self._inbox.take(STOP_LOOK_S)
+                if trigger is not None:
+                    error = self._attempt(trigger.entity)
+                    if isinstance(error, REFUSALS):
+                        pause_s = self._pause_s(trigger.refused)
+                        self._inbox.postpone(trigger, monotonic_ns() + round(pause_s * 1e9))
+                self._report()
+
+    def _run_source(self, every_s: float) -> None:
+        rate = FixedRate(every_s, start_ns=monotonic_ns())
+        missed = 0
+        while not self._stop.wait(max(0, rate.due_ns() - monotonic_ns()) / 1e9):
+            if rate.tick(monotonic_ns()):
+                in_vain = isinstance(self._attempt(None), REFUSALS)
+                self._record.missed(rate.missed - missed + in_vain)
+                missed = rate.missed
+            self._report()
+
+    def _run_once(self) -> None:
+        refused = 0
+        while not self._stop.is_set():
+            error = self._attempt(None)
+            if not isinstance(error, REFUSALS):
+                self._record.state = "done"
+                return
+            self._report()
+            self._stop.wait(self._pause_s(refused))
+            refused += 1
+
+    def _attempt(self, entity: Entity | None) -> Exception | None:
+        """Run `update` once under its lock; return what ended it early."""
+        asked_ns, granted_ns = monotonic_ns(), 0
+        seen: dict[tuple[int, Entity], tuple[int, int]] = {}
+        try:
+            lock = self._bound.lock(entity, wait_s=self._wait_s)
+            with lock:
+                granted_ns = monotonic_ns()
+                seen = self._seen(lock)
+                self._actor.update(lock)
+        except REFUSALS as error:
+            self._record.refused(error, unknown=isinstance(error, CommitUnknownError))
+            log.warning("%s%s: refused: %s", self.name, _about(entity), error)
+            ending: Exception | None = error
+        except Exception as error:
+            self._bound.check_usable()
+            self._record.failed(error)
+            log.exception("%s%s: update failed", self.name, _about(entity))
+            ending = error
+        else:
+            ended_ns = monotonic_ns()
+            self._record.updated(took_ns=ended_ns - granted_ns, now_ns=ended_ns, wall_ns=wall_ns())
+            ending = None
+        self._record.waited((granted_ns or monotonic_ns()) - asked_ns)
+        if not isinstance(ending, REFUSALS):
+            self._inbox.used(seen)
+        if ending is not None and self._on_error is not None:
+            self._on_error(entity, ending)
+        return ending
+
+    def _seen(self, lock: ActorLock) -> dict[tuple[int, Entity], tuple[int, int]]:
+        return {
+            (index, entity): state
+            for index, trigger in enumerate(self._bound.declaration.triggers)
+            for entity, state in lock.granted_states(trigger).items()
+        }
+
+    def _pause_s(self, refused: int) -> float:
+        return self._back_off.wait_s(refused, random.random())  # noqa: S311 (spreads retries)
+
+    def _report(self, *, now: bool = False) -> None:
+        """Post the statistics with the session's keep-alive, at most once a second."""
+        now_ns = monotonic_ns()
+        if now or now_ns - self._reported_ns >= REPORT_EVERY_NS:
+            self._reported_ns = now_ns
+            self._board.post(self._bound.cell, self.statistics())
+
+
+class ReportBoard:
+    """The newest reports of all actors that share a cell's session, by actor name."""
+
+    _boards: ClassVar[WeakKeyDictionary[Cell, ReportBoard]] = WeakKeyDictionary()
+    _making: ClassVar[threading.Lock] = threading.Lock()
+
+    def __init__(self) -> None:
+        self._posted: dict[str, ActorStatistics] = {}
+        self._guard = threading.Lock()
+
+    @classmethod
+    def of(cls, cell: Cell) -> ReportBoard:
+        """Return the board of a cell."""
+        with cls._making:
+            return cls._boards.setdefault(cell, cls())
+
+    def post(self, cell: Cell, statistics: ActorStatistics) -> None:
+        """Replace the report of one actor, and report all."""
+        with self._guard:
+            self._posted[statistics.name] = statistics
+            cell.set_report(encode_reports(list(self._posted.values())))
+
+
+def _about(entity: Entity | None) -> str:
+    return "" if entity is None else f" for {entity}"
