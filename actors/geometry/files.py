@@ -9,6 +9,7 @@ Two rules a change must keep:
 
 from __future__ import annotations
 
+import errno
 import os
 import secrets
 from typing import TYPE_CHECKING
@@ -76,6 +77,11 @@ def write_whole(contents: Mapping[Path, bytes]) -> None:
     Raises:
         OSError: A directory cannot be made or the disk refuses; no file of the set has changed.
     """
+    for path in contents:
+        if path.is_dir():
+            raise IsADirectoryError(
+                errno.EISDIR, "a directory has the name of this file", str(path)
+            )
     staged: dict[Path, Path] = {}
     try:
         for path, content in contents.items():

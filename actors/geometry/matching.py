@@ -18,6 +18,15 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from actors.geometry.clutter import (
+    clusters_of,
+    diagonal_m,
+    open3d_cloud,
+    plane_reach_m,
+    spacing,
+    thinned,
+    without_large_planes,
+)
 from actors.geometry.open3d_on_use import open3d
 
 if TYPE_CHECKING:
@@ -26,17 +35,11 @@ if TYPE_CHECKING:
     Points = npt.NDArray[np.floating[Any]]
     Pose = npt.NDArray[np.float64]
 
-PLANES_MAX: Final = 4
-"""Floor, table, two walls: a view seldom holds more planes that are larger than the object."""
-
 TRIPLES: Final = 20_000
 """Hypotheses per cluster. At 30 % right feature pairs 2.7 % of all triples are right: hundreds."""
 
 CANDIDATES_MAX: Final = 12
 """Hypotheses per cluster that are compared on all points; the rest is judged on pairs only."""
-
-CLUSTERS_MAX: Final = 64
-"""Largest clusters first: what is beyond is debris, and the time stays bounded."""
 
 
 class NoMatchError(ValueError):
@@ -51,7 +54,7 @@ class ClusterMatch:
         cluster: Number of the cluster, 0 is the one with most points.
         points: Points of the cluster after thinning.
         fitness: Share of the model's points with a scene point within the tolerance, 0 … 1; of
-            those that the camera could see, where it is known.
+            those that stand clear of the planes and, where the camera is known, that it could see.
         explained: Share of the cluster's points with a model point within the tolerance.
         rmse_m: Root mean square distance of the model's points that found a partner.
         centre_m: Centroid of the cluster, scene frame, (3,).
@@ -109,7 +112,8 @@ def find_model(
         eye_m: Where the camera stood, scene frame, (3,), if one took the whole scene: then a
             complete model is not blamed for its far side.
         seed: Seed of the sampling; equal seeds give equal poses.
-        voxel_m: Thinning grid in metres; by default 1/64 of the model's diagonal.
+        voxel_m: Thinning grid in metres; by default 1/64 of the model's diagonal,
+            or 1.5 times the spacing of the coarser cloud if that is more.
 
     Returns:
         The pose of the model in every cluster that could hold it, best first. A bad best is
@@ -120,7 +124,8 @@ def find_model(
 
     Source: features after Rusu, Blodow, Beetz 2009 (FPFH); use in ENACT 4.2 (perception).
     """
-    voxel_m = voxel_m or max(diagonal_m(model_m) / 64.0, 1e-4)
+    spacing_m = max(spacing(model_m), spacing(scene_m))
+    voxel_m = voxel_m or max(diagonal_m(model_m) / 64.0, 1.5 * spacing_m, 1e-4)
     model = thinned(model_m, voxel_m)
     if len(model) < 50:
         raise NoMatchError(
@@ -137,7 +142,7 @@ def find_model(
             f" {voxel_m * 1e3:.1f} mm; check that model and scene are both in metres"
         )
     random = np.random.default_rng(seed)
-    reference = _Described(model, voxel_m, eye_m)
+    reference = _Described(model, voxel_m, _Sight(eye_m, planes))
     ranking = sorted(
         (_match(reference, cluster, number, random) for number, cluster in enumerate(clusters)),
         key=lambda match: (-match.score, match.cluster),
@@ -145,72 +150,6 @@ def find_model(
     winner = clusters[ranking[0].cluster]
     side = np.sign(planes[:, :3] @ winner.mean(0) + planes[:, 3])
     return ModelMatch(tuple(ranking), planes * side[:, None], 2.0 * voxel_m, winner)
-
-
-def diagonal_m(points_m: Points) -> float:
-    """Return the diagonal of the axis-parallel box around points (N, 3), in their unit."""
-    return float(np.linalg.norm(np.ptp(points_m, axis=0)))
-
-
-def thinned(points_m: Points, voxel_m: float) -> npt.NDArray[np.float64]:
-    """Return one point, the mean, per occupied cell of a grid of edge `voxel_m`, (K, 3)."""
-    cloud = _cloud(points_m).voxel_down_sample(voxel_m)
-    return np.asarray(cloud.points).copy()
-
-
-def without_large_planes(
-    points_m: Points, *, larger_than_m: float, voxel_m: float
-) -> tuple[Points, Pose]:
-    """Take out floor, table and walls.
-
-    Only connected patches wider than the object go: a plane fitted through the fronts of several
-    objects is as rich in points as a wall, but falls into pieces of their size.
-
-    Args:
-        points_m: Scene, (N, 3), metres.
-        larger_than_m: A patch stays unless it spans more than 1.5 times this.
-        voxel_m: Grid of the thinned scene; a plane reaches 2 cells, and at least 10 mm, what
-            a depth camera scatters at 1 m.
-
-    Returns:
-        What is left, (M, 3), and the planes that went, (P, 4): unit normal, offset.
-    """
-    o3d = open3d()
-    planes: list[Pose] = []
-    while len(planes) < PLANES_MAX and len(points_m) > 100:
-        o3d.utility.random.seed(len(planes))
-        plane, support = _cloud(points_m).segment_plane(max(2.0 * voxel_m, 0.010), 3, 500)
-        index = np.asarray(support)
-        labels = np.asarray(_cloud(points_m[index]).cluster_dbscan(4.0 * voxel_m, 10))
-        wide = [
-            label
-            for label in range(labels.max(initial=-1) + 1)
-            if diagonal_m(points_m[index[labels == label]]) > 1.5 * larger_than_m
-        ]
-        if not wide:
-            break
-        points_m = np.delete(points_m, index[np.isin(labels, wide)], axis=0)
-        planes.append(np.asarray(plane) / np.linalg.norm(plane[:3]))
-    return points_m, np.array(planes).reshape(-1, 4)
-
-
-def clusters_of(points_m: Points, *, gap_m: float, points_min: int) -> list[Points]:
-    """Split a cloud where nothing bridges a gap.
-
-    Args:
-        points_m: (N, 3), metres.
-        gap_m: Points nearer than this belong together.
-        points_min: Smaller clusters are left out.
-
-    Returns:
-        At most `CLUSTERS_MAX` clusters, the one with most points first.
-    """
-    if len(points_m) == 0:
-        return []
-    labels = np.asarray(_cloud(points_m).cluster_dbscan(gap_m, 10))
-    sizes = np.bincount(labels[labels >= 0], minlength=1)
-    order = np.argsort(-sizes, kind="stable")[:CLUSTERS_MAX]
-    return [points_m[labels == label] for label in order if sizes[label] >= points_min]
 
 
 def rigid_fit(source_m: Points, target_m: Points) -> Pose:
@@ -239,17 +178,25 @@ def rigid_fit(source_m: Points, target_m: Points) -> Pose:
     return pose
 
 
+@dataclass(frozen=True, slots=True)
+class _Sight:
+    """What of a placed model the scene can show: nothing hidden, nothing that went with a plane."""
+
+    eye_m: Points | None
+    planes: Pose
+
+
 class _Described:
     """A thinned cloud with what matching needs of it: features, tree, Open3D cloud."""
 
-    def __init__(self, points_m: Points, voxel_m: float, eye_m: Points | None = None) -> None:
+    def __init__(self, points_m: Points, voxel_m: float, sight: _Sight | None = None) -> None:
         from scipy.spatial import cKDTree
 
         o3d = open3d()
         self.points_m = points_m
         self.voxel_m = voxel_m
-        self.eye_m = eye_m
-        self.cloud = _cloud(points_m)
+        self.sight = sight or _Sight(None, np.empty((0, 4)))
+        self.cloud = open3d_cloud(points_m)
         near, wide = (
             o3d.geometry.KDTreeSearchParamHybrid(radius, count)
             for radius, count in ((3.0 * voxel_m, 30), (6.0 * voxel_m, 100))
@@ -337,21 +284,28 @@ def _fits(
     moved = model.points_m @ pose[:3, :3].T + pose[:3, 3]
     out, _ = scene.tree.query(moved)
     back, _ = model.tree.query((scene.points_m - pose[:3, 3]) @ pose[:3, :3])
-    if model.eye_m is not None:
-        out = out[_visible(moved, model.eye_m)]
+    out = out[_showing(model, moved)]
     near = out[out <= tolerance_m]
     rmse_m = float(np.sqrt(np.mean(near**2))) if len(near) else float("inf")
-    return len(near) / len(out), float(np.mean(back <= tolerance_m)), rmse_m
+    # A pose that hides nearly all of the model is judged as if a fifth of it showed.
+    return len(near) / max(len(out), len(moved) // 5), float(np.mean(back <= tolerance_m)), rmse_m
 
 
-def _visible(points_m: Points, eye_m: Points) -> npt.NDArray[np.intp]:
-    """Return the indices of points that no others hide from the eye.
+def _showing(model: _Described, placed_m: Points) -> npt.NDArray[np.bool_]:
+    """Say which points of the placed model the scene could show, (N,).
 
     Source: Katz, Tal, Basri 2007 (hidden point removal).
     """
-    radius_m = 100.0 * diagonal_m(points_m)
-    _, index = _cloud(points_m).hidden_point_removal(np.asarray(eye_m, np.float64), radius_m)
-    return np.asarray(index, np.intp)
+    planes, eye_m = model.sight.planes, model.sight.eye_m
+    above = np.abs(placed_m @ planes[:, :3].T + planes[:, 3]) > plane_reach_m(model.voxel_m)
+    showing = above.all(axis=1)
+    if eye_m is not None:
+        radius_m = 100.0 * diagonal_m(placed_m)
+        _, index = open3d_cloud(placed_m).hidden_point_removal(
+            np.asarray(eye_m, np.float64), radius_m
+        )
+        showing &= np.isin(np.arange(len(placed_m)), index)
+    return np.asarray(showing)
 
 
 def _closeness(model: _Described, scene: _Described, pose: Pose, tolerance_m: float) -> float:
@@ -362,9 +316,3 @@ def _closeness(model: _Described, scene: _Described, pose: Pose, tolerance_m: fl
     """
     distance_m, _ = scene.tree.query(model.points_m @ pose[:3, :3].T + pose[:3, 3])
     return float(np.mean(np.maximum(0.0, 1.0 - (distance_m / tolerance_m) ** 2)))
-
-
-def _cloud(points_m: Points) -> Any:  # Open3D has no types
-    o3d = open3d()
-    # float32 here would cost half a second per 300,000 points: converted one by one.
-    return o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points_m.astype(np.float64)))

@@ -133,7 +133,11 @@ def fuse_frames(
         block_count=BLOCKS,
     )
     matrix = core.Tensor(_matrix(frames[0].depth.acquisition.camera))
-    for frame in frames:
+    depth_mm_max = depth_m_max * 1000.0
+    in_reach = [
+        f for f in frames if ((f.depth.depth_mm > 0) & (f.depth.depth_mm < depth_mm_max)).any()
+    ]
+    for frame in in_reach:  # Open3D raises on a frame that touches nothing
         camera_from_world = core.Tensor(inverse(frame.world_from_camera))
         # uint16 with uint8 is one of the two pairs that Open3D integrates; mixed ones raise.
         depth = o3d.t.geometry.Image(core.Tensor(frame.depth.depth_mm))
@@ -146,8 +150,10 @@ def fuse_frames(
                 f"asked to fuse {len(frames)} frames on a grid of {voxel_m * 1e3:.1f} mm; at"
                 f" {frame.name} it needs more than {BLOCKS_MAX} blocks; use a coarser grid"
             )
-    mesh = grid.extract_triangle_mesh(weight_threshold=min(2.5, 0.5 * len(frames)))
-    if mesh.triangle.indices.shape[0] == 0:
+    mesh = None
+    if in_reach:
+        mesh = grid.extract_triangle_mesh(weight_threshold=min(2.5, 0.5 * len(frames)))
+    if mesh is None or mesh.triangle.indices.shape[0] == 0:
         raise FusionError(
             f"asked to fuse {len(frames)} frames on a grid of {voxel_m * 1e3:.1f} mm; no surface"
             f" came out; is anything nearer than {depth_m_max:g} m?"
@@ -182,11 +188,15 @@ def residual(
 
 
 def _matrix(camera: Camera) -> Floats:
-    """Return the camera matrix K, (3, 3)."""
+    """Return the camera matrix K, (3, 3), for Open3D's integration.
+
+    It cuts pixel coordinates off instead of rounding them, which shifts every image by half a
+    pixel and slanted surfaces by 1.3 mm at 1 m (320 x 240): the centre moves to undo that.
+    """
     return np.array(
         [
-            [camera.fx_px, 0.0, camera.cx_px],
-            [0.0, camera.fy_px, camera.cy_px],
+            [camera.fx_px, 0.0, camera.cx_px + 0.5],
+            [0.0, camera.fy_px, camera.cy_px + 0.5],
             [0.0, 0.0, 1.0],
         ]
     )
