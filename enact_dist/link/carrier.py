@@ -36,7 +36,13 @@ class NoticeFeed(Protocol):
 
 
 class Carrier(Protocol):
-    """Moves requests to shards and brings back their answers."""
+    """Moves requests to shards and brings back their answers.
+
+    Attributes:
+        fetch_bytes: How large a slice of a datum is asked for in one call, at most.
+    """
+
+    fetch_bytes: int
 
     def request(self, shard: str, message: Request, *, timeout_s: float) -> Answer | None:
         """Send one request and return its answer, or None if there was none in time.

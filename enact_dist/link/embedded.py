@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import threading
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.records import SessionSeen
 from enact_dist.errors import MisuseError, ShardUnreachableError
@@ -20,6 +20,10 @@ if TYPE_CHECKING:
 
     from enact_dist.core.messages import Answer, Request, ShardEntry
     from enact_dist.link.host import ShardHost
+
+
+FETCH_BYTES: Final = 1 << 40
+"""More than any datum has."""
 
 
 class _Call:
@@ -43,9 +47,13 @@ class EmbeddedCarrier:
     Args:
         host: The shard; it is not closed with the carrier.
         session: The session whose token is shown as present until `close`.
+
+    Attributes:
+        fetch_bytes: How large a slice of a datum is asked for in one call: all, nothing is copied.
     """
 
     def __init__(self, host: ShardHost, session: str) -> None:
+        self.fetch_bytes = FETCH_BYTES
         self._host = host
         self._session = session
         self._pid = os.getpid()

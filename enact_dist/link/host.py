@@ -35,7 +35,7 @@ from enact_dist.core.records import (
     Reply,
     Tick,
 )
-from enact_dist.core.shard import Shard, ShardSettings
+from enact_dist.core.shard import Shard
 from enact_dist.link.clock import Clock, SystemClock
 
 if TYPE_CHECKING:
@@ -44,6 +44,7 @@ if TYPE_CHECKING:
 
     from enact_dist.core.messages import Answer, Notice, Request
     from enact_dist.core.records import Effect, Event
+    from enact_dist.core.shard_state import ShardSettings
     from enact_dist.link.store import Store
     from enact_dist.link.store_thread import StoreThread
 

@@ -12,6 +12,7 @@ import json
 import logging
 import queue
 import signal
+import socket
 import sys
 import threading
 import time
@@ -21,8 +22,8 @@ from typing import TYPE_CHECKING, Final, Self
 
 from enact_dist.errors import ConfigError, EnactError, LinkError
 from enact_dist.link.host import open_host
-from enact_dist.link.zenoh_carrier import find_shards
 from enact_dist.link.zenoh_config import close_session, open_session
+from enact_dist.link.zenoh_discovery import FoundShard, find_shards
 from enact_dist.link.zenoh_service import ZenohService
 
 if TYPE_CHECKING:
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
     from pathlib import Path
     from types import FrameType
 
-    from enact_dist.core.shard import ShardSettings
+    from enact_dist.core.shard_state import ShardSettings
     from enact_dist.link.host import ShardHost
 
 PROBE_S: Final = 0.3
@@ -141,12 +142,26 @@ def refuse_second_daemon(settings: DaemonSettings) -> None:
         endpoint for shard in shards if shard.name == name for endpoint in shard.endpoints
     ]
     endpoints = list(dict.fromkeys(map(_reachable, (*settings.listen, *advertised))))
-    found = find_shards(endpoints, timeout_s=PROBE_S)
-    if any(other.cell == settings.cell and other.shard == name for other in found):
+    listening = [endpoint for endpoint in endpoints if _somebody_listens(endpoint)]
+    found = find_shards(listening, timeout_s=PROBE_S) if listening else ()
+    if FoundShard(settings.cell, name) in found:
         raise LinkError(
-            f"shard {name} of cell {settings.cell} already runs at {' or '.join(endpoints)}; two"
+            f"shard {name} of cell {settings.cell} already runs at {' or '.join(listening)}; two"
             " daemons must not serve one shard: stop the other, or give this one another name"
         )
+
+
+def _somebody_listens(endpoint: str) -> bool:
+    """Say whether it is worth asking there; a refused connection saves the time of asking."""
+    protocol, _, address = endpoint.partition("/")
+    host, _, port = address.partition("?")[0].partition("#")[0].rpartition(":")
+    if protocol != "tcp" or not port.isdecimal():
+        return True
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), PROBE_S).close()
+    except (OSError, ValueError):
+        return False
+    return True
 
 
 def _reachable(endpoint: str) -> str:

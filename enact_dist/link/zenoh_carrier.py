@@ -33,26 +33,34 @@ from enact_dist.errors import MisuseError, ProtocolError, ShardUnreachableError
 from enact_dist.link.notices import NoticeQueue
 from enact_dist.link.zenoh_config import QUEUED_MAX, close_session, keep_after_fork, open_session
 from enact_dist.wire.frames import decode_frame, encode_frame
-from enact_dist.wire.keys import notice_key, parse_request_key, request_key, token_key, verb_of
+from enact_dist.wire.keys import notice_key, request_key, token_key, verb_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from enact_dist.core.messages import Request, ShardEntry
 
+    _Subscriber = zenoh.Subscriber[zenoh.Handler[zenoh.Sample]]
+
 _log = logging.getLogger("enact.link")
 _ANSWERS: Final = frozenset(get_args(Answer))
 CONTROL_BYTES_MAX: Final = 16 << 10
 """Requests with more data than this leave the control priority to the others."""
+FETCH_BYTES: Final = 1 << 20
+"""Slices of this size keep the other clients' answers within some ms of their turn."""
 CONNECT_S: Final = 5.0
 """How long opening a carrier waits for a first connection."""
 POLL_S: Final = 0.005
 """How often a carrier being opened looks for a connection."""
 REACH_S: Final = 0.3
 """How long a shard has to show that it is already in reach."""
+NAMELESS: Final = "client"
+"""Stands in the keys of a client that gave no name."""
 UNCHECKED_MAX: Final = 256
 """Answered queries that are still watched for a second reply."""
 
+QUESTION: Final = AwaitStamp(0, 0)
+"""The cheapest request: answered at once, changes nothing."""
 _NONE = zenoh.ConsolidationMode.NONE
 _BLOCK, _DROP = zenoh.CongestionControl.BLOCK, zenoh.CongestionControl.DROP
 _CONTROL, _DATA, _BULK = (
@@ -69,11 +77,14 @@ class _Link:
     session: zenoh.Session
     endpoints: tuple[str, ...]
     token: zenoh.LivelinessToken
-    subscribers: list[zenoh.Subscriber] = field(default_factory=list)
+    subscribers: list[_Subscriber] = field(default_factory=list)
 
 
 class ZenohCarrier:
     """Reaches the shards of a cell over Zenoh.  See `Carrier` for the methods; thread-safe.
+
+    Attributes:
+        fetch_bytes: How large a slice of a datum is asked for in one call, at most.
 
     Args:
         cell: The cell's name.
@@ -99,9 +110,10 @@ class ZenohCarrier:
         ttl_s: float,
         connect_s: float = CONNECT_S,
     ) -> None:
+        self.fetch_bytes = FETCH_BYTES
         self._cell = cell
         self._session = session
-        self._actor = actor or "client"
+        self._actor = actor or NAMELESS
         self._lease_s = ttl_s / 2
         self._pid = os.getpid()
         self._closed = False
@@ -115,7 +127,7 @@ class ZenohCarrier:
         self._unchecked: deque[zenoh.Handler[zenoh.Reply]] = deque(maxlen=UNCHECKED_MAX)
         keep_after_fork(self)
         first = self._open_link(tuple(endpoints))
-        if not _wait_connected(first.session, connect_s):
+        if not wait_connected(first.session, connect_s):
             self.close()
             raise ShardUnreachableError(
                 f"nobody answers at {', '.join(endpoints)} (waited {connect_s:g} s); is the shard"
@@ -190,7 +202,7 @@ class ZenohCarrier:
             return None
         self._check_answered_once(shard)
         self._unchecked.append(replies)
-        return _answer_in(sample, shard)
+        return answer_in(sample, shard)
 
     def _check_answered_once(self, shard: str) -> None:
         """Look whether earlier queries got a second reply; that they end costs no waiting then."""
@@ -240,10 +252,8 @@ class ZenohCarrier:
         for link in self._links:
             if set(link.endpoints) & set(endpoints):
                 return link
-        if len(self._links) == 1:
-            ask = AwaitStamp(0, 0)
-            if self.request(shard, ask, timeout_s=REACH_S) is not None:
-                return self._links[0]
+        if len(self._links) == 1 and self.request(shard, QUESTION, timeout_s=REACH_S) is not None:
+            return self._links[0]
         return None
 
     def _open_link(self, endpoints: tuple[str, ...]) -> _Link:
@@ -273,7 +283,7 @@ class ZenohCarrier:
         feed.on_close = lambda: self._unsubscribe(feed, ends)
         return feed
 
-    def _feed(self, link: _Link, feed: NoticeQueue) -> zenoh.Subscriber:
+    def _feed(self, link: _Link, feed: NoticeQueue) -> _Subscriber:
         subscriber = link.session.declare_subscriber(
             notice_key(self._cell, "*"), zenoh.handlers.RingChannel(QUEUED_MAX)
         )
@@ -285,14 +295,14 @@ class ZenohCarrier:
         thread.start()
         return subscriber
 
-    def _unsubscribe(self, feed: NoticeQueue, subscribers: list[zenoh.Subscriber]) -> None:
+    def _unsubscribe(self, feed: NoticeQueue, subscribers: list[_Subscriber]) -> None:
         with self._mutex:
             if feed in self._feeds:
                 self._feeds.remove(feed)
         if self._closed or self._pid != os.getpid():
             return
         for subscriber in subscribers:
-            subscriber.undeclare()
+            subscriber.undeclare()  # type: ignore[no-untyped-call]  # Zenoh's stub lacks it
 
     # ---------------------------------------------------------------- end
 
@@ -330,14 +340,19 @@ def _bytes(payload: zenoh.ZBytes | None) -> bytes:
     return bytes(payload) if payload is not None else b""
 
 
-def _answer_in(sample: zenoh.Sample, shard: str) -> Answer:
+def answer_in(sample: zenoh.Sample, shard: str) -> Answer:
+    """Return the answer that a reply carries.
+
+    Raises:
+        ProtocolError: It cannot be read, or is no answer.
+    """
     answer = decode_frame(_bytes(sample.attachment), _bytes(sample.payload))
     if type(answer) not in _ANSWERS:
         raise ProtocolError(f"shard {shard} answered with a {type(answer).__name__}")
     return cast("Answer", answer)
 
 
-def _wait_connected(session: zenoh.Session, wait_s: float) -> bool:
+def wait_connected(session: zenoh.Session, wait_s: float) -> bool:
     """Wait until the session has a peer; False if it has none after `wait_s`."""
     deadline_s = time.monotonic() + wait_s
     while not session.info.peers_zid():
@@ -345,53 +360,3 @@ def _wait_connected(session: zenoh.Session, wait_s: float) -> bool:
             return False
         time.sleep(POLL_S)
     return True
-
-
-# ---------------------------------------------------------------- discovery
-
-
-@dataclass(frozen=True, slots=True)
-class FoundShard:
-    """A shard that answers somewhere, and the cell that it belongs to."""
-
-    cell: str
-    shard: str
-
-
-def find_shards(endpoints: Sequence[str], *, timeout_s: float) -> tuple[FoundShard, ...]:
-    """Ask who is there: shards that answer at one of `endpoints`; empty if nobody does.
-
-    Returns as soon as everybody connected has answered.
-
-    Raises:
-        ConfigError: An endpoint cannot be read.
-    """
-    session = open_session(connect=endpoints, lease_s=max(timeout_s, 0.2))
-    try:
-        if not _wait_connected(session, timeout_s):
-            return ()
-        deadline_s = time.monotonic() + timeout_s
-        found: set[FoundShard] = set()
-        while not found and time.monotonic() < deadline_s:
-            found = _ask_who(session, timeout_s)
-        return tuple(sorted(found, key=lambda shard: (shard.cell, shard.shard)))
-    finally:
-        close_session(session)
-
-
-def _ask_who(session: zenoh.Session, timeout_s: float) -> set[FoundShard]:
-    question = AwaitStamp(0, 0)
-    header, payload = encode_frame(question)
-    replies = session.get(
-        request_key("*", "*", verb_of(question), "anyone"),
-        payload=payload,
-        attachment=header,
-        timeout=timeout_s,
-        consolidation=_NONE,
-        priority=_CONTROL,
-        congestion_control=_BLOCK,
-    )
-    keys = [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
-    if not keys:
-        time.sleep(POLL_S)  # connected, but what the peer serves is not known yet
-    return {FoundShard(*parse_request_key(key)[:2]) for key in keys}

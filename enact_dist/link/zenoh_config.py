@@ -27,14 +27,15 @@ from typing import TYPE_CHECKING, Final
 import zenoh
 
 from enact_dist.errors import ConfigError, LinkError, MisuseError
+from enact_dist.wire.limits import BODY_BYTES_MAX, HEADER_BYTES_MAX
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
 QUEUED_MAX: Final = 65_536
 """Messages in a channel between Zenoh and Python: the network thread must not wait for Python."""
-MESSAGE_BYTES_MAX: Final = (1 << 30) + (32 << 20)
-"""Longest message: the largest datum with its header (`enact_dist.wire.limits`)."""
+MESSAGE_BYTES_MAX: Final = BODY_BYTES_MAX + HEADER_BYTES_MAX + (1 << 20)
+"""Longest message: the largest datum with its header."""
 CONNECT_WAIT_MS: Final = 50
 """How long `open` may wait for a connection; where there is none it goes on trying behind."""
 TRANSPORTS_MAX: Final = 10_000
@@ -136,7 +137,7 @@ def close_session(session: zenoh.Session) -> None:
     mine = (os.getpid(), session)
     if mine in _open_sessions:
         _open_sessions.remove(mine)
-        session.close()
+        session.close()  # type: ignore[no-untyped-call]  # Zenoh's stub lacks it
 
 
 def keep_after_fork(owner: object) -> None:
@@ -152,7 +153,7 @@ def _after_fork() -> None:
 
 def _at_exit() -> None:
     """Close what was left open: the interpreter would wait for it for ever."""
-    for _, session in list(_open_sessions):
+    for _, session in (*_open_sessions,):
         close_session(session)
 
 

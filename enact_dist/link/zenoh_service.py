@@ -147,7 +147,7 @@ class ZenohService:
                 sample = tokens.recv()
                 session = session_of(str(sample.key_expr))
                 if session:
-                    present = sample.kind is zenoh.SampleKind.PUT
+                    present = sample.kind == zenoh.SampleKind.PUT
                     self._host.event(SessionSeen(session, present))
         except zenoh.ZError:
             return
@@ -158,8 +158,8 @@ class ZenohService:
             return
         self._closed = True
         self._unwatch()
-        self._queryable.undeclare()
-        self._tokens.undeclare()
+        self._queryable.undeclare()  # type: ignore[no-untyped-call]  # as Zenoh's stub has it
+        self._tokens.undeclare()  # type: ignore[no-untyped-call]  # as Zenoh's stub has it
         self._senders.close()
         for thread in self._threads:
             thread.join(JOIN_S)
@@ -182,11 +182,11 @@ class _Parcel:
         except (zenoh.ZError, ProtocolError) as error:
             _log.warning("answer %s not sent: %s", type(self.answer).__name__, error)
         finally:
-            self.query.drop()
+            self.query.drop()  # type: ignore[no-untyped-call]  # as Zenoh's stub has it
 
     def drop(self) -> None:
         """Leave the client without an answer, which tells it to ask again."""
-        self.query.drop()
+        self.query.drop()  # type: ignore[no-untyped-call]  # as Zenoh's stub has it
 
 
 def client_of(message: Request) -> str:

@@ -1,0 +1,120 @@
+"""Who answers at an endpoint: the first contact with a cell, and a daemon's look before it starts.
+
+A client may know nothing but one endpoint.  It asks `enact/*/*/…`, which every shard in reach
+answers under its full name, and learns the rest of the cell from that shard's welcome.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import zenoh
+
+from enact_dist.core.messages import Welcome
+from enact_dist.errors import ProtocolError, ShardUnreachableError
+from enact_dist.link.zenoh_carrier import NAMELESS, POLL_S, QUESTION, answer_in, wait_connected
+from enact_dist.link.zenoh_config import close_session, open_session
+from enact_dist.wire.frames import encode_frame
+from enact_dist.wire.keys import parse_request_key, request_key, verb_of
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from enact_dist.core.messages import Answer, Hello, Request
+
+PROBE_LEASE_S: Final = 1.0
+"""Link lease of the short sessions that only look who is there."""
+
+
+@dataclass(frozen=True, slots=True)
+class FoundShard:
+    """A shard that answers somewhere, and the cell that it belongs to."""
+
+    cell: str
+    shard: str
+
+
+def find_shards(endpoints: Sequence[str], *, timeout_s: float) -> tuple[FoundShard, ...]:
+    """Ask who is there: shards that answer at one of `endpoints`; empty if nobody does.
+
+    Raises:
+        ConfigError: An endpoint cannot be read.
+    """
+    deadline_s = time.monotonic() + timeout_s
+    session = open_session(connect=endpoints, lease_s=PROBE_LEASE_S)
+    try:
+        return _find(session, deadline_s)
+    finally:
+        close_session(session)
+
+
+def discover(endpoints: Sequence[str], hello: Hello, *, timeout_s: float) -> tuple[str, Welcome]:
+    """Say hello to the first shard that answers; return its cell's name and its welcome.
+
+    Raises:
+        ShardUnreachableError: None answered within `timeout_s`.
+        ConfigError: An endpoint cannot be read.
+        ProtocolError: An answer cannot be read, or is none to a hello.
+    """
+    deadline_s = time.monotonic() + timeout_s
+    session = open_session(connect=endpoints, lease_s=PROBE_LEASE_S)
+    try:
+        while time.monotonic() < deadline_s:
+            for found in _find(session, deadline_s):
+                answer = _greet(session, found, hello, deadline_s)
+                if isinstance(answer, Welcome):
+                    return found.cell, answer
+                if answer is not None:
+                    raise ProtocolError(f"shard {found.shard} answered a hello with {answer!r}")
+    finally:
+        close_session(session)
+    where = ", ".join(endpoints)
+    raise ShardUnreachableError(
+        f"no shard answers at {where} (waited {timeout_s:g} s); is one running there?"
+        " (enact shard run, enact doctor)",
+        endpoint=where,
+    )
+
+
+def _find(session: zenoh.Session, deadline_s: float) -> tuple[FoundShard, ...]:
+    """Ask until somebody has answered or time is up."""
+    if not wait_connected(session, deadline_s - time.monotonic()):
+        return ()
+    key = request_key("*", "*", verb_of(QUESTION), "anyone")
+    while (left_s := deadline_s - time.monotonic()) > 0:
+        keys = [
+            str(reply.ok.key_expr)
+            for reply in _get(session, key, QUESTION, left_s)
+            if reply.ok is not None
+        ]
+        if keys:
+            return tuple({FoundShard(*parse_request_key(key)[:2]): None for key in keys})
+        time.sleep(POLL_S)  # connected, but what the peer serves is not known yet
+    return ()
+
+
+def _greet(
+    session: zenoh.Session, found: FoundShard, hello: Hello, deadline_s: float
+) -> Answer | None:
+    key = request_key(found.cell, found.shard, verb_of(hello), hello.actor or NAMELESS)
+    for reply in _get(session, key, hello, max(0.05, deadline_s - time.monotonic())):
+        if reply.ok is not None:
+            return answer_in(reply.ok, found.shard)
+    return None
+
+
+def _get(
+    session: zenoh.Session, key: str, message: Request, timeout_s: float
+) -> zenoh.Handler[zenoh.Reply]:
+    header, payload = encode_frame(message)
+    return session.get(
+        key,
+        payload=payload,
+        attachment=header,
+        timeout=timeout_s,
+        consolidation=zenoh.ConsolidationMode.NONE,
+        priority=zenoh.Priority.INTERACTIVE_HIGH,
+        congestion_control=zenoh.CongestionControl.BLOCK,
+    )

@@ -1,0 +1,182 @@
+"""Shards to talk to with plain messages: `peer` speaks for one session over any carrier."""
+
+import secrets
+import socket
+import subprocess
+import sys
+import time
+from dataclasses import dataclass, field
+
+import pytest
+
+from enact_dist.core.datum import Datum, LockId, Slot
+from enact_dist.core.messages import (
+    Acquire,
+    AspectEntry,
+    Commit,
+    Goodbye,
+    Hello,
+    Item,
+    PlacementMap,
+    Register,
+    ShardEntry,
+    WriteItem,
+)
+from enact_dist.core.shard_state import ShardSettings
+from enact_dist.terms import Access
+
+WORLD, ASPECT = "online", "count"
+
+
+def settings_of(name="s0", *, endpoints=(), durability="volatile", others=()):
+    """Return the settings of a shard with one world and one aspect."""
+    return ShardSettings(
+        name,
+        PlacementMap(1, (ShardEntry(name, tuple(endpoints)), *others), ()),
+        worlds=(WORLD,),
+        aspects=(AspectEntry(ASPECT, "", durability),),
+    )
+
+
+@dataclass
+class Peer:
+    """One session that speaks in messages."""
+
+    call: object
+    shard: str = "s0"
+    session: str = field(default_factory=lambda: secrets.token_hex(16))
+    epoch: int = 0
+    seq: int = 0
+    durability: str = "volatile"
+
+    def hello(self, *, ttl_s=2.0, actor="peer"):
+        message = Hello(self.session, self.epoch, int(ttl_s * 1e9), actor, "host", 1, False)
+        welcome = self.call(self.shard, message)
+        self.epoch = welcome.epoch
+        entry = AspectEntry(ASPECT, "int", self.durability)
+        self.call(self.shard, Register(self.session, (WORLD,), (entry,)))
+        return welcome
+
+    def acquire_message(self, *entities, wait_s=0.0, access=Access.WRITE, hold_s=60.0):
+        self.seq += 1
+        items = tuple(Item(int(access), WORLD, entity, ASPECT) for entity in entities)
+        lock = LockId(self.session, 0, self.seq)
+        return Acquire(lock, self.epoch, 1, 0, items, int(wait_s * 1e9), int(hold_s * 1e9), 0)
+
+    def acquire(self, *entities, **options):
+        return self.call(self.shard, self.acquire_message(*entities, **options))
+
+    def commit(self, granted, entity, body, *, encoding=b"\x01"):
+        datum = Datum(encoding, body, len(body))
+        write = WriteItem(Slot(WORLD, entity, ASPECT), datum)
+        return self.call(self.shard, Commit(granted.lock, granted.token, (write,), 0))
+
+    def write(self, entity, body):
+        """Lock, write and release one datum; return the answer to the commit."""
+        return self.commit(self.acquire(entity), entity, body)
+
+    def goodbye(self):
+        return self.call(self.shard, Goodbye(self.session))
+
+
+@pytest.fixture
+def make_settings():
+    """Settings of a shard: world `online`, aspect `count`."""
+    return settings_of
+
+
+@pytest.fixture
+def make_peer():
+    """Sessions that speak in messages over a `call(shard, message)`."""
+    return Peer
+
+
+def free_endpoint():
+    """Return an endpoint of the loopback at which nobody listens now."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+@pytest.fixture
+def endpoint():
+    """An endpoint of the loopback at which nobody listens yet."""
+    return free_endpoint()
+
+
+@pytest.fixture
+def daemon(make_settings):
+    """Start shards in this process: `daemon(endpoint, name=…)`; stopped after the test."""
+    from enact_dist.link.shard_daemon import DaemonSettings, start_shard
+
+    running = []
+
+    def start(endpoint, name="s0", *, folder=None, cell="cell", **options):
+        shard = make_settings(name, endpoints=(endpoint,), **options)
+        started = start_shard(DaemonSettings(cell, shard, (endpoint,), folder))
+        running.append(started)
+        return started
+
+    yield start
+    for shard in running:
+        shard.stop(drain_s=0.0)
+
+
+@pytest.fixture
+def carry():
+    """Open carriers: `carry(endpoint, …)`; closed after the test."""
+    from enact_dist.link.zenoh_carrier import ZenohCarrier
+
+    opened = []
+
+    def open_carrier(*endpoints, session="", ttl_s=2.0, **options):
+        session = session or secrets.token_hex(16)
+        opened.append(ZenohCarrier("cell", session, "tester", endpoints, ttl_s=ttl_s, **options))
+        return opened[-1]
+
+    yield open_carrier
+    for carrier in opened:
+        carrier.close()
+
+
+@pytest.fixture
+def until():
+    """Ask again until what comes back is true; return it."""
+
+    def ask(question, *, limit_s=10.0):
+        deadline_s = time.monotonic() + limit_s
+        while not (found := question()):
+            assert time.monotonic() < deadline_s, "it never came true"
+            time.sleep(0.002)
+        return found
+
+    return ask
+
+
+@pytest.fixture
+def program():
+    """Run Python text in a process of its own; `program(text, *arguments)`, killed afterwards."""
+    started = []
+
+    def run(text, *arguments):
+        process = subprocess.Popen(
+            [sys.executable, "-c", text, *map(str, arguments)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            stdin=subprocess.PIPE,
+            text=True,
+        )
+        started.append(process)
+        return process
+
+    yield run
+    for process in started:
+        if process.poll() is None:
+            process.kill()
+        process.communicate()
+
+
+@pytest.fixture
+def free():
+    """Returns further endpoints of the loopback at which nobody listens yet."""
+    return free_endpoint

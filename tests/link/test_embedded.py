@@ -1,0 +1,129 @@
+"""The embedded carrier: a call is a function call, with the manners of a network."""
+
+import os
+import threading
+
+import pytest
+
+from enact_dist.core.messages import Granted, ListLocks, ListSessions, Locks
+from enact_dist.errors import MisuseError, ShardUnreachableError
+from enact_dist.link.embedded import EmbeddedCarrier
+from enact_dist.link.host import open_host
+
+
+@pytest.fixture
+def host(make_settings):
+    opened = open_host(make_settings(), None)
+    yield opened
+    opened.close()
+
+
+@pytest.fixture
+def carrier(host):
+    opened = EmbeddedCarrier(host, "me")
+    yield opened
+    opened.close()
+
+
+def test_carrier_answers_all_requests_in_their_order(carrier, make_peer):
+    """Answers come in the order of the requests, whatever was parked between."""
+    peer = make_peer(lambda shard, message: carrier.request(shard, message, timeout_s=5))
+    peer.hello()
+    peer.acquire("cup")
+    waiter = make_peer(peer.call)
+    waiter.hello()
+
+    answers = carrier.request_all(
+        [("s0", ListLocks()), ("s0", waiter.acquire_message("cup", wait_s=9)), ("s0", ListLocks())],
+        timeout_s=0.05,
+    )
+
+    assert [type(answer) for answer in answers] == [Locks, type(None), Locks]
+
+
+def test_carrier_waits_for_a_parked_answer_from_another_thread(carrier, make_peer):
+    """A request in one thread is answered when another thread releases what it waits for."""
+    call = lambda shard, message: carrier.request(shard, message, timeout_s=10)  # noqa: E731
+    holder, waiter = make_peer(call), make_peer(call)
+    holder.hello()
+    waiter.hello()
+    granted = holder.acquire("cup")
+    answers = []
+    thread = threading.Thread(target=lambda: answers.append(waiter.acquire("cup", wait_s=9.0)))
+    thread.start()
+
+    holder.commit(granted, "cup", b"1")
+    thread.join(10)
+
+    assert [type(answer) for answer in answers] == [Granted]
+
+
+def test_carrier_shows_its_session_as_present_until_it_is_closed(host, make_peer):
+    """The token of an embedded session is there as long as its carrier is open."""
+    carrier = EmbeddedCarrier(host, "me")
+    watcher = EmbeddedCarrier(host, "watcher")
+    peer = make_peer(
+        lambda shard, message: carrier.request(shard, message, timeout_s=5), session="me"
+    )
+    peer.hello()
+
+    def present():
+        sessions = watcher.request("s0", ListSessions(), timeout_s=5).sessions
+        return {info.session: info.token_present for info in sessions}["me"]
+
+    before = present()
+    carrier.close()
+
+    assert before
+    assert not present()
+
+
+def test_carrier_refuses_a_shard_that_is_not_here(carrier):
+    """A request for another shard is an error that names both, never an empty answer."""
+    with pytest.raises(ShardUnreachableError, match=r"s9 is not in this process.*s0"):
+        carrier.request("s9", ListLocks(), timeout_s=1)
+
+
+def test_carrier_refuses_to_be_used_after_its_end(carrier):
+    """A closed carrier says so."""
+    carrier.close()
+
+    with pytest.raises(MisuseError, match="closed"):
+        carrier.request("s0", ListLocks(), timeout_s=1)
+
+
+def test_carrier_feeds_notices_until_the_feed_is_closed(carrier, make_peer):
+    """A feed has every commit; a closed feed gets none and the others go on."""
+    peer = make_peer(lambda shard, message: carrier.request(shard, message, timeout_s=5))
+    peer.hello()
+    feed, closed = carrier.subscribe(), carrier.subscribe()
+    closed.close()
+
+    peer.write("cup", b"1")
+    peer.write("tray", b"2")
+
+    notices = [feed.get(5), feed.get(5)]
+    assert [n.changes[0].slot.entity for n in notices] == ["cup", "tray"]
+    assert feed.get(0) is None
+    assert closed.get(0) is None
+
+
+def test_carrier_raises_in_a_forked_child(carrier):
+    """A child that uses its parent's cell is told so, and neither hangs nor answers."""
+    reader, writer = os.pipe()
+    child = os.fork()
+    if child == 0:
+        try:
+            carrier.request("s0", ListLocks(), timeout_s=1)
+            os.write(writer, b"answered")
+        except MisuseError as error:
+            os.write(writer, str(error).encode())
+        finally:
+            os._exit(0)
+    os.close(writer)
+
+    told = os.read(reader, 4096).decode()
+    os.waitpid(child, 0)
+    os.close(reader)
+
+    assert "was forked" in told

@@ -1,0 +1,66 @@
+"""The queue of notices: newest win, losses are counted, a waiter always wakes."""
+
+import threading
+
+from enact_dist.core.messages import Notice
+from enact_dist.link.notices import NoticeQueue
+
+
+def test_queue_gives_notices_in_order_when_they_are_taken():
+    """What was put first comes first; then nothing comes until the time is over."""
+    queue = NoticeQueue()
+    notices = [Notice("s0", 1, number, ()) for number in (1, 2)]
+    for notice in notices:
+        queue.put(notice)
+
+    taken = [queue.get(0.0), queue.get(0.0), queue.get(0.0)]
+
+    assert taken == [*notices, None]
+
+
+def test_queue_drops_the_oldest_and_counts_when_nobody_takes_them():
+    """A full queue keeps the newest; `dropped` says how many are gone."""
+    queue = NoticeQueue(notices_max=3)
+
+    for number in range(1, 11):
+        queue.put(Notice("s0", 1, number, ()))
+
+    assert queue.dropped == 7
+    assert [queue.get(0.0).number for _ in range(3)] == [8, 9, 10]
+
+
+def test_queue_ignores_a_notice_that_came_already():
+    """Two connections to one shard do not double its notices; a new epoch counts anew."""
+    queue = NoticeQueue()
+
+    for epoch, number in ((1, 1), (1, 2), (1, 2), (1, 1), (2, 1)):
+        queue.put(Notice("s0", epoch, number, ()))
+    queue.put(Notice("s1", 1, 1, ()))
+
+    taken = [queue.get(0.0) for _ in range(4)]
+    assert [(n.shard, n.epoch, n.number) for n in taken] == [
+        ("s0", 1, 1),
+        ("s0", 1, 2),
+        ("s0", 2, 1),
+        ("s1", 1, 1),
+    ]
+    assert queue.get(0.0) is None
+
+
+def test_queue_wakes_a_waiter_when_it_is_closed():
+    """`get` without a limit returns None as soon as the feed is closed, and for ever after."""
+    queue = NoticeQueue()
+    closes = []
+    queue.on_close = lambda: closes.append(1)
+    taken = []
+    waiter = threading.Thread(target=lambda: taken.append(queue.get(None)))
+    waiter.start()
+
+    queue.close()
+    queue.close()
+    waiter.join(5)
+
+    queue.put(Notice("s0", 1, 1, ()))
+    assert taken == [None]
+    assert queue.get(0.0) is None
+    assert closes == [1]

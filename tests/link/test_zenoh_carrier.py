@@ -1,0 +1,379 @@
+"""Requests, answers, notices and tokens over real Zenoh sessions on the loopback."""
+
+import os
+import threading
+import time
+
+import pytest
+
+from enact_dist.core.messages import (
+    AwaitStamp,
+    Committed,
+    Fetch,
+    Hello,
+    ListLocks,
+    ListSessions,
+    Locks,
+    Reached,
+    ShardEntry,
+    Slice,
+    Welcome,
+)
+from enact_dist.errors import MisuseError, ProtocolError, ShardUnreachableError
+from enact_dist.link.zenoh_config import close_session, open_session
+from enact_dist.link.zenoh_discovery import FoundShard, discover, find_shards
+from enact_dist.wire.frames import encode_frame
+
+
+def speak(carrier, make_peer, **options):
+    """Return a session that has said hello over `carrier`."""
+    peer = make_peer(lambda shard, message: carrier.request(shard, message, timeout_s=5), **options)
+    peer.hello()
+    return peer
+
+
+def test_carrier_brings_an_answer_from_a_shard(daemon, carry, endpoint):
+    """A request travels to the daemon and its answer back."""
+    daemon(endpoint)
+
+    answer = carry(endpoint).request("s0", ListLocks(), timeout_s=5)
+
+    assert isinstance(answer, Locks)
+
+
+def test_carrier_keeps_many_calls_in_flight_at_once(daemon, carry, endpoint):
+    """100 parked calls and one quick one are under way together; the quick one comes at once."""
+    daemon(endpoint)
+    carrier = carry(endpoint)
+    parked = [("s0", AwaitStamp(2**62, 200_000_000))] * 100
+    started_s = time.monotonic()
+
+    answers = carrier.request_all([*parked, ("s0", ListLocks())], timeout_s=5)
+
+    assert [type(answer) for answer in answers] == [*[Reached] * 100, Locks]
+    assert time.monotonic() - started_s < 2.0
+
+
+def test_carrier_says_unknown_when_an_answer_takes_too_long(daemon, carry, endpoint):
+    """A call that is parked for longer than its caller waits returns None."""
+    daemon(endpoint)
+
+    answer = carry(endpoint).request("s0", AwaitStamp(2**62, 5_000_000_000), timeout_s=0.1)
+
+    assert answer is None
+
+
+def test_carrier_says_unknown_at_once_when_the_shard_is_away(daemon, carry, endpoint):
+    """A request to a shard that is not there returns None well before its time is over."""
+    daemon(endpoint)
+    carrier = carry(endpoint)
+    started_s = time.monotonic()
+
+    answer = carrier.request("s9", ListLocks(), timeout_s=30)
+
+    assert answer is None
+    assert time.monotonic() - started_s < 5
+
+
+def test_carrier_names_the_endpoint_when_nobody_is_there(carry, endpoint):
+    """Opening a carrier to a dead endpoint is an error that names it, not an empty answer."""
+    with pytest.raises(ShardUnreachableError, match=endpoint) as caught:
+        carry(endpoint, connect_s=0.2)
+
+    assert caught.value.endpoint == endpoint
+
+
+def test_carrier_moves_large_data_in_slices_byte_for_byte(daemon, carry, make_peer, endpoint):
+    """3 MB written in one commit come back in slices of the carrier's size, the same bytes."""
+    daemon(endpoint)
+    carrier = carry(endpoint)
+    peer = speak(carrier, make_peer)
+    body = os.urandom(3_000_000)
+    assert isinstance(peer.write("cup", body), Committed)
+
+    granted = peer.acquire("cup")
+    state = granted.states[0]
+    fetches = [
+        ("s0", Fetch(granted.lock, peer.epoch, state.slot, state.version, start, 1 << 20))
+        for start in range(0, len(body), carrier.fetch_bytes)
+    ]
+    slices = carrier.request_all(fetches, timeout_s=10)
+
+    assert state.large
+    assert all(isinstance(part, Slice) for part in slices)
+    assert b"".join(bytes(part.body.body) for part in slices) == body
+
+
+def test_carrier_brings_notices_of_every_commit_in_order(daemon, carry, make_peer, endpoint):
+    """A feed has each commit of another client once, numbered without a gap."""
+    daemon(endpoint)
+    feed = carry(endpoint).subscribe()
+    writer = speak(carry(endpoint), make_peer)
+    while (first := feed.get(0.05)) is None:
+        writer.write("probe", b"0")
+
+    for number in range(50):
+        writer.write("cup", b"%d" % number)
+    numbers = [first.number]
+    while len(numbers) < 51:
+        numbers.append(feed.get(5).number)
+
+    assert first.shard == "s0"
+    assert numbers == list(range(first.number, first.number + 51))
+
+
+def test_carrier_holds_its_token_while_it_is_open(daemon, carry, make_peer, endpoint, until):
+    """The shard sees the session's token soon after the start and no more after the end."""
+    daemon(endpoint)
+    mine, watcher = carry(endpoint, session="mine"), carry(endpoint)
+    speak(mine, make_peer, session="mine")
+
+    def present():
+        sessions = watcher.request("s0", ListSessions(), timeout_s=5).sessions
+        return {info.session: info.token_present for info in sessions}["mine"]
+
+    until(present)
+    mine.close()
+
+    until(lambda: not present())
+
+
+def test_carrier_reaches_further_shards_when_it_learns_of_them(daemon, carry, endpoint, free):
+    """A shard known by its advertised endpoint only is reached, and sees the token."""
+    second = free()
+    daemon(endpoint)
+    daemon(second, "s1")
+    carrier = carry(endpoint)
+    assert carrier.request("s1", ListLocks(), timeout_s=5) is None
+
+    carrier.add_endpoints([ShardEntry("s0", (endpoint,)), ShardEntry("s1", (second,))])
+
+    answers = carrier.request_all([("s0", ListLocks()), ("s1", ListLocks())], timeout_s=5)
+    assert [type(answer) for answer in answers] == [Locks, Locks]
+    assert carrier.endpoint_of("s1") == second
+
+
+def test_carrier_keeps_its_link_when_a_shard_advertises_another_address(daemon, carry, endpoint):
+    """A shard in reach stays reached although its advertised endpoint leads nowhere from here."""
+    daemon(endpoint)
+    carrier = carry(endpoint)
+
+    carrier.add_endpoints([ShardEntry("s0", ("tcp/127.0.0.1:1",))])
+
+    assert isinstance(carrier.request("s0", ListLocks(), timeout_s=5), Locks)
+
+
+def test_carrier_reconnects_by_itself_when_a_shard_comes_back(daemon, carry, endpoint, until):
+    """After a restart at the same endpoint calls are answered again, by the new epoch."""
+    before = daemon(endpoint)
+    carrier = carry(endpoint)
+    old = carrier.request("s0", ListLocks(), timeout_s=5)
+    before.stop(drain_s=0.0)
+    assert carrier.request("s0", ListLocks(), timeout_s=1) is None
+
+    daemon(endpoint)
+
+    new = until(lambda: carrier.request("s0", ListLocks(), timeout_s=1))
+    assert new.epoch > old.epoch
+
+
+def test_carrier_wakes_pending_calls_when_it_is_closed(daemon, carry, endpoint):
+    """A thread that waits for an answer gets None when another thread closes the carrier."""
+    daemon(endpoint)
+    carrier = carry(endpoint)
+    answers = []
+    waiting = threading.Thread(
+        target=lambda: answers.append(
+            carrier.request("s0", AwaitStamp(2**62, 60_000_000_000), timeout_s=60)
+        )
+    )
+    waiting.start()
+    feed = carrier.subscribe()
+
+    carrier.close()
+    waiting.join(5)
+
+    assert answers == [None]
+    assert feed.get(None) is None
+    with pytest.raises(MisuseError, match="closed"):
+        carrier.request("s0", ListLocks(), timeout_s=1)
+
+
+# ---------------------------------------------------------------- a peer that misbehaves
+
+
+@pytest.fixture
+def impostor(endpoint):
+    """A queryable of the test's own in place of a shard: `impostor(reply)`."""
+    session = open_session(listen=[endpoint], lease_s=1.0)
+
+    def serve(reply):
+        session.declare_queryable("enact/cell/s0/*/*", reply, complete=True)
+
+    yield serve
+    close_session(session)
+
+
+def test_carrier_raises_when_an_answer_cannot_be_read(impostor, carry, endpoint):
+    """Garbage in place of an answer is a protocol error, not a crash and not an answer."""
+    impostor(lambda query: query.reply(query.key_expr, b"", attachment=b"\xff\x00garbage"))
+
+    with pytest.raises(ProtocolError):
+        carry(endpoint).request("s0", ListLocks(), timeout_s=5)
+
+
+def test_carrier_raises_when_a_request_comes_back_as_answer(impostor, carry, endpoint):
+    """A frame that is no answer is refused by name."""
+    impostor(
+        lambda query: query.reply(query.key_expr, b"", attachment=encode_frame(ListLocks())[0])
+    )
+
+    with pytest.raises(ProtocolError, match="ListLocks"):
+        carry(endpoint).request("s0", ListLocks(), timeout_s=5)
+
+
+def test_carrier_raises_when_two_daemons_answer_one_request(impostor, carry, endpoint, until):
+    """A second reply to a query is an alarm: two daemons serve one name."""
+    header = encode_frame(Locks(1, ()))[0]
+
+    def twice(query):
+        query.reply(query.key_expr, b"", attachment=header)
+        query.reply(query.key_expr, b"", attachment=header)
+
+    impostor(twice)
+    carrier = carry(endpoint)
+
+    def alarmed():
+        try:
+            carrier.request("s0", ListLocks(), timeout_s=5)
+        except ProtocolError as error:
+            return str(error)
+        return ""
+
+    assert "two daemons" in until(alarmed)
+
+
+# ---------------------------------------------------------------- first contact
+
+
+def test_discovery_learns_cell_and_shard_from_one_endpoint(daemon, endpoint):
+    """Whoever knows one endpoint finds out which shard of which cell is there."""
+    daemon(endpoint, cell="palletizing")
+
+    found = find_shards([endpoint], timeout_s=5)
+
+    assert found == (FoundShard("palletizing", "s0"),)
+
+
+def test_discovery_brings_the_welcome_of_the_first_shard(daemon, endpoint):
+    """A hello to an endpoint is answered by its shard with the whole map of the cell."""
+    daemon(endpoint)
+
+    cell, welcome = discover(
+        [endpoint], Hello("me", 0, 2_000_000_000, "tester", "h", 1, True), timeout_s=5
+    )
+
+    assert cell == "cell"
+    assert isinstance(welcome, Welcome)
+    assert welcome.placement.shards == (ShardEntry("s0", (endpoint,)),)
+
+
+def test_discovery_names_the_endpoint_when_nobody_answers(endpoint):
+    """No shard at an endpoint is an error that names it, after the time given."""
+    hello = Hello("me", 0, 2_000_000_000, "tester", "h", 1, True)
+
+    with pytest.raises(ShardUnreachableError, match=endpoint):
+        discover([endpoint], hello, timeout_s=0.3)
+
+
+# ---------------------------------------------------------------- processes
+
+LEFT_OPEN = """
+import sys, threading
+from enact_dist.core.messages import AwaitStamp
+from enact_dist.link.zenoh_carrier import ZenohCarrier
+carrier = ZenohCarrier("cell", "left-open", "tester", [sys.argv[1]], ttl_s=2.0)
+feed = carrier.subscribe()
+forever = lambda: carrier.request("s0", AwaitStamp(2**62, 60_000_000_000), timeout_s=60)
+threading.Thread(target=forever, daemon=True).start()
+threading.Thread(target=lambda: feed.get(None), daemon=True).start()
+print("open", flush=True)
+"""
+
+
+def test_carrier_left_open_never_holds_up_the_end_of_the_interpreter(daemon, endpoint, program):
+    """A process that forgets its carrier, calls and feeds ends at once and cleanly."""
+    daemon(endpoint)
+    process = program(LEFT_OPEN, endpoint)
+
+    _, errors = process.communicate(timeout=20)
+
+    assert process.returncode == 0, errors
+    assert errors == ""
+
+
+FORKED = """
+import os, sys
+from enact_dist.core.messages import ListLocks
+from enact_dist.errors import MisuseError
+from enact_dist.link.zenoh_carrier import ZenohCarrier
+carrier = ZenohCarrier("cell", "parent", "tester", [sys.argv[1]], ttl_s=2.0)
+child = os.fork()
+if child == 0:
+    try:
+        carrier.request("s0", ListLocks(), timeout_s=1)
+    except MisuseError as error:
+        print("request:", error, flush=True)
+    carrier.close()
+    try:
+        ZenohCarrier("cell", "child", "tester", [sys.argv[1]], ttl_s=2.0)
+    except MisuseError as error:
+        print("open:", error, flush=True)
+    sys.exit(3)
+status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+answer = carrier.request("s0", ListLocks(), timeout_s=5)
+print("child", status, "parent", type(answer).__name__, flush=True)
+carrier.close()
+"""
+
+
+def test_carrier_raises_in_a_forked_child_which_still_ends(daemon, endpoint, program):
+    """A forked child is told to connect for itself, ends normally; the parent goes on."""
+    daemon(endpoint)
+    process = program(FORKED, endpoint)
+
+    output, errors = process.communicate(timeout=30)
+
+    assert "request: " in output, errors
+    assert "was forked" in output
+    assert "open: " in output
+    assert "child 3 parent Locks" in output
+
+
+KILLED = """
+import sys
+from enact_dist.core.messages import Hello
+from enact_dist.link.zenoh_carrier import ZenohCarrier
+carrier = ZenohCarrier("cell", "victim", "tester", [sys.argv[1]], ttl_s=60.0)
+carrier.request("s0", Hello("victim", 0, 60_000_000_000, "victim", "h", 1, False), timeout_s=5)
+print("open", flush=True)
+sys.stdin.read()
+"""
+
+
+@pytest.mark.slow
+def test_shard_sees_at_once_when_a_client_is_killed(daemon, carry, endpoint, program, until):
+    """The token of a process killed with -9 vanishes within a second, long before its lease."""
+    daemon(endpoint)
+    watcher = carry(endpoint)
+    process = program(KILLED, endpoint)
+    process.stdout.readline()
+
+    def present():
+        sessions = watcher.request("s0", ListSessions(), timeout_s=5).sessions
+        return any(info.session == "victim" and info.token_present for info in sessions)
+
+    until(present)
+    process.kill()
+
+    until(lambda: not present(), limit_s=1.0)
