@@ -16,7 +16,11 @@ from actors.geometry.depth import frame_points, median_known, metres, points_gri
 from actors.geometry.shapes import DepthFrame, PointCloud
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     import numpy.typing as npt
+
+    Points = npt.NDArray[np.floating]
 
     Mask = npt.NDArray[np.bool_]
 
@@ -134,3 +138,40 @@ def product_on_plate(frame: DepthFrame) -> PointCloud:
             np.hypot(world[..., 0], world[..., 1]) < PRODUCT_RADIUS_M
         )
     return PointCloud(points_grid(metres(frame.depth_mm), frame.acquisition.camera)[product])
+
+
+MATCH_M: Final = 0.03
+"""Farthest that a package moves between two stops and is still taken for the same one."""
+
+
+def assigned(
+    found_m: Sequence[Points], known_m: Sequence[Points], *, reach_m: float = MATCH_M
+) -> list[int | None]:
+    """Match places that are seen to places that are known, each at most once.
+
+    Args:
+        found_m: Positions (2,) seen, metres, tray frame.
+        known_m: Positions (2,) known.
+        reach_m: Farther apart is no match.
+
+    Returns:
+        For each seen position the number of the known one, or None; the sum of distances of
+        all matches is least.
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    matches: list[int | None] = [None] * len(found_m)
+    if found_m and known_m:
+        apart = np.linalg.norm(np.array(found_m)[:, None] - np.array(known_m)[None], axis=2)
+        # Beyond reach all costs are equal, so that a hopeless pair never spoils a good one.
+        for row, column in zip(*linear_sum_assignment(np.minimum(apart, reach_m)), strict=True):
+            if apart[row, column] < reach_m:
+                matches[row] = int(column)
+    return matches
+
+
+def nearest(place_m: Points, candidates_m: Sequence[Points]) -> int | None:
+    """Return the number of the candidate position nearest to a place, None if there is none."""
+    if not candidates_m:
+        return None
+    return int(np.argmin([float(np.hypot(*(each - place_m))) for each in candidates_m]))

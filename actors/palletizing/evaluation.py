@@ -21,9 +21,9 @@ from actors.geometry.deviation import VERDICTS, Finding, Limits, inspect_place
 from actors.geometry.fusion import fuse_views
 from actors.geometry.reconstruction import reconstruct_view
 from actors.geometry.segmentation import product_on_plate
+from actors.palletizing.pallet import tray_of
 from actors.palletizing.simulation.packages import (
     KINDS,
-    PLACES,
     VERDICT_OF_KIND,
     Package,
     Truth,
@@ -65,16 +65,17 @@ class Case:
         return 1000.0 * float(np.hypot(*(found[:2, 3] - true[:2, 3])))
 
 
-def train(product: str, sensor: OrbitSensor) -> Surface:
+def train(product: str, sensor: OrbitSensor, *, views: int = 14) -> Surface:
     """Return the complete surface of a product from an orbit around it.
 
     Args:
         product: Name of the product on the plate.
         sensor: Eye-in-hand depth sensor.
+        views: How many viewpoints the orbit has.
     """
-    frames = list(sensor.orbit(product))
-    views = [reconstruct_view(product_on_plate(f), f.acquisition.camera) for f in frames]
-    return fuse_views(views, [frame.acquisition for frame in frames])
+    frames = [sensor.capture(product, number, views) for number in range(views)]
+    surfaces = [reconstruct_view(product_on_plate(f), f.acquisition.camera) for f in frames]
+    return fuse_views(surfaces, [frame.acquisition for frame in frames])
 
 
 def judge(
@@ -96,7 +97,7 @@ def judge(
     empty_mm = sensor.capture_empty().depth_mm
     cases, before_mm = [], empty_mm
     for stop, package in enumerate(packages):
-        if stop % len(PLACES) == 0:
+        if stop == 0 or tray_of(stop) != tray_of(stop - 1):
             before_mm = empty_mm
         frame = sensor.capture(stop)
         start = time.perf_counter()

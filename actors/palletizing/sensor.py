@@ -1,16 +1,16 @@
 """What perception needs of a depth sensor; a real one and the simulated one both fit.
 
-A real sensor implements the same two methods: the driver's depth image in millimetres, rectified,
-with the intrinsic parameters and the calibrated (or, eye in hand, the robot's) camera pose.
+A real sensor implements the same two or three methods: the driver's depth image in millimetres,
+rectified, with the intrinsic parameters and the calibrated (or, eye in hand, the robot's) pose.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol
+import importlib
+from typing import TYPE_CHECKING, Any, Protocol
+from urllib.parse import parse_qsl
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from actors.geometry.shapes import DepthFrame
 
 
@@ -36,10 +36,32 @@ class OrbitSensor(Protocol):
     The world of its poses is the product frame: origin on the plate, z up.
     """
 
-    def orbit(self, product: str) -> Iterator[DepthFrame]:
-        """Yield one image per viewpoint; the poses are as good as the robot is.
+    def capture(self, product: str, view: int, views: int) -> DepthFrame:
+        """Go to a viewpoint and return an image from there.
 
         Args:
             product: Name of the product on the plate.
+            view: Number of the viewpoint, from 0.
+            views: How many viewpoints the orbit has.
         """
         ...
+
+
+def open_sensor(address: str) -> Any:  # the caller knows which of the two protocols it asked for
+    """Return the sensor at an address.
+
+    Args:
+        address: ``MODULE:FUNCTION?name=value&name=value``; the function gets the values as text.
+
+    Raises:
+        ValueError: Not of that form, or there is no such function.
+    """
+    path, _, query = address.partition("?")
+    module_name, colon, function_name = path.partition(":")
+    if not colon:
+        raise ValueError(f"{address!r} is no sensor; write MODULE:FUNCTION?name=value")
+    try:
+        make = getattr(importlib.import_module(module_name), function_name)
+    except (ImportError, AttributeError) as error:
+        raise ValueError(f"no sensor at {address!r}: {error}") from error
+    return make(**dict(parse_qsl(query, strict_parsing=bool(query))))

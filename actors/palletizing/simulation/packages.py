@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from actors.geometry.poses import moved, on_tray
+from actors.palletizing.pallet import planned_pose, tray_of
 from actors.palletizing.simulation.products import box_mesh, product_mesh
 
 if TYPE_CHECKING:
@@ -24,8 +25,8 @@ if TYPE_CHECKING:
 
     Mesh = tuple[npt.NDArray[np.float64], npt.NDArray[np.int32]]
 
-PLACES: Final = tuple((x, y) for y in (-0.15, 0.15) for x in (-0.315, -0.105, 0.105, 0.315))
-"""Centres of the places of one tray, metres, in the order they are filled."""
+DEMO_PRODUCTS: Final = ("milk_carton", "meal_tray")
+"""Products of a sequence unless others are named; they come in turn."""
 
 JITTER_M: Final = 0.003
 JITTER_RAD: Final = np.deg2rad(1.5)
@@ -93,7 +94,7 @@ class Package:
 
 
 def package_sequence(
-    count: int, *, seed: int, products: Sequence[str] = ("milk_carton", "meal_tray")
+    count: int, *, seed: int, products: Sequence[str] = DEMO_PRODUCTS
 ) -> list[Package]:
     """Return the packages of a run, one per stop of the conveyor.
 
@@ -112,13 +113,9 @@ def package_sequence(
 
 def on_the_tray(packages: Sequence[Package], stop: int) -> Sequence[Package]:
     """Return what lies on the tray at a stop; an empty tray replaces a full one."""
-    return packages[stop - stop % len(PLACES) : stop + 1]
-
-
-def planned_pose(stop: int) -> npt.NDArray[np.float64]:
-    """Return tray_from_product of the package of a stop as planned: along y, heads alternating."""
-    x, y = PLACES[stop % len(PLACES)]
-    return on_tray(x, y, np.pi / 2.0 if y < 0.0 else -np.pi / 2.0)
+    return [
+        package for n, package in enumerate(packages[: stop + 1]) if tray_of(n) == tray_of(stop)
+    ]
 
 
 def make_package(stop: int, product: str, truth: Truth, random: np.random.Generator) -> Package:

@@ -14,11 +14,16 @@ from actors.geometry.poses import inverse, looking_at, moved, small_motion
 from actors.geometry.rendering import cast, directions, ray_scene
 from actors.geometry.shapes import VGA, Acquisition, DepthFrame
 from actors.palletizing.simulation.noise import sensed
-from actors.palletizing.simulation.packages import Package, on_the_tray
+from actors.palletizing.simulation.packages import (
+    DEMO_PRODUCTS,
+    Package,
+    on_the_tray,
+    package_sequence,
+)
 from actors.palletizing.simulation.products import box_mesh, product_mesh
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Sequence
 
     import numpy.typing as npt
 
@@ -29,9 +34,6 @@ OVERHEAD_M: Final = 0.95
 
 ORBIT_M: Final = 0.45
 """Distance of the eye-in-hand sensor from the product."""
-
-ORBIT_VIEWS: Final = ((8, 30.0), (5, 60.0), (1, 89.0))
-"""Rings of the orbit: how many views at which elevation, degrees."""
 
 ROBOT_SPREAD_M: Final = 0.0004
 """Repeatability and hand-eye calibration of the robot, metres per axis."""
@@ -57,14 +59,14 @@ class SimulatedTraySensor:
 
     def capture_empty(self) -> DepthFrame:
         """Return an image of the tray with nothing on it."""
-        return self._capture([], np.random.default_rng([self._seed, 0]))
+        return self._seen([], np.random.default_rng([self._seed, 0]))
 
     def capture(self, stop: int) -> DepthFrame:
         """Return an image of the tray with the packages of this tray up to the stop's own."""
         visible = on_the_tray(self._packages, stop)
-        return self._capture(visible, np.random.default_rng([self._seed, 1, stop]))
+        return self._seen(visible, np.random.default_rng([self._seed, 1, stop]))
 
-    def _capture(self, visible: Sequence[Package], random: np.random.Generator) -> DepthFrame:
+    def _seen(self, visible: Sequence[Package], random: np.random.Generator) -> DepthFrame:
         meshes = [*_tray(), *(mesh for package in visible for mesh in package.meshes())]
         return _capture(meshes, self._acquisition, self._acquisition, random)
 
@@ -79,25 +81,52 @@ class SimulatedOrbitSensor:
     def __init__(self, *, seed: int) -> None:
         self._seed = seed
 
-    def orbit(self, product: str) -> Iterator[DepthFrame]:
-        """Yield 14 images of a product; the reported poses differ a little from the true ones."""
+    def capture(self, product: str, view: int, views: int) -> DepthFrame:
+        """Return the image of one viewpoint; its reported pose differs a little from the true one.
+
+        Args:
+            product: One of `PRODUCTS`.
+            view: Number of the viewpoint.
+            views: How many the orbit has.
+        """
         mesh = product_mesh(product)
-        random = np.random.default_rng([self._seed, *product.encode()])
+        random = np.random.default_rng([self._seed, view, *product.encode()])
         centre = np.array([0.0, 0.0, mesh[0][:, 2].max() / 2.0])
+        reported = looking_at(centre + ORBIT_M * orbit_direction(view, views), centre)
+        error = random.standard_normal(6) * np.repeat([ROBOT_SPREAD_RAD, ROBOT_SPREAD_M], 3)
+        true = reported @ small_motion(error)
         plate = _moved(box_mesh((0.6, 0.6, 0.02)), [0.0, 0.0, -0.02])
-        for views, elevation_deg in ORBIT_VIEWS:
-            for number in range(views):
-                turn = 2.0 * np.pi * (number + elevation_deg / 90.0) / views
-                rise = np.deg2rad(elevation_deg)
-                offset = np.array(
-                    [np.cos(turn) * np.cos(rise), np.sin(turn) * np.cos(rise), np.sin(rise)]
-                )
-                reported = looking_at(centre + ORBIT_M * offset, centre)
-                error = random.standard_normal(6) * np.repeat([ROBOT_SPREAD_RAD, ROBOT_SPREAD_M], 3)
-                true = reported @ small_motion(error)
-                yield _capture(
-                    [mesh, plate], Acquisition(VGA, true), Acquisition(VGA, reported), random
-                )
+        return _capture([mesh, plate], Acquisition(VGA, true), Acquisition(VGA, reported), random)
+
+
+def orbit_direction(view: int, views: int) -> npt.NDArray[np.float64]:
+    """Return the unit vector from the product to a viewpoint: rings at 30 and 60 degrees, the top.
+
+    Args:
+        view: Number of the viewpoint; the last one is the top.
+        views: How many there are, at least 3.
+    """
+    low = round((views - 1) * 0.6)
+    if view == views - 1:
+        turn, rise = 0.0, np.deg2rad(89.0)
+    elif view < low:
+        turn, rise = 2.0 * np.pi * view / low, np.deg2rad(30.0)
+    else:
+        turn, rise = 2.0 * np.pi * (view - low + 0.5) / (views - 1 - low), np.deg2rad(60.0)
+    return np.array([np.cos(turn) * np.cos(rise), np.sin(turn) * np.cos(rise), np.sin(rise)])
+
+
+def orbit_sensor(seed: str = "1") -> SimulatedOrbitSensor:
+    """Return the simulated eye-in-hand sensor; for `open_sensor`."""
+    return SimulatedOrbitSensor(seed=int(seed))
+
+
+def tray_sensor(packages: str = "16", seed: str = "1", products: str = "") -> SimulatedTraySensor:
+    """Return the simulated overhead sensor of a seeded sequence of packages; for `open_sensor`."""
+    names = products.split() or DEMO_PRODUCTS
+    return SimulatedTraySensor(
+        package_sequence(int(packages), seed=int(seed), products=names), seed=int(seed)
+    )
 
 
 def _capture(

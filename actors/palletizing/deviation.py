@@ -1,0 +1,76 @@
+"""Deviation detection: compares what stands at a place with what should."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from actors.geometry.deviation import Limits, inspect_place
+from actors.geometry.segmentation import nearest
+from actors.palletizing.vocabulary import (
+    DEVIATIONS,
+    OBSERVATION,
+    PACKAGES,
+    PLACES,
+    PLAN,
+    PRODUCTS,
+    REGION,
+    SIGHTING,
+    SURFACE,
+    SYSTEM,
+    Deviation,
+    product_entity,
+)
+from enact_dist import Actor, Entity, View, ViewEach, World, Write
+
+if TYPE_CHECKING:
+    from enact_dist import Lock
+
+
+class DeviationDetection(Actor):
+    """Flag every place where something is missing, extra, moved or deformed (ENACT 4.2).
+
+    The place is the entity that both world contexts know: in training what shall stand there, in
+    online what was seen there.
+
+    Args:
+        moved_m: Largest shift of a sound package.
+        deformed_m2: Least area of a deformation; see `Limits` for what the numbers come from.
+    """
+
+    training, online = World("training"), World("online")
+    plan = View(training, PLACES, PLAN)
+    models = ViewEach(training, PRODUCTS, SURFACE)
+    sightings = ViewEach(online, PACKAGES, SIGHTING)
+    observed = View(online, PLACES, OBSERVATION)
+    flags = Write(online, SYSTEM, DEVIATIONS)
+    region = Write(online, PLACES, REGION)
+    triggers = (observed,)
+
+    def __init__(
+        self, moved_m: float = Limits().moved_m, deformed_m2: float = Limits().deformed_m2
+    ) -> None:
+        self.limits = Limits(moved_m=moved_m, deformed_m2=deformed_m2)
+
+    def update(self, lock: Lock) -> None:
+        """Judge one place."""
+        plan, observed = lock[self.plan], lock[self.observed]
+        model = lock[self.models][product_entity(plan.product)]
+        found = inspect_place(
+            observed.frame, observed.before_mm, model, plan.tray_from_product, limits=self.limits
+        )
+        new = [name for name in observed.packages if Entity(name) in lock[self.sightings]]
+        poses = [lock[self.sightings][Entity(name)].tray_from_package for name in new]
+        chosen = nearest(found.tray_from_product[:2, 3], [pose[:2, 3] for pose in poses])
+        flag = Deviation(
+            package="" if chosen is None or found.verdict == "missing" else new[chosen],
+            product=plan.product,
+            verdict=found.verdict,
+            deviation_mm=found.deviation_mm,
+            area_mm2=found.area_mm2,
+            shift_mm=found.shift_mm,
+            turn_deg=found.turn_deg,
+            captured_ns=observed.captured_ns,
+        )
+        lock[self.region] = found.region
+        others: dict[str, Deviation] = lock.get(self.flags, {})
+        lock[self.flags] = {**others, lock.entity.name: flag}

@@ -1,0 +1,190 @@
+"""Entities and aspects of the palletizing cell (ENACT 4.2, Figure 7), with their units and frames.
+
+======================  ============================================================  =========
+entity                  stands for                                                    contexts
+======================  ============================================================  =========
+`product/<name>`        a kind of food package: what to scan, its complete surface    training
+`view/<product>/<i>`    one viewpoint of the eye-in-hand robot around a product       training
+`place/<n>`             n-th place of the plan: what shall stand there; what was seen both
+`tray`                  the tray: its empty image                                     training
+`conveyor`              the conveyor: at which stop it stands                         online
+`package/<id>`          one real thing on the tray                                    online
+`system`                the cell: one flag per judged place                           online
+`user`                  the person to tell: what was told                             online
+======================  ============================================================  =========
+
+Frames: *product* has its origin on the base, z up; *tray* has its origin in the middle of the
+tray, z up.  Stop n of the conveyor brings the package for place n; places go on counting over
+trays, so that a place has one package for ever.
+"""
+
+# The wire reads these annotations: they stay real types, without `from __future__`.
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from actors.geometry.shapes import Acquisition, DepthFrame, PointCloud, Surface
+from enact_dist import Aspect, Durability, Entities, Entity
+
+PRODUCTS: Final = Entities("product/*")
+VIEWS: Final = Entities("view/*/*")
+PLACES: Final = Entities("place/*")
+PACKAGES: Final = Entities("package/*")
+TRAY: Final = Entity("tray")
+CONVEYOR: Final = Entity("conveyor")
+SYSTEM: Final = Entity("system")
+USER: Final = Entity("user")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Viewpoint:
+    """From where a view was taken.
+
+    Attributes:
+        acquisition: Camera and pose; the world is the product frame.
+        captured_ns: When, nanoseconds since 1970.
+    """
+
+    acquisition: Acquisition
+    captured_ns: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Plan:
+    """What shall stand at a place.
+
+    Attributes:
+        product: Name of the product.
+        tray: Number of the tray; a place of another tray is out of sight.
+        tray_from_product: Where on it, (4, 4) float64, metres.
+    """
+
+    product: str
+    tray: int
+    tray_from_product: npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observation:
+    """What the overhead sensor saw when a package had been put to its place.
+
+    Attributes:
+        frame: The image; its world is the tray frame.
+        before_mm: (H, W) uint16, the image of the stop before, millimetres; of the empty tray
+            for the first package of a tray.
+        packages: Names of the package entities that are new in it.
+        captured_ns: When, nanoseconds since 1970.
+    """
+
+    frame: DepthFrame
+    before_mm: npt.NDArray[np.uint16]
+    packages: tuple[str, ...]
+    captured_ns: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sighting:
+    """Where a package was seen.
+
+    Attributes:
+        tray: Number of the tray.
+        tray_from_package: What its outline suggests, (4, 4) float64, metres; x along its length.
+        first_stop: Stop at which it was seen first.
+        last_stop: Stop at which it was seen last.
+    """
+
+    tray: int
+    tray_from_package: npt.NDArray[np.float64]
+    first_stop: int
+    last_stop: int
+
+
+@dataclass(frozen=True, slots=True)
+class Deviation:
+    """The flag of one judged place.
+
+    Attributes:
+        package: Entity that was judged; empty if nothing came.
+        product: What it should be.
+        verdict: "ok", "missing", "extra", "moved" or "deformed".
+        deviation_mm: By how much, see `actors.geometry.deviation.Finding`.
+        area_mm2: Area of the deviating region.
+        shift_mm: Distance from the planned position.
+        turn_deg: Turn against the planned pose.
+        captured_ns: When the judged image was taken, nanoseconds since 1970.
+    """
+
+    package: str
+    product: str
+    verdict: str
+    deviation_mm: float
+    area_mm2: float
+    shift_mm: float
+    turn_deg: float
+    captured_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Notice:
+    """What the user was told about a place.
+
+    Attributes:
+        text: The line.
+        captured_ns: When the image was taken that it is about, nanoseconds since 1970.
+        latency_ms: From the capture of the image to the telling.
+    """
+
+    text: str
+    captured_ns: int
+    latency_ms: float
+
+
+SCAN: Final = Aspect("scan", int)
+"""How many views of a product are wanted (product/*)."""
+CLOUD: Final = Aspect("cloud", PointCloud)
+"""Points: of a view in its camera's frame (view/*), of a package in the tray frame (package/*)."""
+VIEWPOINT: Final = Aspect("viewpoint", Viewpoint)
+"""Acquisition pose (view/*)."""
+SURFACE: Final = Aspect("surface", Surface)
+"""Boundary representation: of a view in its camera's frame, of a product in the product frame."""
+NEWEST_VIEW: Final = Aspect("newest_view_ns", int)
+"""When the newest view in a product's surface was taken (product/*), ns since 1970."""
+PLAN: Final = Aspect("plan", Plan)
+"""What shall stand at a place (place/*, training)."""
+EMPTY: Final = Aspect("empty", DepthFrame)
+"""Image of the empty tray (tray, training)."""
+STOP: Final = Aspect("stop", int)
+"""Number of the conveyor's stop (conveyor)."""
+OBSERVATION: Final = Aspect("observation", Observation, Durability.OS)
+"""What was seen at a place (place/*, online)."""
+SIGHTING: Final = Aspect("sighting", Sighting, Durability.OS)
+"""Where a package was seen (package/*)."""
+REGION: Final = Aspect("region", np.ndarray, Durability.OS)
+"""(H, W) bool, the deviating pixels of the observation (place/*, online)."""
+DEVIATIONS: Final = Aspect("deviations", dict[str, Deviation])
+"""The flags, by name of the place (system)."""
+NOTICES: Final = Aspect("notices", dict[str, Notice])
+"""What was told, by name of the place (user)."""
+
+
+def view_entity(product: str, number: int) -> Entity:
+    """Return the entity of one viewpoint around a product."""
+    return Entity(f"view/{product}/{number}")
+
+
+def product_of_view(view: Entity) -> str:
+    """Return the name of the product that a view shows."""
+    return view.name.split("/")[1]
+
+
+def product_entity(product: str) -> Entity:
+    """Return the entity of a product."""
+    return Entity(f"product/{product}")
+
+
+def place_entity(stop: int) -> Entity:
+    """Return the entity of the place that the package of a stop is for."""
+    return Entity(f"place/{stop}")
