@@ -95,6 +95,9 @@ class Watch:
 
         Args:
             timeout_s: How long to wait; None waits until `close`.
+
+        Raises:
+            MisuseError: The cell was closed.
         """
         deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
         while not self._closed.is_set():
@@ -109,6 +112,8 @@ class Watch:
             if notice is not None:
                 self._take(notice)
             else:
+                # A closed cell's feed answers None at once: without this the loop would spin.
+                self._client.check_usable()
                 self._look_for_missed_tail()
         return None
 
