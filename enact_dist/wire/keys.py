@@ -10,7 +10,7 @@ key                                 what
 ==================================  ==========================================================
 
 No name starts with ``@`` and Zenoh's wildcards do not match a chunk that does, so requests and the
-rest cannot collide.  Where a shard or session is asked for, `ANY` stands for all of them.
+rest cannot collide.  `ANY` stands for all shards, all sessions, or (in requests) all cells.
 Rules to keep: a key holds only characters that Zenoh allows (no ``# ? $``, no empty chunk), and
 making a key from the parts of one gives the same key again.
 """
@@ -24,7 +24,7 @@ from urllib.parse import quote, unquote
 
 from enact_dist.core.messages import Notice
 from enact_dist.errors import ProtocolError
-from enact_dist.terms import NAME_LENGTH_MAX, checked_name
+from enact_dist.terms import checked_name
 
 if TYPE_CHECKING:
     from enact_dist.core.messages import Message
@@ -53,7 +53,7 @@ def request_key(cell: str, shard: str, verb: str, actor: str) -> str:
     """Return the key on which `actor` sends a request.
 
     Args:
-        cell: Name of the cell.
+        cell: Name of the cell, or `ANY`.
         shard: Name of the shard, or `ANY`.
         verb: See `verb_of`.
         actor: Any text; characters outside names are written as ``%XX`` of their UTF-8 bytes.
@@ -61,8 +61,8 @@ def request_key(cell: str, shard: str, verb: str, actor: str) -> str:
     Raises:
         ValueError: A part cannot stand in a key.
     """
-    who = quote(actor[:NAME_LENGTH_MAX], safe="%") if actor else NOBODY
-    return f"{ROOT}/{_name('cell', cell)}/{_part('shard', shard)}/{_name('verb', verb)}/{who}"
+    who = quote(actor, safe="%") if actor else NOBODY
+    return f"{ROOT}/{_part('cell', cell)}/{_part('shard', shard)}/{_name('verb', verb)}/{who}"
 
 
 def queryable_key(cell: str, shard: str) -> str:

@@ -39,7 +39,7 @@ from enact_dist.wire.limits import (
     DEPTH_MAX,
     DIMENSIONS_MAX,
     ENCODING_BYTES_MAX,
-    LONG_BYTES_MIN,
+    INLINE_BYTES_MAX,
     aligned,
 )
 from enact_dist.wire.shapes import (
@@ -197,10 +197,10 @@ class _Writer:
                 return value
             raise _wrong(where, "an int of 64 bits", value)
         if kind is str:
-            raw = value.encode("utf-8", "surrogatepass") if len(value) >= LONG_BYTES_MIN else b""
+            raw = value.encode("utf-8", "surrogatepass") if len(value) >= INLINE_BYTES_MAX else b""
             return _reference(TEXT, *self.add(raw)) if raw else _encodable(value, where)
         if kind is bytes:
-            return value if len(value) < LONG_BYTES_MIN else _reference(BYTES, *self.add(value))
+            return value if len(value) < INLINE_BYTES_MAX else _reference(BYTES, *self.add(value))
         if kind is list:
             return self.node(value, ListOf(Plain(object)), where, depth + 1)
         if kind is dict:
