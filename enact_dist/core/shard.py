@@ -144,6 +144,11 @@ class Shard:
         return min(deadlines)
 
     @property
+    def counters(self) -> dict[str, int]:
+        """The shard's statistics by name; a transport may add its own."""
+        return self.state.counters
+
+    @property
     def idle(self) -> bool:
         """Whether a draining shard may stop: no commit in flight and no lock held."""
         held = any(tenure.token is not None for tenure in self.state.tenures.by_lock.values())

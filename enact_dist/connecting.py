@@ -1,0 +1,126 @@
+"""How a process comes to a cell: `connect` over the network, `local` inside this process."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import socket
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.cell import Cell
+from enact_dist.core.client import Client
+from enact_dist.core.messages import PlacementMap, ShardEntry, Welcome
+from enact_dist.errors import LinkError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from enact_dist.config import CellConfig
+    from enact_dist.link.clock import Clock
+
+TTL_S: Final = 2.0
+"""Lease of a session that no `cell.toml` says otherwise about."""
+LOCAL_SHARD: Final = "local"
+
+
+def connect(
+    target: str | Path, *, actor: str = "", timeout_s: float = 5.0, observer: bool = False
+) -> Cell:
+    """Join a running cell.
+
+    Args:
+        target: A `cell.toml`, or one endpoint such as ``tcp/host:7447``; one is enough, as each
+            shard knows the others.
+        actor: Name under which `enact lock ls` and `enact actor ls` show this process.
+        timeout_s: How long to wait for a first shard to answer.
+        observer: Only look: no lock can be taken, and a shard keeps no record of the session.
+
+    Raises:
+        ShardUnreachableError: No shard answered in time; the message names shards and endpoints.
+        ConfigError: The `cell.toml` cannot be used.
+    """
+    from enact_dist.link.joining import join
+
+    ttl_s, endpoints = TTL_S, (str(target),)
+    name = ""
+    if not _is_endpoint(str(target)):
+        from enact_dist.config import load_config
+
+        config = load_config(Path(target))
+        name, ttl_s = config.name, config.ttl_s
+        endpoints = tuple(e for entry in config.placement_map().shards for e in entry.endpoints)
+    client = _client(actor, ttl_s=ttl_s, observer=observer)
+    cell_name, cell_client, welcome = join(name, endpoints, client, timeout_s=timeout_s)
+    try:
+        cell_client.start(welcome)
+    except BaseException:
+        cell_client.close()
+        raise
+    return Cell(cell_name, cell_client)
+
+
+def local(
+    path: str | Path | None = None,
+    *,
+    worlds: Sequence[str] = (),
+    config: CellConfig | None = None,
+    actor: str = "",
+    clock: Clock | None = None,
+) -> Cell:
+    """Run one shard inside this process: the paper's mode, several actors as threads.
+
+    Args:
+        path: Folder that keeps what is committed; None keeps it in memory, and every aspect is
+            volatile then whatever it asks for.
+        worlds: World contexts to make.
+        config: Aspects, further world contexts and the session's TTL of a `cell.toml`.
+        actor: Name under which this process is shown.
+        clock: Times of the shard, for tests; the default is this host's.
+
+    Raises:
+        StoreError: The folder is in use, unreadable or corrupt.
+    """
+    from enact_dist.core.shard_state import ShardSettings
+    from enact_dist.link.client import CellClient
+    from enact_dist.link.embedded import EmbeddedCarrier
+    from enact_dist.link.host import open_host
+
+    names = dict.fromkeys((*worlds, *(config.worlds if config else ())))
+    settings = ShardSettings(
+        LOCAL_SHARD,
+        PlacementMap(1, (ShardEntry(LOCAL_SHARD, ()),), ()),
+        tuple(names),
+        config.aspect_entries() if config else (),
+        fetch_bytes_max=1 << 40,
+    )
+    host = open_host(settings, Path(path) if path is not None else None, clock=clock)
+    client = _client(actor, ttl_s=config.ttl_s if config else TTL_S, observer=False)
+    carrier = EmbeddedCarrier(host, client.session)
+    options = {} if clock is None else {"now_ns": clock.monotonic_ns}
+    cell_client = CellClient(carrier, client, keep_alive=False, **options)
+    welcome = cell_client.call(LOCAL_SHARD, client.hello(LOCAL_SHARD))
+    if not isinstance(welcome, Welcome):
+        raise LinkError(f"{type(welcome).__name__} came as the answer to Hello")
+    cell_client.start(welcome)
+    return Cell(config.name if config else LOCAL_SHARD, cell_client, host=host)
+
+
+def _is_endpoint(target: str) -> bool:
+    protocol, slash, address = target.partition("/")
+    return bool(slash) and protocol in _PROTOCOLS and ":" in address
+
+
+_PROTOCOLS: Final = frozenset(("tcp", "udp", "tls", "quic", "ws", "unixsock-stream"))
+
+
+def _client(actor: str, *, ttl_s: float, observer: bool) -> Client:
+    return Client(
+        secrets.token_hex(16),
+        ttl_ns=int(ttl_s * 1e9),
+        actor=actor or Path(sys.argv[0] or "python").stem or "python",
+        host=socket.gethostname(),
+        pid=os.getpid(),
+        observer=observer,
+    )
