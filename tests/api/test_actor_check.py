@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+import sys
+from typing import TYPE_CHECKING
+
 import pytest
 
 from enact_dist.actor import Actor
-from enact_dist.actor_check import ActorDeclaration, Finding, check_actors
+from enact_dist.actor_check import ActorDeclaration, Finding, check_actors, check_cell
+from enact_dist.config import load_config
 from enact_dist.terms import Aspect, Entities, Entity, View, ViewEach, World, Write, WriteEach
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 training, online = World("training"), World("online")
 VIEWS, PRODUCTS = Entities("view/*"), Entities("product/*")
@@ -170,3 +177,59 @@ def test_check_finds_two_types_when_one_aspect_name_has_two():
     assert (found.level, found.kind) == ("error", "two types")
     assert "str" in found.text
     assert "int" in found.text
+
+
+CELL = """
+name = "sample"
+worlds = ["online"]
+
+[shards.one]
+listen = "tcp/127.0.0.1:7447"
+
+[aspects.clod]
+durability = "volatile"
+
+[actors.camera]
+class = "sample_cell:Camera"
+worlds = { online = "online" }
+
+[actors.maker]
+class = "sample_cell:Reconstruction"
+worlds = { online = "online" }
+"""
+
+
+@pytest.fixture
+def cell_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A cell.toml whose actors are those of this module."""
+    monkeypatch.setitem(sys.modules, "sample_cell", sys.modules[__name__])
+    path = tmp_path / "cell.toml"
+    path.write_text(CELL)
+    return path
+
+
+def test_check_cell_warns_when_an_aspect_of_the_file_is_used_by_nobody(cell_file: Path):
+    """A misspelt aspect would silently keep its default durability."""
+    found = only(check_cell(load_config(cell_file)))
+
+    assert (found.level, found.kind) == ("warning", "unused aspect")
+    assert "did you mean 'cloud'" in found.text
+
+
+@pytest.mark.parametrize(
+    ("lines", "message"),
+    [
+        ('class = "sample_cell:Camra"', "did you mean 'Camera'"),
+        ('class = "sample_cell:Camera"\noptions = { fps = 3 }', "has no option 'fps'"),
+        ('class = "sample_cell:Alarm"\nevery_s = 0.5', "every_s = 0.5 for actor Alarm"),
+    ],
+)
+def test_check_cell_finds_actors_that_cannot_be_made(cell_file: Path, lines: str, message: str):
+    """Class, options and period are checked without making the actor."""
+    worlds = 'worlds = { online = "online" }'
+    cell_file.write_text(f"{CELL}\n[actors.wrong]\n{lines}\n{worlds}\n")
+
+    found = check_cell(load_config(cell_file))[0]
+
+    assert (found.level, found.kind, found.actors) == ("error", "no such actor", ("wrong",))
+    assert message in found.text

@@ -10,11 +10,20 @@ import pytest
 
 from enact_dist import testing
 from enact_dist.actor import Actor
+from enact_dist.actor_binding import BoundActor
+from enact_dist.actor_inbox import Inbox, Watching
 from enact_dist.actor_process import ActorThread, actor_command
 from enact_dist.actor_report import decode_reports
 from enact_dist.actor_runner import run_actor
 from enact_dist.connecting import local
-from enact_dist.errors import LeaseLostError, LockTimeoutError, MisuseError
+from enact_dist.errors import (
+    ChangedError,
+    CommitUnknownError,
+    LeaseLostError,
+    LockTimeoutError,
+    MisuseError,
+    ShardUnreachableError,
+)
 from enact_dist.lock import Lock
 from enact_dist.terms import Aspect, Entities, Entity, View, World, Write
 
@@ -61,6 +70,21 @@ class Reconstruction(Actor):
         """Wait until the updates so far include these."""
         with self.moved:
             assert self.moved.wait_for(lambda: set(seen) <= set(self.seen), PATIENCE_S), self.seen
+
+
+class Counter(Actor):
+    """Count its own ticks; sets `reached` at the fifth."""
+
+    count = Write(online, SYSTEM, COUNT)
+
+    def __init__(self, period_s: float, reached: threading.Event) -> None:
+        self.every_s = period_s
+        self.reached = reached
+
+    def update(self, lock: Lock) -> None:
+        lock[self.count] = lock.get(self.count, 0) + 1
+        if lock[self.count] == 5:
+            self.reached.set()
 
 
 def write(cell, entity: Entity, cloud: int) -> None:
@@ -158,6 +182,114 @@ def test_actor_tries_again_when_its_lock_was_not_granted(cell):
     assert (found.updates, found.failures) == (1, 0)
 
 
+@pytest.mark.parametrize(
+    ("refusal", "unknown"),
+    [
+        (LeaseLostError("lease expired"), 0),
+        (ChangedError("view moved on"), 0),
+        (ShardUnreachableError("shard left is silent"), 0),
+        (CommitUnknownError("no answer"), 1),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_actor_tries_again_after_each_error_that_is_not_its_own(
+    cell, refusal: Exception, unknown: int
+):
+    """Lease, view, shard or answer lost: the same datum is looked at again, by itself."""
+
+    class Unlucky(Reconstruction):
+        def update(self, lock: Lock) -> None:
+            super().update(lock)
+            if len(self.seen) == 1:
+                raise refusal
+
+    write(cell, A, 1)
+    with ActorThread(Unlucky(), cell) as thread:
+        wait_for_surface(cell, A, 10)
+
+    found = thread.statistics()
+    assert (found.updates, found.refused, found.failures) == (1, 1, 0)
+    assert found.unknown == unknown
+    assert found.last_error.startswith(type(refusal).__name__)
+
+
+def test_source_counts_a_refused_tick_as_missed_when_it_goes_on(cell):
+    """A source does not repeat a tick: the next one takes a newer measurement."""
+    reached = threading.Event()
+
+    class Unlucky(Counter):
+        ticks = 0
+
+        def update(self, lock: Lock) -> None:
+            self.ticks += 1
+            super().update(lock)
+            if self.ticks == 1:
+                raise LeaseLostError("lease expired")
+
+    actor = Unlucky(0.002, reached)
+    with ActorThread(actor, cell) as thread:
+        assert reached.wait(PATIENCE_S)
+
+    found = thread.statistics()
+    assert actor.ticks == found.updates + 1
+    assert found.refused == 1
+    assert found.missed >= 1
+
+
+def test_actor_that_runs_once_tries_again_when_it_was_refused(cell):
+    """Only an error of its own ends it early."""
+    refusals = [LeaseLostError("lease expired"), ShardUnreachableError("silent")]
+
+    class Initial(Actor):
+        count = Write(online, SYSTEM, COUNT)
+
+        def update(self, lock: Lock) -> None:
+            if refusals:
+                raise refusals.pop()
+            lock[self.count] = 1
+
+    found = run_actor(Initial(), cell, stop=threading.Event())
+
+    assert (found.updates, found.refused, found.state) == (1, 2, "done")
+
+
+class FlakyContext:
+    """Stands for a world context whose shard is away at the first look."""
+
+    name = "online"
+
+    def __init__(self, context, failures: int) -> None:
+        self.context = context
+        self.failures = failures
+
+    def watch(self, *args):
+        """Watch, or fail as long as failures are left."""
+        if self.failures:
+            self.failures -= 1
+            raise ShardUnreachableError("shard left did not answer")
+        return self.context.watch(*args)
+
+
+def test_watching_opens_a_watch_again_when_its_shard_was_away(cell, caplog):
+    """No change is lost: the watch that opens at last begins with what is there."""
+    caplog.set_level(logging.CRITICAL, logger="enact.actor")
+    write(cell, A, 1)
+    bound = BoundActor(Reconstruction(), cell)
+    bound.contexts["online"] = FlakyContext(cell.world("online"), failures=2)
+    inbox = Inbox(per_entity=True)
+
+    with Watching(bound, inbox):
+        trigger = inbox.take(PATIENCE_S)
+
+    assert trigger is not None
+    assert trigger.entity == A
+
+
+def test_inbox_returns_nothing_when_nothing_changes_in_time():
+    """Waiting ends after its time, so that a stopped actor is not kept."""
+    assert Inbox(per_entity=True).take(0.0) is None
+
+
 def test_actor_tries_again_when_its_lease_was_lost():
     """An update whose lock ran out commits nothing and runs again."""
     clock = testing.ManualClock()
@@ -194,21 +326,6 @@ def test_actor_finishes_its_update_when_it_is_stopped(cell):
 
     assert (found.updates, found.state) == (1, "stopped")
     wait_for_surface(cell, A, 10)
-
-
-class Counter(Actor):
-    """Count its own ticks; sets `reached` at the fifth."""
-
-    count = Write(online, SYSTEM, COUNT)
-
-    def __init__(self, period_s: float, reached: threading.Event) -> None:
-        self.every_s = period_s
-        self.reached = reached
-
-    def update(self, lock: Lock) -> None:
-        lock[self.count] = lock.get(self.count, 0) + 1
-        if lock[self.count] == 5:
-            self.reached.set()
 
 
 def test_source_runs_at_its_period_until_it_is_stopped(cell):
