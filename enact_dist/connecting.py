@@ -43,8 +43,8 @@ def connect(
     """
     from enact_dist.link.joining import join
 
-    ttl_s, endpoints = TTL_S, (str(target),)
-    name = ""
+    name, ttl_s = "", TTL_S
+    endpoints: tuple[str, ...] = (str(target),)
     if not _is_endpoint(str(target)):
         from enact_dist.config import load_config
 

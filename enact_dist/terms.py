@@ -375,6 +375,10 @@ class LockRequestEach(LockRequest[T]):
 
     __slots__ = ()
 
+    if TYPE_CHECKING:
+
+        def __init__(self, world: Context, entity: Entities, aspect: Aspect[T]) -> None: ...
+
 
 class ReadEach(LockRequestEach[T]):
     """Shared lock on an aspect of all matching entities, those yet to come included."""

@@ -215,6 +215,15 @@ class LockTable:
                         self._ready[eligible.lock] = eligible
         return claim
 
+    def overtook(self, claim: Claim) -> bool:
+        """Whether a conflicting earlier claim still waits: never, by law 2; counted all the same."""
+        for resource, mode in claim.wants.items():
+            waiting = self._queues[resource].waiting
+            for other in CONFLICTS[mode] if waiting else ():
+                if waiting[other] and _first(waiting[other]).ticket < claim.ticket:
+                    return True
+        return False
+
     def blockers(self, claim: Claim, *, count_max: int) -> list[Claim]:
         """Return up to `count_max` claims that `claim` waits for, holders first."""
         found: dict[LockId, Claim] = {}

@@ -177,6 +177,8 @@ class Tenures:
                 heapq.heapify(self._hold_ends)
             heapq.heappush(self._hold_ends, (tenure.hold_end_ns, tenure.lock))
             self.count("locks_granted")
+            if self.table.overtook(claim):
+                self.count("locks_bypassed")
             if tenure.parked is not None:
                 reply_to, tenure.parked = tenure.parked, None
                 yield Reply(reply_to, self.granted(tenure, now_ns=now_ns, stamp_ns=stamp_ns))

@@ -30,27 +30,15 @@ from enact_dist.core.messages import (
     Welcome,
 )
 from enact_dist.core.multilock import MultiLock, Phase
-from enact_dist.errors import (
-    ChangedError,
-    ClockSkewError,
-    CommitUnknownError,
-    DatumTypeError,
-    EnactError,
-    LeaseLostError,
-    LinkError,
-    LockTimeoutError,
-    MisuseError,
-    ProtocolError,
-    ShardUnreachableError,
-    UnknownWorldError,
-)
+from enact_dist.errors import MisuseError
 from enact_dist.link.clock import boottime_ns
+from enact_dist.link.refusals import error_of, not_committed, not_granted, unreachable
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from enact_dist.core.client import Client
-    from enact_dist.core.messages import Holder, Item, Request, SlotVersion, WriteItem
+    from enact_dist.core.messages import Item, Request, SlotVersion, WriteItem
     from enact_dist.link.carrier import Carrier, NoticeFeed
 
 CALL_S: Final = 1.0
@@ -169,7 +157,7 @@ class CellClient:
                 return [answers[index] for index in range(len(calls))]
             if self._now_ns() >= deadline_ns:
                 missing = next(index for index in left if index not in answers)
-                raise self.unreachable(calls[missing][0], timeout_s)
+                raise unreachable(calls[missing][0], timeout_s, self.carrier.endpoint_of)
             self._stopping.wait(pause_s)
             pause_s = min(2 * pause_s, 0.3)
 
@@ -183,16 +171,6 @@ class CellClient:
             if answer is not None:
                 self._take(shard, request, answer)
         return answers
-
-    def unreachable(self, shard: str, waited_s: float) -> ShardUnreachableError:
-        """Return the error for a shard that does not answer."""
-        endpoint = self.carrier.endpoint_of(shard)
-        return ShardUnreachableError(
-            f"shard {shard} at {endpoint} did not answer for {waited_s:.1f} s;"
-            f" is it running? (enact shard ls; enact shard run {shard})",
-            shard=shard,
-            endpoint=endpoint,
-        )
 
     def _send(self, calls: Sequence[tuple[str, Request]]) -> list[Answer | None]:
         if len(calls) == 1:
@@ -303,7 +281,7 @@ class CellClient:
                 if not restart or now_ns >= started_ns + wait_ns:
                     break
             if lock.phase is not Phase.HELD:
-                raise self._not_granted(lock, (now_ns - started_ns) / 1e9)
+                raise not_granted(lock, (now_ns - started_ns) / 1e9, self.carrier.endpoint_of)
         except BaseException:
             self._lanes_free.append(lane)
             raise
@@ -364,7 +342,7 @@ class CellClient:
                     lock.finish(writes, give_up_ns=give_up_ns, expects=expects)
             self._drive(lock)
             if lock.phase is not Phase.COMMITTED:
-                raise self._not_committed(lock)
+                raise not_committed(lock, FINISH_S, self.carrier.endpoint_of)
         finally:
             self._lanes_free.append(lock.lock.lane)
 
@@ -399,7 +377,7 @@ class CellClient:
                 calls = [(shard, self.core.keep_alive(shard, now_ns)) for shard in shards]
             self.call_all(calls)
         if lock.phase is not Phase.HELD:
-            raise self._not_committed(lock)
+            raise not_committed(lock, FINISH_S, self.carrier.endpoint_of)
 
     def fetch_call(self, request: Fetch, shard: str) -> Answer | None:
         """Ask once for a part of a datum."""
@@ -437,46 +415,6 @@ class CellClient:
         with self._mutex:
             self.core.report = report
 
-    # ---------------------------------------------------------------- errors
-
-    def _not_granted(self, lock: MultiLock, waited_s: float) -> EnactError:
-        if lock.phase is Phase.REFUSED and lock.refusal is not None:
-            return error_of(lock.refusal)
-        if lock.phase is Phase.UNREACHABLE:
-            return self.unreachable(lock.silent_shard, waited_s)
-        wanted = _wanted(lock)
-        holders = tuple(holder_line(holder) for holder in lock.blockers)
-        if holders:
-            why = "; ".join(holders)
-        elif lock.phase is Phase.LOST:
-            why = f"granted and lost again each time: {lock.cause}"
-        else:
-            why = "the shard grants nothing yet: it restarted and waits for older leases to end"
-        return LockTimeoutError(
-            f"waited {waited_s:.1f} s for {wanted}; {why}; raise wait_s, or shorten what holds it",
-            holders=holders,
-            waited_s=waited_s,
-        )
-
-    def _not_committed(self, lock: MultiLock) -> EnactError:
-        if lock.phase is Phase.REFUSED and lock.refusal is not None:
-            return error_of(lock.refusal)
-        if lock.phase is Phase.UNKNOWN:
-            return CommitUnknownError(
-                f"the commit of lock {lock.lock} ({_wanted(lock)}) was sent and not answered for"
-                f" {FINISH_S:g} s; it may stand or not; read the data before writing them again",
-                lock_id=str(lock.lock),
-            )
-        if lock.phase is Phase.UNREACHABLE:
-            return self.unreachable(lock.silent_shard, FINISH_S)
-        if lock.phase is Phase.CHANGED:
-            return ChangedError(f"{lock.cause} since it was viewed; nothing was written")
-        return LeaseLostError(
-            f"lock {lock.lock} on {_wanted(lock)} was lost: {lock.cause}; nothing was written;"
-            " take the lock again and redo the work",
-            cause=lock.cause,
-        )
-
 
 def _patience_s(request: Request) -> float:
     """Return how long to wait for the answer to one call."""
@@ -496,38 +434,3 @@ def _agrees(known: AspectEntry | None, wanted: AspectEntry) -> bool:
         and known.fingerprint == wanted.fingerprint
         and wanted.durability in ("", known.durability)
     )
-
-
-def _wanted(lock: MultiLock) -> str:
-    names = [
-        f"{item.entity}/{item.aspect} in {item.context}"
-        for _, items in (*lock.plan.locks, *lock.plan.views)
-        for item in items
-    ]
-    shown = ", ".join(dict.fromkeys(names[:4]))
-    return shown + (f" and {len(names) - 4} more" if len(names) > 4 else "")
-
-
-def holder_line(holder: Holder) -> str:
-    """Return one line about who holds or awaits a lock, for an error message."""
-    state = "held" if holder.granted else "awaited"
-    return (
-        f"{', '.join(holder.slots)} {state} by {holder.actor or 'client'}@{holder.host}"
-        f" pid {holder.pid} (lock {holder.number}) for {holder.age_ns / 1e9:.1f} s"
-    )
-
-
-def error_of(refused: Refused) -> EnactError:
-    """Return the exception that a refusal stands for."""
-    if refused.code == "unknown_world":
-        known = refused.text.partition("known: ")[2]
-        return UnknownWorldError(refused.text, known=tuple(known.split(", ")) if known else ())
-    classes: dict[str, type[EnactError]] = {
-        "datum_type": DatumTypeError,
-        "unknown_aspect": MisuseError,
-        "value": MisuseError,
-        "clock_skew": ClockSkewError,
-        "protocol": ProtocolError,
-        "overload": LinkError,
-    }
-    return classes.get(refused.code, LinkError)(refused.text)

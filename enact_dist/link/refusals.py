@@ -1,0 +1,121 @@
+"""What a call or lock that did not succeed means to its user: the errors and their texts.
+
+Each text says what was asked, what was found, who holds it and what to do.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from enact_dist.core.multilock import MultiLock, Phase
+from enact_dist.errors import (
+    ChangedError,
+    ClockSkewError,
+    CommitUnknownError,
+    DatumTypeError,
+    EnactError,
+    LeaseLostError,
+    LinkError,
+    LockTimeoutError,
+    MisuseError,
+    ProtocolError,
+    ShardUnreachableError,
+    UnknownWorldError,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from enact_dist.core.messages import Holder, Refused
+
+
+def unreachable(
+    shard: str, waited_s: float, endpoint_of: Callable[[str], str]
+) -> ShardUnreachableError:
+    """Return the error for a shard that does not answer."""
+    endpoint = endpoint_of(shard)
+    return ShardUnreachableError(
+        f"shard {shard} at {endpoint} did not answer for {waited_s:.1f} s;"
+        f" is it running? (enact shard ls; enact shard run {shard})",
+        shard=shard,
+        endpoint=endpoint,
+    )
+
+
+def not_granted(lock: MultiLock, waited_s: float, endpoint_of: Callable[[str], str]) -> EnactError:
+    """Return the error for a lock that came to rest before it was held."""
+    if lock.phase is Phase.REFUSED and lock.refusal is not None:
+        return error_of(lock.refusal)
+    if lock.phase is Phase.UNREACHABLE:
+        return unreachable(lock.silent_shard, waited_s, endpoint_of)
+    wanted = _wanted(lock)
+    holders = tuple(holder_line(holder) for holder in lock.blockers)
+    if holders:
+        why = "; ".join(holders)
+    elif lock.phase is Phase.LOST:
+        why = f"granted and lost again each time: {lock.cause}"
+    else:
+        why = "the shard grants nothing yet: it restarted and waits for older leases to end"
+    return LockTimeoutError(
+        f"waited {waited_s:.1f} s for {wanted}; {why}; raise wait_s, or shorten what holds it",
+        holders=holders,
+        waited_s=waited_s,
+    )
+
+
+def not_committed(
+    lock: MultiLock, finish_s: float, endpoint_of: Callable[[str], str]
+) -> EnactError:
+    """Return the error for a lock that ended otherwise than by its commit."""
+    if lock.phase is Phase.REFUSED and lock.refusal is not None:
+        return error_of(lock.refusal)
+    if lock.phase is Phase.UNKNOWN:
+        return CommitUnknownError(
+            f"the commit of lock {lock.lock} ({_wanted(lock)}) was sent and not answered for"
+            f" {finish_s:g} s; it may stand or not; read the data before writing them again",
+            lock_id=str(lock.lock),
+        )
+    if lock.phase is Phase.UNREACHABLE:
+        return unreachable(lock.silent_shard, finish_s, endpoint_of)
+    if lock.phase is Phase.CHANGED:
+        return ChangedError(f"{lock.cause} since it was viewed; nothing was written")
+    return LeaseLostError(
+        f"lock {lock.lock} on {_wanted(lock)} was lost: {lock.cause}; nothing was written;"
+        " take the lock again and redo the work",
+        cause=lock.cause,
+    )
+
+
+def _wanted(lock: MultiLock) -> str:
+    names = [
+        f"{item.entity}/{item.aspect} in {item.context}"
+        for _, items in (*lock.plan.locks, *lock.plan.views)
+        for item in items
+    ]
+    shown = ", ".join(dict.fromkeys(names[:4]))
+    return shown + (f" and {len(names) - 4} more" if len(names) > 4 else "")
+
+
+def holder_line(holder: Holder) -> str:
+    """Return one line about who holds or awaits a lock, for an error message."""
+    state = "held" if holder.granted else "awaited"
+    return (
+        f"{', '.join(holder.slots)} {state} by {holder.actor or 'client'}@{holder.host}"
+        f" pid {holder.pid} (lock {holder.number}) for {holder.age_ns / 1e9:.1f} s"
+    )
+
+
+def error_of(refused: Refused) -> EnactError:
+    """Return the exception that a refusal stands for."""
+    if refused.code == "unknown_world":
+        known = refused.text.partition("known: ")[2]
+        return UnknownWorldError(refused.text, known=tuple(known.split(", ")) if known else ())
+    classes: dict[str, type[EnactError]] = {
+        "datum_type": DatumTypeError,
+        "unknown_aspect": MisuseError,
+        "value": MisuseError,
+        "clock_skew": ClockSkewError,
+        "protocol": ProtocolError,
+        "overload": LinkError,
+    }
+    return classes.get(refused.code, LinkError)(refused.text)

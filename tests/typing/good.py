@@ -1,0 +1,66 @@
+"""What users write: no line here may be an error of the type checker."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import assert_type
+
+from enact_dist import (
+    Actor,
+    Aspect,
+    Entities,
+    Entity,
+    Lock,
+    Read,
+    ReadEach,
+    View,
+    World,
+    Write,
+    WriteEach,
+    connect,
+)
+
+
+@dataclass(frozen=True)
+class Mesh:
+    lowest_z_m: float
+
+
+MESH = Aspect("mesh", Mesh)
+COUNT = Aspect("contact_count", int)
+FLAGS = Aspect("flags", dict[str, bool])
+piece, bench = Entity("work_piece"), Entity("work_bench")
+
+
+def count_contacts() -> None:
+    with connect("cell.toml") as cell:
+        online = cell.world("online")
+        online.init(piece, MESH, Mesh(-0.1))
+        mesh, count = Read(online, piece, MESH), Write(online, bench, COUNT)
+        each, all_counts = ReadEach(online, Entities("view/*"), MESH), WriteEach(online, Entities("*"), COUNT)
+        with Lock(mesh, count, each, all_counts) as lock:
+            assert_type(lock[mesh], Mesh)
+            assert_type(lock.get(mesh), Mesh | None)
+            assert_type(lock.get(count, 0), int)
+            assert_type(lock[each], Mapping[Entity, Mesh])
+            if lock[mesh].lowest_z_m < 0.0:
+                lock[count] = lock.get(count, 0) + 1
+            lock[count] += 1
+            lock[all_counts][piece] = 3
+            del lock[count]
+        view = View(online, bench, COUNT)
+        snapshot = online.view(view)
+        assert_type(snapshot[view], int)
+        assert_type(snapshot.get(view, 0), int)
+
+
+class Inspect(Actor):
+    """Raise a flag for a mesh below the table."""
+
+    online = World("online")
+    mesh = View(online, Entities("product/*"), MESH)
+    flags = Write(online, Entity("system"), FLAGS)
+    triggers = [mesh]
+
+    def update(self, lock: Lock) -> None:
+        below = lock[self.mesh].lowest_z_m < 0.0
+        lock[self.flags] = {**lock.get(self.flags, {}), lock.entity.name: below}
