@@ -1,0 +1,8 @@
+"""Make the simulator importable as `simulated`, and take the options of a simulation run."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent))

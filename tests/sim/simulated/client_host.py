@@ -1,0 +1,239 @@
+"""The process around one real `Client`: its calls, its keep-alives and its threads.
+
+A thread is a generator that yields what it waits for: `Sleep`, or `Calls` whose answers it is then
+sent, None for each that nobody answered in time.  It drives `MultiLock` as `link.client` does.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from enact_dist.core.client import Client
+from enact_dist.core.messages import (
+    Acquire,
+    Answer,
+    AspectEntry,
+    Hello,
+    KeepAlive,
+    Refused,
+    Register,
+    Registered,
+    Request,
+)
+from simulated.world import MS, Host, S
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Generator, Sequence
+
+    from enact_dist.core.datum import Datum, Slot
+    from enact_dist.core.multilock import MultiLock
+    from simulated.faults import Faults
+    from simulated.model import Model
+    from simulated.network import Network
+    from simulated.shard_host import ShardHost
+    from simulated.world import World
+
+CALL_NS = S
+"""How long a call may stay unanswered before its thread takes that for an answer."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sleep:
+    """Wait for a duration of the host's clock."""
+
+    duration_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Calls:
+    """Make these calls at once and wait for all answers."""
+
+    calls: Sequence[tuple[str, Request]]
+    lock: MultiLock | None = None
+
+
+Thread = "Generator[Sleep | Calls, list[Answer | None], None]"
+
+
+@dataclass(slots=True)
+class _Call:
+    shard: str
+    request: Request
+    take: Callable[[Answer | None], None] | None
+    lock: MultiLock | None
+
+
+class ClientHost(Host):
+    """A client process with one session and several threads."""
+
+    def __init__(
+        self,
+        world: World,
+        name: str,
+        *,
+        network: Network,
+        shards: dict[str, ShardHost],
+        model: Model,
+        faults: Faults,
+        ttl_ns: int,
+    ) -> None:
+        super().__init__(world, name, drift_ppm=faults.drift_ppm, wall_offset_ns=0)
+        self.client = Client(f"{world.random.getrandbits(64):016x}", ttl_ns=ttl_ns, actor=name)
+        self.busy = False
+        self.cache: dict[Slot, tuple[str, int, int, Datum]] = {}
+        self.threads_left = 0
+        self._network, self._shards, self._model = network, shards, model
+        self._faults = faults
+        self._calls: dict[int, _Call] = {}
+        self._calls_made = 0
+
+    # ---------------------------------------------------------------- threads
+
+    def start(self, thread: Thread) -> None:
+        """Run a thread; what breaks it breaks the run."""
+        self.threads_left += 1
+        self._resume(thread, [])
+
+    def _resume(self, thread: Thread, answers: list[Answer | None] | None) -> None:
+        try:
+            wish = thread.send(answers) if answers else next(thread)
+        except StopIteration:
+            self.threads_left -= 1
+            return
+        if isinstance(wish, Sleep):
+            self.later(wish.duration_ns, lambda: self._resume(thread, None))
+        else:
+            self._call_all(thread, wish)
+
+    def _call_all(self, thread: Thread, wish: Calls) -> None:
+        answers: list[Answer | None] = [None] * len(wish.calls)
+        left = [len(wish.calls)]
+
+        def take(index: int, answer: Answer | None) -> None:
+            answers[index] = answer
+            left[0] -= 1
+            if not left[0]:
+                self._resume(thread, answers)
+
+        for index, (shard, request) in enumerate(wish.calls):
+            self.call(
+                shard, request, lambda answer, index=index: take(index, answer), lock=wish.lock
+            )
+
+    # ---------------------------------------------------------------- calls
+
+    def call(
+        self,
+        shard: str,
+        request: Request,
+        take: Callable[[Answer | None], None] | None,
+        *,
+        lock: MultiLock | None = None,
+    ) -> None:
+        """Send a request; `take` gets its answer, or None when time is up."""
+        self._calls_made += 1
+        number = self._calls_made
+        self._calls[number] = _Call(shard, request, take, lock)
+        host = self._shards[shard]
+
+        def reply(answer: Answer) -> None:
+            self._network.send(host, self, answer, lambda came: self._answered(number, came))
+
+        self._network.send(self, host, request, lambda came: host.request(came, reply))
+        patience_ns = CALL_NS
+        if isinstance(request, Acquire):
+            patience_ns += request.wait_ns
+        elif isinstance(request, Hello | KeepAlive):
+            patience_ns = CALL_NS // 2
+        self.later(patience_ns, lambda: self._time_is_up(number))
+
+    def _answered(self, number: int, answer: Answer) -> None:
+        call = self._calls.get(number)
+        if call is None:
+            return
+        if call.take is None:
+            self._late(number, call, answer)
+            return
+        del self._calls[number]
+        call.take(answer)
+        self._model.check_beliefs(self)
+
+    def _time_is_up(self, number: int) -> None:
+        call = self._calls.get(number)
+        if call is None or call.take is None:
+            return
+        self.world.tally["calls without an answer"] += 1
+        take, call.take = call.take, None
+        take(None)
+
+    def _late(self, number: int, call: _Call, answer: Answer) -> None:
+        """Deliver an answer that nobody waits for any more, where the faults say so."""
+        del self._calls[number]
+        if self.world.random.random() < self._faults.late_answers:
+            self.world.tally["late answers"] += 1
+            if call.lock is not None and call.lock.phase.busy:
+                call.lock.answered(call.shard, call.request, answer, self.local_ns)
+            else:
+                self.client.answered(call.shard, call.request, answer, self.local_ns)
+            self._model.check_beliefs(self)
+
+    # ---------------------------------------------------------------- the session
+
+    def open(self, aspects: tuple[AspectEntry, ...], then: Callable[[], None]) -> Thread:
+        """Greet every shard and register the aspects, as often as it takes."""
+        for shard in self._shards:
+            registered = False
+            while not registered:
+                request: Request = self.client.hello(shard)
+                if not self.client.needs_hello(shard):
+                    request = Register(self.client.session, (), aspects)
+                (answer,) = yield Calls([(shard, request)])
+                if answer is None:
+                    yield Sleep(50 * MS)
+                elif isinstance(answer, Registered):
+                    registered = True
+                elif isinstance(answer, Refused):
+                    self.world.violation("nothing is refused", answer)
+                else:
+                    self.client.answered(shard, request, answer, self.local_ns)
+        then()
+
+    def keep_alive(self) -> None:
+        """Renew the session at every shard, four times per TTL, until the process ends."""
+        now_ns = self.local_ns
+        for shard in self.client.shards_in_use():
+            request = self.client.keep_alive(shard, now_ns)
+            self.call(
+                shard,
+                request,
+                lambda answer, shard=shard, request=request: self._renewed(shard, request, answer),
+            )
+        self.later(self.client.ttl_ns // 4, self.keep_alive)
+
+    def _renewed(self, shard: str, request: Request, answer: Answer | None) -> None:
+        if answer is not None:
+            self.client.answered(shard, request, answer, self.local_ns)
+
+    def drive(self, lock: MultiLock) -> Thread:
+        """Make the lock's calls until it rests, then send what it says on leaving."""
+        while True:
+            calls, wait_until_ns = lock.next_calls(self.local_ns)
+            self.client.assert_invariants()
+            if not calls and not lock.phase.busy:
+                break
+            if not calls:
+                yield Sleep(max(MS, wait_until_ns - self.local_ns))
+                continue
+            answers = yield Calls(calls, lock)
+            for (shard, request), answer in zip(calls, answers, strict=True):
+                lock.answered(shard, request, answer, self.local_ns)
+            self._model.check_beliefs(self)
+        for shard, farewell in lock.take_farewells():
+            self.call(shard, farewell, lambda _answer: None)
+
+    def dies(self) -> None:
+        """End without a word: nothing is sent any more."""
+        self.end_life()
+        self._calls.clear()
+        self.threads_left = 0

@@ -1,0 +1,125 @@
+"""The disk of one shard: written in order, synced in batches, torn by crashes.
+
+Duty of a store (core/records.py): each `Persist` whole or not at all, in order, reported when it
+survives what its durability promises.  A crash keeps any prefix that it may keep: a killed process
+loses what it had not handed to the operating system, a power cut also what was not synced.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from enact_dist.core.records import (
+    AspectRecord,
+    OutcomeRecord,
+    Persist,
+    Recovered,
+    SessionEnded,
+    SessionRecord,
+    SlotRecord,
+    WorldRecord,
+)
+from enact_dist.terms import Durability
+from simulated.world import MS
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from simulated.faults import Faults
+    from simulated.world import Host, World
+
+
+class Disk:
+    """Everything that one shard ever asked to keep, as far as it has survived."""
+
+    def __init__(self, world: World, faults: Faults) -> None:
+        self._world = world
+        self.faults = faults
+        self.log: list[Persist] = []
+        self.written = 0
+        self.synced = 0
+        self.epoch = 0
+        self._batch_end = 0
+
+    # ---------------------------------------------------------------- a running shard
+
+    def submit(self, host: Host, persist: Persist, done: Callable[[int], None]) -> None:
+        """Keep these records; `done(ticket)` follows when they survive what they must."""
+        self.log.append(persist)
+        if self._batch_end <= self.written:
+            self._begin_batch(host, done)
+
+    def _begin_batch(self, host: Host, done: Callable[[int], None]) -> None:
+        random = self._world.random
+        self._batch_end = len(self.log)
+        delay_ns = random.randrange(MS // 20, MS)
+        if self.faults.slow_disk and random.random() < self.faults.slow_disk:
+            delay_ns += random.randrange(500 * MS)
+            self._world.tally["slow disk batches"] += 1
+        host.later(delay_ns, lambda: self._batch_written(host, done))
+
+    def _batch_written(self, host: Host, done: Callable[[int], None]) -> None:
+        first, self.written = self.written, self._batch_end
+        batch = self.log[first : self.written]
+        if any(persist.durability is Durability.DURABLE for persist in batch):
+            delay_ns = self._world.random.randrange(MS // 4, 4 * MS)
+            host.later(delay_ns, lambda: self._batch_synced(host, batch, done))
+        else:
+            self._batch_done(host, batch, done)
+
+    def _batch_synced(self, host: Host, batch: list[Persist], done: Callable[[int], None]) -> None:
+        self.synced = self.written
+        self._batch_done(host, batch, done)
+
+    def _batch_done(self, host: Host, batch: list[Persist], done: Callable[[int], None]) -> None:
+        if len(self.log) > self.written:
+            self._begin_batch(host, done)
+        for persist in batch:
+            if persist.ticket:
+                done(persist.ticket)
+
+    # ---------------------------------------------------------------- a crash and what is left
+
+    def crash(self, *, power_cut: bool) -> list[Persist]:
+        """Lose what this kind of crash may lose; return what was lost."""
+        random = self._world.random
+        if power_cut:
+            keep = random.randint(self.synced, self.written)
+        else:
+            keep = random.randint(self.written, max(self.written, self._batch_end))
+        lost = self.log[keep:]
+        del self.log[keep:]
+        self.written = self.synced = self._batch_end = keep
+        self._world.tally["torn logs"] += bool(lost)
+        return lost
+
+    def recovered(self, *, unix_s: int) -> Recovered:
+        """Open the store: a new epoch, durable, and everything that has survived."""
+        self.epoch = max(self.epoch + 1, unix_s)
+        sessions: dict[str, SessionRecord] = {}
+        worlds: dict[str, None] = {}
+        aspects: dict[str, AspectRecord] = {}
+        slots: dict[object, SlotRecord] = {}
+        outcomes: dict[tuple[str, int], OutcomeRecord] = {}
+        for persist in self.log:
+            for record in persist.records:
+                if isinstance(record, SlotRecord):
+                    slots[record.slot] = record
+                elif isinstance(record, OutcomeRecord):
+                    outcomes[record.lock.session, record.lock.lane] = record
+                elif isinstance(record, SessionRecord):
+                    sessions[record.session] = record
+                elif isinstance(record, SessionEnded):
+                    sessions.pop(record.session, None)
+                elif isinstance(record, WorldRecord):
+                    worlds[record.name] = None
+                elif isinstance(record, AspectRecord):
+                    aspects[record.entry.name] = record
+        return Recovered(
+            self.epoch,
+            list(sessions.values()),
+            list(worlds),
+            [record.entry for record in aspects.values()],
+            list(slots.values()),
+            list(outcomes.values()),
+        )

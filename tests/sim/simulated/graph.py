@@ -1,0 +1,127 @@
+"""The end of a run: was everything that committed strictly serializable?
+
+Slot versions give the exact dependencies: who wrote what after whom, who read whose write, whose
+read was overwritten by whom.  Real time gives the rest: what ended before another began comes
+before it.  The order exists exactly if the graph has no cycle.
+
+A restart counts as one more writer: it sets every volatile slot to null, and after a power cut the
+slots of class `os` to an older state.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from enact_dist.core.multilock import Phase
+
+if TYPE_CHECKING:
+    from collections.abc import Hashable
+
+    from enact_dist.core.datum import Slot
+    from simulated.history import Entry, History
+    from simulated.model import Model, Picture
+
+NEVER = 1 << 63
+
+
+class Graph:
+    """Dependencies between everything that committed."""
+
+    def __init__(self, history: History, model: Model) -> None:
+        self._model = model
+        self.after: dict[Hashable, dict[Hashable, str]] = {}
+        self._entries = [entry for entry in history.entries.values() if self._counts(entry)]
+        for picture in model.pictures.values():
+            for chain in picture.chains.values():
+                for older, newer in zip(chain, chain[1:], strict=False):
+                    self._edge(older.writer, newer.writer, "ww")
+        for entry in self._entries:
+            self._add_reads(entry)
+        self._add_real_time()
+
+    def _counts(self, entry: Entry) -> bool:
+        if entry.told is Phase.COMMITTED:
+            return True
+        return any(entry.id in picture.applied for picture in self._model.pictures.values())
+
+    def _edge(self, one: Hashable, other: Hashable, why: str) -> None:
+        if one != other:
+            self.after.setdefault(one, {}).setdefault(other, why)
+
+    # ---------------------------------------------------------------- reads
+
+    def _add_reads(self, entry: Entry) -> None:
+        pictures = self._model.pictures
+        for reading in entry.readings():
+            name = (reading.state.version, reading.state.stamp_ns)
+            self._add_read(entry, pictures[reading.shard], reading.state.slot, reading.epoch, name)
+        for (shard, slot), (epoch, name) in self._model.absent.get(entry.id, {}).items():
+            self._add_read(entry, pictures[shard], slot, epoch, name)
+
+    def _add_read(
+        self, entry: Entry, picture: Picture, slot: Slot, epoch: int, name: tuple[int, int]
+    ) -> None:
+        chain = picture.chains.get(slot, [])
+        index = -1
+        for position, state in enumerate(chain):
+            if state.epoch == epoch and state.name == name:
+                index = position
+        if index >= 0:
+            self._edge(chain[index].writer, entry.id, f"wr {slot}")
+        if index + 1 < len(chain):
+            self._edge(entry.id, chain[index + 1].writer, f"rw {slot}")
+
+    # ---------------------------------------------------------------- real time
+
+    def _add_real_time(self) -> None:
+        """What ended leads to a moment, each moment to the next and to what begins after it."""
+        spans: list[tuple[int, int, Hashable]] = []
+        for entry in self._entries:
+            told = entry.told is Phase.COMMITTED and entry.ended_ns is not None
+            ended_ns = entry.ended_ns if told and entry.ended_ns is not None else NEVER
+            spans.append((entry.begun_ns, ended_ns, entry.id))
+        for picture in self._model.pictures.values():
+            spans += [(begun, ended, writer) for writer, begun, ended in picture.restarts]
+        points = sorted(
+            [(begun_ns, 0, str(one), one) for begun_ns, _, one in spans]
+            + [(ended_ns, 1, str(one), one) for _, ended_ns, one in spans if ended_ns < NEVER]
+        )
+        moment = 0
+        for when_ns, ends, _, one in points:
+            if ends:
+                self._edge(("moment", moment), ("moment", moment + 1), "time")
+                moment += 1
+                self._edge(one, ("moment", moment), f"ended {when_ns / 1e9:.6f}")
+            else:
+                self._edge(("moment", moment), one, f"began {when_ns / 1e9:.6f}")
+
+    # ---------------------------------------------------------------- cycles
+
+    def cycle(self) -> list[str] | None:
+        """Return a cycle as lines to read, or None if there is an order."""
+        state: dict[Hashable, int] = {}
+        for root in self.after:
+            if root in state:
+                continue
+            path = [(root, iter(self.after.get(root, ())))]
+            state[root] = 1
+            while path:
+                one, others = path[-1]
+                for other in others:
+                    if state.get(other) == 1:
+                        return self._told([node for node, _ in path], other)
+                    if other not in state:
+                        state[other] = 1
+                        path.append((other, iter(self.after.get(other, ()))))
+                        break
+                else:
+                    state[one] = 2
+                    path.pop()
+        return None
+
+    def _told(self, path: list[Hashable], back_to: Hashable) -> list[str]:
+        around = path[path.index(back_to) :]
+        return [
+            f"{one} --{self.after[one][other]}--> {other}"
+            for one, other in zip(around, [*around[1:], back_to], strict=True)
+        ]

@@ -1,0 +1,100 @@
+"""What the clients asked for and were told, lock by lock: the evidence of a run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from enact_dist.core.multilock import Phase
+from enact_dist.terms import Access, pattern_matches, patterns_overlap
+
+if TYPE_CHECKING:
+    from enact_dist.core.datum import LockId
+    from enact_dist.core.messages import Item
+    from enact_dist.core.multilock import MultiLock, Reading
+
+TOLD_NOT = frozenset(
+    (
+        Phase.RELEASED,
+        Phase.LOST,
+        Phase.CHANGED,
+        Phase.TIMED_OUT,
+        Phase.UNREACHABLE,
+        Phase.REFUSED,
+        Phase.MISPLACED,
+    )
+)
+"""Ends after which nothing of a lock may ever be visible."""
+
+
+@dataclass(slots=True, eq=False)
+class Entry:
+    """One lock of one thread.
+
+    Attributes:
+        begun_ns: When it was asked for, in true time.
+        ended_ns: When its thread was told how it ended (None: never, its process died).
+        told: What its thread was told.
+    """
+
+    lock: MultiLock
+    items: tuple[Item, ...]
+    kind: str
+    begun_ns: int
+    ended_ns: int | None = None
+    told: Phase | None = None
+    expects: bool = False
+
+    @property
+    def id(self) -> LockId:
+        return self.lock.lock
+
+    def readings(self) -> list[Reading]:
+        """Return what the lock read under protection: its reads, and its views if expected."""
+        return [
+            reading
+            for reading in self.lock.states
+            if self.expects or any(_covers(item, reading) for item in self.items)
+        ]
+
+
+@dataclass(slots=True)
+class History:
+    """All locks of a run."""
+
+    entries: dict[LockId, Entry] = field(default_factory=dict)
+
+    def begin(self, entry: Entry) -> None:
+        """Note that a thread asks for a lock."""
+        self.entries[entry.id] = entry
+
+    def end(self, entry: Entry, *, now_ns: int) -> None:
+        """Note how it ended."""
+        entry.ended_ns = now_ns
+        entry.told = entry.lock.phase
+
+
+def _covers(item: Item, reading: Reading) -> bool:
+    slot = reading.state.slot
+    access = Access(item.access)
+    if not access.locks or (item.context, item.aspect) != (slot.context, slot.aspect):
+        return False
+    return pattern_matches(item.entity, slot.entity)
+
+
+def conflict(some: tuple[Item, ...], others: tuple[Item, ...]) -> bool:
+    """Say whether two locks may not be held at once: paper, 3.2, with readers shared."""
+    return any(_items_conflict(one, other) for one in some for other in others)
+
+
+def _items_conflict(one: Item, other: Item) -> bool:
+    if one.context != other.context or one.aspect != other.aspect:
+        return False
+    mine, theirs = Access(one.access), Access(other.access)
+    if not (mine.locks and theirs.locks and (mine.writes or theirs.writes)):
+        return False
+    if mine.each and theirs.each:
+        return patterns_overlap(one.entity, other.entity)
+    if mine.each or theirs.each:
+        return pattern_matches(*((one.entity, other.entity) if mine.each else (other.entity, one.entity)))
+    return one.entity == other.entity

@@ -1,0 +1,395 @@
+"""What must hold at every step, judged from what goes into a shard and what comes out.
+
+The model keeps its own picture of each slot's committed states, its own order of arrival and its
+own list of grants, and compares.  Rules are named as in the design's list of invariants (I1-I19).
+The end of a run is judged by `graph`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, NamedTuple
+
+from enact_dist.core.datum import Datum, LockId, Slot, Token
+from enact_dist.core.messages import (
+    Acquire,
+    Committed,
+    Granted,
+    Hello,
+    Item,
+    Notice,
+    SlotState,
+    Viewed,
+)
+from enact_dist.core.multilock import Phase
+from enact_dist.core.records import OutcomeRecord, Persist, Publish, Recovered, Reply
+from enact_dist.terms import Access, Durability, pattern_matches
+from simulated.history import TOLD_NOT, Entry, History, conflict
+from simulated.workload import label_of, value_of, writer_of
+
+if TYPE_CHECKING:
+    from enact_dist.core.multilock import Reading
+    from enact_dist.core.tenures import Tenure
+    from simulated.client_host import ClientHost
+    from simulated.shard_host import ShardHost
+    from simulated.world import World
+
+
+class State(NamedTuple):
+    """One committed state of a slot: `writer` is a lock, or the restart that left it so."""
+
+    version: int
+    stamp_ns: int
+    writer: LockId | str
+    epoch: int
+    datum: Datum | None
+
+    @property
+    def name(self) -> tuple[int, int]:
+        """What a reader in this epoch knows the state by."""
+        return self.version, self.stamp_ns
+
+
+NEVER_SET = State(0, 0, "nobody", 0, None)
+
+
+@dataclass(slots=True)
+class Picture:
+    """What the model knows of one shard."""
+
+    epoch: int = 0
+    chains: dict[Slot, list[State]] = field(default_factory=dict)
+    columns: dict[tuple[str, str], dict[Slot, None]] = field(default_factory=dict)
+    in_flight: dict[LockId, Persist] = field(default_factory=dict)
+    applied: dict[LockId, Persist | None] = field(default_factory=dict)
+    arrivals: dict[LockId, int] = field(default_factory=dict)
+    granted: dict[LockId, Token] = field(default_factory=dict)
+    granted_ever: dict[LockId, Token] = field(default_factory=dict)
+    grants: int = 0
+    newest_token: Token = Token(0, 0)
+    notices: int = 0
+    grace_waits_for: dict[str, int] = field(default_factory=dict)
+    grace_end_ns: int = 0
+    restarts: list[tuple[str, int, int]] = field(default_factory=list)
+
+    def now(self, slot: Slot) -> State:
+        """Return the newest committed state of a slot."""
+        chain = self.chains.get(slot)
+        return chain[-1] if chain else NEVER_SET
+
+    def put(self, slot: Slot, state: State) -> None:
+        """Add a state to the chain of a slot."""
+        self.chains.setdefault(slot, []).append(state)
+        self.columns.setdefault((slot.context, slot.aspect), {})[slot] = None
+
+
+class Model:
+    """The judge of a running simulation."""
+
+    def __init__(self, world: World, history: History, durabilities: dict[str, str]) -> None:
+        self._world, self._history = world, history
+        self._durabilities = {name: Durability(text) for name, text in durabilities.items()}
+        self.pictures: dict[str, Picture] = {}
+        self.clients: list[ClientHost] = []
+        self.absent: dict[LockId, dict[tuple[str, Slot], tuple[int, tuple[int, int]]]] = {}
+        self.labels: dict[tuple[str, str], Slot] = {}
+        self.permitted_losses: dict[LockId, None] = {}
+
+    def _fail(self, rule: str, *facts: object) -> None:
+        self._world.violation(rule, *facts)
+
+    # ---------------------------------------------------------------- restart
+
+    def crashed(self, host: ShardHost, lost: list[Persist], *, power_cut: bool) -> None:
+        """A shard died and its disk lost these records: was it allowed to?"""
+        picture = self.pictures[host.name]
+        gone = {id(persist) for persist in lost}
+        for lock, persist in picture.applied.items():
+            if persist is None or id(persist) not in gone:
+                continue
+            if not (power_cut and persist.durability is Durability.OS):
+                self._fail("I5 committed survives", lock, persist.durability, power_cut)
+            self.permitted_losses[lock] = None
+            self._world.tally["commits lost as declared"] += 1
+        for lock, persist in picture.in_flight.items():
+            if id(persist) not in gone:
+                self._world.tally["commits found after a crash"] += 1
+                self._apply(host, lock, persist, picture, datum_of=_recorded_data(persist))
+        picture.in_flight.clear()
+        picture.applied = {lock: None for lock in picture.applied}
+
+    def booted(self, host: ShardHost, recovered: Recovered, *, crashed_at_ns: int) -> None:
+        """A shard started: what it recovered becomes one writer of all slots in the history."""
+        picture = self.pictures.setdefault(host.name, Picture())
+        if recovered.epoch <= picture.epoch:
+            self._fail("epochs grow", recovered.epoch, picture.epoch)
+        picture.epoch = recovered.epoch
+        writer = f"restart {recovered.epoch} of {host.name}"
+        picture.restarts.append((writer, crashed_at_ns, self._world.now_ns))
+        found = {record.slot: record for record in recovered.slots if not record.volatile}
+        for slot in list(picture.chains):
+            record, before = found.get(slot), picture.now(slot)
+            name = (record.version, record.stamp_ns) if record else (0, 0)
+            durability = self._durabilities[slot.aspect]
+            if durability is Durability.DURABLE and name != before.name:
+                self._fail("I4 committed versions never regress", slot, name, before)
+            if durability is Durability.OS and name not in _names(picture.chains[slot]):
+                self._fail("I19 only declared losses", slot, name)
+            content = host.shard.state.slots[slot]
+            if (content.version, content.stamp_ns) != name:
+                self._fail("I15 recovery is exact", slot, content, name)
+            picture.put(slot, State(*name, writer, picture.epoch, content.datum))
+        picture.arrivals.clear()
+        picture.granted.clear()
+        picture.granted_ever.clear()
+        picture.notices = 0
+        longest_ns = max((record.ttl_ns for record in recovered.sessions), default=0)
+        picture.grace_end_ns = host.local_ns + longest_ns * 101 // 100
+        picture.grace_waits_for = {record.session: 0 for record in recovered.sessions}
+
+    # ---------------------------------------------------------------- one step of a shard
+
+    def handled(self, host: ShardHost, message: object, effects: list[object]) -> None:
+        """Judge one step: what came in, and what the shard decided."""
+        picture = self.pictures[host.name]
+        if isinstance(message, Hello) and message.known_epoch == picture.epoch:
+            picture.grace_waits_for.pop(message.session, None)
+        self._check_commits(host, effects, picture)
+        self._check_tenures(host, message, picture)
+        for effect in effects:
+            if isinstance(effect, Reply) and isinstance(effect.answer, Granted | Viewed):
+                self._check_snapshot(host, effect.answer, picture)
+
+    def _check_commits(self, host: ShardHost, effects: list[object], picture: Picture) -> None:
+        told = {
+            effect.answer.position.stamp_ns: effect.answer
+            for effect in effects
+            if isinstance(effect, Reply) and isinstance(effect.answer, Committed)
+        }
+        for effect in effects:
+            if isinstance(effect, Persist):
+                for record in effect.records:
+                    if isinstance(record, OutcomeRecord):
+                        picture.in_flight[record.lock] = effect
+            elif isinstance(effect, Publish):
+                assert isinstance(effect.notice, Notice)
+                picture.notices += 1
+                if effect.notice.number != picture.notices:
+                    self._fail("notices have no gap", effect.notice.number, picture.notices)
+                committed = told[effect.notice.changes[0].stamp_ns]
+                self._applied(host, committed, effect.notice, picture)
+
+    def _applied(
+        self, host: ShardHost, committed: Committed, notice: Notice, picture: Picture
+    ) -> None:
+        """A commit became visible."""
+        lock = committed.lock
+        persist = picture.in_flight.pop(lock, None)
+        self._check_on_disk(host, lock, persist, notice)
+        if picture.granted.get(lock) is None:
+            self._fail("the fence: only a holder commits", lock)
+        if [(c.slot, c.version) for c in notice.changes] != list(committed.versions):
+            self._fail("a notice tells what was committed", notice, committed)
+        versions = {change.slot: (change.version, change.stamp_ns) for change in notice.changes}
+        datum_of = {slot: host.shard.state.slots[slot].datum for slot in versions}
+        self._put_all(lock, versions, picture, datum_of)
+        picture.applied[lock] = persist
+        self._world.tally["commits"] += 1
+
+    def _check_on_disk(
+        self, host: ShardHost, lock: LockId, persist: Persist | None, notice: Notice
+    ) -> None:
+        strictest = {self._durabilities[change.slot.aspect] for change in notice.changes}
+        if strictest == {Durability.VOLATILE}:
+            return
+        kept = host.disk.synced if Durability.DURABLE in strictest else host.disk.written
+        log = host.disk.log
+        if persist is None or not any(log[i] is persist for i in range(kept - 1, -1, -1)):
+            self._fail("P5 on disk before it is told", lock, strictest)
+
+    def _apply(
+        self,
+        host: ShardHost,
+        lock: LockId,
+        persist: Persist,
+        picture: Picture,
+        *,
+        datum_of: dict[Slot, Datum | None],
+    ) -> None:
+        """A commit that was in flight at a crash turned out to be on disk."""
+        (outcome,) = (r for r in persist.records if isinstance(r, OutcomeRecord))
+        stamp_ns = outcome.position.stamp_ns
+        versions = {slot: (version, stamp_ns) for slot, version in outcome.versions}
+        self._put_all(lock, versions, picture, datum_of)
+        picture.applied[lock] = persist
+        self._world.tally["commits"] += 1
+
+    def _put_all(
+        self,
+        lock: LockId,
+        versions: dict[Slot, tuple[int, int]],
+        picture: Picture,
+        datum_of: dict[Slot, Datum | None],
+    ) -> None:
+        if any(lock in other.applied for other in self.pictures.values()):
+            self._fail("I16 one execution per lock", lock)
+        entry = self._history.entries.get(lock)
+        if entry is not None and entry.told in TOLD_NOT:
+            self._fail("I5 told not committed, then visible", lock, entry.told)
+        for slot, (version, stamp_ns) in versions.items():
+            before, datum = picture.now(slot), datum_of.get(slot)
+            if version != before.version + 1:
+                self._fail("I2 versions are a chain", slot, version, before)
+            if datum is not None:
+                self._check_content(lock, slot, before, datum)
+            picture.put(slot, State(version, stamp_ns, lock, picture.epoch, datum))
+
+    def _check_content(self, lock: LockId, slot: Slot, before: State, datum: Datum) -> None:
+        if writer_of(datum) != str(lock):
+            self._fail("a commit publishes its own data", slot, datum)
+        if slot.aspect == "made":
+            first = self.labels.setdefault((slot.context, label_of(datum)), slot)
+            if first != slot:
+                self._fail("no phantom: two created one thing", first, slot, label_of(datum))
+            return
+        old = 0 if before.datum is None else value_of(before.datum)
+        if value_of(datum) != old + 1:
+            self._fail("no lost update", slot, old, datum)
+
+    # ---------------------------------------------------------------- locks
+
+    def _check_tenures(self, host: ShardHost, message: object, picture: Picture) -> None:
+        tenures = host.shard.state.tenures.by_lock
+        for lock in [lock for lock in picture.arrivals if lock not in tenures]:
+            del picture.arrivals[lock]
+            picture.granted.pop(lock, None)
+        if isinstance(message, Acquire) and message.lock in tenures:
+            if message.lock not in picture.arrivals:
+                picture.grants += 1
+                picture.arrivals[message.lock] = picture.grants
+        for lock in picture.in_flight:
+            if lock not in picture.granted:
+                self._fail("I17 a commit in flight keeps its lock", lock)
+        fresh = [
+            tenure
+            for lock, tenure in tenures.items()
+            if tenure.token is not None and lock not in picture.granted
+        ]
+        for tenure in sorted(fresh, key=lambda tenure: tenure.token or Token(0, 0)):
+            self._check_grant(host, tenure, tenures, picture)
+
+    def _check_grant(
+        self, host: ShardHost, tenure: Tenure, tenures: dict[LockId, Tenure], picture: Picture
+    ) -> None:
+        lock, token = tenure.lock, tenure.token
+        assert token is not None
+        if not picture.newest_token < token or token.epoch != picture.epoch:
+            self._fail("I8 tokens grow", lock, token, picture.newest_token)
+        if lock in picture.granted_ever:
+            self._fail("I8 a seq is granted once", lock, token)
+        if picture.grace_waits_for and host.local_ns < picture.grace_end_ns:
+            self._fail("I11 no grant in the grace", lock, list(picture.grace_waits_for))
+        arrival = picture.arrivals[lock]
+        for other in tenures.values():
+            if other is tenure or not conflict(tenure.items, other.items):
+                continue
+            if other.lock in picture.granted:
+                self._fail("I1 no conflicting grants", lock, other.lock)
+            if other.token is None and picture.arrivals[other.lock] < arrival:
+                self._fail("I13 nobody is overtaken", other.lock, "by", lock)
+        picture.newest_token = token
+        picture.granted[lock] = picture.granted_ever[lock] = token
+
+    def _check_snapshot(self, host: ShardHost, answer: Granted | Viewed, picture: Picture) -> None:
+        """I18: an answer shows one committed moment, and all of it."""
+        for state in answer.states:
+            now = picture.now(state.slot)
+            if (state.version, state.stamp_ns) != now.name:
+                self._fail("I18 readers see what is committed", state.slot, state, now)
+            if (state.null_reason == "") != (now.datum is not None):
+                self._fail("null is null", state, now)
+        if isinstance(answer, Viewed):
+            return
+        shown = {state.slot for state in answer.states}
+        for item in host.shard.state.tenures.by_lock[answer.lock].items:
+            if Access(item.access).each:
+                for slot in self._not_shown(item, shown, picture):
+                    now = picture.now(slot)
+                    if now.datum is not None:
+                        self._fail("I18 a pattern shows all that match", item, slot)
+                    absent = self.absent.setdefault(answer.lock, {})
+                    absent[host.name, slot] = (picture.epoch, now.name)
+
+    @staticmethod
+    def _not_shown(item: Item, shown: set[Slot], picture: Picture) -> list[Slot]:
+        column = picture.columns.get((item.context, item.aspect), {})
+        return [s for s in column if s not in shown and pattern_matches(item.entity, s.entity)]
+
+    # ---------------------------------------------------------------- clients
+
+    def holds(self, host: ClientHost, entry: Entry) -> None:
+        """A thread has its lock."""
+        self._world.tally["locks held"] += 1
+        self.check_beliefs(host)
+
+    def check_beliefs(self, host: ClientHost) -> None:
+        """I7: whoever believes in a lock now is alone with it."""
+        entries = self._history.entries
+        mine = _believed(host)
+        if not mine:
+            return
+        for other in self.clients:
+            if not other.up:
+                continue
+            for theirs in _believed(other):
+                for lock in mine:
+                    if lock is not theirs and conflict(
+                        entries[lock.lock].items, entries[theirs.lock].items
+                    ):
+                        self._fail("I7 two believers", lock.lock, theirs.lock)
+
+    def datum_seen(self, reading: Reading, datum: Datum | None) -> None:
+        """A thread looks at a datum, from the grant, its cache or a fetch: is it the right one?"""
+        picture = self.pictures[reading.shard]
+        state = reading.state
+        for one in reversed(picture.chains.get(state.slot, ())):
+            if one.epoch == reading.epoch and one.name == (state.version, state.stamp_ns):
+                same = (one.datum is None) == (datum is None) and (
+                    datum is None or one.datum is None or bytes(datum.body) == bytes(one.datum.body)
+                )
+                if not same:
+                    self._fail("no stale datum is served", reading, one)
+                return
+        if (state.version, state.stamp_ns) != (0, 0) or datum is not None:
+            self._fail("what is read was committed", reading)
+
+    def told(self, host: ClientHost, entry: Entry) -> None:
+        """A thread was told how its lock ended: is it true?"""
+        self._world.tally[f"told: {entry.told.value if entry.told else '-'}"] += 1
+        applied = any(entry.id in picture.applied for picture in self.pictures.values())
+        if entry.told is Phase.REFUSED:
+            self._fail("nothing is refused", entry.id, entry.lock.refusal)
+        if entry.told is Phase.COMMITTED and entry.lock.versions and not applied:
+            self._fail("I5 told committed, not visible", entry.id)
+        if entry.told in TOLD_NOT and applied and not self._volatile(entry):
+            self._fail("I5 told not committed, but visible", entry.id, entry.told, entry.lock.cause)
+
+    def _volatile(self, entry: Entry) -> bool:
+        written = (item for item in entry.items if Access(item.access).writes)
+        return all(self._durabilities[item.aspect] is Durability.VOLATILE for item in written)
+
+
+def _believed(host: ClientHost) -> list[object]:
+    now_ns = host.local_ns
+    return [lock for lock in host.client.live_locks() if lock.valid(now_ns)]
+
+
+def _names(chain: list[State]) -> set[tuple[int, int]]:
+    return {state.name for state in chain} | {(0, 0)}
+
+
+def _recorded_data(persist: Persist) -> dict[Slot, Datum | None]:
+    return {r.slot: r.datum for r in persist.records if hasattr(r, "datum")}
+
+
+__all__ = ["Model", "Picture", "SlotState", "State"]

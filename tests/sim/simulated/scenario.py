@@ -1,0 +1,298 @@
+"""A whole run from one seed: a cell, its faults, its work, its judgement.
+
+::
+
+    0 s ───────── faults ────────── heal ── work goes on ── wind down ── quiet? ── judge
+"""
+
+from __future__ import annotations
+
+import traceback
+from dataclasses import dataclass, field
+from random import Random
+from typing import TYPE_CHECKING
+
+from enact_dist.core.messages import PlacementMap, ShardEntry
+from enact_dist.core.records import SessionSeen
+from enact_dist.core.shard_state import ShardSettings
+from simulated import faults as fault_options
+from simulated.client_host import ClientHost
+from simulated.graph import Graph
+from simulated.history import History
+from simulated.model import Model
+from simulated.network import Network
+from simulated.shard_host import ShardHost
+from simulated.workload import ASPECTS, CONTEXTS, Workload
+from simulated.world import MS, Host, S, SimulationError, World
+
+if TYPE_CHECKING:
+    from collections import Counter
+
+    from simulated.faults import Faults
+
+FAULTS_NS = 14 * S
+"""How long faults go on."""
+WORK_NS = 18 * S
+"""How long new locks are begun."""
+QUIET_NS = 30 * S
+"""How long after that everything must have come to rest."""
+POLL_NS = 500 * MS
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """What a run has shown.  `violation` is empty where every rule held."""
+
+    seed: int
+    violation: str
+    tally: Counter[str]
+    simulated_s: float
+    trace: str = field(default="", repr=False)
+
+
+class Scenario:
+    """One cell and its run."""
+
+    def __init__(
+        self, seed: int, *, faults: Faults | None = None, through_wire: bool = True
+    ) -> None:
+        self.seed = seed
+        random = Random(seed)
+        self.world = world = World(random)
+        count = random.choice((1, 1, 1, 2, 2, 3))
+        self.faults = fault_options.drawn(random, shards=count) if faults is None else faults
+        self.ttl_ns = random.choice((500 * MS, S, 2 * S))
+        self.history = History()
+        durabilities = {entry.name: entry.durability for entry in ASPECTS}
+        self.model = Model(world, self.history, durabilities)
+        self.network = Network(world, self.faults, through_wire=through_wire)
+        self.network.set_off = self._set_off
+        self.shards = self._made_shards(count)
+        self.workload = Workload(
+            world, self.history, self.model, entities=random.choice((2, 3, 4))
+        )
+        self._lanes = random.choice((1, 2, 3))
+        self._clients = random.choice((2, 3, 4))
+        self._named = 0
+
+    def _made_shards(self, count: int) -> dict[str, ShardHost]:
+        names = [f"s{index}" for index in range(count)]
+        placement = PlacementMap(1, tuple(ShardEntry(name, ()) for name in names), ())
+        shards = {}
+        for name in names:
+            settings = ShardSettings(name, placement, worlds=CONTEXTS)
+            host = shards[name] = ShardHost(
+                self.world,
+                settings,
+                self.faults,
+                wall_offset_ns=self.world.random.randrange(-200 * MS, 200 * MS),
+            )
+            host.model = self.model
+            host.tokens = self._tokens_seen
+            host.on_persist = self._on_persist
+        return shards
+
+    def _add_client(self) -> None:
+        self._named += 1
+        host = ClientHost(
+            self.world,
+            f"c{self._named}",
+            network=self.network,
+            shards=self.shards,
+            model=self.model,
+            faults=self.faults,
+            ttl_ns=self.ttl_ns,
+        )
+        self.model.clients.append(host)
+        self._show_token(host, present=True)
+
+        def work() -> None:
+            host.keep_alive()
+            for lane in range(self._lanes):
+                host.start(self.workload.thread(host, lane))
+
+        host.start(host.open(ASPECTS, work))
+
+    # ---------------------------------------------------------------- the run
+
+    def run(self) -> Result:
+        """Run to the end and judge."""
+        try:
+            self._run()
+            violation, trace = "", ""
+        except SimulationError as broken:
+            violation, trace = str(broken), ""
+        except Exception as failure:  # whatever the core raises is a finding too
+            violation = f"{type(failure).__name__} at {self.world.now_ns / 1e9:.6f} s: {failure}"
+            trace = traceback.format_exc()
+        return Result(
+            self.seed, violation, self.world.tally, self.world.now_ns / 1e9, trace
+        )
+
+    def _run(self) -> None:
+        for host in self.shards.values():
+            host.boot()
+        for _ in range(self._clients):
+            self._add_client()
+        self._plan_faults()
+        self.world.run_until(FAULTS_NS)
+        self._heal()
+        self.world.run_until(WORK_NS)
+        self.world.winding_down = True
+        while not self._quiet() and self.world.now_ns < WORK_NS + QUIET_NS:
+            self.world.run_until(self.world.now_ns + POLL_NS)
+        self._check_quiet()
+        for host in self.shards.values():
+            host.close()
+        cycle = Graph(self.history, self.model).cycle()
+        if cycle is not None:
+            self.world.violation("I6 strict serializability", *("\n  " + line for line in cycle))
+
+    def _quiet(self) -> bool:
+        busy = any(host.threads_left for host in self.model.clients if host.up)
+        locks = any(
+            host.shard.state.tenures.by_lock or host.unanswered for host in self.shards.values()
+        )
+        return not busy and not locks
+
+    def _check_quiet(self) -> None:
+        """I12: when faults have ended, everything comes to rest."""
+        for host in self.model.clients:
+            if host.up and (host.threads_left or host.client.live_locks()):
+                phases = [(str(lock.lock), lock.phase) for lock in host.client.live_locks()]
+                self.world.violation("I12 all threads end", host.name, host.threads_left, phases)
+        for host in self.shards.values():
+            left = host.shard.state.tenures.by_lock
+            if left or host.unanswered:
+                self.world.violation(
+                    "I12 nothing is left", host.name, list(left.values()), host.unanswered
+                )
+
+    # ---------------------------------------------------------------- faults in time
+
+    def _plan_faults(self) -> None:
+        faults, random = self.faults, self.world.random
+        for rate, act in (
+            (faults.crashes_per_s, self._crash_one),
+            (faults.kills_per_s, self._kill_one),
+            (faults.pauses_per_s, self._pause_one),
+            (faults.partitions_per_s, self._partition),
+            (faults.wall_jumps_per_s, self._jump),
+        ):
+            when_s = random.expovariate(rate) if rate else FAULTS_NS
+            while when_s < FAULTS_NS / 1e9:
+                self.world.after(int(when_s * 1e9), act)
+                when_s += random.expovariate(rate)
+
+    def _heal(self) -> None:
+        self.network.heal(fault_options.NONE)
+        for host in (*self.shards.values(), *self.model.clients):
+            if host.paused:
+                host.resume()
+        for host in self.model.clients:
+            self._show_token(host, present=host.up)
+
+    def _up_clients(self) -> list[ClientHost]:
+        return [host for host in self.model.clients if host.up]
+
+    def _crash_one(self) -> None:
+        self._crash(self.world.random.choice(list(self.shards.values())))
+
+    def _crash(self, host: ShardHost) -> None:
+        random = self.world.random
+        if self.world.now_ns < FAULTS_NS:
+            host.crash(
+                power_cut=random.random() < self.faults.power_cut,
+                down_ns=random.choice((20 * MS, 300 * MS, 2 * S)),
+            )
+
+    def _kill_one(self) -> None:
+        host = self.world.random.choice(self._up_clients())
+        self.world.tally["clients killed"] += 1
+        host.dies()
+        self._show_token(host, present=False)
+        self._add_client()
+
+    def _pause_one(self) -> None:
+        self._pause(self.world.random.choice([*self.shards.values(), *self._up_clients()]))
+
+    def _pause(self, host: Host) -> None:
+        random, world = self.world.random, self.world
+        duration_ns = random.choice((self.ttl_ns // 4, self.ttl_ns, 3 * self.ttl_ns))
+        world.tally["pauses"] += 1
+        host.pause(min(duration_ns, max(0, FAULTS_NS - world.now_ns)))
+        if isinstance(host, ClientHost) and random.random() >= self.faults.busy:
+            world.after(self.ttl_ns // 2, lambda: self._token_of(host))
+            world.after(duration_ns + 10 * MS, lambda: self._token_of(host))
+        elif isinstance(host, ClientHost):
+            world.tally["pauses with token"] += 1
+
+    def _partition(self) -> None:
+        random, world = self.world.random, self.world
+        client = random.choice(self._up_clients())
+        shards = random.sample(list(self.shards.values()), random.randint(1, len(self.shards)))
+        duration_ns = random.choice((500 * MS, 2 * S, 5 * S))
+        ways = random.choice(("out", "in", "both"))
+        world.tally[f"partitions: {ways}"] += 1
+        for shard in shards:
+            if ways != "in":
+                self.network.cut(client, shard, duration_ns=duration_ns)
+            if ways != "out":
+                self.network.cut(shard, client, duration_ns=duration_ns)
+        world.after(self.ttl_ns // 2, lambda: self._token_of(client))
+        world.after(duration_ns + 10 * MS, lambda: self._token_of(client))
+
+    def _jump(self) -> None:
+        random = self.world.random
+        host = random.choice(list(self.shards.values()))
+        jump_ns = int(self.faults.wall_jump_s * 1e9)
+        host.wall_offset_ns = random.randint(-jump_ns, jump_ns)
+        self.world.tally["wall clocks set"] += 1
+
+    # ---------------------------------------------------------------- faults by state
+
+    def _set_off(self, source: Host, target: Host) -> bool:
+        """Let something happen at a decisive message; return whether the message is lost."""
+        random, world = self.world.random, self.world
+        if world.now_ns >= FAULTS_NS:
+            return False
+        world.tally["faults set off"] += 1
+        kind = random.choice(("lose", "pause", "crash", "partition", "twice"))
+        host = random.choice((source, target))
+        if kind == "lose":
+            world.tally["lost"] += 1
+            return True
+        if kind == "pause":
+            self._pause(host)
+        elif kind == "crash":
+            shard = next(h for h in (source, target) if isinstance(h, ShardHost))
+            world.after(random.choice((0, MS // 2, MS, 3 * MS)), lambda: self._crash(shard))
+        elif kind == "partition":
+            self.network.cut(target, source, duration_ns=random.choice((300 * MS, self.ttl_ns)))
+        return False
+
+    def _on_persist(self, host: ShardHost) -> None:
+        random = self.world.random
+        if self.faults.triggered and random.random() < self.faults.triggered / 2:
+            self.world.after(random.randrange(6 * MS), lambda: self._crash(host))
+
+    # ---------------------------------------------------------------- liveliness tokens
+
+    def _visible(self, host: ClientHost, shard: ShardHost) -> bool:
+        return host.up and not host.paused and not self.network.is_cut(host, shard)
+
+    def _tokens_seen(self, shard: ShardHost) -> list[str]:
+        return [h.client.session for h in self.model.clients if self._visible(h, shard)]
+
+    def _token_of(self, host: ClientHost) -> None:
+        """Let every shard notice whether the client's liveliness token is there."""
+        for shard in self.shards.values():
+            seen = SessionSeen(host.client.session, self._visible(host, shard))
+            shard.receive(lambda shard=shard, seen=seen: shard.event(seen))
+
+    def _show_token(self, host: ClientHost, *, present: bool) -> None:
+        seen = SessionSeen(host.client.session, present)
+        for shard in self.shards.values():
+            self.world.after(
+                10 * MS, lambda shard=shard: shard.receive(lambda: shard.event(seen))
+            )

@@ -1,0 +1,130 @@
+"""The process around one real `Shard`: carries out its effects, ticks it, dies and comes back."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from enact_dist.core.messages import Answer, Refused, Request
+from enact_dist.core.records import Persist, Persisted, Reply, SessionSeen, Tick
+from enact_dist.core.shard import Shard
+from simulated.disk import Disk
+from simulated.world import MS, Host, S
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from enact_dist.core.records import Event
+    from enact_dist.core.shard_state import ShardSettings
+    from simulated.faults import Faults
+    from simulated.model import Model
+    from simulated.world import World
+
+
+class ShardHost(Host):
+    """A shard daemon."""
+
+    def __init__(
+        self, world: World, settings: ShardSettings, faults: Faults, *, wall_offset_ns: int
+    ) -> None:
+        super().__init__(
+            world, settings.name, drift_ppm=faults.drift_ppm, wall_offset_ns=wall_offset_ns
+        )
+        self.settings = settings
+        self.faults = faults
+        self.disk = Disk(world, faults)
+        self.model: Model
+        self.shard: Shard
+        self.tokens: Callable[[ShardHost], list[str]] = lambda _host: []
+        self.on_persist: Callable[[ShardHost], None] = lambda _host: None
+        self._replies: dict[int, Callable[[Answer], None]] = {}
+        self._handle = 0
+        self._tick_due_ns = 0
+        self._crashed_at_ns = 0
+
+    # ---------------------------------------------------------------- life
+
+    def boot(self) -> None:
+        """Start with what the disk has kept."""
+        self.up = True
+        self.clock = self.new_clock()
+        recovered = self.disk.recovered(unix_s=self.wall_ns // S)
+        self._replies.clear()
+        self.shard = Shard(
+            self.settings, recovered, now_ns=self.local_ns, wall_ns=self.wall_ns
+        )
+        self.model.booted(self, recovered, crashed_at_ns=self._crashed_at_ns)
+        self._tick_due_ns = 0
+        self._plan_tick()
+        for session in self.tokens(self):
+            self.later(10 * MS, lambda session=session: self.event(SessionSeen(session, True)))
+        if self.shard.epoch != 1:
+            self.world.tally["epoch changes"] += 1
+
+    def crash(self, *, power_cut: bool, down_ns: int) -> None:
+        """Die now and come back after a while."""
+        if not self.up:
+            return
+        self.world.tally["power cuts" if power_cut else "crashes"] += 1
+        self.end_life()
+        self._crashed_at_ns = self.world.now_ns
+        self._tally_counters()
+        lost = self.disk.crash(power_cut=power_cut)
+        self.model.crashed(self, lost, power_cut=power_cut)
+        self.world.after(down_ns, self.boot)
+
+    def _tally_counters(self) -> None:
+        for name, count in self.shard.counters.items():
+            self.world.tally[f"shard: {name}"] += count
+
+    def close(self) -> None:
+        """Add this shard's own statistics to those of the run."""
+        self._tally_counters()
+
+    # ---------------------------------------------------------------- messages in, effects out
+
+    def request(self, message: Request, reply: Callable[[Answer], None]) -> None:
+        """Hand a request to the shard; exactly one answer must come, now or later."""
+        self._handle += 1
+        self._replies[self._handle] = reply
+        self._give(message, self._handle)
+
+    def event(self, event: Event) -> None:
+        """Hand an event of this host to the shard."""
+        self._give(event, 0)
+
+    def _give(self, message: Request | Event, handle: int) -> None:
+        now_ns, wall_ns = self.local_ns, self.wall_ns
+        effects = self.shard.handle(message, reply_to=handle, now_ns=now_ns, wall_ns=wall_ns)
+        self.shard.assert_invariants()
+        self.model.handled(self, message, effects)
+        for effect in effects:
+            if isinstance(effect, Reply):
+                reply = self._replies.pop(effect.reply_to, None)
+                if reply is None:
+                    self.world.violation("one answer per request", self.name, effect.answer)
+                    return
+                if isinstance(effect.answer, Refused):
+                    self.world.tally[f"refused: {effect.answer.code}"] += 1
+                reply(effect.answer)
+            elif isinstance(effect, Persist):
+                self.disk.submit(self, effect, lambda ticket: self.event(Persisted(ticket)))
+                self.on_persist(self)
+        self._plan_tick()
+
+    def _plan_tick(self) -> None:
+        now_ns = self.local_ns
+        due_ns = max(self.shard.next_deadline_ns(), now_ns + MS)
+        if self._tick_due_ns > now_ns and self._tick_due_ns <= due_ns:
+            return
+        self._tick_due_ns = due_ns
+        self.later(due_ns - now_ns, lambda: self._tick(due_ns))
+
+    def _tick(self, due_ns: int) -> None:
+        if due_ns == self._tick_due_ns:
+            self._tick_due_ns = 0
+            self.event(Tick())
+
+    @property
+    def unanswered(self) -> int:
+        """How many requests have had no answer yet."""
+        return len(self._replies)

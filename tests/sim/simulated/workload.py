@@ -1,0 +1,298 @@
+"""What the simulated threads do: small locks of every kind on few slots, so that they collide.
+
+Every write sets a slot to one more than was read under the same lock, and names its lock in the
+body; every creation looks for its label first.  So a lost update or a phantom shows at once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from enact_dist.core.datum import Datum, Slot
+from enact_dist.core.messages import (
+    AspectEntry,
+    Fetch,
+    Gone,
+    Item,
+    Slice,
+    SlotVersion,
+    WriteItem,
+)
+from enact_dist.core.multilock import MultiLock, Phase, Reading
+from enact_dist.core.placement import shard_of
+from enact_dist.terms import Access
+from simulated.client_host import Calls, ClientHost, Sleep, Thread
+from simulated.history import Entry, History
+from simulated.world import MS, S
+
+if TYPE_CHECKING:
+    from random import Random
+
+    from simulated.model import Model
+    from simulated.world import World
+
+CONTEXTS = ("training", "online")
+ASPECTS = (
+    AspectEntry("count", "int", "durable"),
+    AspectEntry("note", "int", "os"),
+    AspectEntry("frame", "int", "volatile"),
+    AspectEntry("made", "str", "durable"),
+)
+PLAIN = ("count", "note", "frame")
+ENTITIES = ("piece", "bench", "tray/1", "tray/2")
+LABELS = 40
+"""Things that creators look for, and create when nobody has: about as many as there are looks."""
+LARGE = 64 * 1024 + 1
+"""Bytes of a datum that does not travel with the grant."""
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """One thing that a thread does under one lock."""
+
+    kind: str
+    items: tuple[Item, ...]
+    wait_ns: int
+    hold_ns: int
+    work_ns: int
+    abandons: bool
+    expects: bool
+    label: str = ""
+
+
+class Workload:
+    """Draws jobs and does them."""
+
+    def __init__(self, world: World, history: History, model: Model, *, entities: int) -> None:
+        self._world, self._history, self._model = world, history, model
+        self._entities = ENTITIES[:entities]
+
+    # ---------------------------------------------------------------- drawing
+
+    def job(self) -> Job:
+        """Draw a job."""
+        random = self._world.random
+        kind = random.choices(
+            ("increment", "derive", "read", "view", "read each", "write each", "create"),
+            (30, 20, 12, 10, 8, 6, 14),
+        )[0]
+        items = getattr(self, "_" + kind.replace(" ", "_"))(random)
+        hold_ns = random.choice((60 * S, 60 * S, 60 * S, 300 * MS))
+        return Job(
+            kind,
+            items,
+            wait_ns=random.choice((0, 200 * MS, 2 * S, 8 * S)),
+            hold_ns=hold_ns,
+            work_ns=random.choice((0, 0, 2 * MS, 20 * MS, 100 * MS, 500 * MS)),
+            abandons=random.random() < 0.08,
+            expects=any(item.access == Access.VIEW for item in items) and random.random() < 0.7,
+            label=f"package-{random.randrange(LABELS)}",
+        )
+
+    def _slot(self, random: Random) -> tuple[str, str, str]:
+        return random.choice(CONTEXTS), random.choice(self._entities), random.choice(PLAIN)
+
+    def _increment(self, random: Random) -> tuple[Item, ...]:
+        return self._written(random, random.choice((1, 1, 2, 3)))
+
+    def _written(self, random: Random, count: int) -> tuple[Item, ...]:
+        """Writes stay on one shard: one entity."""
+        entity = random.choice(self._entities)
+        slots = {(random.choice(CONTEXTS), entity, random.choice(PLAIN)): None for _ in range(count)}
+        return tuple(Item(Access.WRITE, *slot) for slot in slots)
+
+    def _besides(self, random: Random, items: tuple[Item, ...], access: Access) -> tuple[Item, ...]:
+        named = {item[1:4] for item in items}
+        slots = {self._slot(random): None for _ in range(random.choice((1, 1, 2)))}
+        return tuple(Item(access, *slot) for slot in slots if slot not in named)
+
+    def _derive(self, random: Random) -> tuple[Item, ...]:
+        items = self._written(random, 1)
+        items += self._besides(random, items, Access.READ)
+        return items + self._besides(random, items, Access.VIEW)
+
+    def _read(self, random: Random) -> tuple[Item, ...]:
+        return self._besides(random, (), Access.READ)
+
+    def _view(self, random: Random) -> tuple[Item, ...]:
+        views = self._besides(random, (), Access.VIEW)
+        return views + self._besides(random, views, Access.READ) if random.random() < 0.5 else views
+
+    def _read_each(self, random: Random) -> tuple[Item, ...]:
+        pattern, aspect = random.choice((("made/*", "made"), ("tray/*", "count"), ("**", "frame")))
+        each = Item(Access.READ_EACH, random.choice(CONTEXTS), pattern, aspect)
+        # What is written may lie in the column that is read (mode SIX of the lock table).
+        return (each, *self._written(random, random.choice((0, 1))))
+
+    def _write_each(self, random: Random) -> tuple[Item, ...]:
+        pattern, aspect = random.choice((("tray/*", "count"), ("**", "note")))
+        return (Item(Access.WRITE_EACH, random.choice(CONTEXTS), pattern, aspect),)
+
+    def _create(self, random: Random) -> tuple[Item, ...]:
+        return (Item(Access.WRITE_EACH, random.choice(CONTEXTS), "made/*", "made"),)
+
+    # ---------------------------------------------------------------- doing
+
+    def thread(self, host: ClientHost, lane: int) -> Thread:
+        """Do one job after the other until the run winds down."""
+        random = self._world.random
+        while not self._world.winding_down:
+            yield Sleep(random.choice((0, 5 * MS, 50 * MS, 300 * MS)))
+            yield from self._do(host, lane, self.job())
+
+    def _do(self, host: ClientHost, lane: int, job: Job) -> Thread:
+        client = host.client
+        items = tuple(self._with_known(host, item) for item in job.items)
+        lock = client.begin(
+            lane,
+            client.plan(items),
+            now_ns=host.local_ns,
+            wait_ns=job.wait_ns,
+            hold_ns=job.hold_ns,
+        )
+        entry = Entry(lock, items, job.kind, self._world.now_ns)
+        self._history.begin(entry)
+        yield from host.drive(lock)
+        if lock.phase is Phase.HELD:
+            self._model.holds(host, entry)
+            data = yield from self._data(host, lock)
+            if lock.phase is Phase.HELD and job.work_ns:
+                yield Sleep(job.work_ns)
+            if data is None or job.abandons:
+                lock.release()
+            elif lock.phase is Phase.HELD:
+                self._finish(host, entry, job, data)
+            yield from host.drive(lock)
+        self._history.end(entry, now_ns=self._world.now_ns)
+        self._model.told(host, entry)
+
+    @staticmethod
+    def _with_known(host: ClientHost, item: Item) -> Item:
+        """Say which version the client still has, as `link.fetching` does."""
+        slot = Slot(item.context, item.entity, item.aspect)
+        known = host.cache.get(slot)
+        if known is None or Access(item.access).each:
+            return item
+        shard, epoch, version, _ = known
+        current = host.client.epoch(shard) == epoch
+        return item._replace(known=version) if current else item
+
+    # ---------------------------------------------------------------- reading
+
+    def _data(self, host: ClientHost, lock: MultiLock) -> Thread:
+        """Return the datum of each slot read, fetching what did not come with the grant."""
+        data: dict[Slot, Datum | None] = {}
+        for reading in lock.states:
+            state = reading.state
+            datum = state.datum
+            known = host.cache.get(state.slot)
+            if state.same or state.large:
+                here = (reading.shard, reading.epoch, state.version)
+                if known is not None and known[:3] == here:
+                    datum = known[3]
+                    self._world.tally["data reused"] += 1
+                else:
+                    datum = yield from self._fetched(host, lock, reading)
+                    if datum is None:
+                        return None
+            self._model.datum_seen(reading, datum)
+            data[state.slot] = datum
+            if datum is not None:
+                host.cache[state.slot] = (reading.shard, reading.epoch, state.version, datum)
+        return data
+
+    def _fetched(self, host: ClientHost, lock: MultiLock, reading: Reading) -> Thread:
+        state = reading.state
+        request = Fetch(lock.lock, reading.epoch, state.slot, state.version, 0, 1 << 20)
+        for _ in range(5):
+            (answer,) = yield Calls([(reading.shard, request)])
+            if isinstance(answer, Slice):
+                self._world.tally["data fetched"] += 1
+                return replace(
+                    answer.body, encoding=answer.encoding, stamp_ns=answer.stamp_ns
+                )
+            if isinstance(answer, Gone) and lock.valid(host.local_ns) and lock.parts:
+                self._world.violation("what a held lock names stays fetchable", lock.lock, state)
+            if answer is not None:
+                return None
+        return None
+
+    # ---------------------------------------------------------------- writing
+
+    def _finish(
+        self, host: ClientHost, entry: Entry, job: Job, data: dict[Slot, Datum | None]
+    ) -> None:
+        lock = entry.lock
+        slots = self._slots_to_write(host, job, data)
+        writes = [WriteItem(slot, self._datum(lock, job, slot, data)) for slot in slots]
+        shard = shard_of(slots[0].entity, host.client.placement) if slots else ""
+        expects: list[SlotVersion] = []
+        if job.expects and writes:
+            expects = [
+                SlotVersion(reading.state.slot, reading.state.version)
+                for reading in lock.states
+                if reading.shard == shard
+            ]
+            entry.expects = len(expects) == len(lock.states)
+        finish_s = self._world.random.choice((10, 10, 3))
+        lock.finish(
+            {shard: writes} if writes else {},
+            give_up_ns=host.local_ns + finish_s * S,
+            expects=expects,
+        )
+
+    def _slots_to_write(
+        self, host: ClientHost, job: Job, data: dict[Slot, Datum | None]
+    ) -> list[Slot]:
+        if job.kind == "create":
+            if any(datum is not None and label_of(datum) == job.label for datum in data.values()):
+                self._world.tally["labels found"] += 1
+                return []
+            name = f"made/{self._world.random.getrandbits(64):016x}"
+            return [Slot(job.items[0].context, name, "made")]
+        if job.kind == "write each":
+            item = job.items[0]
+            slots = [Slot(item.context, found.entity, item.aspect) for found in data]
+            shards = {shard_of(slot.entity, host.client.placement): None for slot in slots}
+            first = next(iter(shards), "")
+            return [s for s in slots if shard_of(s.entity, host.client.placement) == first]
+        return [
+            Slot(item.context, item.entity, item.aspect)
+            for item in job.items
+            if item.access == Access.WRITE
+        ]
+
+    def _datum(
+        self, lock: MultiLock, job: Job, slot: Slot, data: dict[Slot, Datum | None]
+    ) -> Datum | None:
+        random = self._world.random
+        if job.kind == "create":
+            return datum_of(f"{lock.lock}|{job.label}")
+        if job.kind == "increment" and random.random() < 0.05:
+            return None
+        old = data.get(slot)
+        value = 1 if old is None else value_of(old) + 1
+        large = slot.aspect == "frame" and random.random() < 0.1
+        return datum_of(f"{lock.lock}|{value}", size=LARGE if large else 0)
+
+
+def datum_of(text: str, *, size: int = 0) -> Datum:
+    """Return a datum that says who wrote it and what."""
+    body = text.encode().ljust(size, b".")
+    return Datum(b"text", body, len(body))
+
+
+def writer_of(datum: Datum) -> str:
+    """Return the lock that wrote a datum."""
+    return bytes(datum.body[:200]).decode().partition("|")[0]
+
+
+def value_of(datum: Datum) -> int:
+    """Return the number in a datum."""
+    return int(bytes(datum.body[:200]).decode().rstrip(".").partition("|")[2])
+
+
+def label_of(datum: Datum) -> str:
+    """Return the label in a datum."""
+    return bytes(datum.body[:200]).decode().rstrip(".").partition("|")[2]
