@@ -131,8 +131,9 @@ def check_actors(
 def check_cell(config: CellConfig, *, initial: Collection[str] = ()) -> tuple[Finding, ...]:
     """Check all actors that a `cell.toml` configures: that they load, and `check_actors`.
 
-    No actor is made; only its module is imported.  The file's list of aspects names those whose
-    durability differs, so an aspect that it does not list is no finding.
+    No actor is made; only its module is imported.  An actor without `worlds` in the file has each
+    role bound to the world context of its name, as running it does.  The file's list of aspects
+    names those whose durability differs, so an aspect that it does not list is no finding.
 
     Args:
         config: The cell.
@@ -143,7 +144,7 @@ def check_cell(config: CellConfig, *, initial: Collection[str] = ()) -> tuple[Fi
     for actor in config.actors:
         try:
             actor_class = load_class(actor.class_path)
-            actors.append(ActorDeclaration(actor.name, actor_class, actor.worlds))
+            actors.append(ActorDeclaration(actor.name, actor_class, actor.worlds or None))
             read_options(actor_class, actor.options)
             if actor.every_s is not None:
                 check_every_s(actor_class, actor.every_s)

@@ -195,7 +195,6 @@ worlds = { online = "online" }
 
 [actors.maker]
 class = "sample_cell:Reconstruction"
-worlds = { online = "online" }
 """
 
 
