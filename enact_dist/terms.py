@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
 T = TypeVar("T")
+T_co = TypeVar("T_co", covariant=True)
+"""Type of the datum that a request names; what only reads may promise less than it holds."""
 
 NAME_LENGTH_MAX: Final = 200
 """Longest name of an entity, aspect or world context; keeps every key of the wire below 1 kB."""
@@ -299,7 +301,7 @@ class World(Context):
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class LockRequest(Generic[T]):
+class LockRequest(Generic[T_co]):
     """One line of a lock: which datum, and what for.  Use its subclasses.
 
     Args:
@@ -313,7 +315,7 @@ class LockRequest(Generic[T]):
 
     world: Context
     entity: Entity | Entities
-    aspect: Aspect[T]
+    aspect: Aspect[T_co]
     access: ClassVar[Access]
 
     def __post_init__(self) -> None:
@@ -343,13 +345,13 @@ class LockRequest(Generic[T]):
         return f"{type(self).__name__}({'/'.join(self.address[:2])} {self.address[2]})"
 
 
-class LockRequestOne(LockRequest[T]):
+class LockRequestOne(LockRequest[T_co]):
     """A lock request for the datum of one entity."""
 
     __slots__ = ()
 
 
-class Read(LockRequestOne[T]):
+class Read(LockRequestOne[T_co]):
     """Shared lock on one datum, held until the block ends."""
 
     __slots__ = ()
@@ -363,31 +365,31 @@ class Write(LockRequestOne[T]):
     access = Access.WRITE
 
 
-class View(LockRequestOne[T]):
+class View(LockRequestOne[T_co]):
     """The newest committed datum as of the grant, without holding any lock."""
 
     __slots__ = ()
     access = Access.VIEW
 
 
-class LockRequestEach(LockRequest[T]):
+class LockRequestEach(LockRequest[T_co]):
     """A lock request over all entities of a pattern; the matching set is part of it."""
 
     __slots__ = ()
 
     if TYPE_CHECKING:
 
-        def __init__(self, world: Context, entity: Entities, aspect: Aspect[T]) -> None: ...
+        def __init__(self, world: Context, entity: Entities, aspect: Aspect[T_co]) -> None: ...
 
 
-class ReadEach(LockRequestEach[T]):
+class ReadEach(LockRequestEach[T_co]):
     """Shared lock on an aspect of all matching entities, those yet to come included."""
 
     __slots__ = ()
     access = Access.READ_EACH
 
 
-class ViewEach(LockRequestEach[T]):
+class ViewEach(LockRequestEach[T_co]):
     """The newest committed data of all matching entities, without holding any lock."""
 
     __slots__ = ()
