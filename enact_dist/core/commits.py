@@ -150,11 +150,11 @@ class Commits:
             yield Reply(reply_to, refusal)
             return
         assert tenure is not None
-        moved = next((e for e in message.expects if self._slots[e.slot].version != e.version), None)
+        moved = next((e for e in message.expects if self._newest_version(e.slot) != e.version), None)
         if moved is not None:
             self._count("commits_changed")
             yield from self._tenures.remove(tenure, now_ns=now_ns)
-            found = self._slots[moved.slot].version
+            found = self._newest_version(moved.slot)
             yield Reply(reply_to, Changed(message.lock, moved.slot, found))
             return
         stamp_ns = self._stamps.next(seen_ns=message.seen_stamp_ns, wall_ns=wall_ns)
@@ -168,6 +168,17 @@ class Commits:
         )
         commit = _InFlight(tenure, message.writes, outcome, [reply_to])
         yield from self._make_durable(commit, now_ns=now_ns)
+
+    def _newest_version(self, slot: Slot) -> int:
+        """Return the version of a slot, one in flight included: it comes before us in the log.
+
+        Otherwise two locks that each expect what the other writes could both commit.
+        """
+        for commit in self._in_flight.values():
+            for written, version in commit.outcome.versions:
+                if written == slot:
+                    return version
+        return self._slots[slot].version
 
     def _make_durable(self, commit: _InFlight, *, now_ns: int) -> Iterator[Effect]:
         """Hand the commit to the store, or apply it at once where nothing is to survive."""

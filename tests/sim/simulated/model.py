@@ -94,6 +94,7 @@ class Model:
         self.absent: dict[LockId, dict[tuple[str, Slot], tuple[int, tuple[int, int]]]] = {}
         self.labels: dict[tuple[str, str], Slot] = {}
         self.permitted_losses: dict[LockId, None] = {}
+        self.clocks_were_set = False
 
     def _fail(self, rule: str, *facts: object) -> None:
         self._world.violation(rule, *facts)
@@ -367,16 +368,21 @@ class Model:
         """A thread was told how its lock ended: is it true?"""
         self._world.tally[f"told: {entry.told.value if entry.told else '-'}"] += 1
         applied = any(entry.id in picture.applied for picture in self.pictures.values())
-        if entry.told is Phase.REFUSED:
-            self._fail("nothing is refused", entry.id, entry.lock.refusal)
+        refusal = entry.lock.refusal
+        if refusal is not None and not (self.clocks_were_set and refusal.code == "clock_skew"):
+            self._fail("nothing is refused", entry.id, refusal)
         if entry.told is Phase.COMMITTED and entry.lock.versions and not applied:
             self._fail("I5 told committed, not visible", entry.id)
-        if entry.told in TOLD_NOT and applied and not self._volatile(entry):
+        if entry.told in TOLD_NOT and applied and not self._may_be_gone(entry):
             self._fail("I5 told not committed, but visible", entry.id, entry.told, entry.lock.cause)
 
-    def _volatile(self, entry: Entry) -> bool:
+    def _may_be_gone(self, entry: Entry) -> bool:
+        """Whether a restart may have undone the lock's writes: volatile, or `os` and power cut."""
         written = (item for item in entry.items if Access(item.access).writes)
-        return all(self._durabilities[item.aspect] is Durability.VOLATILE for item in written)
+        volatile = all(
+            self._durabilities[item.aspect] is Durability.VOLATILE for item in written
+        )
+        return volatile or entry.id in self.permitted_losses
 
 
 def _believed(host: ClientHost) -> list[object]:

@@ -247,6 +247,7 @@ class Scenario:
         host = random.choice(list(self.shards.values()))
         jump_ns = int(self.faults.wall_jump_s * 1e9)
         host.wall_offset_ns = random.randint(-jump_ns, jump_ns)
+        self.model.clocks_were_set = True
         self.world.tally["wall clocks set"] += 1
 
     # ---------------------------------------------------------------- faults by state
