@@ -1,0 +1,151 @@
+"""One process per data folder: the exclusive lock, and the folder's format version.
+
+The lock is the kernel's (`flock`), so it ends with its process, `kill -9` included; what the file
+says about its holder is for people.  The format is checked under the lock and before anything
+else in the folder is opened: a folder of a newer version is left exactly as it is.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import os
+import socket
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.errors import StoreError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+LOCK_FILE: Final = "lock"
+FORMAT_FILE: Final = "format"
+FORMAT: Final = 1
+"""Version of everything below a data folder; goes up when an older program could misread it."""
+
+_FORMAT_WORDS: Final = "enact-dist store"
+_LOCK_BYTES_MAX: Final = 512
+
+
+class FolderLock:
+    """The exclusive lock on a data folder, held from construction to `close`.
+
+    Args:
+        folder: An existing folder.
+
+    Raises:
+        StoreError: Somebody else holds it, or the lock file cannot be made.
+    """
+
+    __slots__ = ("_descriptor",)
+
+    def __init__(self, folder: Path) -> None:
+        path = folder / LOCK_FILE
+        try:
+            self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        except OSError as failure:
+            raise StoreError(
+                f"cannot open {path}: {failure.strerror}; the data folder must belong to the user"
+                " that runs the shard, on a file system that is mounted for writing",
+                path=str(path),
+            ) from failure
+        try:
+            self._take(folder)
+        except BaseException:
+            os.close(self._descriptor)
+            raise
+
+    def _take(self, folder: Path) -> None:
+        try:
+            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as failure:
+            if failure.errno not in {errno.EWOULDBLOCK, errno.EACCES}:
+                raise StoreError(
+                    f"cannot lock {folder}: {failure.strerror}; use a folder on a local disk",
+                    path=str(folder),
+                ) from failure
+            raise StoreError(
+                f"data folder {folder} is in use by {self._holder()}; a folder serves one shard"
+                " process at a time: stop that one first, or give this shard a folder of its own",
+                path=str(folder),
+            ) from failure
+        os.ftruncate(self._descriptor, 0)
+        os.pwrite(self._descriptor, f"{os.getpid()} {socket.gethostname()}\n".encode(), 0)
+
+    def _holder(self) -> str:
+        words = os.pread(self._descriptor, _LOCK_BYTES_MAX, 0).decode(errors="replace").split()
+        if len(words) != 2:
+            return "another process"
+        pid, host = words
+        return f"process {pid} on host {host}" + (" (this one)" if pid == str(os.getpid()) else "")
+
+    def close(self) -> None:
+        """Let the folder go; twice is harmless."""
+        if self._descriptor >= 0:
+            os.close(self._descriptor)
+            self._descriptor = -1
+
+
+def sync_folder(folder: Path) -> None:
+    """Make the entries of `folder` durable: names made, renamed and unlinked so far.
+
+    Raises:
+        OSError: As the system reports it.
+    """
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def replace_file(path: Path, content: bytes) -> None:
+    """Put `content` in place of the file at `path`, durably, whole or not at all.
+
+    Raises:
+        OSError: As the system reports it; the file before stands then.
+    """
+    draft = path.with_name(path.name + ".tmp")
+    descriptor = os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
+    try:
+        os.write(descriptor, content)
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+    draft.rename(path)
+    sync_folder(path.parent)
+
+
+def check_format(folder: Path, *, is_new: bool) -> None:
+    """Refuse a folder of another format; mark a new one with ours.
+
+    Args:
+        folder: The data folder, locked.
+        is_new: Whether nothing was ever stored in it.
+
+    Raises:
+        StoreError: The format is newer, unreadable, or missing in a folder with data.
+        OSError: The mark cannot be written.
+    """
+    path = folder / FORMAT_FILE
+    text = None
+    with contextlib.suppress(FileNotFoundError):
+        text = path.read_text(encoding="ascii", errors="replace").strip()
+    if text is None and is_new:
+        replace_file(path, f"{_FORMAT_WORDS} {FORMAT}\n".encode())
+        return
+    words, _, version = (text or "").rpartition(" ")
+    if words != _FORMAT_WORDS or not version.isdecimal():
+        raise StoreError(
+            f"{path} says {text!r} where '{_FORMAT_WORDS} {FORMAT}' was expected: {folder} is no"
+            " data folder of a shard, or the file is damaged; restore the folder from a backup, or"
+            " give the shard an empty folder",
+            path=str(path),
+        )
+    if int(version) > FORMAT:
+        raise StoreError(
+            f"{folder} has store format {version}, this program reads up to {FORMAT}: it was"
+            " written by a newer enact-dist; install that one again, nothing was changed",
+            path=str(path),
+        )

@@ -1,0 +1,135 @@
+"""The rows of one store in SQLite: one table, one writer, a write-ahead log forced out on demand.
+
+Rules that a change must keep:
+
+- Never `synchronous=OFF`: it would let a checkpoint overwrite the database before the log is on
+  the disk.  `NORMAL` forces nothing out at a commit and everything at a checkpoint.
+- Checkpoints run only here, where their errors are seen; SQLite's automatic one hides them.
+- Locking is `EXCLUSIVE`, so the index of the log lives in memory and no other process writes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import sqlite3
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+    from pathlib import Path
+
+_PRAGMAS: Final = (
+    "locking_mode=EXCLUSIVE",
+    "journal_mode=WAL",
+    "synchronous=FULL",
+    "wal_autocheckpoint=0",
+    "secure_delete=OFF",
+    "cell_size_check=ON",
+    "trusted_schema=OFF",
+    "cache_size=-16384",  # KiB
+)
+_TABLE: Final = """
+CREATE TABLE IF NOT EXISTS record (
+    id INTEGER PRIMARY KEY, kind INTEGER NOT NULL, batch INTEGER NOT NULL,
+    key BLOB NOT NULL, body BLOB NOT NULL, crc INTEGER NOT NULL
+)
+"""
+_CORRUPT: Final = frozenset({sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB, sqlite3.SQLITE_FORMAT})
+
+
+class DatabaseRow(NamedTuple):
+    """One row as it is stored; `batch` is the number of the batch that wrote it."""
+
+    id: int
+    kind: int
+    batch: int
+    key: bytes
+    body: bytes
+    crc: int
+
+
+class Database:
+    """An open database of rows.  Used by one thread at a time.
+
+    Args:
+        path: The database file; made if it does not exist.
+
+    Raises:
+        sqlite3.Error: In every method, as SQLite reports it; `is_damage` tells damage from
+            errors of the system.
+    """
+
+    __slots__ = ("_connection", "_forced")
+
+    def __init__(self, path: Path) -> None:
+        self._connection = sqlite3.connect(
+            path, isolation_level=None, check_same_thread=False, timeout=0.0
+        )
+        self._forced = True
+        try:
+            for pragma in _PRAGMAS:
+                self._connection.execute(f"PRAGMA {pragma}").fetchall()
+        except BaseException:
+            self._connection.close()
+            raise
+
+    def problems(self) -> list[str]:
+        """Return what SQLite's own check finds wrong with the file's structure."""
+        rows = self._connection.execute("PRAGMA quick_check(5)").fetchall()
+        found = [str(problem) for (problem,) in rows]
+        return [] if found == ["ok"] else found
+
+    def make_table(self) -> None:
+        """Make the table of an empty database."""
+        self._connection.execute(_TABLE)
+
+    def rows(self) -> Iterator[DatabaseRow]:
+        """Yield all rows, oldest identity first."""
+        cursor = self._connection.execute(
+            "SELECT id, kind, batch, key, body, crc FROM record ORDER BY id"
+        )
+        yield from map(DatabaseRow._make, cursor)
+
+    def commit(self, rows: Iterable[DatabaseRow], gone: Iterable[int], *, forced: bool) -> None:
+        """Put `rows` and remove those with an id in `gone`, all or nothing.
+
+        With `forced` everything committed so far is on the disk when this returns.
+        """
+        if forced != self._forced:
+            self._connection.execute(f"PRAGMA synchronous={'FULL' if forced else 'NORMAL'}")
+            self._forced = forced
+        self._connection.execute("BEGIN IMMEDIATE")
+        try:
+            self._connection.executemany(
+                "DELETE FROM record WHERE id = ?", ((row_id,) for row_id in gone)
+            )
+            self._connection.executemany(
+                "INSERT OR REPLACE INTO record VALUES (?, ?, ?, ?, ?, ?)", rows
+            )
+            self._connection.execute("COMMIT")
+        except BaseException:
+            with contextlib.suppress(sqlite3.Error):
+                self._connection.execute("ROLLBACK")
+            raise
+
+    def checkpoint(self, *, cut: bool = False) -> None:
+        """Force the log out, carry it into the database, and start it anew.
+
+        The log keeps its length, so that later commits overwrite it (half the time of one that
+        makes the file longer); with `cut` it is emptied.
+        """
+        mode = "TRUNCATE" if cut else "RESTART"
+        ((busy, _, _),) = self._connection.execute(f"PRAGMA wal_checkpoint({mode})").fetchall()
+        if busy:
+            raise sqlite3.OperationalError("the database is read or locked by another process")
+
+    def close(self) -> None:
+        """Carry the log into the database and close; an error leaves the log as it is."""
+        with contextlib.suppress(sqlite3.Error):
+            self._connection.close()
+
+
+def is_damage(failure: BaseException) -> bool:
+    """Whether SQLite says that the file itself is wrong, not the system below it."""
+    code = getattr(failure, "sqlite_errorcode", None)
+    return isinstance(failure, sqlite3.DatabaseError) and (code or 0) & 0xFF in _CORRUPT

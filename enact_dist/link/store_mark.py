@@ -1,0 +1,100 @@
+"""The mark beside a store: in which boot it was written, and which batch is surely on the disk.
+
+The mark is written after each durable batch, in place and without forcing it out.  So it never
+runs ahead of the disk; after a power cut it may lag by the system's write-back time, after
+`kill -9` it does not.  It answers two questions that the database cannot answer about itself:
+
+- Is something acknowledged missing at the end (a cut log, a deleted log, an older copy)?
+- Can the system have gone down since?  Only then may unforced writes have gone in any order.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+import uuid
+import zlib
+from pathlib import Path
+from typing import Final, NamedTuple, Self
+
+MARK_FILE: Final = "mark"
+_LAYOUT: Final = struct.Struct("<8s16sQ")
+_MAGIC: Final = b"enactmrk"
+_BOOT_ID: Final = Path("/proc/sys/kernel/random/boot_id")
+
+
+class Mark(NamedTuple):
+    """What the mark of a store says."""
+
+    boot: bytes
+    """Id of the system's boot in which the store was last opened, 16 bytes; zeros: unknown."""
+    batch: int
+    """Number of the newest batch known to be on the disk."""
+
+
+def boot_id() -> bytes:
+    """Return the id of this boot of the system, 16 bytes; zeros where there is none."""
+    try:
+        return uuid.UUID(_BOOT_ID.read_text(encoding="ascii").strip()).bytes
+    except (OSError, ValueError):
+        return bytes(16)
+
+
+def read_mark(folder: Path) -> Mark | None:
+    """Return the mark of a folder, or None if there is none that can be read.
+
+    Raises:
+        OSError: As the system reports it.
+    """
+    try:
+        raw = (folder / MARK_FILE).read_bytes()
+    except FileNotFoundError:
+        return None
+    if len(raw) != _LAYOUT.size + 4:
+        return None
+    magic, boot, batch = _LAYOUT.unpack_from(raw)
+    if magic != _MAGIC or raw[_LAYOUT.size :] != _checksum(raw[: _LAYOUT.size]):
+        return None
+    return Mark(boot, batch)
+
+
+def _checksum(packed: bytes) -> bytes:
+    return zlib.crc32(packed).to_bytes(4, "little")
+
+
+class MarkFile:
+    """The mark of an open store.
+
+    Raises:
+        OSError: As the system reports it, in every method.
+    """
+
+    __slots__ = ("_boot", "_descriptor")
+
+    def __init__(self, descriptor: int, boot: bytes) -> None:
+        self._descriptor = descriptor
+        self._boot = boot
+
+    @classmethod
+    def open(cls, folder: Path, batch: int) -> Self:
+        """Say durably that this boot has opened the store, and that `batch` is on the disk."""
+        descriptor = os.open(folder / MARK_FILE, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        mark = cls(descriptor, boot_id())
+        try:
+            mark.note(batch)
+            os.fsync(descriptor)
+        except BaseException:
+            mark.close()
+            raise
+        return mark
+
+    def note(self, batch: int) -> None:
+        """Say that `batch` is on the disk."""
+        packed = _LAYOUT.pack(_MAGIC, self._boot, batch)
+        os.pwrite(self._descriptor, packed + _checksum(packed), 0)
+
+    def close(self) -> None:
+        """Let the file go; twice is harmless."""
+        if self._descriptor >= 0:
+            os.close(self._descriptor)
+            self._descriptor = -1

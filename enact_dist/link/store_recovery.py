@@ -1,0 +1,267 @@
+"""Reads a data folder at the start of a shard and refuses whatever is not as it was left.
+
+Refusing costs an operator minutes; serving from a damaged store costs trust in every datum.  So
+each check ends in a `StoreError` that names the file and the way out.  What a crash may leave is no
+damage: a torn tail of the log, drafts and orphans among the blobs.  What a power cut may leave in
+addition (only if the system has started anew since) is what was never forced to the disk: holes
+in the log behind the last durable batch, and the bodies of `os` data, which then come back as
+null with the reason `LOST`.
+"""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import sqlite3
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Final, NamedTuple, NoReturn
+
+import msgpack
+
+from enact_dist.core.records import Recovered, SlotRecord
+from enact_dist.errors import StoreError
+from enact_dist.link.blobs import Blob, BlobFolder, DamagedBlobError, allow_mapped
+from enact_dist.link.store_database import Database, DatabaseRow, is_damage
+from enact_dist.link.store_mark import Mark, boot_id, read_mark
+from enact_dist.link.store_rows import (
+    EPOCH_KEY,
+    DamagedRowError,
+    Key,
+    Kind,
+    StoredSlot,
+    read_aspect,
+    read_ended,
+    read_epoch,
+    read_outcome,
+    read_session,
+    read_slot,
+    read_world,
+    row_checksum,
+    slot_key,
+)
+from enact_dist.link.wal_check import check_wal
+from enact_dist.terms import NullReason
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+DATABASE_FILE: Final = "store.db"
+LOG_FILE: Final = "store.db-wal"
+BLOB_FOLDER: Final = "blobs"
+_REFUSED_SUFFIX: Final = ".refused"
+
+_RESTORE: Final = (
+    "restore the whole folder from a backup, or give the shard an empty folder and start without"
+    " its data"
+)
+
+_log = logging.getLogger("enact.store")
+
+
+@dataclass(slots=True)
+class Contents:
+    """What a store's database holds, by key.
+
+    Attributes:
+        recovered: The records; `epoch` is the stored one, 0 in a new folder.
+        ids: Row ids by key.
+        blobs: Blob files by the key of their slot.
+        ended: When sessions ended whose outcomes are kept still, wall clock in ns.
+        lost: Slots whose unforced body a power cut took, to be stored as null.
+        batch: Number of the newest batch.
+    """
+
+    recovered: Recovered = field(default_factory=lambda: Recovered(epoch=0))
+    ids: dict[Key, int] = field(default_factory=dict)
+    blobs: dict[Key, Blob] = field(default_factory=dict)
+    ended: dict[str, int] = field(default_factory=dict)
+    lost: list[SlotRecord] = field(default_factory=list)
+    batch: int = 0
+
+
+class Found(NamedTuple):
+    """What a folder says of itself before its database is opened."""
+
+    mark: Mark | None
+    is_new: bool
+    power_cut: bool
+    """Whether the system has started anew since the store was last opened."""
+
+
+def refuse(path: Path, found: str, remedy: str = _RESTORE) -> NoReturn:
+    """Raise the `StoreError` of a damaged file.
+
+    Raises:
+        StoreError: Always.
+    """
+    raise StoreError(f"{path} {found}; the shard does not start: {remedy}", path=str(path))
+
+
+def look_at(folder: Path) -> Found:
+    """Find out what kind of folder this is.
+
+    Raises:
+        StoreError: Data are there and their database is not.
+        OSError: As the system reports it.
+    """
+    mark = read_mark(folder)
+    database = folder / DATABASE_FILE
+    is_new = not database.exists() or database.stat().st_size == 0
+    if is_new:
+        log = folder / LOG_FILE
+        blobs = folder / BLOB_FOLDER
+        has_log = log.exists() and log.stat().st_size > 0
+        if mark is not None or has_log or (blobs.exists() and any(blobs.iterdir())):
+            refuse(database, "is missing or empty, but the folder has been in use")
+    return Found(mark, is_new, mark is not None and mark.boot != boot_id())
+
+
+def check_log(folder: Path, *, power_cut: bool) -> None:
+    """Refuse a log that is damaged in its middle.
+
+    Raises:
+        StoreError: It is damaged, and no power cut explains it.
+        OSError: As the system reports it.
+    """
+    log = folder / LOG_FILE
+    verdict = check_wal(log)
+    if verdict.damaged_at is None:
+        return
+    if power_cut:
+        _log.warning(
+            "%s: what was written from byte %d on and not forced to the disk is gone after the"
+            " system's restart",
+            log,
+            verdict.damaged_at,
+        )
+        return
+    refuse(
+        log,
+        f"is damaged at byte {verdict.damaged_at}, and commits that were acknowledged follow",
+        "restore the whole folder from a backup; or, to go on without what was written from there"
+        f" on, keep a copy of the folder, delete its file 'mark', and cut the log with 'truncate -s"
+        f" {verdict.damaged_at} {log}'",
+    )
+
+
+def open_database(folder: Path, found: Found) -> tuple[Database, Contents]:
+    """Open the database and read all of it.
+
+    Raises:
+        StoreError: It is damaged, or lacks what was acknowledged.
+        OSError: As the system reports it.
+        sqlite3.Error: As SQLite reports it, except for damage.
+    """
+    path = folder / DATABASE_FILE
+    database = None
+    try:
+        database = Database(path)
+        problems = database.problems()
+        if problems:
+            refuse(path, f"is damaged: {'; '.join(problems)}")
+        if found.is_new:
+            database.make_table()
+        contents = read_contents(database, path)
+        _check_complete(folder, contents, found)
+    except BaseException as failure:
+        if database is not None:
+            database.close()
+        if isinstance(failure, sqlite3.Error) and is_damage(failure):
+            refuse(path, f"is damaged: {failure}")
+        raise
+    return database, contents
+
+
+def _check_complete(folder: Path, contents: Contents, found: Found) -> None:
+    """Compare what was read with what the mark says was acknowledged."""
+    if EPOCH_KEY not in contents.ids and (contents.ids or found.mark is not None):
+        refuse(folder / DATABASE_FILE, "holds no epoch: rows are missing")
+    if found.mark is None or contents.batch >= found.mark.batch:
+        return
+    log = folder / LOG_FILE
+    if log.exists():
+        # Closing the database cuts the log to what SQLite could read.
+        shutil.copyfile(log, log.with_name(log.name + _REFUSED_SUFFIX))
+    refuse(
+        log,
+        f"is cut or damaged at its end: batch {found.mark.batch} was acknowledged, the last one"
+        f" that can be read is {contents.batch}",
+        "restore the whole folder from a backup; or, to go on without the missing commits, keep a"
+        f" copy of the folder and delete {folder / 'mark'}",
+    )
+
+
+def read_contents(database: Database, path: Path) -> Contents:
+    """Read all rows, each checked.
+
+    Raises:
+        StoreError: A row is damaged.
+    """
+    contents = Contents()
+    slots: list[StoredSlot] = []
+    for row in database.rows():
+        try:
+            _read_row(row, contents, slots)
+        except (DamagedRowError, ValueError, TypeError, msgpack.UnpackException) as damage:
+            refuse(path, f"is damaged in row {row.id}: {damage}")
+    contents.recovered.slots = [slot.record for slot in slots]
+    return contents
+
+
+def _read_row(row: DatabaseRow, contents: Contents, slots: list[StoredSlot]) -> None:
+    key = Key(Kind(row.kind), row.key)
+    if row_checksum(key, row.batch, row.body) != row.crc:
+        raise DamagedRowError("its checksum is wrong")
+    if contents.ids.setdefault(key, row.id) != row.id:
+        raise DamagedRowError(f"it says the same as row {contents.ids[key]}")
+    contents.batch = max(contents.batch, row.batch)
+    recovered = contents.recovered
+    match key.kind:
+        case Kind.EPOCH:
+            recovered.epoch = read_epoch(row.body)
+        case Kind.SESSION:
+            recovered.sessions.append(read_session(key, row.body))
+        case Kind.ENDED:
+            ended = read_ended(key, row.body)
+            contents.ended[ended.session] = ended.wall_ns
+        case Kind.WORLD:
+            recovered.worlds.append(read_world(key))
+        case Kind.ASPECT:
+            recovered.aspects.append(read_aspect(key, row.body))
+        case Kind.SLOT:
+            slot = read_slot(key, row.body)
+            slots.append(slot)
+            if slot.blob is not None:
+                contents.blobs[key] = slot.blob
+        case Kind.OUTCOME:
+            recovered.outcomes.append(read_outcome(key, row.body))
+        case Kind.AUDIT:
+            pass
+
+
+def read_blobs(contents: Contents, blobs: BlobFolder, *, power_cut: bool) -> None:
+    """Check every blob file and give the slots their bodies.
+
+    Raises:
+        StoreError: A file is missing or damaged, and no power cut explains it.
+        OSError: As the system reports it.
+    """
+    allow_mapped(len(contents.blobs))
+    slots = contents.recovered.slots
+    for number, record in enumerate(slots):
+        blob = contents.blobs.get(slot_key(record.slot))
+        if blob is None or record.datum is None:
+            continue
+        try:
+            body = blobs.read(blob)
+        except DamagedBlobError as damage:
+            if blob.synced or not power_cut:
+                refuse(
+                    blobs.folder / blob.name,
+                    f"holds {record.slot}, version {record.version}, and cannot be used: {damage}",
+                )
+            _log.warning("%s is lost with the power: %s", record.slot, damage)
+            slots[number] = replace(record, datum=None, null_reason=NullReason.LOST.name)
+            contents.lost.append(slots[number])
+        else:
+            slots[number] = replace(record, datum=replace(record.datum, body=body))

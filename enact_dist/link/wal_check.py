@@ -1,0 +1,187 @@
+"""Finds damage in the middle of an SQLite write-ahead log, which SQLite itself passes over.
+
+SQLite reads a log up to the first frame that does not check and takes everything after it for the
+remains of a crash.  That is right for a torn tail and wrong for a damaged sector: commits that
+were acknowledged would vanish without a word.  The two can be told apart, because each frame's
+checksum continues its predecessor's *stored* checksum.  A frame after the bad one that continues
+its predecessor and carries the same salts was written after it, so the bad one was whole once.
+
+File format: https://www.sqlite.org/fileformat2.html#walformat.  Remains of an older generation of
+the log carry other salts and prove nothing.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+HEADER_BYTES: Final = 32
+FRAME_HEADER_BYTES: Final = 24
+_MAGIC_LITTLE: Final = 0x377F0682
+_MAGIC_BIG: Final = 0x377F0683
+_VERSION: Final = 3_007_000
+_PAGE_BYTES: Final = frozenset(1 << power for power in range(9, 17))
+_FRAMES_AT_ONCE: Final = 1024
+
+
+@dataclass(frozen=True, slots=True)
+class WalVerdict:
+    """What a log holds.
+
+    Attributes:
+        frames: How many frames check, from the first one on.
+        page_bytes: Length of a page, 0 where the header does not say.
+        damaged_at: Offset in bytes of the header or frame that was damaged after it had been
+            written whole; None if there is none.  A torn tail is no damage.
+    """
+
+    frames: int
+    page_bytes: int
+    damaged_at: int | None
+
+
+def check_wal(path: Path) -> WalVerdict:
+    """Read the log at `path` and say whether anything in its middle is damaged.
+
+    A missing, empty or cut log is fine: SQLite never acknowledges from what is not there.
+
+    Raises:
+        OSError: As the system reports it.
+    """
+    try:
+        size = path.stat().st_size
+    except FileNotFoundError:
+        return WalVerdict(0, 0, None)
+    if size < HEADER_BYTES:
+        return WalVerdict(0, 0, None)
+    raw = np.memmap(path, dtype=np.uint8, mode="r")
+    header = raw[:HEADER_BYTES].view(">u4").astype(np.uint32)
+    if not _header_checks(raw, header):
+        return WalVerdict(0, 0, 0 if _any_belong_together(raw, header) else None)
+    page_bytes = int(header[2])
+    frames = _frames(raw, page_bytes)
+    good = _continuing(frames, header) & (_words(frames, 0, 4)[:, 0] != 0)
+    good &= (_words(frames, 8, 16) == header[4:6]).all(axis=1)
+    if good.all():
+        return WalVerdict(len(good), page_bytes, None)
+    first_bad = int(np.argmin(good))
+    offset = HEADER_BYTES + first_bad * (FRAME_HEADER_BYTES + page_bytes)
+    damaged = bool(good[first_bad + 1 :].any())
+    return WalVerdict(first_bad, page_bytes, offset if damaged else None)
+
+
+def _any_belong_together(raw: NDArray[np.uint8], header: NDArray[np.uint32]) -> bool:
+    """Say of a log with a bad header whether frames follow that prove it was good once.
+
+    SQLite takes such a log for empty.  Whatever the header says may be wrong, so each length of
+    a page is tried; the stored checksum of the header counts like that of a frame.
+    """
+    for page_bytes in sorted(_PAGE_BYTES):
+        frames = _frames(raw, page_bytes)
+        if len(frames):
+            first = _checksums(_covered(frames[:1]), header[None, 6:8], _order(header))
+            if (first == _words(frames[:1], 16, 24)).all() or _continuing(frames, header)[1:].any():
+                return True
+    return False
+
+
+def _header_checks(raw: NDArray[np.uint8], header: NDArray[np.uint32]) -> bool:
+    if header[0] not in {_MAGIC_LITTLE, _MAGIC_BIG} or header[1] != _VERSION:
+        return False
+    if int(header[2]) not in _PAGE_BYTES:
+        return False
+    summed = _checksums(raw[None, :24], np.zeros((1, 2), np.uint32), _order(header))
+    return bool((summed[0] == header[6:8]).all())
+
+
+def _order(header: NDArray[np.uint32]) -> str:
+    """Byte order of checksummed words; little where a damaged header does not say."""
+    return ">u4" if header[0] == _MAGIC_BIG else "<u4"
+
+
+def _frames(raw: NDArray[np.uint8], page_bytes: int) -> NDArray[np.uint8]:
+    """Return the whole frames of the log, (frames, bytes of a frame) uint8, without a copy."""
+    length = FRAME_HEADER_BYTES + page_bytes
+    count = (len(raw) - HEADER_BYTES) // length
+    return raw[HEADER_BYTES : HEADER_BYTES + count * length].reshape(count, length)
+
+
+def _words(frames: NDArray[np.uint8], begin: int, end: int) -> NDArray[np.uint32]:
+    """Return header words of all frames, (frames, words) uint32."""
+    return np.ascontiguousarray(frames[:, begin:end]).view(">u4").astype(np.uint32)
+
+
+def _covered(frames: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return what a frame's checksum covers: eight bytes of its header, then its page."""
+    return np.hstack([frames[:, :8], frames[:, FRAME_HEADER_BYTES:]])
+
+
+def _continuing(frames: NDArray[np.uint8], header: NDArray[np.uint32]) -> NDArray[np.bool_]:
+    """Say of each frame whether it continues its predecessor's checksum and salts, (frames,).
+
+    The first frame continues the header.
+    """
+    stored = _words(frames, 16, 24)
+    salts = _words(frames, 8, 16)
+    seeds = np.vstack([header[None, 6:8], stored])[:-1]
+    good: NDArray[np.bool_] = (salts == np.vstack([header[None, 4:6], salts])[:-1]).all(axis=1)
+    for begin in range(0, len(frames), _FRAMES_AT_ONCE):
+        part = slice(begin, begin + _FRAMES_AT_ONCE)
+        found = _checksums(_covered(frames[part]), seeds[part], _order(header))
+        good[part] &= (found == stored[part]).all(axis=1)
+    return good
+
+
+def _checksums(
+    covered: NDArray[np.uint8], seeds: NDArray[np.uint32], order: str
+) -> NDArray[np.uint32]:
+    """Return SQLite's two-word checksum of each row of bytes, (rows, 2) uint32.
+
+    The sums are linear in seed and words modulo 2^32, so each word has a fixed weight.
+    """
+    words = np.ascontiguousarray(covered).view(order).astype(np.uint32)
+    on_words, on_seed = _weights(words.shape[1])
+    found = np.empty((len(words), 2), np.uint32)
+    for part in range(2):
+        found[:, part] = (words * on_words[part]).sum(axis=1, dtype=np.uint32)
+        found[:, part] += (seeds * on_seed[part]).sum(axis=1, dtype=np.uint32)
+    return found
+
+
+@functools.cache
+def _weights(words: int) -> tuple[NDArray[np.uint32], NDArray[np.uint32]]:
+    """Return the weights of words, (2, words), and of the seed, (2, 2), in both sums.
+
+    One pair of words (x, y) takes (s0, s1) to (s0 + s1 + x, s0 + 2 s1 + x + y); from the last pair
+    to the first, each earlier one passes that step once more.
+    """
+    step = ((1, 1), (1, 2))
+    power = ((1, 0), (0, 1))
+    on_words = np.empty((2, words), np.uint32)
+    for pair in range(words - 2, -1, -2):
+        for row, (first, second) in enumerate(power):
+            on_words[row, pair] = (first + second) & 0xFFFFFFFF
+            on_words[row, pair + 1] = second
+        power = _times(power, step)
+    return on_words, np.array(power, np.uint32)
+
+
+_Matrix = tuple[tuple[int, int], tuple[int, int]]
+
+
+def _times(left: _Matrix, right: _Matrix) -> _Matrix:
+    (a, b), (c, d) = left
+    (e, f), (g, h) = right
+    mask = 0xFFFFFFFF
+    return (
+        ((a * e + b * g) & mask, (a * f + b * h) & mask),
+        ((c * e + d * g) & mask, (c * f + d * h) & mask),
+    )
