@@ -1,0 +1,117 @@
+"""Readers that must not stop writers, and data that must not be stale."""
+
+import json
+import statistics
+
+import numpy as np
+import pytest
+
+from enact_dist import Aspect, Durability, Entity, Lock, Read, View, Write, connect
+from enact_dist.errors import NullDatumError
+
+COUNT = Aspect("count", int)
+FRAME = Aspect("frame", np.ndarray, Durability.VOLATILE)
+counter = Entity("counter")
+
+
+def p99(values):
+    return sorted(values)[int(len(values) * 0.99)]
+
+
+@pytest.mark.slow
+@pytest.mark.timing
+def test_slow_viewer_leaves_writer_alone(make_cell):
+    """A 10 s View reader leaves the p99 of a 100 Hz writer as it is without one."""
+    cell = make_cell().start_all()
+    times = {}
+    for name in ("alone", "viewed"):
+        ticking = cell.worker("ticker", 100)
+        ticking.expect("started")
+        viewer = cell.worker("view_slowly", 10 if name == "viewed" else 5)
+        if name == "alone":
+            viewer.signal(9)
+            viewer.finish()
+            quiet = cell.worker("view_slowly", 0)
+            quiet.expect("still")
+            with connect(cell.file) as joined:
+                watch = joined.world("online").watch(Entity("ticker"), COUNT)
+                while watch.next(5.0).version < 1000:
+                    pass
+                watch.close()
+        else:
+            first = viewer.expect("viewing")
+            assert viewer.expect("still", 30) == first, "a view is of one moment"
+        ticking.tell("stop")
+        times[name] = json.loads(ticking.expect("times"))
+    assert len(times["viewed"]) > 500
+    assert p99(times["viewed"]) < 2 * p99(times["alone"]) + 5.0, {
+        name: (statistics.median(values), p99(values)) for name, values in times.items()
+    }
+
+
+@pytest.mark.slow
+def test_no_stale_value_is_served_after_shard_restarted(make_cell):
+    """A warm client cache never answers for a volatile slot that its shard has lost."""
+    cell = make_cell().start_all()
+    with connect(cell.file) as joined:
+        online = joined.world("online")
+        read, write = Read(online, counter, FRAME), Write(online, counter, FRAME)
+        for value in (1, 2):
+            with Lock(write) as lock:
+                lock[write] = np.full(100_000, value)
+        with Lock(read) as lock:
+            assert lock[read][0] == 2
+
+        cell.kill()
+        cell.start()
+
+        with Lock(read, wait_s=20.0) as lock, pytest.raises(NullDatumError, match="lost"):
+            lock[read]
+        for value in (3, 4):  # versions 1 and 2 again, with other data
+            with Lock(write) as lock:
+                lock[write] = np.full(100_000, value)
+        with Lock(read) as lock:
+            assert lock.version(read) == 2
+            assert lock[read][0] == 4
+
+
+@pytest.mark.slow
+def test_watcher_that_was_stopped_resynchronises_and_says_what_it_missed(make_cell):
+    """A reader stopped for 3 s gets the newest state and the number of skipped versions."""
+    import signal
+
+    cell = make_cell().start_all()
+    watcher = cell.worker("watch_ticker")
+    ticking = cell.worker("ticker", 100)
+    ticking.expect("started")
+    watcher.expect("version 100", 30)
+    watcher.signal(signal.SIGSTOP)
+    with connect(cell.file) as joined:
+        view = View(joined.world("online"), Entity("ticker"), COUNT)
+        start = joined.world("online").view(view)[view]
+        watch = joined.world("online").watch(Entity("ticker"), COUNT)
+        while watch.next(5.0).version < start + 300:  # 3 s at 100 Hz
+            pass
+        watch.close()
+    watcher.signal(signal.SIGCONT)
+    ticking.tell("stop")
+    last = len(json.loads(ticking.expect("times")))
+    said = json.loads(watcher.expect("summary", 30))
+
+    assert said["last"] == last
+    assert said["seen"] + said["gap"] == last
+    assert said["in_order"]
+
+
+def test_missing_shard_is_an_error_that_names_shard_and_endpoint(make_cell):
+    """Nothing that lies on a dead shard looks like an empty answer."""
+    from enact_dist.errors import ShardUnreachableError
+
+    cell = make_cell(shards=("s0", "s1")).start_all()
+    with connect(cell.file) as joined:
+        online = joined.world("online")
+        cell.kill("s1")
+        with pytest.raises(ShardUnreachableError, match=rf"s1 at tcp/127.0.0.1:{cell.ports['s1']}"):
+            online.survey()
+        states = {shard.name: shard.reachable for shard in joined.shards()}
+        assert states == {"s0": True, "s1": False}

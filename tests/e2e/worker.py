@@ -1,0 +1,212 @@
+"""Client processes of the end-to-end tests: `worker.py ROLE CELL_FILE ARGUMENT…`.
+
+Each prints what happened line by line and waits for lines where the test decides when to go on.
+"""
+
+import ctypes
+import json
+import random
+import sys
+import time
+
+import numpy as np
+
+from enact_dist import Aspect, Durability, Entities, Entity, Lock, Read, View, Write, WriteEach, connect
+from enact_dist.errors import EnactError, LeaseLostError, LockTimeoutError
+
+COUNT = Aspect("count", int)
+FRAME = Aspect("frame", np.ndarray, Durability.VOLATILE)
+NAME = Aspect("name", str)
+counter = Entity("counter")
+
+
+def say(*words):
+    print(*words, flush=True)
+
+
+def wait_line():
+    return sys.stdin.readline().strip()
+
+
+def increment(cell, count):
+    """Add 1 to a counter `count` times; every add is certain when the process ends well."""
+    request = Write(cell.world("online"), counter, COUNT)
+    done = lost = 0
+    say("started")
+    while done < int(count):
+        try:
+            with Lock(request, wait_s=30.0) as lock:
+                lock[request] = lock.get(request, 0) + 1
+            done += 1
+            if done % 50 == 0:
+                say("progress", done)
+        except LeaseLostError:
+            lost += 1  # nothing was written: do it again
+    say("done", done, "lost", lost)
+
+
+def hold(cell, hold_s="60"):
+    """Take the write lock, wait for a line, then commit 111."""
+    request = Write(cell.world("online"), counter, COUNT)
+    try:
+        with Lock(request, hold_s=float(hold_s)) as lock:
+            lock[request] = 111
+            say("holding")
+            wait_line()
+        say("committed")
+    except LeaseLostError as error:
+        say("lost", error)
+
+
+def hold_gil(cell, seconds):
+    """Hold the lock while the interpreter lock is held by C code for `seconds`."""
+    request = Write(cell.world("online"), counter, COUNT)
+    watch = cell.world("online").watch(Entities("ticker"), COUNT)
+    with Lock(request, hold_s=120.0) as lock:
+        say("holding")
+        libc = ctypes.PyDLL(None)  # unlike CDLL, calls keep the interpreter lock
+        started = time.monotonic()
+        libc.sleep(int(seconds))
+        say("slept", round(time.monotonic() - started, 1))
+        lock[request] = 222
+    say("committed")
+    watch.close()
+
+
+def ticker(cell, hz):
+    """Commit a counter at a fixed rate until told to stop; report the time of each commit."""
+    import threading
+
+    request = Write(cell.world("online"), Entity("ticker"), COUNT)
+    stop = threading.Event()
+    threading.Thread(target=lambda: (wait_line(), stop.set()), daemon=True).start()
+    period_s, took_ms, number = 1 / float(hz), [], 0
+    say("started")
+    due = time.monotonic()
+    while not stop.is_set():
+        due += period_s
+        stop.wait(max(0.0, due - time.monotonic()))
+        started = time.monotonic()
+        with Lock(request) as lock:
+            number += 1
+            lock[request] = number
+        took_ms.append((time.monotonic() - started) * 1e3)
+    say("times", json.dumps([round(t, 3) for t in took_ms]))
+
+
+def opposite(cell, seed, seconds, count):
+    """Lock random pairs in random order for `seconds`, adding 1 to both."""
+    world, draw = cell.world("online"), random.Random(int(seed))
+    entities = [Entity(f"pair/{i}") for i in range(int(count))]
+    end = time.monotonic() + float(seconds)
+    done, longest_s, timeouts = 0, 0.0, 0
+    say("started")
+    while time.monotonic() < end:
+        first, second = draw.sample(entities, 2)
+        one, two = Write(world, first, COUNT), Write(world, second, COUNT)
+        started = time.monotonic()
+        try:
+            with Lock(one, two, wait_s=20.0) as lock:
+                longest_s = max(longest_s, time.monotonic() - started)
+                lock[one] = lock.get(one, 0) + 1
+                lock[two] = lock.get(two, 0) + 1
+            done += 1
+        except LockTimeoutError:
+            timeouts += 1
+    say("done", json.dumps({"done": done, "longest_s": longest_s, "timeouts": timeouts}))
+
+
+def perceive(cell, label):
+    """Look for a package; create it only if nobody has."""
+    each = WriteEach(cell.world("online"), Entities("package/*"), NAME)
+    say("ready")
+    wait_line()
+    with Lock(each) as lock:
+        packages = lock[each]
+        if label not in packages.values():
+            packages[Entity.fresh("package")] = label
+            say("created")
+        else:
+            say("found")
+
+
+def view_slowly(cell, seconds):
+    """View the ticker and work on it for `seconds`."""
+    request = View(cell.world("online"), Entity("ticker"), COUNT)
+    with Lock(request) as lock:
+        say("viewing", lock.get(request, 0))
+        time.sleep(float(seconds))
+        say("still", lock.get(request, 0))
+
+
+def read_long(cell):
+    """Hold a read lock until told to leave."""
+    request = Read(cell.world("online"), counter, COUNT)
+    with Lock(request, hold_s=100.0):
+        say("reading")
+        wait_line()
+    say("left")
+
+
+def write_once(cell, value):
+    """Write the counter once."""
+    request = Write(cell.world("online"), counter, COUNT)
+    say("asking")
+    with Lock(request, wait_s=30.0) as lock:
+        lock[request] = int(value)
+    say("wrote")
+
+
+def commit_pairs(cell):
+    """Commit growing equal numbers to a durable and an os aspect, saying each one acknowledged."""
+    world = cell.world("online")
+    one = Write(world, counter, Aspect("kept", int, Durability.DURABLE))
+    two = Write(world, counter, Aspect("swift", int, Durability.OS))
+    number = 0
+    say("started")
+    while True:
+        try:
+            with Lock(one, two, wait_s=30.0) as lock:
+                number = max(lock.get(one, 0), lock.get(two, 0)) + 1
+                lock[one] = number
+                lock[two] = number
+            say("acknowledged", number)
+        except EnactError as error:
+            say("refused", type(error).__name__)
+
+
+def commit_swift(cell):
+    """Commit growing numbers to an os aspect alone, saying each one acknowledged."""
+    request = Write(cell.world("online"), Entity("swift"), Aspect("swift", int, Durability.OS))
+    say("started")
+    while True:
+        try:
+            with Lock(request, wait_s=30.0) as lock:
+                number = lock.get(request, 0) + 1
+                lock[request] = number
+            say("acknowledged", number)
+        except EnactError as error:
+            say("refused", type(error).__name__)
+
+
+def watch_ticker(cell):
+    """Follow the ticker until it rests; say what was seen and what was missed."""
+    seen = gap = last = 0
+    in_order = True
+    with cell.world("online").watch(Entities("ticker"), COUNT) as watch:
+        while (change := watch.next(30.0 if not seen else 6.0)) is not None:
+            in_order = in_order and change.version > last
+            seen, gap, last = seen + 1, gap + change.gap, change.version
+            if last % 50 == 0:
+                say("version", last)
+    say("summary", json.dumps({"seen": seen, "gap": gap, "last": last, "in_order": in_order}))
+
+
+def main():
+    role, file, *arguments = sys.argv[1:]
+    with connect(file, actor=role, timeout_s=20.0) as cell:
+        globals()[role](cell, *arguments)
+
+
+if __name__ == "__main__":
+    main()
