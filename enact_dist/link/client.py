@@ -82,8 +82,8 @@ class CellClient:
         self._lanes_free: list[int] = []
         self._lanes_made = 0
         self._aspects: dict[str, dict[str, AspectEntry]] = {}
+        self._registered: dict[str, AspectEntry] = {}
         self._worlds: dict[str, tuple[str, ...]] = {}
-        self._refused_keep_alives = ""
         self._renewer: threading.Thread | None = None
         if keep_alive:
             self._renewer = threading.Thread(
@@ -231,6 +231,7 @@ class CellClient:
             ShardUnreachableError: A shard does not answer.
         """
         worlds, aspects = tuple(worlds), tuple(aspects)
+        self._registered.update((entry.name, entry) for entry in aspects)
         missing = [
             shard
             for shard in self.shards()
@@ -278,6 +279,11 @@ class CellClient:
                 self._drive(lock)
                 now_ns = self._now_ns()
                 restart = lock.phase in (Phase.LOST, Phase.MISPLACED)
+                if lock.refusal is not None and lock.refusal.code == "unknown_aspect":
+                    # A shard that keeps nothing restarted since: its catalogue is empty again.
+                    self.greet()
+                    self.register(aspects=self._registered.values())
+                    restart = True
                 if not restart or now_ns >= started_ns + wait_ns:
                     break
             if lock.phase is not Phase.HELD:
