@@ -33,6 +33,7 @@ from enact_dist.core.records import (
     Publish,
     Recovered,
     Reply,
+    Story,
     Tick,
 )
 from enact_dist.core.shard import Shard
@@ -205,6 +206,7 @@ class ShardHost:
         )
 
     def _perform(self, effects: list[Effect]) -> None:
+        """Do what the shard says: answers first, since somebody waits for them."""
         for effect in effects:
             if isinstance(effect, Reply):
                 reply = self._replies.pop(effect.reply_to, None)
@@ -212,10 +214,11 @@ class ShardHost:
                     reply(cast("Answer", effect.answer))
             elif isinstance(effect, Persist):
                 self._persist(effect)
-            elif isinstance(effect, Publish):
+        for effect in effects:
+            if isinstance(effect, Publish):
                 for watcher in self._watchers:
                     watcher(cast("Notice", effect.notice))
-            else:
+            elif isinstance(effect, Story):
                 _log.info("%s: %s", effect.event, effect.text, extra={"event": effect.event})
 
     def _persist(self, effect: Persist) -> None:

@@ -10,16 +10,18 @@ A query is answered once and then dropped; one that is dropped without an answer
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 import threading
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, get_args
+from operator import attrgetter
+from typing import TYPE_CHECKING, Final, cast, get_args
 
 import zenoh
 
 from enact_dist.core.messages import (
     Answer,
     Granted,
+    Reached,
     Refused,
     Request,
     Slice,
@@ -40,11 +42,12 @@ from enact_dist.wire.keys import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from enact_dist.core.messages import Notice, SlotState
     from enact_dist.link.host import ShardHost
 
 _log = logging.getLogger("enact.link")
-_REQUESTS: Final = frozenset(get_args(Request))
 SURVEYED_BYTES: Final = 160
 """Estimated length of one slot in the answer to a `Survey`."""
 JOIN_S: Final = 0.5
@@ -52,12 +55,16 @@ JOIN_S: Final = 0.5
 
 
 class ZenohService:
-    """One shard's face on one Zenoh session.  The session is not closed with the service."""
+    """One shard's face on one Zenoh session.  The session is not closed with the service.
+
+    Attributes:
+        senders: Who sends the answers.
+    """
 
     def __init__(self, host: ShardHost, session: zenoh.Session, cell: str) -> None:
         self._host = host
         self._cell = cell
-        self._senders = Senders(host.count)
+        self.senders = Senders(host.count)
         self._closed = False
         keep_after_fork(self)
         self._publisher = session.declare_publisher(
@@ -84,7 +91,7 @@ class ZenohService:
 
     def _dispatch(self) -> None:
         """Take queries until the queryable ends."""
-        inbox, senders = self._inbox, self._senders
+        inbox, senders = self._inbox, self.senders
         try:
             while True:
                 query = inbox.try_recv()
@@ -105,34 +112,36 @@ class ZenohService:
             return
 
     def _take(self, query: zenoh.Query) -> None:
-        key = str(query.key_expr)
-        client = key
+        header, payload = query.attachment, query.payload
         try:
-            header, payload = query.attachment, query.payload
             message = decode_frame(
                 bytes(header) if header is not None else b"",
                 bytes(payload) if payload is not None else b"",
             )
-            if type(message) not in _REQUESTS:
+            client_of = _CLIENT_OF.get(type(message))
+            if client_of is None:
                 raise ProtocolError(f"{type(message).__name__} is no request")
         except ProtocolError as error:
             self._host.count("frames_refused")
-            self._answer(query, key, client, Refused("protocol", str(error)))
+            _Call(self, query, str(query.key_expr))(Refused("protocol", str(error)))
             return
-        client = client_of(message) or key
-        self._senders.heard(client)
-        self._host.submit(message, lambda answer: self._answer(query, key, client, answer))
+        client = client_of(message) or str(query.key_expr)
+        self.senders.heard(client)
+        self._host.submit(cast("Request", message), _Call(self, query, client))
 
-    def _answer(self, query: zenoh.Query, key: str, client: str, answer: Answer) -> None:
-        if "*" in key:
-            # Asked of every shard in reach, by a client that does not know our name yet.
-            key = request_key(self._cell, self._host.name, *key.split("/")[-2:])
-        self._senders.send(client, _Parcel(query, key, answer, size_of(answer)))
+    def reply_key(self, query: zenoh.Query, answer: Answer) -> zenoh.KeyExpr | str:
+        """Return the key to answer under: the query's own, unless that asked every shard."""
+        key = query.key_expr
+        if type(answer) is not Reached or "*" not in str(key):
+            return key
+        return request_key(self._cell, self._host.name, *str(key).split("/")[-2:])
 
     # ---------------------------------------------------------------- notices and tokens
 
     def _publish(self, notice: Notice) -> None:
-        """Send a notice; Zenoh drops it for whoever does not read."""
+        """Send a notice if anybody watches; Zenoh drops it for whoever does not read."""
+        if not self._publisher.matching_status.matching:  # type: ignore[attr-defined]  # see its stub
+            return
         header, payload = encode_frame(notice)
         try:
             self._publisher.put(payload or b"", attachment=header)
@@ -160,39 +169,55 @@ class ZenohService:
         self._unwatch()
         self._queryable.undeclare()  # type: ignore[no-untyped-call]  # as Zenoh's stub has it
         self._tokens.undeclare()  # type: ignore[no-untyped-call]  # as Zenoh's stub has it
-        self._senders.close()
+        self.senders.close()
         for thread in self._threads:
             thread.join(JOIN_S)
 
 
-@dataclass(frozen=True, slots=True)
-class _Parcel:
-    """An answer and the query that it belongs to."""
+class _Call:
+    """One query on its way to its answer: the host's reply callback, and what is sent then."""
 
-    query: zenoh.Query
-    key: str
-    answer: Answer
-    size: int
+    __slots__ = ("_answer", "_client", "_query", "_service", "size")
+
+    def __init__(self, service: ZenohService, query: zenoh.Query, client: str) -> None:
+        self._service = service
+        self._query = query
+        self._client = client
+
+    def __call__(self, answer: Answer) -> None:
+        self._answer = answer
+        self.size = size_of(answer)
+        self._service.senders.send(self._client, self)
 
     def send(self) -> None:
         """Encode and send; a connection that has gone takes the answer with it."""
+        query, answer = self._query, self._answer
         try:
-            header, payload = encode_frame(self.answer)
-            self.query.reply(self.key, payload or b"", attachment=header)
+            header, payload = encode_frame(answer)
+            query.reply(self._service.reply_key(query, answer), payload or b"", attachment=header)
         except (zenoh.ZError, ProtocolError) as error:
-            _log.warning("answer %s not sent: %s", type(self.answer).__name__, error)
+            _log.warning("answer %s not sent: %s", type(answer).__name__, error)
         finally:
-            self.query.drop()  # type: ignore[no-untyped-call]  # as Zenoh's stub has it
+            self.drop()
 
     def drop(self) -> None:
         """Leave the client without an answer, which tells it to ask again."""
-        self.query.drop()  # type: ignore[no-untyped-call]  # as Zenoh's stub has it
+        self._query.drop()  # type: ignore[no-untyped-call]  # as Zenoh's stub has it
 
 
-def client_of(message: Request) -> str:
-    """Return the session that sent a request, or nothing where it does not say."""
-    lock = getattr(message, "lock", None)
-    return lock.session if lock is not None else getattr(message, "session", "")
+def _nameless(_: object) -> str:
+    """Stand for a request that does not say whose it is: its key has to do."""
+    return ""
+
+
+def _client_getter(kind: type) -> Callable[[object], str]:
+    fields = {field.name for field in dataclasses.fields(kind)}
+    path = "lock.session" if "lock" in fields else "session" if "session" in fields else ""
+    return attrgetter(path) if path else _nameless
+
+
+_CLIENT_OF: Final = {kind: _client_getter(kind) for kind in get_args(Request)}
+"""How to read from each request whose answer counts together with whose."""
 
 
 def size_of(answer: Answer) -> int:

@@ -172,7 +172,7 @@ def test_host_acknowledges_a_durable_commit_only_after_the_store(start, make_pee
     answered = threading.Event()
     answers = []
     commit = []
-    peer.call = lambda shard, message: commit.append(message)
+    peer.call = lambda _, message: commit.append(message)
     peer.commit(granted, "cup", b"x")
 
     host.submit(commit[0], lambda answer: (answers.append(answer), answered.set()))
