@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
-    from enact_dist.core.shard import ShardSettings
+    from enact_dist.core.shard_state import ShardSettings
     from enact_dist.terms import Durability
 
 TTL_S_DEFAULT: Final = 2.0
@@ -149,7 +149,7 @@ class CellConfig:
         Raises:
             ConfigError: The cell has none of that name.
         """
-        from enact_dist.core.shard import ShardSettings
+        from enact_dist.core.shard_state import ShardSettings
 
         return ShardSettings(
             name=self.shard(name).name,

@@ -1,0 +1,207 @@
+"""`enact actor run|ls|check`."""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+from typing import TYPE_CHECKING
+
+from enact_dist.cli.output import print_json, print_table, shown_s
+from enact_dist.cli.verbs import (
+    DONE,
+    FAILED,
+    StopOnSignal,
+    add_cell,
+    add_noun,
+    add_reader,
+    add_timeout,
+    add_verb,
+    cell_config,
+    open_cell,
+    pair,
+    pairs,
+    seconds,
+    see_working_folder,
+    verbs_of,
+)
+from enact_dist.errors import ConfigError, ProtocolError
+
+if TYPE_CHECKING:
+    import argparse
+    from collections.abc import Iterator
+
+    from enact_dist.actor import Actor
+    from enact_dist.actor_report import ActorStatistics
+    from enact_dist.cell import ActorInfo
+    from enact_dist.cli.verbs import Verb
+
+
+def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
+    """Add the noun and its verbs."""
+    verbs = verbs_of(add_noun(nouns, "actor", "run, list and check actors"))
+    _add_run(verbs)
+    ls = add_verb(
+        verbs,
+        "ls",
+        "list the sessions of the cell with what their actors report",
+        run=list_actors,
+        example="enact actor ls --json",
+    )
+    add_reader(ls)
+    check = add_verb(
+        verbs,
+        "check",
+        "check all declared reads and writes of the cell's actors, without running any",
+        run=check_actors,
+        example="enact actor check --cell cell.toml",
+    )
+    add_cell(check)
+    check.add_argument("--json", action="store_true", help="print JSON instead of lines")
+    check.add_argument(
+        "--initial",
+        action="append",
+        default=[],
+        metavar="ASPECT",
+        help="an aspect that is written from outside; may be repeated",
+    )
+
+
+def _add_run(verbs: argparse._SubParsersAction[Verb]) -> None:
+    run = add_verb(
+        verbs,
+        "run",
+        "run one actor in this process until SIGTERM or until it is done",
+        run=run_actor,
+        example="enact actor run fusion\n"
+        "enact actor run actors.palletizing.fusion:Fusion --world training=training"
+        " --option voxel_m=0.002",
+    )
+    run.add_argument(
+        "target", metavar="TARGET", help="MODULE:CLASS, or the name of an actor of cell.toml"
+    )
+    add_cell(run)
+    add_timeout(run)
+    run.add_argument("--name", default="", help="how others see it (default: its class)")
+    run.add_argument(
+        "--world",
+        action="append",
+        type=pair,
+        metavar="ROLE=NAME",
+        help="bind a role to a world context; without any, each role to that of its name",
+    )
+    run.add_argument(
+        "--option", action="append", type=pair, metavar="KEY=VALUE", help="argument of the class"
+    )
+    run.add_argument("--every", type=seconds, metavar="S", help="period of a source, seconds")
+
+
+def run_actor(arguments: argparse.Namespace) -> int:
+    """Run one actor until it is done or a signal comes."""
+    from enact_dist.actor_runner import run_actor as run
+
+    see_working_folder()
+    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
+    with StopOnSignal() as stop:
+        actor, name, worlds = _made(arguments)
+        with open_cell(arguments, observer=False, actor=name) as cell:
+            print(f"ready: actor {name} in cell {cell.name}", flush=True)
+            statistics = run(actor, cell, worlds, stop=stop.event, name=name)
+    print(_farewell(name, statistics), flush=True)
+    return DONE
+
+
+def _made(arguments: argparse.Namespace) -> tuple[Actor, str, dict[str, str] | None]:
+    """Return the actor that the command names, its name and its roles' world contexts."""
+    from enact_dist.actor_load import check_every_s, configured_actor, load_actor
+
+    worlds = pairs(arguments.world, "--world") or None
+    options = pairs(arguments.option, "--option")
+    if ":" in arguments.target:
+        actor = load_actor(arguments.target, options)
+        name = arguments.name or type(actor).__name__
+    else:
+        config = cell_config(arguments)
+        for entry in config.actors:
+            if entry.name == arguments.target:
+                break
+        else:
+            known = ", ".join(entry.name for entry in config.actors) or "none"
+            raise ConfigError(
+                f"{config.path} has no actor {arguments.target!r} (known: {known}); or write"
+                " MODULE:CLASS"
+            )
+        if options:
+            raise ConfigError(f"the options of {entry.name} stand in {config.path}; leave --option")
+        actor = configured_actor(entry)
+        name = arguments.name or entry.name
+        worlds = worlds or dict(entry.worlds) or None
+    if arguments.every is not None:
+        check_every_s(type(actor), arguments.every)
+        actor.every_s = arguments.every
+    return actor, name, worlds
+
+
+def _farewell(name: str, statistics: ActorStatistics) -> str:
+    error = f"; last error: {statistics.last_error}" if statistics.last_error else ""
+    return (
+        f"{statistics.state}: actor {name} after {statistics.updates} updates,"
+        f" {statistics.failures} failures, {statistics.refused} refusals{error}"
+    )
+
+
+# ---------------------------------------------------------------- ls, check
+
+
+def list_actors(arguments: argparse.Namespace) -> int:
+    """Print every session but this one; one line per reporting actor."""
+    with open_cell(arguments) as cell:
+        infos = [info for info in cell.actors() if info.pid != os.getpid()]
+    if arguments.json:
+        print_json(infos)
+        return DONE
+    print_table(
+        ("actor", "host", "pid", "state", "updates", "rate", "failures", "refused", "wait p99",
+         "last update", "lease left", "locks", "last error"),
+        [row for info in infos for row in _rows(info)],
+        empty="no actor is connected",
+    )  # fmt: skip
+    return DONE
+
+
+def _rows(info: ActorInfo) -> Iterator[tuple[object, ...]]:
+    from enact_dist.actor_report import read_reports
+
+    here, left = (info.host, info.pid), (shown_s(info.lease_left_s), info.locks)
+    try:
+        reports = read_reports(info.report)
+    except ProtocolError:
+        reports = ()  # a session that reports something of its own
+    for report in reports:
+        ago_s = time.time() - report.last_update_unix_s
+        last = f"{shown_s(max(0.0, ago_s))} ago" if report.last_update_unix_s else "never"
+        yield (
+            report.name, *here, report.state, report.updates, f"{report.rate_hz:.1f}/s",
+            report.failures, report.refused, f"{report.lock_wait_p99_ms:.1f} ms", last, *left,
+            report.last_error or "-",
+        )  # fmt: skip
+    if not reports:
+        yield (info.actor, *here, "connected", *["-"] * 6, *left, "-")
+
+
+def check_actors(arguments: argparse.Namespace) -> int:
+    """Print what is wrong with the actors of a `cell.toml`; status 1 if there is an error."""
+    from enact_dist.actor_check import check_cell
+
+    see_working_folder()
+    config = cell_config(arguments)
+    findings = check_cell(config, initial=arguments.initial)
+    wrong = any(finding.level == "error" for finding in findings)
+    if arguments.json:
+        print_json(findings)
+    elif not findings:
+        print(f"ok: {len(config.actors)} actors of cell {config.name} fit together")
+    else:
+        for finding in findings:
+            print(finding)
+    return FAILED if wrong else DONE

@@ -1,0 +1,95 @@
+"""`enact demo palletizing`: the application of ENACT 4.2, simulated or on real recordings."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.cli.verbs import add_noun, add_verb, verbs_of, whole
+from enact_dist.errors import ConfigError
+
+if TYPE_CHECKING:
+    import argparse
+
+    from enact_dist.cli.verbs import Verb
+
+_EXTRA: Final = ("open3d", "scipy", "cv2")
+"""Modules of the `actors` extra, which the core does without."""
+
+
+def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
+    """Add the noun and its one verb."""
+    verbs = verbs_of(add_noun(nouns, "demo", "run a demonstration"))
+    demo = add_verb(
+        verbs,
+        "palletizing",
+        "actors train a model of a package, watch a tray and report damaged packages",
+        run=run_palletizing,
+        example="enact demo palletizing --packages 6 --seed 1 --out demo\n"
+        "enact demo palletizing --views redwood_rgbd --out surface\n"
+        "enact demo palletizing --model milk.pcd --scene table.pcd --out pose",
+    )
+    demo.add_argument("--packages", type=whole, metavar="N", help="how many packages come by")
+    demo.add_argument("--seed", type=int, metavar="S", help="of sensor noise and damage")
+    demo.add_argument("--out", type=Path, metavar="DIR", help="where pictures and tables go")
+    demo.add_argument(
+        "--keep-running", action="store_true", help="leave the cell up afterwards, until Ctrl-C"
+    )
+    real = demo.add_argument_group("real recordings instead of the simulated sensor")
+    real.add_argument("--views", type=Path, metavar="DIR", help="train from an RGB-D recording")
+    real.add_argument("--model", type=Path, metavar="FILE", help="a model to find (PLY, PCD, …)")
+    real.add_argument("--scene", type=Path, metavar="FILE", help="the cloud to find it in")
+
+
+def run_palletizing(arguments: argparse.Namespace) -> int:
+    """Run the demonstration that the options ask for."""
+    _refuse_mixture(arguments)
+    try:
+        return _run(arguments)
+    except ImportError as error:
+        if (error.name or "").partition(".")[0] in _EXTRA or ".so" in str(error):
+            raise _missing(error) from error
+        raise
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    out: Path = arguments.out or Path("demo_out")
+    if arguments.views:
+        from actors.palletizing.real_input import run_views
+
+        return run_views(arguments.views, out)
+    if arguments.model:
+        from actors.palletizing.real_input import run_match
+
+        return run_match(arguments.model, arguments.scene, out)
+    from actors.palletizing.demo import run_demo
+
+    chosen = {"packages": arguments.packages, "seed": arguments.seed}
+    given = {name: value for name, value in chosen.items() if value is not None}
+    return run_demo(out=out, keep_running=arguments.keep_running, **given)
+
+
+def _refuse_mixture(arguments: argparse.Namespace) -> None:
+    if (arguments.model is None) != (arguments.scene is None):
+        raise ConfigError("--model and --scene belong together: the model is found in the scene")
+    if arguments.views and arguments.model:
+        raise ConfigError("--views trains, --model and --scene find: run them one after the other")
+    simulated = [
+        name
+        for name in ("packages", "seed", "keep_running")
+        if getattr(arguments, name) not in {None, False}
+    ]
+    if simulated and (arguments.views or arguments.model):
+        option = simulated[0].replace("_", "-")
+        raise ConfigError(f"--{option} belongs to the simulated sensor, not to real recordings")
+
+
+def _missing(error: ImportError) -> ConfigError:
+    if ".so" in str(error):
+        return ConfigError(
+            f"the demo cannot load a shared library ({error}); enact doctor names the package"
+        )
+    return ConfigError(
+        f"the demo needs {error.name}, which is not installed; install the actors extra:"
+        " pip install 'enact-dist[actors]'"
+    )

@@ -1,0 +1,256 @@
+"""`enact lock ls|hold|break`."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.cli.output import print_json, print_table, shown_s
+from enact_dist.cli.verbs import (
+    DONE,
+    StopOnSignal,
+    add_cell,
+    add_noun,
+    add_reader,
+    add_timeout,
+    add_verb,
+    open_cell,
+    seconds,
+    slot_name,
+    verbs_of,
+    whole,
+)
+from enact_dist.errors import ConfigError, LeaseLostError, MisuseError
+from enact_dist.terms import Access, Entities, Entity, checked_name
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from enact_dist.cell import Cell, LockInfo
+    from enact_dist.cli.verbs import Verb
+    from enact_dist.core.messages import Item
+
+POLL_S: Final = 0.05
+"""How soon a lost lock or an ended command is noticed."""
+
+_HELD: Final = re.compile(r"(?:(?P<world>[^:/]+):)?(?P<slot>[^:]+):(?P<access>read|write)\Z")
+
+_ACCESSES: Final = {
+    ("read", False): Access.READ,
+    ("write", False): Access.WRITE,
+    ("read", True): Access.READ_EACH,
+    ("write", True): Access.WRITE_EACH,
+}
+
+
+def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
+    """Add the noun and its verbs."""
+    verbs = verbs_of(add_noun(nouns, "lock", "look at locks, hold one, break one"))
+    ls = add_verb(
+        verbs,
+        "ls",
+        "list who holds what and who waits for whom",
+        run=list_locks,
+        example="enact lock ls",
+    )
+    add_reader(ls)
+    _add_hold(verbs)
+    _add_break(verbs)
+
+
+def _add_hold(verbs: argparse._SubParsersAction[Verb]) -> None:
+    hold = add_verb(
+        verbs,
+        "hold",
+        "run a command while holding a lock; status is the command's, 1 if the lock is lost",
+        run=hold_lock,
+        example="enact lock hold online:robot/pose:write -- ./calibrate.sh\n"
+        "enact lock hold --world online robot/pose:write 'tray/*/surface:read' -- sleep 5",
+    )
+    hold.usage = "enact lock hold [options] [WORLD:]ENTITY/ASPECT:read|write … -- COMMAND …"
+    hold.add_argument(
+        "requests",
+        nargs="+",
+        type=held,
+        metavar="[WORLD:]ENTITY/ASPECT:MODE",
+        help="what to hold; MODE is read or write; an entity with * means all that match",
+    )
+    hold.add_argument("--world", metavar="WORLD", help="of requests that name none")
+    hold.add_argument("--wait", type=seconds, default=10.0, metavar="S", help="for the grant")
+    hold.add_argument(
+        "--hold", type=seconds, default=3600.0, metavar="S", help="at most (default: 3600)"
+    )
+    add_cell(hold)
+    add_timeout(hold)
+
+
+def _add_break(verbs: argparse._SubParsersAction[Verb]) -> None:
+    cut = add_verb(
+        verbs,
+        "break",
+        "take a lock away from its holder, who is told why; its commit will be refused",
+        run=break_lock,
+        example="enact lock break 1742 --shard left --reason 'camera unplugged'",
+    )
+    cut.add_argument("number", type=whole, metavar="NUMBER", help="as `enact lock ls` shows it")
+    cut.add_argument("--shard", metavar="NAME", help="needed where two shards use the number")
+    cut.add_argument("--reason", default="broken by hand", metavar="TEXT", help="for the holder")
+    add_reader(cut)
+
+
+# ---------------------------------------------------------------- ls
+
+
+def list_locks(arguments: argparse.Namespace) -> int:
+    """Print all locks of the cell, held or awaited."""
+    with open_cell(arguments) as cell:
+        locks = cell.locks()
+    if arguments.json:
+        print_json(locks)
+        return DONE
+    known = {(lock.shard, lock.number): lock for lock in locks}
+    print_table(
+        ("lock", "shard", "who", "state", "mode", "age", "lease left", "hold left", "data",
+         "waits for"),
+        [_row(lock, known) for lock in locks],
+        empty="no lock is held or awaited",
+    )  # fmt: skip
+    return DONE
+
+
+def _row(lock: LockInfo, known: dict[tuple[str, int], LockInfo]) -> tuple[object, ...]:
+    blockers = [_blocker(number, known.get((lock.shard, number))) for number in lock.waits_for]
+    return (
+        lock.number,
+        lock.shard,
+        who(lock),
+        "held" if lock.granted else "waits",
+        lock.modes,
+        shown_s(lock.age_s),
+        shown_s(lock.lease_left_s),
+        shown_s(lock.hold_left_s) if lock.granted else "-",
+        ", ".join(lock.slots),
+        ", ".join(blockers) or "-",
+    )
+
+
+def who(lock: LockInfo) -> str:
+    """Return the holder as people look for it: actor, host, process."""
+    return f"{lock.actor}@{lock.host} pid {lock.pid}"
+
+
+def _blocker(number: int, lock: LockInfo | None) -> str:
+    return f"{number} ({who(lock)})" if lock is not None else str(number)
+
+
+# ---------------------------------------------------------------- hold
+
+
+def held(text: str) -> tuple[str, str, str, str]:
+    """Read ``[WORLD:]ENTITY/ASPECT:read|write``; an `argparse` type."""
+    found = _HELD.match(text)
+    if found is None:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not written [WORLD:]ENTITY/ASPECT:read or …:write"
+        )
+    entity, aspect = slot_name(found["slot"])
+    try:
+        (Entities if "*" in entity else Entity)(entity)
+        checked_name("aspect", aspect, slashes=False)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+    return found["world"] or "", entity, aspect, found["access"]
+
+
+def hold_lock(arguments: argparse.Namespace) -> int:
+    """Hold a lock while a command runs."""
+    if not arguments.command:
+        raise ConfigError("lock hold needs a command: enact lock hold REQUEST … -- COMMAND …")
+    with (
+        StopOnSignal() as stop,
+        open_cell(arguments, observer=False, actor=_command_name(arguments)) as cell,
+    ):
+        return _hold(cell, arguments, stop)
+
+
+def _hold(cell: Cell, arguments: argparse.Namespace, stop: StopOnSignal) -> int:
+    from enact_dist.cli.held_command import HeldCommand
+
+    items = [_item(cell, request, arguments.world) for request in arguments.requests]
+    client = cell.world(items[0].context).session.client
+    lock = client.acquire(
+        items, wait_s=arguments.wait, hold_s=arguments.hold, check_plan=lambda: None
+    )
+    try:
+        with HeldCommand(arguments.command) as running:
+            while not running.wait(POLL_S):
+                running.pass_on(stop)
+                if not client.valid(lock):
+                    # It may be lost: the command must not go on while nobody knows.
+                    running.pause()
+                    client.check(lock)
+                    running.resume()
+        client.check(lock)
+    except LeaseLostError as error:
+        raise LeaseLostError(
+            f"{error}; {arguments.command[0]} was ended, as it no longer holds the lock",
+            cause=error.cause,
+        ) from error
+    finally:
+        client.release(lock)
+    return running.status
+
+
+def _command_name(arguments: argparse.Namespace) -> str:
+    return f"hold:{os.path.basename(arguments.command[0])}"  # noqa: PTH119 (a word, not a file)
+
+
+def _item(cell: Cell, request: tuple[str, str, str, str], default: str | None) -> Item:
+    """Return the protocol's line for a request, whose datum type is of no matter here."""
+    from enact_dist.core.messages import Item
+
+    world, entity, aspect, access = request
+    worlds = cell.worlds()
+    world = world or default or (worlds[0] if len(worlds) == 1 else "")
+    if not world:
+        raise ConfigError(
+            f"in which world context is {entity}/{aspect}? write WORLD:{entity}/{aspect}:{access}"
+            f" or --world WORLD (known: {', '.join(worlds) or 'none'})"
+        )
+    known = cell.aspects()
+    if not known.get(aspect, ("", ""))[0]:
+        names = ", ".join(sorted(name for name, entry in known.items() if entry[0]))
+        raise MisuseError(f"no aspect {aspect!r} is registered (known: {names or 'none'})")
+    cell.world(world)  # refuses an unknown one by name
+    return Item(int(_ACCESSES[access, "*" in entity]), world, entity, aspect)
+
+
+# ---------------------------------------------------------------- break
+
+
+def break_lock(arguments: argparse.Namespace) -> int:
+    """Take a lock away by its number."""
+    with open_cell(arguments) as cell:
+        shard = arguments.shard or _shard_of(arguments.number, cell.locks())
+        broken = cell.break_lock(arguments.number, shard=shard, reason=arguments.reason)
+    if broken is None:
+        raise MisuseError(f"shard {shard} knows no lock {arguments.number}; see enact lock ls")
+    if arguments.json:
+        print_json(broken)
+    else:
+        state = "held" if broken.granted else "awaited"
+        print(
+            f"broke lock {broken.number} on {shard}, {state} by {who(broken)}: {arguments.reason}"
+        )
+    return DONE
+
+
+def _shard_of(number: int, locks: Sequence[LockInfo]) -> str:
+    shards = sorted({lock.shard for lock in locks if lock.number == number})
+    if not shards:
+        raise MisuseError(f"no shard knows a lock {number}; see enact lock ls")
+    if len(shards) > 1:
+        raise ConfigError(f"shards {', '.join(shards)} all have a lock {number}; say --shard NAME")
+    return shards[0]

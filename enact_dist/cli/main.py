@@ -1,0 +1,127 @@
+"""`enact`: reads the command line, runs the verb, turns every error into one line and a status.
+
+====  =======================================================
+exit  meaning
+====  =======================================================
+0     done
+1     refused or failed
+2     wrong usage, or a configuration that cannot be used
+3     a shard is unreachable
+130   interrupted with Ctrl-C
+====  =======================================================
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.cli import actor, demo, doctor, lock, shard, up, world
+from enact_dist.cli.verbs import DONE, FAILED, UNREACHABLE, USAGE
+from enact_dist.errors import ConfigError, EnactError, ShardUnreachableError
+from enact_dist.supervise import end_with_supervisor
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+INTERRUPTED: Final = 130
+
+_EPILOG: Final = """\
+examples:
+  enact up cell.toml                  run every shard and actor of a cell on this machine
+  enact world tree online             what a world context knows
+  enact lock ls                       who holds what, and who waits for whom
+  enact demo palletizing              watch actors report damaged packages
+
+The cell is ./cell.toml unless --cell or $ENACT_CELL names another file or an endpoint.
+Exit status: 0 done, 1 refused or failed, 2 usage or configuration, 3 unreachable."""
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """Return the parser of all nouns and verbs."""
+    parser = argparse.ArgumentParser(
+        prog="enact",
+        description="Distributed world contexts for robots.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--debug", action="store_true", help="show tracebacks of errors")
+    parser.add_argument("--version", action="store_true", help="print the version and leave")
+    nouns = parser.add_subparsers(metavar="COMMAND", title="commands", dest="noun")
+    for noun in (up, shard, actor, world, lock, doctor, demo):
+        noun.add_to(nouns)
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Carry out one command line and return its exit status.
+
+    Args:
+        argv: Arguments without the program's name; those of this process unless given.
+
+    Raises:
+        SystemExit: The command line cannot be read (status 2), or `--help` was asked (0).
+    """
+    words = list(sys.argv[1:] if argv is None else argv)
+    words, command = _split_command(words)
+    parser = build_parser()
+    arguments = parser.parse_args(words)
+    arguments.command = command
+    if arguments.version:
+        return _version()
+    if arguments.noun is None:
+        parser.print_help()
+        return USAGE
+    return _run(arguments)
+
+
+def _split_command(words: list[str]) -> tuple[list[str], list[str] | None]:
+    """Take off what follows a lone ``--``: a command to run, never options of ours."""
+    if "--" not in words:
+        return words, None
+    at = words.index("--")
+    return words[:at], words[at + 1 :]
+
+
+def _version() -> int:
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        print(f"enact-dist {version('enact-dist')}")
+    except PackageNotFoundError:
+        print("enact-dist (not installed as a package)")
+    return DONE
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    try:
+        end_with_supervisor()
+        status: int = arguments.run(arguments)
+        sys.stdout.flush()
+    except EnactError as error:
+        return _report(error, debug=arguments.debug)
+    except KeyboardInterrupt:
+        return INTERRUPTED
+    except BrokenPipeError:
+        # Whoever read our output has seen enough; what is left must not fail again at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return DONE
+    except (OSError, ImportError, MemoryError) as error:
+        return _report(error, debug=arguments.debug)
+    return status
+
+
+def _report(error: Exception, *, debug: bool) -> int:
+    if debug:
+        raise error
+    text = str(error) or type(error).__name__
+    print(f"enact: {' '.join(text.split())}", file=sys.stderr)
+    if isinstance(error, ConfigError):
+        return USAGE
+    return UNREACHABLE if isinstance(error, ShardUnreachableError) else FAILED
+
+
+if __name__ == "__main__":
+    sys.exit(main())

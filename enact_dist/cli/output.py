@@ -1,0 +1,141 @@
+"""Tables, trees and JSON on standard output: for people on a terminal, plain text into a pipe."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import sys
+from typing import TYPE_CHECKING, Protocol
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+
+COLOURS = ("36", "33", "35", "32", "34", "31", "96", "93", "95", "92")
+"""ANSI colours of log prefixes, in turn."""
+
+
+def on_terminal() -> bool:
+    """Say whether standard output is a terminal that shows colours."""
+    return sys.stdout.isatty() and "NO_COLOR" not in os.environ and os.environ.get("TERM") != "dumb"
+
+
+def print_json(value: object) -> None:
+    """Print a value as JSON; dataclasses as objects, what JSON does not have as text."""
+    print(json.dumps(value, default=_plain, ensure_ascii=False, indent=2))
+
+
+def print_json_line(value: object) -> None:
+    """Print a value as one line of JSON, at once."""
+    print(json.dumps(value, default=_plain, ensure_ascii=False), flush=True)
+
+
+def _plain(value: object) -> object:
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+    return str(value)
+
+
+def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]], *, empty: str) -> None:
+    """Print rows under their column names, or the sentence `empty` where there are none."""
+    texts = [[str(cell) for cell in row] for row in rows]
+    if not texts:
+        print(empty)
+    elif on_terminal():
+        _rich_table(columns, texts)
+    else:
+        _plain_table(columns, texts)
+
+
+def _rich_table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(box=SIMPLE_HEAD, header_style="bold", pad_edge=False)
+    for column in columns:
+        table.add_column(column, overflow="fold")
+    for row in rows:
+        table.add_row(*(Text(cell) for cell in row))
+    Console().print(table)
+
+
+def _plain_table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    lines = [list(columns), *rows]
+    widths = [max(len(line[index]) for line in lines) for index in range(len(columns))]
+    for line in lines:
+        padded = (cell.ljust(width) for cell, width in zip(line, widths, strict=True))
+        print("  ".join(padded).rstrip())
+
+
+class Branch(Protocol):
+    """A part of a tree: its own line and the parts below it, by name."""
+
+    @property
+    def label(self) -> str:
+        """The line of this part."""
+
+    @property
+    def children(self) -> Mapping[str, Branch]:
+        """The parts below."""
+
+
+def print_tree(root: Branch) -> None:
+    """Print a tree with its root as the first line."""
+    if on_terminal():
+        _rich_tree(root)
+    else:
+        _plain_tree(root, 0)
+
+
+def _plain_tree(branch: Branch, depth: int) -> None:
+    print(f"{'  ' * depth}{branch.label}")
+    for child in branch.children.values():
+        _plain_tree(child, depth + 1)
+
+
+def _rich_tree(root: Branch) -> None:
+    from rich.console import Console
+    from rich.text import Text
+    from rich.tree import Tree
+
+    def grow(tree: Tree, branch: Branch) -> None:
+        for child in branch.children.values():
+            grow(tree.add(Text(child.label)), child)
+
+    tree = Tree(Text(root.label, style="bold"))
+    grow(tree, root)
+    Console().print(tree)
+
+
+# ---------------------------------------------------------------- units for people
+
+
+def shown_s(value_s: float) -> str:
+    """Return a duration as people read it: ``12 ms``, ``3.4 s``, ``2 h 5 min``."""
+    if value_s < 1.0:
+        return f"{value_s * 1e3:.0f} ms" if value_s >= 0.01 else f"{value_s * 1e3:.1f} ms"
+    if value_s < 60.0:
+        return f"{value_s:.1f} s"
+    minutes, rest_s = divmod(round(value_s), 60)
+    hours, minutes = divmod(minutes, 60)
+    days, hours = divmod(hours, 24)
+    if days:
+        return f"{days} d {hours} h"
+    return f"{hours} h {minutes} min" if hours else f"{minutes} min {rest_s} s"
+
+
+def shown_bytes(size_bytes: float) -> str:
+    """Return a size as people read it, in decimal units: ``312 B``, ``1.4 MB``."""
+    for unit in ("B", "kB", "MB", "GB"):
+        if size_bytes < 1000.0 or unit == "GB":
+            digits = 0 if unit == "B" or size_bytes >= 100.0 else 1
+            return f"{size_bytes:.{digits}f} {unit}"
+        size_bytes /= 1000.0
+    raise AssertionError
+
+
+def coloured(text: str, index: int) -> str:
+    """Return `text` in the colour of that index, where the terminal shows colours."""
+    return f"\033[{COLOURS[index % len(COLOURS)]}m{text}\033[0m" if on_terminal() else text

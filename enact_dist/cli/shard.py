@@ -1,0 +1,125 @@
+"""`enact shard run|ls`."""
+
+from __future__ import annotations
+
+import os
+from typing import TYPE_CHECKING
+
+from enact_dist.cli.output import print_json, print_table, shown_bytes, shown_s
+from enact_dist.cli.verbs import (
+    DONE,
+    UNREACHABLE,
+    add_cell,
+    add_noun,
+    add_reader,
+    add_verb,
+    cell_target,
+    is_endpoint,
+    open_cell,
+    verbs_of,
+)
+from enact_dist.errors import ConfigError
+
+if TYPE_CHECKING:
+    import argparse
+
+    from enact_dist.cell import ShardInfo
+    from enact_dist.cli.verbs import Verb
+
+
+def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
+    """Add the noun and its verbs."""
+    verbs = verbs_of(add_noun(nouns, "shard", "run and list shard daemons"))
+    run = add_verb(
+        verbs,
+        "run",
+        "run one shard daemon of the cell until SIGTERM",
+        run=run_shard,
+        example="enact shard run left --cell cell.toml",
+    )
+    run.add_argument("name", metavar="NAME", help="name of the shard in cell.toml")
+    add_cell(run)
+    run.add_argument(
+        "--listen", action="append", metavar="ENDPOINT", help="replaces `listen` of cell.toml"
+    )
+    run.add_argument(
+        "--advertise", action="append", metavar="ENDPOINT", help="replaces `advertise`"
+    )
+    run.add_argument("--folder", metavar="DIR", help="replaces `folder` of cell.toml")
+    run.add_argument(
+        "--log-format", choices=("text", "json"), default="text", help="of the log on stderr"
+    )
+    ls = add_verb(
+        verbs,
+        "ls",
+        "list the shards of the cell and how they are",
+        run=list_shards,
+        example="enact shard ls --cell tcp/127.0.0.1:7447",
+    )
+    add_reader(ls)
+
+
+def run_shard(arguments: argparse.Namespace) -> int:
+    """Run one shard daemon in this process."""
+    from enact_dist.config import load_config
+    from enact_dist.config_environment import variable_of
+    from enact_dist.link import shard_daemon
+
+    target = cell_target(arguments)
+    if is_endpoint(target):
+        raise ConfigError(f"{target} is an endpoint; a shard needs the cell.toml: --cell FILE")
+    environment = dict(os.environ)
+    for key, found in (
+        ("LISTEN", ",".join(arguments.listen or ())),
+        ("ADVERTISE", ",".join(arguments.advertise or ())),
+        ("FOLDER", arguments.folder),
+    ):
+        if found:
+            environment[variable_of(arguments.name, key)] = found
+    # The name comes first: an override for a shard that is not there would blame the override.
+    load_config(target).shard(arguments.name)
+    config = load_config(target, environment=environment)
+    shard = config.shard(arguments.name)
+    return shard_daemon.run_shard(
+        shard_daemon.DaemonSettings(
+            cell=config.name,
+            shard=config.shard_settings(shard.name),
+            listen=shard.listen,
+            folder=shard.folder,
+            log_format=arguments.log_format,
+            link_lease_s=config.ttl_s / 2,
+        )
+    )
+
+
+def list_shards(arguments: argparse.Namespace) -> int:
+    """Print all shards, also those that do not answer."""
+    with open_cell(arguments) as cell:
+        shards = cell.shards()
+    if arguments.json:
+        print_json(shards)
+    else:
+        print_table(
+            ("shard", "endpoint", "state", "epoch", "up", "slots", "data", "sessions", "locks",
+             "rtt"),
+            [_row(shard) for shard in shards],
+            empty="no shards",
+        )  # fmt: skip
+    return DONE if all(shard.reachable for shard in shards) else UNREACHABLE
+
+
+def _row(shard: ShardInfo) -> tuple[object, ...]:
+    if not shard.reachable:
+        return (shard.name, shard.endpoint, "UNREACHABLE", *["-"] * 7)
+    return (
+        shard.name,
+        shard.endpoint,
+        "open" if shard.open else "waits for older leases",
+        shard.epoch,
+        shown_s(shard.uptime_s),
+        shard.slots,
+        shown_bytes(shard.size_bytes),
+        shard.sessions,
+        shard.locks,
+        shown_s(shard.round_trip_s),
+    )

@@ -1,0 +1,241 @@
+"""What all verbs share: options, how a cell is named and joined, clean ends on signals."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import sys
+import threading
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, Self
+
+from enact_dist.errors import ConfigError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from types import FrameType
+
+    from enact_dist.cell import Cell
+    from enact_dist.config_types import CellConfig
+
+DONE: Final = 0
+FAILED: Final = 1
+USAGE: Final = 2
+UNREACHABLE: Final = 3
+
+CELL_VARIABLE: Final = "ENACT_CELL"
+CELL_DEFAULT: Final = "cell.toml"
+
+Verb = argparse.ArgumentParser
+"""A parser of one verb, as `add_verb` returns it."""
+
+
+def add_noun(nouns: argparse._SubParsersAction[Verb], name: str, summary: str) -> Verb:
+    """Add a noun and return its parser."""
+    return nouns.add_parser(name, help=summary, description=summary)
+
+
+def add_verb(
+    verbs: argparse._SubParsersAction[Verb],
+    name: str,
+    summary: str,
+    *,
+    run: Callable[[argparse.Namespace], int],
+    example: str,
+) -> Verb:
+    """Add a verb that `run` carries out; its help ends with `example`."""
+    parser = verbs.add_parser(
+        name,
+        help=summary,
+        description=f"{summary[0].upper()}{summary[1:]}.",
+        epilog="example"
+        + ("s" if "\n" in example else "")
+        + ":\n  "
+        + example.replace("\n", "\n  "),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.set_defaults(run=run)
+    parser.add_argument(
+        "--debug", action="store_true", default=argparse.SUPPRESS, help="show tracebacks of errors"
+    )
+    return parser
+
+
+def verbs_of(noun: Verb) -> argparse._SubParsersAction[Verb]:
+    """Return where the verbs of a noun are added."""
+    return noun.add_subparsers(metavar="VERB", required=True)
+
+
+def add_cell(parser: Verb) -> None:
+    """Add the option that names the cell."""
+    parser.add_argument(
+        "--cell",
+        metavar="CELL",
+        help="a cell.toml or an endpoint such as tcp/host:7447"
+        f" (default: ${CELL_VARIABLE}, else ./{CELL_DEFAULT})",
+    )
+
+
+def add_reader(parser: Verb) -> None:
+    """Add the options of a verb that only looks."""
+    add_cell(parser)
+    parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
+    add_timeout(parser)
+
+
+def add_timeout(parser: Verb) -> None:
+    """Add the option that says how long to wait for a shard."""
+    parser.add_argument(
+        "--timeout",
+        dest="timeout_s",
+        type=seconds,
+        default=5.0,
+        metavar="S",
+        help="seconds to wait for a first shard (default: 5)",
+    )
+
+
+def seconds(text: str) -> float:
+    """Read a positive number of seconds; an `argparse` type."""
+    value = float(text)
+    if not 0.0 < value < float("inf"):
+        raise ValueError(text)
+    return value
+
+
+def whole(text: str) -> int:
+    """Read a whole number above zero; an `argparse` type."""
+    value = int(text)
+    if value < 1:
+        raise ValueError(text)
+    return value
+
+
+def pair(text: str) -> tuple[str, str]:
+    """Read ``name=value``; an `argparse` type."""
+    name, equals, value = text.partition("=")
+    if not equals or not name:
+        raise argparse.ArgumentTypeError(f"{text!r} is not written name=value")
+    return name, value
+
+
+def pairs(found: list[tuple[str, str]] | None, option: str) -> dict[str, str]:
+    """Return repeated ``name=value`` options as a dict; a name given twice is refused.
+
+    Raises:
+        ConfigError: A name is given twice.
+    """
+    read: dict[str, str] = {}
+    for name, value in found or ():
+        if name in read:
+            raise ConfigError(f"{option} {name} is given twice: {read[name]!r} and {value!r}")
+        read[name] = value
+    return read
+
+
+def slot_name(text: str) -> tuple[str, str]:
+    """Read ``ENTITY/ASPECT``, split at the last slash; an `argparse` type."""
+    entity, slash, aspect = text.rpartition("/")
+    if not slash or not entity or not aspect:
+        raise argparse.ArgumentTypeError(f"{text!r} is not written ENTITY/ASPECT")
+    return entity, aspect
+
+
+# ---------------------------------------------------------------- the cell
+
+
+def cell_target(arguments: argparse.Namespace) -> str:
+    """Return the `cell.toml` or endpoint that the command names.
+
+    Raises:
+        ConfigError: None is named and none lies here.
+    """
+    named = arguments.cell or os.environ.get(CELL_VARIABLE)
+    if named:
+        return str(named)
+    if not Path(CELL_DEFAULT).is_file():
+        raise ConfigError(
+            f"no cell: there is no {CELL_DEFAULT} in {Path.cwd()}; name one with --cell FILE or"
+            f" --cell tcp/host:7447, or set {CELL_VARIABLE}"
+        )
+    return CELL_DEFAULT
+
+
+def is_endpoint(target: str) -> bool:
+    """Say whether a cell is named by an endpoint instead of a file."""
+    protocol, slash, address = target.partition("/")
+    return bool(slash) and protocol in {"tcp", "tls", "quic", "udp", "ws"} and ":" in address
+
+
+def cell_config(arguments: argparse.Namespace) -> CellConfig:
+    """Return the configuration of the cell that the command names.
+
+    Raises:
+        ConfigError: It names an endpoint, or the file cannot be used.
+    """
+    from enact_dist.config import load_config
+
+    target = cell_target(arguments)
+    if is_endpoint(target):
+        raise ConfigError(f"{target} is an endpoint; this command needs the cell.toml: --cell FILE")
+    return load_config(target)
+
+
+def open_cell(arguments: argparse.Namespace, *, observer: bool = True, actor: str = "") -> Cell:
+    """Join the cell that the command names.
+
+    Args:
+        arguments: Of a verb with the option `--cell`.
+        observer: Only look.
+        actor: How others see this process; `enact` unless given.
+
+    Raises:
+        ConfigError: The cell is named wrongly.
+        ShardUnreachableError: No shard answered in time.
+    """
+    from enact_dist.connecting import connect
+
+    return connect(
+        cell_target(arguments),
+        actor=actor or "enact",
+        timeout_s=getattr(arguments, "timeout_s", 5.0),
+        observer=observer,
+    )
+
+
+def see_working_folder() -> None:
+    """Let ``MODULE:CLASS`` name a module of the working folder, as ``python -m`` would."""
+    folder = os.getcwd()  # noqa: PTH109 (sys.path holds text)
+    if folder not in sys.path:
+        sys.path.insert(0, folder)
+
+
+# ---------------------------------------------------------------- signals
+
+
+class StopOnSignal:
+    """Turns SIGTERM and SIGINT into an event while its block runs.  Main thread only.
+
+    Attributes:
+        event: Set by the first signal.
+        count: How many signals came.
+    """
+
+    _NUMBERS = (signal.SIGTERM, signal.SIGINT)
+
+    def __init__(self) -> None:
+        self.event = threading.Event()
+        self.count = 0
+
+    def __enter__(self) -> Self:
+        self._before = {number: signal.signal(number, self._take) for number in self._NUMBERS}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _take(self, _number: int, _frame: FrameType | None) -> None:
+        self.count += 1
+        self.event.set()

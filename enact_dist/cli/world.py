@@ -1,0 +1,282 @@
+"""`enact world ls|tree|get|put|watch`."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from enact_dist.cli.output import (
+    print_json,
+    print_json_line,
+    print_table,
+    print_tree,
+    shown_bytes,
+    shown_s,
+)
+from enact_dist.cli.verbs import (
+    DONE,
+    StopOnSignal,
+    add_noun,
+    add_reader,
+    add_verb,
+    open_cell,
+    seconds,
+    slot_name,
+    verbs_of,
+    whole,
+)
+from enact_dist.terms import Entities, Entity
+
+if TYPE_CHECKING:
+    import argparse
+
+    from enact_dist.cli.verbs import Verb
+    from enact_dist.watch import Change
+    from enact_dist.world import SlotInfo
+
+WATCH_SLICE_S = 0.2
+"""How soon a watch notices a signal."""
+
+
+def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
+    """Add the noun and its verbs."""
+    verbs = verbs_of(add_noun(nouns, "world", "look into world contexts and set data"))
+    ls = add_verb(
+        verbs, "ls", "list the world contexts of the cell", run=list_worlds,
+        example="enact world ls",
+    )  # fmt: skip
+    add_reader(ls)
+    _add_tree(verbs)
+    _add_get(verbs)
+    _add_put(verbs)
+    _add_watch(verbs)
+
+
+def _add_tree(verbs: argparse._SubParsersAction[Verb]) -> None:
+    tree = add_verb(
+        verbs, "tree", "show the entities of a world context with their aspects", run=show_tree,
+        example="enact world tree online 'tray/**'",
+    )  # fmt: skip
+    tree.add_argument("world", metavar="WORLD", help="name of the world context")
+    tree.add_argument("pattern", metavar="PATTERN", nargs="?", default="**", help="of entities")
+    tree.add_argument("--null", action="store_true", help="show slots without a datum, too")
+    add_reader(tree)
+
+
+def _add_get(verbs: argparse._SubParsersAction[Verb]) -> None:
+    get = add_verb(
+        verbs, "get", "print or save one datum, as last committed", run=get_datum,
+        example="enact world get online system/deviations\n"
+        "enact world get training product/surface --out surface.npz",
+    )  # fmt: skip
+    get.add_argument("world", metavar="WORLD", help="name of the world context")
+    get.add_argument("slot", metavar="ENTITY/ASPECT", type=slot_name, help="which datum")
+    get.add_argument(
+        "--out", metavar="FILE", help="save it: .npz (arrays), .npy (one array) or .json (the rest)"
+    )
+    add_reader(get)
+
+
+def _add_put(verbs: argparse._SubParsersAction[Verb]) -> None:
+    put = add_verb(
+        verbs, "put", "set one datum under a lock, checked against its aspect's type", run=put_datum,
+        example="enact world put online work_bench/contact_count 3\n"
+        "enact world put online camera/intrinsics @intrinsics.npy",
+    )  # fmt: skip
+    put.add_argument("world", metavar="WORLD", help="name of the world context")
+    put.add_argument("slot", metavar="ENTITY/ASPECT", type=slot_name, help="which datum")
+    put.add_argument(
+        "value",
+        metavar="VALUE",
+        help="JSON literal (null deletes), or @FILE: .npy, .json or raw",
+    )
+    put.add_argument(
+        "--new", action="store_true", help="register the aspect, if unknown, by the value's type"
+    )
+    put.add_argument("--wait", type=seconds, default=10.0, metavar="S", help="for the lock")
+    add_reader(put)
+
+
+def _add_watch(verbs: argparse._SubParsersAction[Verb]) -> None:
+    watch = add_verb(
+        verbs, "watch", "print what is there and then every change, until Ctrl-C", run=watch_world,
+        example="enact world watch online 'tray/**' --aspect surface",
+    )  # fmt: skip
+    watch.add_argument("world", metavar="WORLD", help="name of the world context")
+    watch.add_argument("pattern", metavar="PATTERN", nargs="?", default="**", help="of entities")
+    watch.add_argument("--aspect", action="append", metavar="NAME", help="only these")
+    watch.add_argument("--count", type=whole, metavar="N", help="leave after N changes")
+    add_reader(watch)
+
+
+# ---------------------------------------------------------------- ls, tree
+
+
+def list_worlds(arguments: argparse.Namespace) -> int:
+    """Print the world contexts with what they hold."""
+    with open_cell(arguments) as cell:
+        rows = []
+        for name in cell.worlds():
+            known = [info for info in cell.world(name).survey() if not info.null_reason]
+            rows.append(
+                {
+                    "world": name,
+                    "entities": len({info.entity for info in known}),
+                    "data": len(known),
+                    "size_bytes": sum(info.size_bytes for info in known),
+                }
+            )
+    if arguments.json:
+        print_json(rows)
+    else:
+        print_table(
+            ("world", "entities", "data", "size"),
+            [(*list(row.values())[:3], shown_bytes(int(str(row["size_bytes"])))) for row in rows],
+            empty="the cell has no world context",
+        )
+    return DONE
+
+
+@dataclass(slots=True)
+class _Branch:
+    """One segment of an entity's path: its line, and what lies below."""
+
+    label: str
+    children: dict[str, _Branch] = field(default_factory=dict)
+
+    def at(self, segments: list[str]) -> _Branch:
+        """Return the branch at a path below this one, growing it where needed."""
+        branch = self
+        for segment in segments:
+            branch = branch.children.setdefault(segment, _Branch(f"{segment}/"))
+        return branch
+
+
+def show_tree(arguments: argparse.Namespace) -> int:
+    """Print the entities of one world context as a tree, aspects as its leaves."""
+    with open_cell(arguments) as cell:
+        infos = [
+            info
+            for info in cell.world(arguments.world).survey(Entities(arguments.pattern))
+            if arguments.null or not info.null_reason
+        ]
+    if arguments.json:
+        print_json([_slot_facts(info) for info in infos])
+        return DONE
+    root = _Branch(f"{arguments.world} ({len(infos)} data)")
+    for info in infos:
+        # A space cannot stand in a segment, so an aspect never hides an entity of its name.
+        leaf = f"{info.aspect}  {_slot_line(info)}"
+        root.at(info.entity.name.split("/")).children[f" {info.aspect}"] = _Branch(leaf)
+    print_tree(root)
+    return DONE
+
+
+def _slot_facts(info: SlotInfo) -> dict[str, object]:
+    return {
+        "entity": info.entity.name,
+        "aspect": info.aspect,
+        "version": info.version,
+        "stamp_ns": info.position.stamp_ns,
+        "size_bytes": info.size_bytes,
+        "null_reason": info.null_reason,
+        "shard": info.shard,
+    }
+
+
+def _slot_line(info: SlotInfo) -> str:
+    if info.null_reason:
+        return f"v{info.version}  NULL ({info.null_reason})"
+    ago_s = max(0.0, time.time() - info.position.stamp_ns / 1e9)
+    size = f"  {shown_bytes(info.size_bytes)}" if info.size_bytes else ""
+    return f"v{info.version}{size}  {shown_s(ago_s)} ago"
+
+
+# ---------------------------------------------------------------- get, put
+
+
+def get_datum(arguments: argparse.Namespace) -> int:
+    """Print or save one datum."""
+    from enact_dist.cli import data
+
+    entity, aspect = arguments.slot
+    with open_cell(arguments) as cell:
+        datum = cell.world(arguments.world).raw(Entity(entity), aspect)
+    if arguments.out:
+        print(data.save(datum, arguments.out))
+    elif arguments.json:
+        print_json(data.plain(datum))
+    else:
+        for line in data.lines(datum):
+            print(line)
+    return DONE
+
+
+def put_datum(arguments: argparse.Namespace) -> int:
+    """Set one datum under a write lock."""
+    from enact_dist.cli import data
+    from enact_dist.lock import Lock
+    from enact_dist.terms import Aspect, Write
+
+    entity, name = arguments.slot
+    with open_cell(arguments, observer=False) as cell:
+        world = cell.world(arguments.world)
+        datum_type = data.type_to_put(name, cell.aspects(), arguments.value, new=arguments.new)
+        value = data.read(arguments.value, datum_type)
+        request = Write(world, Entity(entity), Aspect(name, datum_type))
+        with Lock(request, wait_s=arguments.wait) as lock:
+            version = lock.version(request) + 1
+            if value is data.NOTHING:
+                del lock[request]
+            else:
+                lock[request] = value
+    if arguments.json:
+        print_json({"world": world.name, "entity": entity, "aspect": name, "version": version})
+    else:
+        done = "is null" if value is data.NOTHING else "set"
+        print(f"{world.name}:{entity}/{name} {done}, v{version}")
+    return DONE
+
+
+# ---------------------------------------------------------------- watch
+
+
+def watch_world(arguments: argparse.Namespace) -> int:
+    """Print changes as they come until a signal, or until there were enough."""
+    with StopOnSignal() as stop, open_cell(arguments) as cell:
+        world = cell.world(arguments.world)
+        shown = 0
+        with world.watch(Entities(arguments.pattern)) as watch:
+            while not stop.event.is_set() and shown != arguments.count:
+                change = watch.next(WATCH_SLICE_S)
+                if change is None or (arguments.aspect and change.aspect not in arguments.aspect):
+                    continue
+                _print_change(world.name, change, as_json=arguments.json)
+                shown += 1
+    return DONE
+
+
+def _print_change(world: str, change: Change, *, as_json: bool) -> None:
+    if as_json:
+        facts = {
+            "world": world,
+            "entity": change.entity.name,
+            "aspect": change.aspect,
+            "version": change.version,
+            "stamp_ns": change.position.stamp_ns,
+            "shard": change.position.shard,
+            "gap": change.gap,
+            "null": change.null,
+        }
+        print_json_line(facts)
+        return
+    stamp_s, nanoseconds = divmod(change.position.stamp_ns, 1_000_000_000)
+    clock = time.strftime("%H:%M:%S", time.localtime(stamp_s))
+    null = "  NULL" if change.null else ""
+    gap = f"  ({change.gap} versions not seen)" if change.gap else ""
+    print(
+        f"{clock}.{nanoseconds // 1_000_000:03d}  {world}:{change.entity}/{change.aspect}"
+        f"  v{change.version}{null}{gap}",
+        flush=True,
+    )

@@ -1,0 +1,345 @@
+"""Checks of a machine and of the way from it to a cell, each with what to do about it.
+
+`examine` yields one finding per check, good ones too, as each check ends.  It changes nothing.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import enum
+import importlib
+import importlib.util
+import os
+import re
+import shutil
+import socket
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.errors import ConfigError, EnactError, ShardUnreachableError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from enact_dist.cell import Cell, ShardInfo
+    from enact_dist.config_types import CellConfig
+
+PYTHON_MIN: Final = (3, 11)
+
+LIBRARIES: Final = {
+    "libusb-1.0.so.0": "libusb-1.0-0",
+    "libEGL.so.1": "libegl1",
+    "libGL.so.1": "libgl1",
+    "libX11.so.6": "libx11-6",
+    "libudev.so.1": "libudev1",
+    "libidn2.so.0": "libidn2-0",
+    "libgomp.so.1": "libgomp1",
+}
+"""What Open3D loads beside the C library, and the Debian or Ubuntu package that has it."""
+
+SKEW_S_WARN: Final = 0.1
+SKEW_S_FAIL: Final = 1.0
+"""Stamps further ahead than this are refused by the shards."""
+SKEW_ROUNDS: Final = 5
+"""Of several round trips the shortest tells the skew best."""
+ROUND_TRIP_S_WARN: Final = 0.02
+
+SHM_FOLDER: Final = Path("/dev/shm")  # noqa: S108 (the kernel's folder, not a temporary file)
+SHM_BYTES_WARN: Final = 256_000_000
+DISK_BYTES_WARN: Final = 1_000_000_000
+DISK_BYTES_FAIL: Final = 50_000_000
+
+
+class Level(enum.Enum):
+    """How grave a finding is."""
+
+    OK = "ok"
+    WARN = "warn"
+    FAIL = "FAIL"
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """The result of one check.
+
+    Attributes:
+        level: How grave it is.
+        subject: What was checked.
+        text: What was found.
+        remedy: What to do; empty where nothing has to be done.
+    """
+
+    level: Level
+    subject: str
+    text: str
+    remedy: str = ""
+
+
+def examine(target: str, *, timeout_s: float = 5.0) -> Iterator[Finding]:
+    """Check this machine and, unless `target` is empty, the cell.
+
+    Args:
+        target: A `cell.toml`, an endpoint, or the empty string.
+        timeout_s: How long to wait for a shard.
+    """
+    yield python_version(sys.version_info[:3])
+    yield from _packages()
+    yield from _open3d()
+    yield shared_memory(SHM_FOLDER)
+    if not target:
+        yield Finding(
+            Level.WARN,
+            "cell",
+            "not checked: no cell.toml here",
+            "name it: enact doctor --cell FILE",
+        )
+        return
+    config = None
+    if Path(target).suffix == ".toml" or Path(target).exists():
+        try:
+            config = _config(target)
+        except ConfigError as error:
+            yield Finding(Level.FAIL, "cell.toml", str(error), "correct the file")
+            return
+        yield Finding(Level.OK, "cell.toml", f"{target}: cell {config.name}, {_counts(config)}")
+        yield from _folders(config)
+    yield from _cell(target, config, timeout_s)
+
+
+def _config(target: str) -> CellConfig:
+    from enact_dist.config import load_config
+
+    return load_config(target)
+
+
+def _counts(config: CellConfig) -> str:
+    return (
+        f"{len(config.shards)} shards, {len(config.worlds)} world contexts,"
+        f" {len(config.actors)} actors"
+    )
+
+
+# ---------------------------------------------------------------- this machine
+
+
+def python_version(found: tuple[int, ...]) -> Finding:
+    """Check a version of Python."""
+    shown = ".".join(map(str, found))
+    if found[:2] >= PYTHON_MIN:
+        return Finding(Level.OK, "python", f"{shown} at {sys.executable}")
+    return Finding(Level.FAIL, "python", f"{shown} is older than 3.11", "install a newer python3")
+
+
+def _packages() -> Iterator[Finding]:
+    for name, package in (("zenoh", "eclipse-zenoh"), ("msgpack", "msgpack"), ("numpy", "numpy")):
+        try:
+            importlib.import_module(name)
+        except ImportError as error:
+            yield Finding(
+                Level.FAIL, name, f"cannot be imported: {error}", f"pip install {package}"
+            )
+        else:
+            yield Finding(Level.OK, name, _version(package))
+
+
+def _version(package: str) -> str:
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "imported, version unknown"
+
+
+def _open3d() -> Iterator[Finding]:
+    if importlib.util.find_spec("open3d") is None:
+        yield Finding(
+            Level.WARN,
+            "open3d",
+            "not installed; the core does without, the demo does not",
+            "pip install 'enact-dist[actors]'",
+        )
+        return
+    missing = missing_libraries(LIBRARIES)
+    if missing:
+        yield Finding(
+            Level.FAIL,
+            "open3d",
+            f"cannot load {', '.join(missing)}",
+            f"sudo apt-get install -y {' '.join(missing.values())}",
+        )
+        return
+    yield _open3d_import()
+
+
+def missing_libraries(wanted: dict[str, str]) -> dict[str, str]:
+    """Return those of the shared libraries that this machine cannot load, with their packages."""
+    missing = {}
+    for library, package in wanted.items():
+        try:
+            ctypes.CDLL(library)
+        except OSError:
+            missing[library] = package
+    return missing
+
+
+def _open3d_import() -> Finding:
+    """Import Open3D in a process of its own: it may need a library that the list does not have."""
+    code = "import open3d; print(open3d.__version__)"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=120
+    )
+    if done.returncode == 0:
+        version = done.stdout.strip().splitlines()[-1]
+        return Finding(Level.OK, "open3d", f"{version}, all shared libraries found")
+    last = (done.stderr.strip().splitlines() or [f"exit status {done.returncode}"])[-1]
+    found = re.search(r"(\S+\.so[.\d]*): cannot open shared object", last)
+    remedy = f"apt-file search {found[1]} names the package" if found else "reinstall open3d-cpu"
+    return Finding(Level.FAIL, "open3d", f"cannot be imported: {last}", remedy)
+
+
+def shared_memory(folder: Path) -> Finding:
+    """Check the folder in which processes of one host can share memory."""
+    if not folder.is_dir():
+        return Finding(
+            Level.WARN, "shared memory", f"{folder} does not exist", f"mount a tmpfs at {folder}"
+        )
+    if not os.access(folder, os.W_OK | os.X_OK):
+        return Finding(
+            Level.WARN, "shared memory", f"{folder} is not writable", f"sudo chmod 1777 {folder}"
+        )
+    usage = shutil.disk_usage(folder)
+    text = f"{folder}: {usage.free / 1e6:.0f} MB free of {usage.total / 1e6:.0f} MB"
+    if usage.free < SHM_BYTES_WARN:
+        remedy = f"enlarge it: mount -o remount,size=1G {folder} (docker run --shm-size=1g)"
+        return Finding(Level.WARN, "shared memory", text, remedy)
+    return Finding(Level.OK, "shared memory", text)
+
+
+def _folders(config: CellConfig) -> Iterator[Finding]:
+    host = socket.gethostname()
+    for shard in config.shards:
+        if shard.folder is None:
+            yield Finding(
+                Level.WARN,
+                f"disk of {shard.name}",
+                "no folder: everything is lost when the shard stops",
+                f"write data_folder, or a folder in [shards.{shard.name}]",
+            )
+        elif shard.host in {"", host}:
+            yield data_folder(shard.name, shard.folder)
+
+
+def data_folder(shard: str, folder: Path) -> Finding:
+    """Check the disk on which a shard keeps, or will keep, its data."""
+    subject = f"disk of {shard}"
+    there = folder
+    while not there.exists() and there != there.parent:
+        there = there.parent
+    if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
+        user = os.environ.get("USER", str(os.getuid()))
+        return Finding(
+            Level.FAIL,
+            subject,
+            f"{there} cannot be written by {user}",
+            f"sudo install -d -o {user} {folder}",
+        )
+    free = shutil.disk_usage(there).free
+    text = f"{folder}: {free / 1e9:.1f} GB free"
+    if free < DISK_BYTES_FAIL:
+        return Finding(Level.FAIL, subject, text, "free some space: a full disk stops the shard")
+    if free < DISK_BYTES_WARN:
+        return Finding(Level.WARN, subject, text, "free some space: a full disk stops the shard")
+    return Finding(Level.OK, subject, text)
+
+
+# ---------------------------------------------------------------- the cell
+
+
+def _cell(target: str, config: CellConfig | None, timeout_s: float) -> Iterator[Finding]:
+    from enact_dist.connecting import connect
+
+    try:
+        with connect(target, actor="enact", timeout_s=timeout_s, observer=True) as cell:
+            for shard in _best_rounds(cell):
+                yield from _shard(shard)
+    except ShardUnreachableError as error:
+        if config is None:
+            yield _unreachable("cell", target)
+        for known in config.shards if config else ():
+            yield _unreachable(f"shard {known.name}", known.advertise[0])
+        if config is None:
+            return
+        yield Finding(Level.FAIL, "cell", str(error), f"enact up {target}")
+    except EnactError as error:
+        yield Finding(Level.FAIL, "cell", f"{type(error).__name__}: {error}")
+
+
+def _best_rounds(cell: Cell) -> list[ShardInfo]:
+    """Return each shard as seen by the shortest of several round trips."""
+    best: dict[str, ShardInfo] = {}
+    for _ in range(SKEW_ROUNDS):
+        for shard in cell.shards():
+            known = best.get(shard.name)
+            better = known is None or not known.reachable
+            if known is not None and shard.reachable and known.reachable:
+                better = shard.round_trip_s < known.round_trip_s
+            if better:
+                best[shard.name] = shard
+        if not all(shard.reachable for shard in best.values()):
+            break  # each further round would wait for it again
+    return list(best.values())
+
+
+def _shard(shard: ShardInfo) -> Iterator[Finding]:
+    subject = f"shard {shard.name}"
+    if not shard.reachable:
+        yield _unreachable(subject, shard.endpoint)
+        return
+    yield _connection(subject, shard)
+    yield clock_skew(f"clock of {shard.name}", shard.clock_ahead_s)
+
+
+def _connection(subject: str, shard: ShardInfo) -> Finding:
+    state = "" if shard.open else ", still waits for leases of before its restart"
+    text = f"{shard.endpoint} answers in {shard.round_trip_s * 1e3:.2f} ms{state}"
+    if shard.round_trip_s > ROUND_TRIP_S_WARN:
+        remedy = "every lock takes two round trips: look for a busy host or a slow link"
+        return Finding(Level.WARN, subject, text, remedy)
+    return Finding(Level.OK, subject, text)
+
+
+def clock_skew(subject: str, ahead_s: float) -> Finding:
+    """Check how far a shard's wall clock is ahead of ours."""
+    text = f"{abs(ahead_s) * 1e3:.1f} ms {'ahead of' if ahead_s > 0 else 'behind'} this host"
+    remedy = "synchronise both hosts' clocks: sudo apt-get install -y chrony"
+    if abs(ahead_s) > SKEW_S_FAIL:
+        return Finding(Level.FAIL, subject, f"{text}; commits would be refused", remedy)
+    if abs(ahead_s) > SKEW_S_WARN:
+        return Finding(Level.WARN, subject, text, remedy)
+    return Finding(Level.OK, subject, text)
+
+
+def _unreachable(subject: str, endpoint: str) -> Finding:
+    found, remedy = knock(endpoint)
+    return Finding(Level.FAIL, subject, f"{endpoint} does not answer: {found}", remedy)
+
+
+def knock(endpoint: str, *, timeout_s: float = 2.0) -> tuple[str, str]:
+    """Say why a ``tcp/host:port`` endpoint may not answer, and what to do about it."""
+    host, _, port = endpoint.partition("/")[2].rpartition(":")
+    host = host.strip("[]")
+    try:
+        socket.create_connection((host, int(port)), timeout_s).close()
+    except socket.gaierror:
+        return f"nobody knows the host {host}", f"correct the endpoint, or add {host} to /etc/hosts"
+    except ConnectionRefusedError:
+        return f"nothing listens at port {port}", "start the shard: enact up, or enact shard run"
+    except TimeoutError:
+        return "no packet comes back", f"look for a firewall in front of port {port} of {host}"
+    except (OSError, ValueError) as error:
+        return str(error), f"look at the network: ping {host}"
+    return "something listens, but it is no shard of this cell", f"see what runs at port {port}"

@@ -1,0 +1,275 @@
+"""Child processes of one machine: started, restarted with back-off, drained in order, one log.
+
+Rules a change must keep
+  * Shards are up before actors start, and actors are gone before shards stop: an actor that stops
+    can still commit, and a shard that stops has nobody left to wait for.
+  * A child never outlives its supervisor, even one that was killed: the kernel sends it SIGTERM.
+  * A child is restarted unless it ended as it should (an actor: 0) or can never run (2: usage or
+    configuration); pauses double up to `PAUSE_S_MAX` and start again after a good while.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import queue
+import signal
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from enact_dist.errors import EnactError
+
+PAUSE_S_MIN: Final = 0.2
+PAUSE_S_MAX: Final = 10.0
+"""Pauses between restarts: a shard with a damaged store must not fill the log."""
+GOOD_S: Final = 10.0
+"""A child that ran this long counts as well again."""
+READY_S: Final = 20.0
+"""How long actors wait for the shards at the start; then they try by themselves."""
+DRAIN_S: Final = {"actor": 10.0, "shard": 5.0}
+"""How long a child may take to end after SIGTERM; then it is killed."""
+SUPERVISOR_VARIABLE: Final = "ENACT_SUPERVISOR_PID"
+NEVER_AGAIN: Final = 2
+"""Exit status of wrong usage or configuration: the same command would fail the same way."""
+
+READY_MARK: Final = "ready:"
+"""First word of the line by which a child says that it serves."""
+
+Say = Callable[[str, str], None]
+"""Takes the name of a child, or the empty string, and one line of its output."""
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """One child process.
+
+    Attributes:
+        name: How the log names it.
+        kind: "shard" or "actor"; decides the order of start and end.
+        command: What to run.
+    """
+
+    name: str
+    kind: str
+    command: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _Ended:
+    child: _Child
+    status: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Ready:
+    child: _Child
+
+
+class _Child:
+    """One task with its process; used by the supervisor's thread only, but for `_read`."""
+
+    def __init__(self, task: Task, say: Say, events: queue.SimpleQueue[_Ended | _Ready]) -> None:
+        self.task = task
+        self.ready = False
+        self.over = False
+        self.restart_at_s = 0.0
+        self._say, self._events = say, events
+        self._process: subprocess.Popen[str] | None = None
+        self._pause_s = PAUSE_S_MIN
+        self._started_s = 0.0
+
+    @property
+    def running(self) -> bool:
+        return self._process is not None
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid if self._process is not None else 0
+
+    def start(self) -> None:
+        self._started_s = time.monotonic()
+        self._process = subprocess.Popen(
+            self.task.command,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            errors="replace",
+            bufsize=1,
+            env={**os.environ, SUPERVISOR_VARIABLE: str(os.getpid()), "PYTHONUNBUFFERED": "1"},
+            process_group=0,  # Ctrl-C on the terminal is the supervisor's to pass on, in order
+        )
+        threading.Thread(target=self._read, args=(self._process,), daemon=True).start()
+
+    def ended(self) -> None:
+        """Note that the process is gone and when it may be started again."""
+        self._process = None
+        if time.monotonic() - self._started_s > GOOD_S:
+            self._pause_s = PAUSE_S_MIN
+        self.restart_at_s = time.monotonic() + self._pause_s
+        self._pause_s = min(2 * self._pause_s, PAUSE_S_MAX)
+
+    @property
+    def pause_s(self) -> float:
+        """How long the next restart is away."""
+        return max(0.0, self.restart_at_s - time.monotonic())
+
+    def send(self, number: signal.Signals) -> None:
+        if self._process is not None:
+            with contextlib.suppress(ProcessLookupError):
+                self._process.send_signal(number)
+
+    def _read(self, process: subprocess.Popen[str]) -> None:
+        assert process.stdout is not None
+        with process.stdout as output:
+            for line in output:
+                if line.startswith(READY_MARK):
+                    self._events.put(_Ready(self))
+                self._say(self.task.name, line.rstrip("\n"))
+        self._events.put(_Ended(self, process.wait()))
+
+
+class Supervisor:
+    """Runs tasks until it is told to stop.  One thread calls `run`.
+
+    Args:
+        tasks: What to run; shards start first.
+        say: Takes every line; called from several threads, one call at a time.
+    """
+
+    def __init__(self, tasks: Sequence[Task], say: Say) -> None:
+        self._mutex = threading.Lock()
+        self._sink = say
+        self._events: queue.SimpleQueue[_Ended | _Ready] = queue.SimpleQueue()
+        self._children = [_Child(task, self._say, self._events) for task in tasks]
+        self._actors_started = False
+        self._failed = ""
+
+    def run(self, stop: threading.Event, *, count: Callable[[], int] = lambda: 1) -> int:
+        """Run everything until `stop` is set; return 0, or 1 if a shard can never run.
+
+        Args:
+            stop: Ends the run; children are drained before this returns.
+            count: How many times the stop was asked for; the second time, children are killed.
+        """
+        started_s = time.monotonic()
+        self._start("shard")
+        try:
+            while not stop.is_set() and not self._failed:
+                if not self._actors_started and (
+                    self._all_ready() or time.monotonic() - started_s > READY_S
+                ):
+                    self._actors_started = True
+                    self._start("actor")
+                self._take_event(0.1)
+                self._restart_due()
+        finally:
+            for kind in ("actor", "shard"):
+                self._drain(kind, count)
+        if self._failed:
+            self._say("", f"stopped: {self._failed}")
+        return 1 if self._failed else 0
+
+    def pids(self) -> dict[str, int]:
+        """Return the process ids of running children by name."""
+        return {child.task.name: child.pid for child in self._children if child.pid}
+
+    def _say(self, name: str, line: str) -> None:
+        with self._mutex:
+            self._sink(name, line)
+
+    def _of(self, kind: str) -> list[_Child]:
+        return [child for child in self._children if child.task.kind == kind]
+
+    def _all_ready(self) -> bool:
+        return all(child.ready for child in self._of("shard"))
+
+    def _start(self, kind: str) -> None:
+        for child in self._of(kind):
+            child.start()
+
+    def _take_event(self, timeout_s: float) -> None:
+        try:
+            event = self._events.get(timeout=timeout_s)
+        except queue.Empty:
+            return
+        if isinstance(event, _Ready):
+            event.child.ready = True
+        else:
+            event.child.ended()
+            self._judge(event.child, event.status)
+
+    def _judge(self, child: _Child, status: int) -> None:
+        """Decide what the end of a child means while nobody asked for it."""
+        how = f"ended by {signal.Signals(-status).name}" if status < 0 else f"exit status {status}"
+        if child.task.kind == "actor" and status == 0:
+            child.over = True
+            self._say(child.task.name, "done; it is not started again")
+        elif status == NEVER_AGAIN:
+            child.over = True
+            self._say(child.task.name, f"{how}; it cannot run like this and is not started again")
+            if child.task.kind == "shard":
+                self._failed = f"shard {child.task.name} cannot run"
+        else:
+            self._say(child.task.name, f"{how}; started again in {child.pause_s:.1f} s")
+
+    def _restart_due(self) -> None:
+        for child in self._children:
+            if (
+                child.over
+                or child.running
+                or (child.task.kind == "actor" and not self._actors_started)
+            ):
+                continue
+            if time.monotonic() >= child.restart_at_s:
+                child.start()
+
+    def _drain(self, kind: str, count: Callable[[], int]) -> None:
+        running = [child for child in self._of(kind) if child.running]
+        for child in running:
+            child.send(signal.SIGTERM)
+        deadline_s = time.monotonic() + DRAIN_S[kind]
+        while any(child.running for child in running):
+            if time.monotonic() > deadline_s or count() > 1:
+                for child in running:
+                    if child.running:
+                        self._say(child.task.name, "did not end in time and is killed")
+                        child.send(signal.SIGKILL)
+                deadline_s = float("inf")
+                count = _once
+            self._take_end(0.1)
+
+    def _take_end(self, timeout_s: float) -> None:
+        with contextlib.suppress(queue.Empty):
+            event = self._events.get(timeout=timeout_s)
+            if isinstance(event, _Ended):
+                event.child.ended()
+                if event.status:
+                    self._say(event.child.task.name, f"ended with status {event.status}")
+
+
+def _once() -> int:
+    return 1
+
+
+def end_with_supervisor() -> None:
+    """Ask the kernel for SIGTERM when the supervisor that started this process is gone.
+
+    Does nothing where no supervisor did, or the system has no such service (it is Linux's).
+
+    Raises:
+        EnactError: The supervisor is gone already.
+    """
+    supervisor = os.environ.pop(SUPERVISOR_VARIABLE, "")
+    if not supervisor:
+        return
+    import ctypes
+
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).prctl(1, int(signal.SIGTERM), 0, 0, 0)  # PR_SET_PDEATHSIG
+    if str(os.getppid()) != supervisor:
+        raise EnactError(f"the supervisor (pid {supervisor}) that started this process is gone")
