@@ -36,7 +36,7 @@ class Codec:
 _by_type: dict[type[Any], Codec] = {}
 _by_name: dict[str, Codec] = {}
 changed: list[Callable[[], None]] = []
-"""Called after each registration: plans made before may read a type differently now."""
+"""Called after each registration: a type read before may have another shape now."""
 
 
 def register_codec(

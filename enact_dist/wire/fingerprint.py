@@ -1,25 +1,19 @@
 """The fingerprint of a datum type: equal in two processes exactly if they mean the same data.
 
 Structural: names of dataclasses and fields and the shapes below them, as text, so that an error
-can show both sides.
+can show both sides.  Modules do not count: a dataclass may move.
+Rule to keep: catalogues store fingerprints, so one never changes while its type does not.
 """
 
 from __future__ import annotations
 
-from typing import Any
+import hashlib
+from typing import Any, Final
 
-from enact_dist.wire.shapes import (
-    ArrayOf,
-    CodecOf,
-    DictOf,
-    ListOf,
-    OptionalOf,
-    Plain,
-    RecordOf,
-    Shape,
-    TupleOf,
-    shape_of,
-)
+from enact_dist.wire.shapes import shape_of, text_of
+
+FINGERPRINT_CHARACTERS_MAX: Final = 2000
+"""Longer ones are cut and end in a digest of the whole."""
 
 
 def fingerprint(datum_type: Any) -> str:
@@ -28,25 +22,8 @@ def fingerprint(datum_type: Any) -> str:
     Raises:
         DatumTypeError: The type cannot be a datum.
     """
-    return _text(shape_of(datum_type))
-
-
-def _text(shape: Shape) -> str:
-    match shape:
-        case Plain(kind):
-            return "any" if kind is object else kind.__name__
-        case ArrayOf(dtype):
-            return "ndarray" if dtype is None else f"ndarray[{dtype.name}]"
-        case ListOf(each):
-            return f"list[{_text(each)}]"
-        case DictOf(key, each):
-            return f"dict[{key.__name__},{_text(each)}]"
-        case TupleOf(parts, repeated):
-            return f"tuple[{','.join(map(_text, parts))}{',…' if repeated else ''}]"
-        case OptionalOf(inner):
-            return f"{_text(inner)}?"
-        case RecordOf(kind, fields):
-            inside = ",".join(f"{name}:{_text(part)}" for name, part in fields)
-            return f"{kind.__name__}{{{inside}}}"
-        case CodecOf(codec):
-            return f"<{codec.name}>"
+    text = text_of(shape_of(datum_type))
+    if len(text) <= FINGERPRINT_CHARACTERS_MAX:
+        return text
+    digest = hashlib.sha256(text.encode()).hexdigest()
+    return f"{text[:FINGERPRINT_CHARACTERS_MAX]}…sha256:{digest}"

@@ -22,7 +22,6 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Final, NamedTuple
 from urllib.parse import quote, unquote
 
-from enact_dist.core.messages import Notice
 from enact_dist.errors import ProtocolError
 from enact_dist.terms import checked_name
 
@@ -80,15 +79,14 @@ def token_key(cell: str, session: str) -> str:
     return f"{ROOT}/{_name('cell', cell)}/{_SESSIONS}/{_part('session', session)}"
 
 
-@lru_cache(maxsize=256)
-def _verb(message_type: type) -> str:
-    return _HUMP.sub("_", message_type.__name__).lower()
-
-
 def verb_of(message: Message) -> str:
     """Return the verb of a request: its class name in lower case, `take_view` for `TakeView`."""
-    assert not isinstance(message, Notice), "notices have a key of their own"
-    return _verb(type(message))
+    return _verb(type(message).__name__)
+
+
+@lru_cache(maxsize=256)
+def _verb(class_name: str) -> str:
+    return _HUMP.sub("_", class_name).lower()
 
 
 def parse_request_key(key: str) -> RequestKey:
@@ -100,7 +98,8 @@ def parse_request_key(key: str) -> RequestKey:
     chunks = key.split("/")
     if len(chunks) != 5 or chunks[0] != ROOT or chunks[2].startswith("@") or not all(chunks):
         raise ProtocolError(
-            f"a request came on the key {key[:200]!r} instead of enact/<cell>/<shard>/<verb>/<actor>"
+            f"a request came on the key {key[:200]!r} instead of"
+            " enact/<cell>/<shard>/<verb>/<actor>"
         )
     actor = "" if chunks[4] == NOBODY else unquote(chunks[4])
     return RequestKey(chunks[1], chunks[2], chunks[3], actor)

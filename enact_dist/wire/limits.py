@@ -54,16 +54,6 @@ FIELDS_MAX: Final = 1024
 SMALL_BODY_BYTES: Final = 64 << 10
 """Bodies below this are copied out of a received payload, so that they do not keep it alive."""
 
-LONG_BYTES_MIN: Final = 1024
-"""Texts and byte strings from here on lie in the body."""
-ELEMENTS_MAX: Final = 1 << 20
-"""Entries of one tuple in a header."""
-
-
-def aligned(offset: int) -> int:
-    """Return the next multiple of `ALIGNMENT` from `offset` on."""
-    return -(-offset // ALIGNMENT) * ALIGNMENT
-
 
 def aligned(length: int) -> int:
     """Return the next multiple of `ALIGNMENT` from `length` on."""

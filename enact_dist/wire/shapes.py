@@ -25,7 +25,8 @@ from typing import Any, Final
 import numpy as np
 
 from enact_dist.errors import DatumTypeError
-from enact_dist.wire.codecs import Codec, codec_of
+from enact_dist.wire import codecs
+from enact_dist.wire.codecs import Codec
 from enact_dist.wire.limits import DEPTH_MAX
 
 
@@ -92,6 +93,7 @@ Shape = Plain | ArrayOf | ListOf | DictOf | TupleOf | OptionalOf | RecordOf | Co
 
 _PLAIN: Final = (int, float, bool, str, bytes, list, dict, object)
 _known: dict[Any, Shape] = {}
+codecs.changed.append(_known.clear)
 
 
 def shape_of(datum_type: Any) -> Shape:
@@ -103,72 +105,76 @@ def shape_of(datum_type: Any) -> Shape:
     try:
         known = _known.get(datum_type)
     except TypeError:
-        known = None
+        raise DatumTypeError(f"{datum_type!r} is no type") from None
     if known is None:
-        known = _shape(datum_type, _name(datum_type), depth=0)
-        if not _has_late_codec(known):
-            _known[datum_type] = known
+        known = _known[datum_type] = _shape(datum_type, _name(datum_type), ())
     return known
 
 
-def _has_late_codec(shape: Shape) -> bool:
-    return isinstance(shape, CodecOf)  # a codec may be registered anew, so it is looked up
-
-
-def _shape(hint: Any, where: str, *, depth: int) -> Shape:
-    if depth > DEPTH_MAX:
+def _shape(hint: Any, where: str, around: tuple[type[Any], ...]) -> Shape:
+    """Return the shape of an annotation found at `where`, inside these dataclasses."""
+    if len(around) > DEPTH_MAX:
         raise DatumTypeError(f"{where} is nested deeper than {DEPTH_MAX}")
-    codec = codec_of(hint)
+    codec = codecs.codec_of(hint)
     if codec is not None:
         return CodecOf(codec)
-    if hint is Any or hint in _PLAIN:
-        return Plain(object if hint is Any else hint)
+    if hint is Any:
+        return Plain(object)
+    if isinstance(hint, type) and hint in _PLAIN:
+        return Plain(hint)
     if hint is np.ndarray:
         return ArrayOf(None)
     if dataclasses.is_dataclass(hint) and isinstance(hint, type):
-        return _record(hint, where, depth=depth)
-    return _generic(hint, where, depth=depth)
+        return _record(hint, where, around)
+    return _generic(hint, where, around)
 
 
-def _generic(hint: Any, where: str, *, depth: int) -> Shape:
+def _generic(hint: Any, where: str, around: tuple[type[Any], ...]) -> Shape:
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin is np.ndarray:
         return ArrayOf(_dtype_of(arguments))
     if origin is list:
-        return ListOf(_shape(arguments[0], f"{where}[]", depth=depth + 1))
+        return ListOf(_shape(arguments[0], f"{where}[]", around))
     if origin is dict:
         if arguments[0] not in (str, int):
-            raise DatumTypeError(f"{where}: keys of a dict are str or int, not {arguments[0]!r}")
-        return DictOf(arguments[0], _shape(arguments[1], f"{where}[]", depth=depth + 1))
+            raise DatumTypeError(
+                f"{where}: keys of a dict are str or int, not {_name(arguments[0])}"
+            )
+        return DictOf(arguments[0], _shape(arguments[1], f"{where}[]", around))
     if origin is tuple:
-        repeated = len(arguments) == 2 and arguments[1] is Ellipsis  # noqa: PLR2004
+        repeated = len(arguments) == 2 and arguments[1] is Ellipsis
         parts = arguments[:1] if repeated else arguments
-        shapes = tuple(_shape(part, f"{where}[]", depth=depth + 1) for part in parts)
-        return TupleOf(shapes, repeated)
+        return TupleOf(tuple(_shape(part, f"{where}[]", around) for part in parts), repeated)
     if origin in (types.UnionType, typing.Union):
         others = [part for part in arguments if part is not types.NoneType]
-        if len(others) == 1 and len(arguments) == 2:  # noqa: PLR2004
-            return OptionalOf(_shape(others[0], where, depth=depth + 1))
+        if len(others) == 1 and len(arguments) == 2 and around:
+            return OptionalOf(_shape(others[0], where, around))
     raise DatumTypeError(
-        f"{where}: {_name(hint)} cannot be part of a datum; use int, float, bool, str, bytes, list,"
-        " dict, tuple, X | None, numpy.ndarray, frozen dataclasses of these, or register_codec()"
+        f"{where}: {_name(hint)} cannot be {'part of ' if around else ''}a datum; use int, float,"
+        " bool, str, bytes, list, dict, tuple[X, ...], numpy.ndarray, frozen dataclasses of these"
+        " (there also X | None), or register_codec()"
     )
 
 
-def _record(kind: type, where: str, *, depth: int) -> RecordOf:
-    if not kind.__dataclass_params__.frozen:  # type: ignore[attr-defined]  # is a dataclass
+def _record(kind: type[Any], where: str, around: tuple[type[Any], ...]) -> RecordOf:
+    if kind in around:
+        raise DatumTypeError(
+            f"{where}: {kind.__qualname__} contains itself; refer to others by entity name"
+        )
+    if not kind.__dataclass_params__.frozen:
         raise DatumTypeError(
             f"{where}: dataclass {kind.__qualname__} is not frozen; data are immutable values:"
             " write @dataclass(frozen=True)"
         )
     try:
         hints = typing.get_type_hints(kind)
-    except NameError as error:
-        raise DatumTypeError(f"{where}: an annotation cannot be resolved: {error}") from None
+    except (NameError, TypeError) as error:
+        raise DatumTypeError(f"{where}: an annotation cannot be resolved: {error}") from error
+    around = (*around, kind)
     return RecordOf(
         kind,
         tuple(
-            (field.name, _shape(hints[field.name], f"{where}.{field.name}", depth=depth + 1))
+            (field.name, _shape(hints[field.name], f"{where}.{field.name}", around))
             for field in dataclasses.fields(kind)
         ),
     )
@@ -200,3 +206,25 @@ _ABSTRACT: Final = (
 
 def _name(hint: Any) -> str:
     return getattr(hint, "__qualname__", None) or repr(hint)
+
+
+def text_of(shape: Shape) -> str:
+    """Return the structure as text, for example ``Surface{vertices_m:ndarray,colour:str?}``."""
+    match shape:
+        case Plain(kind):
+            return "any" if kind is object else kind.__name__
+        case ArrayOf(dtype):
+            return "ndarray" if dtype is None else f"ndarray[{dtype.name}]"
+        case ListOf(each):
+            return f"list[{text_of(each)}]"
+        case DictOf(key, each):
+            return f"dict[{key.__name__},{text_of(each)}]"
+        case TupleOf(parts, repeated):
+            return f"tuple[{','.join(map(text_of, parts))}{',...' if repeated else ''}]"
+        case OptionalOf(inner):
+            return f"{text_of(inner)}?"
+        case RecordOf(kind, fields):
+            inside = ",".join(f"{name}:{text_of(part)}" for name, part in fields)
+            return f"{kind.__name__}{{{inside}}}"
+        case CodecOf(codec):
+            return f"<{codec.name}>"

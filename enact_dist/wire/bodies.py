@@ -1,0 +1,112 @@
+"""Bodies of data in the payload of a frame: put there one after another, taken out the same way.
+
+Rule to keep: there is one layout per sequence of bodies (each at the next multiple of 64), so
+that nothing can hide between them, overlap, or be taken twice.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+from enact_dist.core.datum import Datum
+from enact_dist.errors import ProtocolError
+from enact_dist.wire.limits import (
+    ALIGNMENT,
+    BODY_BYTES_MAX,
+    ENCODING_BYTES_MAX,
+    INTEGER_MAX,
+    PAYLOAD_BYTES_MAX,
+    SMALL_BODY_BYTES,
+    aligned,
+)
+
+_PADDING: Final = bytes(ALIGNMENT)
+_DATUM: Final = (bytes, int, int, int)
+
+
+class BodyWriter:
+    """Collects the bodies of a frame that is written."""
+
+    __slots__ = ("_end", "_parts")
+
+    def __init__(self) -> None:
+        self._parts: list[bytes | memoryview] = []
+        self._end = 0
+
+    def add(self, datum: Datum) -> tuple[bytes, int, int, int]:
+        """Take a datum's body; return what stands for the datum in the header.
+
+        Raises:
+            ProtocolError: The datum contradicts itself, or the payload is over its limit.
+        """
+        size = datum.size
+        if not 0 <= size <= BODY_BYTES_MAX or len(datum.body) != size:
+            raise ProtocolError(
+                f"a datum said to have {size} bytes has {len(datum.body)}; at most {BODY_BYTES_MAX}"
+            )
+        if not size:
+            return datum.encoding, 0, 0, datum.stamp_ns
+        start = aligned(self._end)
+        if start + size > PAYLOAD_BYTES_MAX:
+            raise ProtocolError(
+                f"data of more than {PAYLOAD_BYTES_MAX} bytes in one message; write fewer at once"
+            )
+        if start > self._end:
+            self._parts.append(_PADDING[: start - self._end])
+        self._end = start + size
+        self._parts.append(datum.body)
+        return datum.encoding, start, size, datum.stamp_ns
+
+    def payload(self) -> bytes | None:
+        """Return all bodies in one; None where there are none.  A single one is not copied."""
+        if len(self._parts) == 1:
+            return bytes(self._parts[0])
+        return b"".join(self._parts) if self._parts else None
+
+
+class BodyReader:
+    """Takes the bodies of a frame that is read; `end` is how far it has come."""
+
+    __slots__ = ("_payload", "end")
+
+    def __init__(self, payload: bytes | memoryview) -> None:
+        self._payload = payload
+        self.end = 0
+
+    def take(self, raw: Any) -> Datum:
+        """Return the datum that `raw` of the header stands for.
+
+        Raises:
+            ProtocolError: It is no datum, or its body is not where the next one must be.
+        """
+        if type(raw) is not tuple or tuple(map(type, raw)) != _DATUM:
+            raise ProtocolError(f"a datum came as {raw!s:.60}")
+        encoding, offset, size, stamp_ns = raw
+        if len(encoding) > ENCODING_BYTES_MAX + 1 or not 0 <= stamp_ns <= INTEGER_MAX:
+            raise ProtocolError(
+                f"a datum has an encoding of {len(encoding)} bytes and the stamp {stamp_ns}"
+            )
+        if size == 0 == offset:
+            return Datum(encoding, b"", 0, stamp_ns)
+        start, end = aligned(self.end), offset + size
+        if offset != start or not 0 < size <= BODY_BYTES_MAX or end > len(self._payload):
+            raise ProtocolError(
+                f"a datum is said to have {size} bytes at {offset}; expected at {start}, and"
+                f" {len(self._payload)} bytes came in all"
+            )
+        self._check_padding(start)
+        self.end = end
+        return Datum(encoding, self._slice(start, end), size, stamp_ns)
+
+    def _check_padding(self, start: int) -> None:
+        between = bytes(self._payload[self.end : start])
+        if between.strip(b"\0"):
+            raise ProtocolError(f"the {len(between)} bytes before offset {start} are not zero")
+
+    def _slice(self, start: int, end: int) -> bytes | memoryview:
+        payload = self._payload
+        if start == 0 and end == len(payload):
+            # Whole, it keeps nothing else alive; a writable buffer could change under its reader.
+            return payload if type(payload) is bytes else memoryview(payload).toreadonly()
+        part = memoryview(payload)[start:end]
+        return bytes(part) if end - start < SMALL_BODY_BYTES else part.toreadonly()
