@@ -20,6 +20,10 @@ if TYPE_CHECKING:
 PLANES_MAX: Final = 4
 """Floor, table, two walls: a view seldom holds more planes that are larger than the object."""
 
+PLANE_TRIPLES: Final = 500
+PLANE_JUDGES: Final = 4000
+"""Points that judge a triple: of a plane with a tenth of the scene 400 of them lie on it."""
+
 CLUSTERS_MAX: Final = 64
 """Largest clusters first: what is beyond is debris, and the time stays bounded."""
 
@@ -60,12 +64,11 @@ def without_large_planes(
     Returns:
         What is left, (M, 3), and the planes that went, (P, 4): unit normal, offset.
     """
-    o3d = open3d()
     planes: list[Planes] = []
+    random = np.random.default_rng(0)
     while len(planes) < PLANES_MAX and len(points_m) > 100:
-        o3d.utility.random.seed(len(planes))
-        plane, support = open3d_cloud(points_m).segment_plane(plane_reach_m(voxel_m), 3, 500)
-        index = np.asarray(support)
+        plane = largest_plane(points_m, reach_m=plane_reach_m(voxel_m), random=random)
+        index = np.flatnonzero(np.abs(points_m @ plane[:3] + plane[3]) < plane_reach_m(voxel_m))
         labels = np.asarray(open3d_cloud(points_m[index]).cluster_dbscan(4.0 * voxel_m, 10))
         wide = [
             label
@@ -75,8 +78,36 @@ def without_large_planes(
         if not wide:
             break
         points_m = np.delete(points_m, index[np.isin(labels, wide)], axis=0)
-        planes.append(np.asarray(plane) / np.linalg.norm(plane[:3]))
+        planes.append(plane)
     return points_m, np.array(planes).reshape(-1, 4)
+
+
+def largest_plane(points_m: Points, *, reach_m: float, random: np.random.Generator) -> Planes:
+    """Return the plane that most points lie on: unit normal and offset, (4,).
+
+    Open3D's segment_plane stops early by a race of its threads: under load one seed gave two
+    planes in 25 runs.  This one depends on the generator alone.
+
+    Args:
+        points_m: (N, 3), N >= 3.
+        reach_m: Points nearer than this lie on it.
+        random: Draws the triples, and the points that judge them.
+    """
+    judges = points_m[random.permutation(len(points_m))[:PLANE_JUDGES]]
+    a, b, c = points_m[random.integers(0, len(points_m), (PLANE_TRIPLES, 3))].transpose(1, 0, 2)
+    normal = np.cross(b - a, c - a)
+    length = np.linalg.norm(normal, axis=1)
+    normal, a = normal[length > 0.0] / length[length > 0.0, None], a[length > 0.0]
+    offset = -np.einsum("ki,ki->k", normal, a)
+    support = (np.abs(judges @ normal.T + offset) < reach_m).sum(axis=0)
+    best = int(np.argmax(support))
+    plane = np.append(normal[best], offset[best])
+    for _ in range(3):
+        near = points_m[np.abs(points_m @ plane[:3] + plane[3]) < reach_m]
+        centre = near.mean(axis=0)
+        _, axes = np.linalg.eigh((near - centre).T @ (near - centre))
+        plane = np.append(axes[:, 0], -axes[:, 0] @ centre)
+    return plane
 
 
 def clusters_of(points_m: Points, *, gap_m: float, points_min: int) -> list[Points]:

@@ -64,6 +64,19 @@ def existing_file(path: Path, *, asked: str) -> Path:
     return path
 
 
+def check_output(folder: Path) -> None:
+    """Refuse an output folder that could not be written, before minutes go into its content.
+
+    Raises:
+        OSError: It is a file, or it or its nearest existing parent may not be written.
+    """
+    nearest = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    if not nearest.is_dir():
+        raise NotADirectoryError(errno.ENOTDIR, "asked for a folder, found a file", str(nearest))
+    if not os.access(nearest, os.W_OK | os.X_OK):
+        raise PermissionError(errno.EACCES, "this user may not write here", str(nearest))
+
+
 def write_whole(contents: Mapping[Path, bytes]) -> None:
     """Write a set of files so that a failure leaves none of them half written.
 

@@ -78,20 +78,28 @@ class RecordedFrame:
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """A checked recording: at least one frame, all of one camera."""
+    """A checked recording.
+
+    Attributes:
+        frames: At least one, all of one camera.
+        camera: Its intrinsics.
+        recorded: How many frames the directory holds; more than `frames` if it was thinned.
+    """
 
     frames: tuple[RecordedFrame, ...]
     camera: Camera
+    recorded: int
 
 
-def read_recording(directory: Path) -> Recording:
+def read_recording(directory: Path, *, views_max: int | None = None) -> Recording:
     """Read and check a recording.
 
     Args:
         directory: Laid out as the module describes.
+        views_max: Frames to keep of a longer recording, evenly spread; None keeps all.
 
     Returns:
-        All frames with their poses, in the order of the trajectory.
+        The frames with their poses, in the order of the trajectory.
 
     Raises:
         InputFileError: Anything missing, unreadable, in wrong units or not fitting together.
@@ -113,16 +121,26 @@ def read_recording(directory: Path) -> Recording:
             remedy="images and trajectory are of different recordings, or frames are missing",
         )
     camera = read_intrinsics(_intrinsics_file(directory))
+    kept = range(len(pairs))
+    if views_max is not None and views_max < len(pairs):
+        kept = np.unique(np.linspace(0, len(pairs) - 1, views_max).round().astype(int)).tolist()
+    if len(kept) > FRAMES_MAX:
+        raise InputFileError(
+            directory,
+            asked=f"at most {FRAMES_MAX} frames",
+            found=f"{len(kept)} frames",
+            remedy="keep every second or tenth, in images and trajectory alike",
+        )
     frames = tuple(
         RecordedFrame(
             depth_file.name,
             DepthFrame(read_depth(depth_file, camera), Acquisition(camera, pose)),
             read_colour(colour_file, camera),
         )
-        for (colour_file, depth_file), pose in zip(pairs, poses, strict=True)
+        for (colour_file, depth_file), pose in ((pairs[i], poses[i]) for i in kept)
     )
     check_agreement(directory, frames)
-    return Recording(frames, camera)
+    return Recording(frames, camera, len(pairs))
 
 
 def paired_images(directory: Path) -> list[tuple[Path, Path]]:
@@ -132,8 +150,8 @@ def paired_images(directory: Path) -> list[tuple[Path, Path]]:
         directory: The recording.
 
     Raises:
-        InputFileError: No images, one kind without the other, more than `FRAMES_MAX`, or a pair
-            that `rgbd.match` names but nobody finds.
+        InputFileError: No images, one kind without the other, or a pair that `rgbd.match` names
+            but nobody finds.
     """
     colours, depths = _images(directory)
     if not depths or not colours:
@@ -156,13 +174,6 @@ def paired_images(directory: Path) -> list[tuple[Path, Path]]:
         )
     else:
         pairs = list(zip(colours, depths, strict=True))
-    if len(pairs) > FRAMES_MAX:
-        raise InputFileError(
-            directory,
-            asked=f"at most {FRAMES_MAX} frames",
-            found=f"{len(pairs)} frames",
-            remedy="keep every second or tenth, in images and trajectory alike",
-        )
     return pairs
 
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from actors.geometry.coloured_surface import ColouredSurface
 from actors.geometry.depth import frame_points
 from actors.geometry.open3d_on_use import open3d
 from actors.geometry.poses import inverse
@@ -46,23 +47,6 @@ BLOCKS_MAX: Final = 250_000
 
 ISLAND_SHARE: Final = 0.002
 """Connected pieces below this share of all triangles are flying pixels of edges."""
-
-
-@dataclass(frozen=True, slots=True)
-class ColouredSurface:
-    """A triangle mesh with a colour at each vertex.
-
-    Attributes:
-        vertices_m: (N, 3) float64, metres, world frame.
-        normals: Unit, outward, (N, 3) float64.
-        colours: RGB, uint8, (N, 3).
-        triangles: (K, 3) int32, counter-clockwise seen from outside.
-    """
-
-    vertices_m: Floats
-    normals: Floats
-    colours: Colours
-    triangles: npt.NDArray[np.int32]
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,8 +195,8 @@ def _without_islands(mesh: Any) -> ColouredSurface:  # an Open3D mesh; Open3D ha
     mesh.compute_vertex_normals()
     colours = np.asarray(mesh.vertex_colors)
     return ColouredSurface(
-        np.asarray(mesh.vertices).copy(),
-        np.asarray(mesh.vertex_normals).copy(),
+        np.asarray(mesh.vertices).astype(np.float32),
+        np.asarray(mesh.vertex_normals).astype(np.float32),
         np.rint(colours * 255.0).clip(0, 255).astype(np.uint8),
         np.asarray(mesh.triangles).astype(np.int32),
     )

@@ -5,8 +5,8 @@
 
 Each reads and judges all input, computes, and only then writes its files, all of them whole; a
 wrong input is one line on the error stream and exit status 1.
-The halves are public, so that actors can take the frames one by one: `read_recording` for the
-shots, `view_cloud` for what one of them saw, `fuse_frames` for the surface of all.
+A recording goes the way of the simulated views: perception, reconstruction and fusion as actors on
+a world context (`real_training`); a model and a scene are two files and need no actor.
 """
 
 from __future__ import annotations
@@ -18,14 +18,15 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from actors.geometry.files import InputFileError, write_whole
+from actors.geometry.files import InputFileError, check_output, write_whole
 from actors.geometry.matching import NoMatchError, find_model
 from actors.geometry.picture import png_bytes
 from actors.geometry.pointcloud_files import read_cloud
-from actors.geometry.recordings import read_recording
-from actors.geometry.rgbd_fusion import FusionError, fuse_frames, natural_voxel_m, residual
+from actors.geometry.rgbd_fusion import FusionError, natural_voxel_m, residual
 from actors.geometry.surface_files import ply_bytes
 from actors.palletizing.real_pictures import match_sheet, recording_sheet
+from actors.palletizing.real_training import trained_surface
+from actors.palletizing.recorded import RecordedPerception
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -86,21 +87,23 @@ def run_match(
 
 
 def _train(directory: Path, out: Path, voxel_m: float | None, say: Say) -> None:
-    """Read, fuse, draw, write."""
+    """Read, train, draw, write."""
     clock = _Clock()
-    recording = read_recording(directory)
+    check_output(out)
+    perception = RecordedPerception(str(directory))
+    recording = perception.recording
     for line in _recording_lines(recording):
         say(line)
     clock.lap("read")
     voxel_m = voxel_m or natural_voxel_m(recording.frames)
-    surface = fuse_frames(recording.frames, voxel_m=voxel_m)
+    surface = trained_surface(perception, voxel_m=voxel_m, progress=_Progress(recording))
     spread = residual(surface, recording.frames)
     size_m = " x ".join(f"{edge:.2f}" for edge in np.ptp(surface.vertices_m, axis=0))
     grid = f"grid of {voxel_m * 1e3:.1f} mm"
     agree = f"median {spread.median_m * 1e3:.1f} mm, 95 % within {spread.p95_m * 1e3:.1f} mm"
     say(f"surface    {len(surface.triangles):,} triangles on a {grid}, {size_m} m")
     say(f"agreement  of the views with the surface: {agree}")
-    clock.lap("fused")
+    clock.lap("trained")
     near, far = _depth_range_m(recording)
     sheet = recording_sheet(
         recording,
@@ -127,6 +130,7 @@ def _train(directory: Path, out: Path, voxel_m: float | None, say: Say) -> None:
 def _find(files: tuple[Path, Path], out: Path, seed: int, say: Say) -> int:
     """Read, search, judge, draw, write."""
     clock = _Clock()
+    check_output(out)
     model = read_cloud(files[0], asked="a model: point cloud or mesh (PCD or PLY)")
     scene = read_cloud(files[1], asked="a scene: point cloud (PCD or PLY)")
     for line in _cloud_lines(files, model, scene):
@@ -173,9 +177,11 @@ def _recording_lines(recording: Recording) -> list[str]:
     near, far = _depth_range_m(recording)
     places = np.array([frame.world_from_camera[:3, 3] for frame in frames])
     travel_m = float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
+    thinned = f" of {recording.recorded}" if recording.recorded > len(frames) else ""
+    count = f"{len(frames)}{thinned}"
     size = f"{camera.width_px} x {camera.height_px} pixels"
     depth = f"depth {near:.2f} to {far:.2f} m"
-    return [f"recording  {len(frames)} views of {size}, {depth}, camera moved {travel_m:.3f} m"]
+    return [f"recording  {count} views of {size}, {depth}, camera moved {travel_m:.3f} m"]
 
 
 def _depth_range_m(recording: Recording) -> tuple[float, float]:
@@ -258,6 +264,21 @@ def _refused(error: Exception) -> int:
     """Print one line on the error stream; return the exit status."""
     print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
     return 1
+
+
+class _Progress:
+    """Counts the views on a terminal; says nothing into a file or pipe."""
+
+    def __init__(self, recording: Recording) -> None:
+        self._views = len(recording.frames)
+
+    def __call__(self, done: int) -> None:
+        """Show that so many views have their surface."""
+        if sys.stderr.isatty():
+            end = "\n" if done == self._views else ""
+            print(
+                f"\rtraining   {done} of {self._views} views", end=end, file=sys.stderr, flush=True
+            )
 
 
 class _Clock:

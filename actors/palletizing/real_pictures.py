@@ -15,10 +15,10 @@ from actors.geometry.shapes import Acquisition, Camera
 if TYPE_CHECKING:
     import numpy.typing as npt
 
+    from actors.geometry.coloured_surface import ColouredSurface
     from actors.geometry.matching import ModelMatch
     from actors.geometry.pointcloud_files import CloudFile
     from actors.geometry.recordings import RecordedFrame, Recording
-    from actors.geometry.rgbd_fusion import ColouredSurface
 
     Floats = npt.NDArray[np.floating[Any]]
     Picture = npt.NDArray[np.uint8]

@@ -17,7 +17,7 @@ CLUTTER_BOXES = [((0.25, 0.1, 0), (0.40, 0.24, 0.09)), ((-0.35, 0.2, 0), (-0.27,
 TRUE_POSE = small_motion(np.array([0.0, 0.0, 0.7, 0.02, -0.12, 0.0]))
 
 
-def box_points(random, low, high, density=60_000):
+def box_points(random, low, high, density=40_000):
     """Return points and outward normals on the faces of a box, `density` points per m2."""
     low, high = np.array(low, float), np.array(high, float)
     points, normals = [], []
@@ -49,7 +49,7 @@ def boxes(random, parts, eye=None, pose=None):
 
 def scene_points(random, *, with_model=True, eye=None):
     """Return a table with clutter and, turned and moved, the model; 1 mm of noise."""
-    table = np.column_stack([random.uniform(-0.6, 0.6, (60_000, 2)), np.zeros(60_000)])
+    table = np.column_stack([random.uniform(-0.5, 0.5, (40_000, 2)), np.zeros(40_000)])
     parts = [table, boxes(random, CLUTTER_BOXES, eye)]
     if with_model:
         parts.append(boxes(random, MODEL_BOXES, eye, TRUE_POSE))
@@ -106,14 +106,13 @@ def test_complete_model_is_not_blamed_for_its_far_side_when_the_eye_is_known():
 
 
 def test_match_is_the_same_when_the_seed_is():
-    """Two runs with one seed give one pose to the last micrometre."""
+    """Two runs with one seed give one pose to the last bit, whatever else the machine does."""
     random = np.random.default_rng(4)
     model, scene = boxes(random, MODEL_BOXES), scene_points(random)
 
     one, other = (find_model(model, scene, seed=7) for _ in range(2))
 
-    difference = one.best.scene_from_model - other.best.scene_from_model
-    assert np.abs(difference).max() < 1e-6
+    assert np.array_equal(one.best.scene_from_model, other.best.scene_from_model)
     assert [c.cluster for c in one.ranking] == [c.cluster for c in other.ranking]
 
 
@@ -129,7 +128,7 @@ def test_score_is_low_when_the_model_is_absent():
 def test_match_is_refused_when_there_is_only_a_table():
     """A scene without clusters is an error that counts what it had."""
     random = np.random.default_rng(6)
-    table = np.column_stack([random.uniform(-0.6, 0.6, (60_000, 2)), np.zeros(60_000)])
+    table = np.column_stack([random.uniform(-0.5, 0.5, (40_000, 2)), np.zeros(40_000)])
 
     with pytest.raises(NoMatchError, match="no cluster"):
         find_model(boxes(random, MODEL_BOXES), table)

@@ -8,11 +8,18 @@ import numpy as np
 import pytest
 
 from actors.geometry.poses import moved, small_motion
+from actors.palletizing import real_pictures
 from actors.palletizing.real_input import run_match, run_views
 
 o3d = pytest.importorskip("open3d", exc_type=ImportError)
 
 TRUE_POSE = small_motion(np.array([0.0, 0.0, 0.9, 0.05, -0.1, 0.0]))
+
+
+@pytest.fixture(autouse=True)
+def small_pictures(monkeypatch):
+    """Draw a twenty-fifth of the pixels: these tests are about files and numbers."""
+    monkeypatch.setattr(real_pictures, "TILE_PX", (160, 120))
 
 
 def write_cloud(path, points):
@@ -104,6 +111,20 @@ def test_views_are_refused_when_the_output_folder_is_a_file(recording, tmp_path,
 
     assert capsys.readouterr().err.count("\n") == 1
     assert (tmp_path / "out").read_bytes() == b"in the way"
+
+
+def test_views_are_refused_when_no_surface_comes_out(recording, tmp_path, capsys):
+    """An actor's failure ends the run with its reason in one line: all is beyond 6 m."""
+    for number, depth in enumerate(recording.depth_mm):
+        recording.depth_mm[number] = depth * 10
+        recording.poses[number][:3, 3] *= 10.0
+
+    assert run_views(recording.write(), tmp_path / "out", say=print) == 1
+
+    heard = capsys.readouterr().err
+    assert "no surface" in heard
+    assert heard.count("\n") == 1
+    assert not (tmp_path / "out").exists()
 
 
 def test_match_gives_pose_fit_and_picture(clouds, tmp_path):

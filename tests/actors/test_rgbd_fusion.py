@@ -66,7 +66,7 @@ def test_residual_is_small_when_poses_are_right_and_large_when_one_is_wrong(reco
     shifted = read_recording(recording.folder).frames
 
     one, other = (
-        residual(fuse_frames(f, voxel_m=0.006, depth_m_max=2.0), f, depth_m_max=2.0)
+        residual(fuse_frames(f, voxel_m=0.01, depth_m_max=1.1), f, depth_m_max=1.0)
         for f in (sound, shifted)
     )
 

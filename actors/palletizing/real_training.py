@@ -1,0 +1,103 @@
+"""Run the training actors on a recording: three threads, one world context, in this process.
+
+The actors are those that a cell runs as processes on shards; here they are the paper's threads of
+one process, since a single recording needs no second host.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Final
+
+from actors.palletizing.reconstruction import Reconstruction
+from actors.palletizing.recorded import (
+    COLOURED_SURFACE,
+    RECORDED,
+    RecordedFusion,
+    RecordedPerception,
+)
+from actors.palletizing.vocabulary import SURFACE, product_entity
+from enact_dist import View, local, run_actor
+from enact_dist.errors import EnactError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from actors.geometry.coloured_surface import ColouredSurface
+    from enact_dist import Actor, Cell, Entity
+
+LOOK_S: Final = 0.2
+"""How often the wait for the surface looks whether an actor has failed."""
+
+
+def trained_surface(
+    perception: RecordedPerception,
+    *,
+    voxel_m: float,
+    progress: Callable[[int], None] = lambda _: None,
+) -> ColouredSurface:
+    """Let perception, reconstruction and fusion make one surface of a recording.
+
+    Blocks until the surface stands in the training context or an actor fails; a second per view.
+
+    Args:
+        perception: With the recording read and checked.
+        voxel_m: Edge of the fusion grid, metres; 0 for two pixels at the median depth.
+        progress: Told how many views have their surface.
+
+    Raises:
+        Exception: What an actor's update raised, `FusionError` for example.
+    """
+    with local(worlds=("training",), actor="recording") as cell:
+        training = cell.world("training")
+        with (
+            training.watch("**", SURFACE, COLOURED_SURFACE) as watch,
+            _running([perception, Reconstruction(), RecordedFusion(voxel_m)], cell) as failures,
+        ):
+            views: set[Entity] = set()
+            while True:
+                change = watch.next(LOOK_S)
+                if failures:
+                    raise failures[0]
+                if change is None or change.null:
+                    continue
+                if change.aspect == COLOURED_SURFACE.name:
+                    break
+                views.add(change.entity)
+                progress(len(views))
+        request = View(training, product_entity(RECORDED), COLOURED_SURFACE)
+        return training.view(request)[request]
+
+
+@contextmanager
+def _running(actors: list[Actor], cell: Cell) -> Iterator[list[Exception]]:
+    """Run actors in threads for the length of a block; yield what went wrong in them."""
+    stop, failures = threading.Event(), list[Exception]()
+
+    def failed(_: Entity | None, error: Exception) -> None:
+        if not isinstance(error, EnactError):  # those the framework tries again by itself
+            failures.append(error)
+
+    threads = [
+        threading.Thread(
+            target=run_actor,
+            args=(actor, cell),
+            kwargs={"stop": stop, "on_error": failed},
+            name=type(actor).__name__,
+        )
+        for actor in actors
+    ]
+    # A failure ends the run with one line of its own; its traceback in the log says no more.
+    log = logging.getLogger("enact.actor")
+    heard, log.disabled = log.disabled, True
+    for thread in threads:
+        thread.start()
+    try:
+        yield failures
+    finally:
+        stop.set()
+        for thread in threads:
+            thread.join()
+        log.disabled = heard
