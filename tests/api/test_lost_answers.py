@@ -1,0 +1,80 @@
+"""An answer that never arrives is asked about, never guessed."""
+
+import random
+import threading
+
+import pytest
+
+from enact_dist import Aspect, Entity, Lock, View, Write
+from enact_dist.core.messages import Acquire, Commit, Fetch, Outcome, Release, Validate
+from enact_dist.errors import CommitUnknownError
+from enact_dist.link import client as link_client
+
+COUNT = Aspect("count", int)
+counter = Entity("counter")
+
+
+class LosingCarrier:
+    """Carries every request, and loses answers of some kinds on their way back."""
+
+    def __init__(self, inner, *, kinds, seed, chance):
+        self._inner = inner
+        self._kinds = kinds
+        self._draw = random.Random(seed)
+        self._chance = chance
+        self.lost = 0
+
+    def __getattr__(self, name):
+        return getattr(self._inner, name)
+
+    def _maybe(self, request, answer):
+        if isinstance(request, self._kinds) and self._draw.random() < self._chance:
+            self.lost += 1
+            return None
+        return answer
+
+    def request(self, shard, message, *, timeout_s):
+        return self._maybe(message, self._inner.request(shard, message, timeout_s=timeout_s))
+
+    def request_all(self, requests, *, timeout_s):
+        answers = self._inner.request_all(requests, timeout_s=timeout_s)
+        return [self._maybe(q, a) for (_, q), a in zip(requests, answers, strict=True)]
+
+
+def lose(cell, *kinds, chance=0.3, seed=1):
+    cell._client.carrier = LosingCarrier(
+        cell._client.carrier, kinds=kinds, seed=seed, chance=chance
+    )
+    return cell._client.carrier
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_increments_are_exact_when_answers_are_lost(cell, online, seed):
+    """With 3 of 10 answers of every kind lost, 4 threads x 25 increments are 100."""
+    carrier = lose(cell, Acquire, Commit, Outcome, Validate, Release, Fetch, seed=seed)
+    count = Write(online, counter, COUNT)
+
+    def increment():
+        for _ in range(25):
+            with Lock(count, wait_s=60.0) as lock:
+                lock[count] = lock.get(count, 0) + 1
+
+    threads = [threading.Thread(target=increment) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+
+    view = View(online, counter, COUNT)
+    assert online.view(view)[view] == 100
+    assert carrier.lost > 30
+
+
+def test_commit_raises_unknown_when_no_answer_ever_comes(cell, online, monkeypatch):
+    """CommitUnknownError comes only after the deadline, and names the lock."""
+    monkeypatch.setattr(link_client, "FINISH_S", 0.3)
+    count = Write(online, counter, COUNT)
+    with pytest.raises(CommitUnknownError, match="may stand or not") as caught, Lock(count) as lock:
+        lock[count] = 1
+        lose(cell, Commit, Outcome, chance=1.1)
+    assert caught.value.lock_id
