@@ -13,8 +13,8 @@ LAYERS = ("errors", "terms", "core", "wire", "link", "api")  # low to high
 PURE = {
     "core": {"__future__", "collections", "dataclasses", "enum", "hashlib", "heapq", "typing"},
     "wire": {
-        "__future__", "collections", "dataclasses", "enum", "functools", "math", "msgpack",
-        "numpy", "operator", "re", "types", "typing", "urllib",
+        "__future__", "collections", "dataclasses", "enum", "functools", "hashlib", "itertools",
+        "math", "msgpack", "numpy", "operator", "re", "reprlib", "types", "typing", "urllib",
     },
 }  # fmt: skip
 ACTORS_MAY_IMPORT = {"enact_dist", "enact_dist.testing", "enact_dist.errors"}
