@@ -37,6 +37,7 @@ from enact_dist.core.records import (
     Tick,
 )
 from enact_dist.core.shard import Shard
+from enact_dist.errors import StoreError
 from enact_dist.link.clock import Clock, SystemClock
 
 if TYPE_CHECKING:
@@ -53,8 +54,8 @@ TICK_S_MAX: Final = 0.1
 """The timer wakes at least so often: bounds by how much an expiry may be late."""
 TICK_S_MIN: Final = 0.001
 """The timer rests at least so long; deadlines of many locks then share one tick."""
-FLUSH_S: Final = 1.5
-"""How long a closing host waits for its store; a drain has to be over within 2 s."""
+JOIN_S: Final = 0.5
+"""How long a closing host waits for its timer; a drain has to be over within 2 s."""
 
 _log = logging.getLogger("enact.shard")
 
@@ -305,6 +306,9 @@ class ShardHost:
             self._replies.clear()
         self._wake_timer()
         if threading.current_thread() is not self._timer:
-            self._timer.join(FLUSH_S)
+            self._timer.join(JOIN_S)
         if self._store is not None:
-            self._store.close()
+            try:
+                self._store.close()
+            except StoreError as failure:
+                self._fail(failure)

@@ -6,7 +6,8 @@ relay between peers).  Reasons for the settings, measured with 1.10 on a loopbac
 - Multicast and gossip off: with them `open` takes 0.5 s and strangers join.
 - Zenoh's shared memory off: it falls back silently, so that no figure means anything.
 - Link lease = TTL / 2: the token of a stopped process has to vanish before its lease ends.
-- `wait_before_close` 0.3 s: a client that stops reading is given up after that, not after 5 s.
+- `wait_before_close`: whoever does not read for the time of a link lease is given up, not after
+  5 s; a client waits longer, since only its own thread does, and a busy shard must not lose it.
 - `max_wait_before_drop_fragments` 2 s: slices of a large datum over a slow network are not
   dropped after 50 ms; only senders of their own ever wait for it.
 - Reconnection every 50 ms: a restarted shard is back in use after 0.1 s, not 1 s.
@@ -38,12 +39,20 @@ MESSAGE_BYTES_MAX: Final = BODY_BYTES_MAX + HEADER_BYTES_MAX + (1 << 20)
 """Longest message: the largest datum with its header."""
 CONNECT_WAIT_MS: Final = 50
 """How long `open` may wait for a connection; where there is none it goes on trying behind."""
+OPEN_S: Final = 5.0
+"""How long whoever accepts a connection has to answer in Zenoh's language."""
+CLIENT_BLOCK_S: Final = 3.0
+"""How long a client waits for a shard that does not read before it gives up the connection."""
 TRANSPORTS_MAX: Final = 10_000
 """Connections of one shard; as many as sessions."""
 
 
 def session_config(
-    *, listen: Sequence[str] = (), connect: Sequence[str] = (), lease_s: float
+    *,
+    listen: Sequence[str] = (),
+    connect: Sequence[str] = (),
+    lease_s: float,
+    open_s: float = OPEN_S,
 ) -> zenoh.Config:
     """Return the settings of a session.
 
@@ -51,6 +60,7 @@ def session_config(
         listen: Endpoints to listen at ("tcp/0.0.0.0:7447"); clients have none.
         connect: Endpoints to connect to, and to connect to again whenever a link is lost.
         lease_s: After so long without a sign of life of this process, a peer drops the link.
+        open_s: How long a connected endpoint has to answer in Zenoh's language.
 
     Raises:
         ConfigError: Zenoh does not understand an endpoint.
@@ -58,7 +68,7 @@ def session_config(
     retry = {"period_init_ms": 50, "period_max_ms": 50, "period_increase_factor": 1}
     congestion = {
         "drop": {"wait_before_drop": 1_000, "max_wait_before_drop_fragments": 2_000_000},
-        "block": {"wait_before_close": 300_000},
+        "block": {"wait_before_close": round(1e6 * (lease_s if listen else CLIENT_BLOCK_S))},
     }
     settings: dict[str, object] = {
         "mode": "peer",
@@ -69,6 +79,7 @@ def session_config(
         "scouting/gossip/enabled": False,
         "scouting/delay": CONNECT_WAIT_MS,
         "transport/shared_memory/enabled": False,
+        "transport/unicast/open_timeout": round(open_s * 1e3),
         "transport/unicast/max_sessions": TRANSPORTS_MAX,
         "transport/link/tx/lease": max(1, round(lease_s * 1e3)),
         "transport/link/tx/keep_alive": 4,
@@ -87,7 +98,11 @@ def session_config(
 
 
 def open_session(
-    *, listen: Sequence[str] = (), connect: Sequence[str] = (), lease_s: float
+    *,
+    listen: Sequence[str] = (),
+    connect: Sequence[str] = (),
+    lease_s: float,
+    open_s: float = OPEN_S,
 ) -> zenoh.Session:
     """Open a session; whoever opens one closes it.
 
@@ -101,7 +116,7 @@ def open_session(
             "this process was forked from one that is connected, where Zenoh cannot work; start it"
             " with the 'spawn' method, or connect only after the fork"
         )
-    config = session_config(listen=listen, connect=connect, lease_s=lease_s)
+    config = session_config(listen=listen, connect=connect, lease_s=lease_s, open_s=open_s)
     try:
         session = zenoh.open(config)
     except zenoh.ZError as error:

@@ -43,7 +43,7 @@ def find_shards(endpoints: Sequence[str], *, timeout_s: float) -> tuple[FoundSha
         ConfigError: An endpoint cannot be read.
     """
     deadline_s = time.monotonic() + timeout_s
-    session = open_session(connect=endpoints, lease_s=PROBE_LEASE_S)
+    session = open_session(connect=endpoints, lease_s=PROBE_LEASE_S, open_s=timeout_s)
     try:
         return _find(session, deadline_s)
     finally:

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import pytest
 
@@ -24,6 +25,8 @@ from enact_dist.core.messages import (
 )
 from enact_dist.core.shard_state import ShardSettings
 from enact_dist.terms import Access
+
+sys.path.insert(0, str(Path(__file__).parent))
 
 WORLD, ASPECT = "online", "count"
 

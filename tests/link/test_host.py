@@ -50,6 +50,9 @@ class FakeStore:
             raise self.failure
         self.batches.append(list(batch))
 
+    def rest(self):
+        pass
+
     def close(self):
         self.closed = True
 

@@ -1,0 +1,299 @@
+"""The daemon: starts once, says why not, refuses what it cannot read, ends in time."""
+
+import os
+import signal
+import socket
+import threading
+import time
+
+import pytest
+
+from enact_dist.core.messages import (
+    AwaitStamp,
+    Committed,
+    Granted,
+    ListLocks,
+    ListSessions,
+    Locks,
+    Refused,
+    Waiting,
+)
+from enact_dist.errors import ConfigError, LinkError, StoreError
+from enact_dist.link.shard_daemon import DaemonSettings, start_shard
+from enact_dist.link.zenoh_config import close_session, open_session
+from enact_dist.wire.frames import decode_frame, encode_frame
+
+DAEMON = """
+import sys
+from pathlib import Path
+from enact_dist.core.messages import AspectEntry, PlacementMap, ShardEntry
+from enact_dist.core.shard_state import ShardSettings
+from enact_dist.link.shard_daemon import DaemonSettings, run_shard
+endpoint, folder, log_format, durability = sys.argv[1:]
+shard = ShardSettings(
+    "s0",
+    PlacementMap(1, (ShardEntry("s0", (endpoint,)),), ()),
+    worlds=("online",),
+    aspects=(AspectEntry("count", "", durability),),
+)
+path = Path(folder) if folder else None
+sys.exit(run_shard(DaemonSettings("cell", shard, (endpoint,), path, log_format)))
+"""
+
+
+@pytest.fixture
+def process(program):
+    """Start a daemon as a process; returns it once it said that it is ready."""
+
+    def start(endpoint, folder="", *, log_format="text", durability="volatile", ready=True):
+        started = program(DAEMON, endpoint, folder, log_format, durability)
+        if ready:
+            line = started.stdout.readline()
+            assert line.startswith("ready: shard s0 of cell cell at "), line + started.stderr.read()
+        return started
+
+    return start
+
+
+def speak(carrier, make_peer, **options):
+    """Return a session that has said hello over `carrier`."""
+    peer = make_peer(lambda shard, message: carrier.request(shard, message, timeout_s=9), **options)
+    peer.hello()
+    return peer
+
+
+# ---------------------------------------------------------------- one daemon per shard
+
+
+def test_daemon_refuses_to_start_when_its_shard_already_runs(daemon, endpoint):
+    """A second daemon of the same name at the same endpoint is refused by name."""
+    daemon(endpoint)
+
+    with pytest.raises(LinkError, match="shard s0 of cell cell already runs"):
+        daemon(endpoint)
+
+
+def test_daemon_refuses_to_start_when_its_shard_runs_elsewhere(
+    daemon, endpoint, free, make_settings
+):
+    """Another daemon that answers at the advertised endpoint is found before we serve."""
+    daemon(endpoint)
+    settings = DaemonSettings("cell", make_settings(endpoints=(endpoint,)), (free(),))
+
+    with pytest.raises(LinkError, match="already runs"):
+        start_shard(settings)
+
+
+def test_daemon_names_an_endpoint_that_another_program_uses(daemon):
+    """A port in use is one clear error with the endpoint in it."""
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        endpoint = f"tcp/127.0.0.1:{other.getsockname()[1]}"
+
+        with pytest.raises(LinkError, match=f"{endpoint} is in use"):
+            daemon(endpoint)
+
+
+def test_daemon_refuses_a_folder_that_another_daemon_holds(daemon, endpoint, free, tmp_path):
+    """Two daemons never write one folder; the second says whose it is."""
+    daemon(endpoint, folder=tmp_path)
+
+    with pytest.raises(StoreError, match=str(tmp_path)):
+        daemon(free(), "s1", folder=tmp_path)
+
+
+def test_daemon_refuses_settings_without_an_endpoint(make_settings):
+    """A shard that listens nowhere could never be used."""
+    with pytest.raises(ConfigError, match="no endpoint"):
+        start_shard(DaemonSettings("cell", make_settings(), ()))
+
+
+# ---------------------------------------------------------------- frames that cannot be read
+
+
+@pytest.mark.parametrize(
+    "header",
+    [b"", b"\xff\xfe garbage", os.urandom(200), encode_frame(Locks(1, ()))[0]],
+    ids=["empty", "garbage", "random", "an answer"],
+)
+def test_daemon_refuses_and_counts_what_it_cannot_read(daemon, carry, endpoint, header):
+    """A frame that is no request is answered with a refusal; the next request is served."""
+    daemon(endpoint)
+    carrier = carry(endpoint)
+    session = open_session(connect=[endpoint], lease_s=1.0)
+    try:
+        carrier.request("s0", ListLocks(), timeout_s=5)
+        replies = session.get("enact/cell/s0/acquire/x", attachment=header, timeout=5)
+        sample = replies.recv().ok
+        answer = decode_frame(bytes(sample.attachment), bytes(sample.payload))
+    finally:
+        close_session(session)
+
+    counters = carrier.request("s0", ListSessions(), timeout_s=5).counters
+
+    assert isinstance(answer, Refused)
+    assert answer.code == "protocol"
+    assert ("frames_refused", 1) in counters
+
+
+# ---------------------------------------------------------------- the end
+
+
+def test_daemon_answers_who_is_parked_when_it_stops(daemon, carry, make_peer, endpoint):
+    """A client that waits for a lock is told so at the end, long before its wait is over."""
+    shard = daemon(endpoint)
+    holder = speak(carry(endpoint), make_peer)
+    waiter = speak(carry(endpoint), make_peer)
+    granted = holder.acquire("cup")
+    answers = []
+    thread = threading.Thread(target=lambda: answers.append(waiter.acquire("cup", wait_s=0.9)))
+    parked = threading.Event()
+    waiter.call = _noting(waiter.call, parked)
+    thread.start()
+    parked.wait(5)
+    while len(holder.call("s0", ListLocks()).holders) < 2:
+        continue
+
+    shard.stop(drain_s=0.0)
+    thread.join(5)
+
+    assert isinstance(granted, Granted)
+    assert [type(answer) for answer in answers] == [Waiting]
+
+
+def _noting(call, event):
+    def noting(shard, message):
+        event.set()
+        return call(shard, message)
+
+    return noting
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.slow
+def test_daemon_ends_with_status_0_in_two_seconds_on_a_signal(
+    process, carry, make_peer, endpoint, number
+):
+    """With a lock held and a wait parked it still drains and leaves in time."""
+    started = process(endpoint)
+    holder = speak(carry(endpoint), make_peer)
+    holder.acquire("cup")
+    carrier = carry(endpoint)
+    answers = []
+    thread = threading.Thread(
+        target=lambda: answers.append(
+            carrier.request("s0", AwaitStamp(2**62, 9_000_000_000), timeout_s=9)
+        )
+    )
+    thread.start()
+    holder.call("s0", ListLocks())
+    began_s = time.monotonic()
+
+    started.send_signal(number)
+    status = started.wait(10)
+
+    took_s = time.monotonic() - began_s
+    thread.join(5)
+    assert status == 0, started.stderr.read()
+    assert took_s < 2.0
+    assert answers[0] is not None
+
+
+@pytest.mark.slow
+def test_daemon_says_one_line_and_status_1_when_its_endpoint_is_in_use(process):
+    """No traceback: who must act reads one line."""
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        endpoint = f"tcp/127.0.0.1:{other.getsockname()[1]}"
+        started = process(endpoint, ready=False)
+        output, errors = started.communicate(timeout=20)
+
+    assert started.returncode == 1
+    assert output == ""
+    assert errors == (
+        f"shard s0: endpoint {endpoint} is in use by another process of this host; stop it or"
+        " listen elsewhere\n"
+    )
+
+
+@pytest.mark.slow
+def test_daemon_keeps_what_it_acknowledged_when_it_is_killed(
+    process, carry, make_peer, endpoint, tmp_path, until
+):
+    """A durable commit that was answered is there after kill -9 and a new start."""
+    first = process(endpoint, tmp_path, durability="durable")
+    peer = speak(carry(endpoint), make_peer, durability="durable")
+    assert isinstance(peer.write("cup", b"kept"), Committed)
+    first.kill()
+    first.wait()
+
+    process(endpoint, tmp_path, durability="durable")
+    again = speak(carry(endpoint), make_peer, durability="durable")
+    granted = until(lambda: isinstance(g := again.acquire("cup", wait_s=0.5), Granted) and g)
+
+    assert bytes(granted.states[0].datum.body) == b"kept"
+    assert granted.states[0].version == 1
+
+
+# ---------------------------------------------------------------- one client never delays another
+
+STOPPED = """
+import secrets, sys
+from enact_dist.core.messages import Fetch, Hello, Item, Register, AspectEntry, TakeView
+from enact_dist.core.datum import LockId, Slot
+from enact_dist.link.zenoh_carrier import ZenohCarrier
+from enact_dist.terms import Access
+session = secrets.token_hex(16)
+carrier = ZenohCarrier("cell", session, "stopped", [sys.argv[1]], ttl_s=4.0)
+hello = Hello(session, 0, 4_000_000_000, "stopped", "h", 1, False)
+epoch = carrier.request("s0", hello, timeout_s=5).epoch
+lock = LockId(session, 0, 1)
+item = Item(int(Access.VIEW), "online", "cloud", "count")
+state = carrier.request("s0", TakeView(lock, epoch, 1, 1, (item,), 0), timeout_s=5).states[0]
+size = carrier.fetch_bytes
+calls = [
+    ("s0", Fetch(lock, epoch, state.slot, state.version, start, size))
+    for start in range(0, state.size, size)
+]
+print("go", flush=True)
+while True:
+    carrier.request_all(calls, timeout_s=30)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.timing
+def test_daemon_delays_no_other_client_when_one_is_stopped_with_50_mb_in_flight(
+    process, carry, make_peer, endpoint, program
+):
+    """A stopped reader of 50 MB adds less than 50 ms (p99) and 150 ms (max) to anybody else."""
+    process(endpoint)
+    writer = speak(carry(endpoint), make_peer)
+    assert isinstance(writer.write("cloud", bytes(50_000_000)), Committed)
+    calm = _latencies_s(writer, 300)
+    reader = program(STOPPED, endpoint)
+    assert reader.stdout.readline() == "go\n"
+    writer.call("s0", ListLocks())
+
+    reader.send_signal(signal.SIGSTOP)
+    disturbed = _latencies_s(writer, 3000)
+
+    p99_s, max_s = disturbed[len(disturbed) * 99 // 100], disturbed[-1]
+    print(
+        f"calm p50 {calm[150] * 1e3:.2f} p99 {calm[297] * 1e3:.2f} ms; beside a stopped reader"
+        f" p50 {disturbed[1500] * 1e3:.2f} p99 {p99_s * 1e3:.2f} max {max_s * 1e3:.2f} ms"
+    )
+    assert p99_s - calm[150] < 0.050
+    assert max_s - calm[150] < 0.150
+
+
+def _latencies_s(peer, count):
+    """Return how long whole updates took, sorted, in seconds."""
+    took = []
+    for _ in range(count):
+        began_s = time.perf_counter()
+        assert isinstance(peer.write("cup", b"x"), Committed)
+        took.append(time.perf_counter() - began_s)
+    return sorted(took)
