@@ -80,7 +80,7 @@ class ClientHost(Host):
     ) -> None:
         super().__init__(world, name, drift_ppm=faults.drift_ppm, wall_offset_ns=0)
         self.client = Client(f"{world.random.getrandbits(64):016x}", ttl_ns=ttl_ns, actor=name)
-        self.busy = False
+        self.starves_until_ns = 0
         self.cache: dict[Slot, tuple[str, int, int, Datum]] = {}
         self.threads_left = 0
         self._network, self._shards, self._model = network, shards, model
@@ -201,6 +201,12 @@ class ClientHost(Host):
 
     def keep_alive(self) -> None:
         """Renew the session at every shard, four times per TTL, until the process ends."""
+        starves = self.world.now_ns < self.starves_until_ns
+        if not (starves and self.world.random.random() < self._faults.starved):
+            self._renew()
+        self.later(self.client.ttl_ns // 4, self.keep_alive)
+
+    def _renew(self) -> None:
         now_ns = self.local_ns
         for shard in self.client.shards_in_use():
             request = self.client.keep_alive(shard, now_ns)
@@ -209,7 +215,6 @@ class ClientHost(Host):
                 request,
                 lambda answer, shard=shard, request=request: self._renewed(shard, request, answer),
             )
-        self.later(self.client.ttl_ns // 4, self.keep_alive)
 
     def _renewed(self, shard: str, request: Request, answer: Answer | None) -> None:
         if answer is not None:

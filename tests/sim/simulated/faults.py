@@ -33,6 +33,10 @@ class Faults:
     """Processes that stand still for up to three TTLs while their messages queue up."""
     busy: float = 0.0
     """Share of pauses of a client in which its liveliness token stays (a held interpreter lock)."""
+    tokens: bool = True
+    """Whether shards see liveliness tokens at all; without them keep-alives alone renew."""
+    starved: float = 0.0
+    """Share of keep-alive rounds that do not take place (the thread that sends them starves)."""
     partitions_per_s: float = 0.0
     """Links that are cut for a while, in one direction or in both."""
     slow_disk: float = 0.0
@@ -71,6 +75,8 @@ def drawn(random: Random, *, shards: int) -> Faults:
         kills_per_s=random.choice((0.0, 0.1)),
         pauses_per_s=random.choice((0.0, 0.2, 0.5)),
         busy=random.choice((0.0, 0.5)),
+        tokens=random.random() < 0.6,
+        starved=random.choice((0.0, 0.0, 0.5, 0.9)),
         partitions_per_s=random.choice((0.0, 0.2)),
         slow_disk=random.choice((0.0, 0.05)),
         drift_ppm=random.choice((0, 9_900)),

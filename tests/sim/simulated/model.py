@@ -312,13 +312,15 @@ class Model:
         if isinstance(answer, Viewed):
             return
         shown = {state.slot for state in answer.states}
+        absent = self.absent.setdefault(answer.lock, {})
+        for known in [known for known in absent if known[0] == host.name]:
+            del absent[known]  # of an earlier grant, before a restart
         for item in host.shard.state.tenures.by_lock[answer.lock].items:
             if Access(item.access).each:
                 for slot in self._not_shown(item, shown, picture):
                     now = picture.now(slot)
                     if now.datum is not None:
                         self._fail("I18 a pattern shows all that match", item, slot)
-                    absent = self.absent.setdefault(answer.lock, {})
                     absent[host.name, slot] = (picture.epoch, now.name)
 
     @staticmethod

@@ -103,6 +103,7 @@ class Scenario:
             faults=self.faults,
             ttl_ns=self.ttl_ns,
         )
+        host.starves_until_ns = FAULTS_NS
         self.model.clients.append(host)
         self._show_token(host, present=True)
 
@@ -280,7 +281,7 @@ class Scenario:
     # ---------------------------------------------------------------- liveliness tokens
 
     def _visible(self, host: ClientHost, shard: ShardHost) -> bool:
-        return host.up and not host.paused and not self.network.is_cut(host, shard)
+        return self.faults.tokens and host.up and not host.paused and not self.network.is_cut(host, shard)
 
     def _tokens_seen(self, shard: ShardHost) -> list[str]:
         return [h.client.session for h in self.model.clients if self._visible(h, shard)]
@@ -292,7 +293,7 @@ class Scenario:
             shard.receive(lambda shard=shard, seen=seen: shard.event(seen))
 
     def _show_token(self, host: ClientHost, *, present: bool) -> None:
-        seen = SessionSeen(host.client.session, present)
+        seen = SessionSeen(host.client.session, present and self.faults.tokens)
         for shard in self.shards.values():
             self.world.after(
                 10 * MS, lambda shard=shard: shard.receive(lambda: shard.event(seen))
