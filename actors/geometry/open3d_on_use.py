@@ -36,5 +36,5 @@ def open3d() -> Any:  # its stubs contradict its behaviour, so the module is han
         else:
             package = DEBIAN_PACKAGES.get(missing[1], f"the package that holds {missing[1]}")
             remedy = f"sudo apt-get install -y {package}"
-        raise ImportError(f"Open3D cannot be loaded ({error}); {remedy}") from error
+        raise ImportError(f"Open3D cannot be loaded ({error}); {remedy}", name="open3d") from error
     return module

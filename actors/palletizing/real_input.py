@@ -41,8 +41,9 @@ if TYPE_CHECKING:
 FOUND_SCORE_MIN: Final = 0.85
 """Below this a model counts as not found; wrong packages of like size reach 0.74."""
 
-REFUSALS: Final = (InputFileError, NoMatchError, FusionError, ImportError, OSError)
-"""What the user can act on; anything else is a defect and keeps its traceback."""
+REFUSALS: Final = (InputFileError, NoMatchError, FusionError, OSError)
+"""What the user can act on; anything else is a defect and keeps its traceback.  A missing library
+is for the command line to tell, as for every other command."""
 
 
 def run_views(directory: Path, out: Path, *, voxel_m: float | None = None, say: Say = print) -> int:
