@@ -67,9 +67,7 @@ def install_packages(packages: list[str]) -> None:
     say(line)
     environment = {**os.environ, "DEBIAN_FRONTEND": "noninteractive"}
     for command in (["apt-get", "update", "-qq"], line.split()):
-        done = subprocess.run(
-            command, env=environment, check=False, capture_output=True, text=True
-        )
+        done = subprocess.run(command, env=environment, check=False, capture_output=True, text=True)
         if done.returncode and command[1] != "update":
             give_up(f"'{line}' failed:\n{done.stderr.strip()}")
     still = missing_packages()

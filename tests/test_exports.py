@@ -8,7 +8,9 @@ NAMES_MAX = 26
 
 def test_public_names_are_sorted_and_few():
     """`__all__` is sorted (constants, classes, functions), each name exists, and there are about 25."""
-    assert enact_dist.__all__ == sorted(enact_dist.__all__, key=lambda n: (not n.isupper(), not n[0].isupper(), n))
+    assert enact_dist.__all__ == sorted(
+        enact_dist.__all__, key=lambda n: (not n.isupper(), not n[0].isupper(), n)
+    )
     assert len(enact_dist.__all__) <= NAMES_MAX
     for name in enact_dist.__all__:
         assert hasattr(enact_dist, name)

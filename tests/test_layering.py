@@ -88,9 +88,7 @@ def test_geometry_knows_nothing_of_enact_dist():
 def test_importing_the_package_loads_neither_zenoh_nor_open3d():
     """`import enact_dist` is light: transports and geometry load on use."""
     code = "import sys, enact_dist; print({'zenoh', 'open3d', 'rich'} & set(sys.modules))"
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True
-    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"
 
 

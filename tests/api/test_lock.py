@@ -176,7 +176,10 @@ def test_wrong_datum_type_raises_at_assignment(online):
 def test_aspect_with_other_type_is_refused_by_name(cell, online):
     """An aspect's type is fixed once it is registered."""
     online.init(bench, COUNT, 1)
-    with pytest.raises(DatumTypeError, match="count"), Lock(Read(online, bench, Aspect("count", str))):
+    with (
+        pytest.raises(DatumTypeError, match="count"),
+        Lock(Read(online, bench, Aspect("count", str))),
+    ):
         pass
 
 
@@ -213,7 +216,7 @@ def test_requests_are_values(online):
 
 def test_unknown_world_lists_those_that_exist(cell):
     """The error names what was asked and what there is."""
-    with pytest.raises(UnknownWorldError, match="onlin.*online, training") as caught:
+    with pytest.raises(UnknownWorldError, match=r"onlin.*online, training") as caught:
         cell.world("onlin")
     assert caught.value.known == ("online", "training")
 

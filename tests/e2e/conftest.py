@@ -51,9 +51,13 @@ class Process:
             try:
                 line = self.lines.get(timeout=timeout_s)
             except queue.Empty:
-                raise AssertionError(f"no line {start!r} within {timeout_s} s; {self.story()}") from None
+                raise AssertionError(
+                    f"no line {start!r} within {timeout_s} s; {self.story()}"
+                ) from None
             if line is None:
-                raise AssertionError(f"ended ({self.popen.wait()}) before {start!r}; {self.story()}")
+                raise AssertionError(
+                    f"ended ({self.popen.wait()}) before {start!r}; {self.story()}"
+                )
             self.seen.append(line)
             if line.startswith(start):
                 return line[len(start) :].strip()

@@ -99,7 +99,8 @@ def test_watcher_that_was_stopped_resynchronises_and_says_what_it_missed(make_ce
     said = json.loads(watcher.expect("summary", 30))
 
     assert said["last"] == last
-    assert said["seen"] + said["gap"] == last
+    assert said["first"] - 1 + said["seen"] + said["gap"] == last
+    assert said["gap"] > 0
     assert said["in_order"]
 
 

@@ -11,7 +11,18 @@ import time
 
 import numpy as np
 
-from enact_dist import Aspect, Durability, Entities, Entity, Lock, Read, View, Write, WriteEach, connect
+from enact_dist import (
+    Aspect,
+    Durability,
+    Entities,
+    Entity,
+    Lock,
+    Read,
+    View,
+    Write,
+    WriteEach,
+    connect,
+)
 from enact_dist.errors import EnactError, LeaseLostError, LockTimeoutError
 
 COUNT = Aspect("count", int)
@@ -191,15 +202,17 @@ def commit_swift(cell):
 
 def watch_ticker(cell):
     """Follow the ticker until it rests; say what was seen and what was missed."""
-    seen = gap = last = 0
+    seen = gap = last = first = 0
     in_order = True
     with cell.world("online").watch(Entities("ticker"), COUNT) as watch:
         while (change := watch.next(30.0 if not seen else 6.0)) is not None:
             in_order = in_order and change.version > last
+            first = first or change.version
             seen, gap, last = seen + 1, gap + change.gap, change.version
             if last % 50 == 0:
                 say("version", last)
-    say("summary", json.dumps({"seen": seen, "gap": gap, "last": last, "in_order": in_order}))
+    counts = {"first": first, "seen": seen, "gap": gap, "last": last, "in_order": in_order}
+    say("summary", json.dumps(counts))
 
 
 def main():
