@@ -25,7 +25,7 @@ import threading
 from collections import deque
 from typing import TYPE_CHECKING, Final, cast
 
-from enact_dist.core.messages import Acquire, AwaitStamp, Hello
+from enact_dist.core.messages import Acquire, AwaitStamp, Hello, Refused
 from enact_dist.core.records import (
     Drain,
     Persist,
@@ -54,6 +54,8 @@ TICK_S_MAX: Final = 0.1
 """The timer wakes at least so often: bounds by how much an expiry may be late."""
 TICK_S_MIN: Final = 0.001
 """The timer rests at least so long; deadlines of many locks then share one tick."""
+PARKED_MAX: Final = 100_000
+"""Requests that may wait for their answers at one time."""
 JOIN_S: Final = 0.5
 """How long a closing host waits for its timer; a drain has to be over within 2 s."""
 
@@ -156,6 +158,10 @@ class ShardHost:
         """
         with self._mutex:
             if self._ended:
+                return
+            if len(self._replies) >= PARKED_MAX:
+                self.count("overloads")
+                reply(Refused("overload", f"{PARKED_MAX} requests wait for shard {self.name}"))
                 return
             self._handles += 1
             self._replies[self._handles] = reply

@@ -145,7 +145,9 @@ class ZenohCarrier:
             MisuseError: The carrier is closed or was opened before a fork.
         """
         self._check_usable()
-        return self._receive(shard, self._send(shard, message, timeout_s))
+        replies = self._send(shard, message, timeout_s)
+        self._check_answered_once()
+        return self._receive(shard, replies)
 
     def request_all(
         self, requests: Sequence[tuple[str, Request]], *, timeout_s: float
@@ -158,6 +160,8 @@ class ZenohCarrier:
         """
         self._check_usable()
         sent = [(shard, self._send(shard, message, timeout_s)) for shard, message in requests]
+        for _ in sent:
+            self._check_answered_once()
         return [self._receive(shard, replies) for shard, replies in sent]
 
     def _send(
@@ -200,12 +204,11 @@ class ZenohCarrier:
             return None
         if sample is None:  # the error that stands for a timeout
             return None
-        self._check_answered_once(shard)
         self._unchecked.append(replies)
         return answer_in(sample, shard)
 
-    def _check_answered_once(self, shard: str) -> None:
-        """Look whether earlier queries got a second reply; that they end costs no waiting then."""
+    def _check_answered_once(self) -> None:
+        """Look whether an earlier query got a second reply; the present one is under way then."""
         try:
             earlier = self._unchecked.popleft()
         except IndexError:

@@ -13,8 +13,9 @@ from __future__ import annotations
 import dataclasses
 import logging
 import threading
+from collections.abc import Callable
 from operator import attrgetter
-from typing import TYPE_CHECKING, Final, cast, get_args
+from typing import TYPE_CHECKING, Any, Final, cast, get_args
 
 import zenoh
 
@@ -42,14 +43,14 @@ from enact_dist.wire.keys import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from enact_dist.core.messages import Notice, SlotState
+    from enact_dist.core.messages import Notice
     from enact_dist.link.host import ShardHost
 
 _log = logging.getLogger("enact.link")
 SURVEYED_BYTES: Final = 160
 """Estimated length of one slot in the answer to a `Survey`."""
+_NOTICES: Final = "@notices"
+"""Stands for all watchers together among the clients of `Senders`."""
 JOIN_S: Final = 0.5
 """How long a closing service waits for each of its threads."""
 
@@ -139,14 +140,15 @@ class ZenohService:
     # ---------------------------------------------------------------- notices and tokens
 
     def _publish(self, notice: Notice) -> None:
-        """Send a notice if anybody watches; Zenoh drops it for whoever does not read."""
+        """Send a notice if anybody watches; Zenoh drops it for whoever does not read.
+
+        Zenoh may wait 1 ms before it drops one message, but 2 s for one in several fragments: such
+        a long notice, and whatever comes after it, is left to a thread.
+        """
         if not self._publisher.matching_status.matching:  # type: ignore[attr-defined]  # see its stub
             return
-        header, payload = encode_frame(notice)
-        try:
-            self._publisher.put(payload or b"", attachment=header)
-        except zenoh.ZError:
-            self._host.count("notices_dropped")
+        self.senders.heard(_NOTICES)
+        self.senders.send(_NOTICES, _Publication(self._publisher, *encode_frame(notice)))
 
     def _see(self) -> None:
         """Tell the host which sessions' tokens are there, until the subscription ends."""
@@ -172,6 +174,28 @@ class ZenohService:
         self.senders.close()
         for thread in self._threads:
             thread.join(JOIN_S)
+
+
+class _Publication:
+    """A notice on its way to all who watch."""
+
+    __slots__ = ("_header", "_payload", "_publisher", "size")
+
+    def __init__(self, publisher: zenoh.Publisher, header: bytes, payload: bytes | None) -> None:
+        self._publisher = publisher
+        self._header = header
+        self._payload = payload or b""
+        self.size = len(self._header) + len(self._payload)
+
+    def send(self) -> None:
+        """Publish it; a session that is closed meanwhile takes it with it."""
+        try:
+            self._publisher.put(self._payload, attachment=self._header)
+        except zenoh.ZError as error:
+            _log.warning("notice not sent: %s", error)
+
+    def drop(self) -> None:
+        """Do nothing: a watcher sees the gap in the numbers."""
 
 
 class _Call:
@@ -222,14 +246,20 @@ _CLIENT_OF: Final = {kind: _client_getter(kind) for kind in get_args(Request)}
 
 def size_of(answer: Answer) -> int:
     """Estimate the length of an answer's data in bytes, without encoding it."""
-    if isinstance(answer, Granted | Viewed):
-        return sum(map(_size_of_state, answer.states))
-    if isinstance(answer, Slice):
-        return answer.body.size
-    if isinstance(answer, Surveyed):
-        return SURVEYED_BYTES * len(answer.states)
-    return 0
+    estimate = _SIZE_OF.get(type(answer))
+    return estimate(answer) if estimate is not None else 0
 
 
-def _size_of_state(state: SlotState) -> int:
-    return SURVEYED_BYTES + (state.datum.size if state.datum is not None else 0)
+def _size_of_states(answer: Granted | Viewed) -> int:
+    return sum(
+        SURVEYED_BYTES + (state.datum.size if state.datum is not None else 0)
+        for state in answer.states
+    )
+
+
+_SIZE_OF: Final[dict[type, Callable[[Any], int]]] = {
+    Granted: _size_of_states,
+    Viewed: _size_of_states,
+    Slice: lambda answer: answer.body.size,
+    Surveyed: lambda answer: SURVEYED_BYTES * len(answer.states),
+}

@@ -12,6 +12,7 @@ from enact_dist.core.messages import (
     ListSessions,
     Locks,
     Reached,
+    Refused,
     Waiting,
 )
 from enact_dist.core.records import Recovered
@@ -244,6 +245,18 @@ def test_host_answers_the_parked_and_grants_nothing_when_it_drains(start, make_p
     assert not busy
     assert host.idle
     assert isinstance(after, Waiting)
+
+
+def test_host_refuses_and_counts_when_too_many_requests_wait(start, monkeypatch):
+    """Parked requests are bounded; one too many is told so at once."""
+    monkeypatch.setattr("enact_dist.link.host.PARKED_MAX", 2)
+    host = start()
+    answers = []
+
+    for _ in range(3):
+        host.submit(AwaitStamp(2**62, 9_000_000_000), answers.append)
+
+    assert [(type(answer), answer.code) for answer in answers] == [(Refused, "overload")]
 
 
 def test_host_counts_for_list_sessions(start):

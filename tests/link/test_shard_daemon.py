@@ -1,5 +1,6 @@
 """The daemon: starts once, says why not, refuses what it cannot read, ends in time."""
 
+import json
 import os
 import signal
 import socket
@@ -237,6 +238,30 @@ def test_daemon_keeps_what_it_acknowledged_when_it_is_killed(
     assert granted.states[0].version == 1
 
 
+FULL_DISK = """
+import resource
+resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, 1_000_000))
+"""
+
+
+@pytest.mark.slow
+def test_daemon_acknowledges_nothing_and_ends_with_status_1_when_its_disk_is_full(
+    program, carry, make_peer, endpoint, tmp_path
+):
+    """A commit that could not be written is never answered, and the daemon does not go on."""
+    started = program(FULL_DISK + DAEMON, endpoint, tmp_path, "json", "durable")
+    assert started.stdout.readline().startswith("ready")
+    peer = speak(carry(endpoint), make_peer, durability="durable")
+
+    answer = peer.write("cup", bytes(3_000_000))
+    status = started.wait(10)
+
+    lines = [json.loads(line) for line in started.stderr]
+    assert answer is None
+    assert status == 1
+    assert any(line["level"] == "CRITICAL" and str(tmp_path) in line["text"] for line in lines)
+
+
 # ---------------------------------------------------------------- one client never delays another
 
 STOPPED = """
@@ -247,6 +272,7 @@ from enact_dist.link.zenoh_carrier import ZenohCarrier
 from enact_dist.terms import Access
 session = secrets.token_hex(16)
 carrier = ZenohCarrier("cell", session, "stopped", [sys.argv[1]], ttl_s=4.0)
+feed = carrier.subscribe()
 hello = Hello(session, 0, 4_000_000_000, "stopped", "h", 1, False)
 epoch = carrier.request("s0", hello, timeout_s=5).epoch
 lock = LockId(session, 0, 1)
