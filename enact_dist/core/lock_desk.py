@@ -121,6 +121,8 @@ class LockDesk:
         if refusal is not None or session is None:
             yield Reply(reply_to, refusal or EpochChanged(self._state.epoch))
             return
+        # Whatever is counted renews: the client believes from the newest counter that was seen.
+        session.renewed_ns = max(session.renewed_ns, self._state.now_ns)
         session.count_seen = max(session.count_seen, message.count)
         states = self._state.slots.states(message.items)
         pins = self._state.tenures.pins_of(states)

@@ -79,25 +79,28 @@ class SessionDesk:
             tuple(self._state.catalogue.worlds),
             tuple(self._state.catalogue.aspects.values()),
         )
-        recording = self._recording.get(session.session)
-        if recording is not None:
-            self._answers_after[recording].append((reply_to, welcome))
-        elif unrecorded:
+        if unrecorded and session.session not in self._recording:
             # A session that a restart would not know could lose its grants without the grace, so
             # it may do nothing before its record is durable.
             record = SessionRecord(session.session, session.ttl_ns)
             yield from self._answer_when_durable(reply_to, welcome, (record,))
             self._recording[session.session] = self._ticket
         else:
-            session.present = True
-            yield Reply(reply_to, welcome)
+            session.present = session.present or not unrecorded
+            yield from self._answer_when_durable(reply_to, welcome, ())
 
     def _answer_when_durable(
         self, reply_to: int, answer: Answer, records: tuple[Record, ...]
     ) -> Iterator[Effect]:
-        self._ticket -= 1
-        self._answers_after[self._ticket] = [(reply_to, answer)]
-        yield Persist(self._ticket, records, Durability.DURABLE)
+        """Answer when `records` are durable, and all before them that the answer may tell of."""
+        if records:
+            self._ticket -= 1
+            self._answers_after[self._ticket] = [(reply_to, answer)]
+            yield Persist(self._ticket, records, Durability.DURABLE)
+        elif self._answers_after:
+            self._answers_after[self._ticket].append((reply_to, answer))
+        else:
+            yield Reply(reply_to, answer)
 
     def persisted(self, ticket: int) -> Iterator[Effect]:
         """The records of one of this desk's answers are durable: answer."""
@@ -113,6 +116,7 @@ class SessionDesk:
     def on_register(self, message: Register, reply_to: int) -> Iterator[Effect]:
         """Create world contexts and register aspects, all or none."""
         records: list[Record] = []
+        before = dict(self._state.catalogue.aspects)
         for name in message.worlds:
             try:
                 checked_name("world context", name, slashes=False)
@@ -124,6 +128,7 @@ class SessionDesk:
         for entry in message.aspects:
             registered = self._state.catalogue.register(entry)
             if isinstance(registered, str):
+                self._state.catalogue.aspects = before
                 yield Reply(reply_to, Refused("datum_type", registered))
                 return
             if registered[1]:
@@ -132,10 +137,7 @@ class SessionDesk:
         answer = Registered(
             tuple(self._state.catalogue.worlds), tuple(self._state.catalogue.aspects.values())
         )
-        if records:
-            yield from self._answer_when_durable(reply_to, answer, tuple(records))
-        else:
-            yield Reply(reply_to, answer)
+        yield from self._answer_when_durable(reply_to, answer, tuple(records))
 
     def on_keep_alive(self, message: KeepAlive, reply_to: int) -> Iterator[Effect]:
         """Renew a session and free what it does not want any more."""
@@ -188,7 +190,8 @@ class SessionDesk:
         self._state.drop_pins(session)
         self._state.sessions.forget(session)
         self._state.sessions.end_grace_if_all_acknowledged(self._state.now_ns)
-        if found.durable:
+        recording = self._recording.pop(session, None)
+        if found.durable or recording is not None:
             yield Persist(0, (SessionEnded(session, self._state.wall_ns),), Durability.OS)
 
     def on_session_seen(self, message: SessionSeen, _: int) -> Iterator[Effect]:

@@ -191,7 +191,8 @@ class Tenures:
         """Return the grant with its data as of now."""
         assert tenure.token is not None
         states = self._slots.states(tenure.items)
-        tenure.pins = self.pins_of(states)
+        # Added to: the client may have taken an earlier answer, whose views have moved on since.
+        tenure.pins.update(self.pins_of(states))
         session = self._sessions.by_id[tenure.lock.session]
         return Granted(
             tenure.lock,
