@@ -48,6 +48,7 @@ class Limits:
         slope_m: What registration is off in the plane, metres; counts by the model's slope.
         edge_px: Width of the band along outlines that is left out: the filters reach 5, the
             registration is off by 1 or 2.
+        beside_px: Width of the band around the product where nothing counts as foreign.
         deformed_m2: Least area of a deformation, square metres.
         extra_m2: Least area of a foreign object outside the band, square metres.
         moved_m: Largest shift of a package in its place, metres.
@@ -59,8 +60,9 @@ class Limits:
     depth_m: float = 0.0009
     slope_m: float = 0.0015
     edge_px: int = 9
+    beside_px: int = 6
     deformed_m2: float = 0.00012
-    extra_m2: float = 0.0003
+    extra_m2: float = 0.00025
     moved_m: float = 0.010
     turned_rad: float = float(np.deg2rad(8.0))
     present_share: float = 0.35
@@ -117,7 +119,8 @@ def inspect_place(
     product_m2 = float(_areas_of(expected, frame).sum())
     if not pieces or pieces[0].area_m2 < limits.present_share * product_m2:
         return _missing(expected, before_mm, frame, planned)
-    pose = register(pieces[0].cloud, surface, planned).tray_from_product
+    piece = pieces[0]
+    pose = register(piece.cloud, piece.outline_m, surface, planned).tray_from_product
     shift_m = float(np.hypot(*(pose[:2, 3] - planned[:2, 3])))
     turn = yaw_between(yaw_of(planned), yaw_of(pose))
     rendered = render_depth([(surface, pose)], frame.acquisition)
@@ -195,7 +198,7 @@ def _missing(
 
 def _foreign(pieces: list[Piece], product: Mask, limits: Limits) -> Mask:
     """Return the pixels of all pieces that lie outside the product and its edge band."""
-    beside = ~_grown(product, limits.edge_px)
+    beside = ~_grown(product, limits.beside_px)
     every = np.any([piece.mask for piece in pieces], axis=0)
     return np.asarray(every & beside)
 

@@ -128,8 +128,10 @@ def grid_triangles(grid_m: npt.NDArray[np.float32], camera: Camera) -> npt.NDArr
     a, b = number[:-1, :-1].ravel(), number[:-1, 1:].ravel()
     c, d = number[1:, :-1].ravel(), number[1:, 1:].ravel()
     triangles = np.concatenate([np.column_stack([a, c, b]), np.column_stack([b, c, d])])
-    depth = grid_m[..., 2].ravel()[triangles]
-    far, near = depth.max(axis=1), depth.min(axis=1)
+    # Corner by corner: a reduction over an axis of three is ten times slower.
+    one, other, third = (grid_m[..., 2].ravel()[triangles[:, corner]] for corner in range(3))
+    far = np.maximum(np.maximum(one, other), third)
+    near = np.minimum(np.minimum(one, other), third)
     step_max = far * (GRAZING_TANGENT / camera.fx_px) + 2.0 * spread_m(far)
     with np.errstate(invalid="ignore"):
         return np.asarray(triangles[far - near < step_max])

@@ -45,12 +45,14 @@ class Piece:
     Attributes:
         mask: (H, W) bool, its pixels.
         cloud: Its points in the tray frame, metres.
+        outline_m: (K, 2) float64, its points along the outline, tray frame, metres.
         area_m2: Area of its pixels at their own distance, square metres.
         centre_m: Mean of its points, (3,) float64, tray frame.
     """
 
     mask: Mask
     cloud: PointCloud
+    outline_m: npt.NDArray[np.float64]
     area_m2: float
     centre_m: npt.NDArray[np.float64]
 
@@ -63,7 +65,7 @@ def new_pieces(frame: DepthFrame, before_mm: npt.NDArray[np.uint16]) -> list[Pie
         before_mm: (H, W) uint16, the same camera's image before (the empty tray, or the last
             stop), millimetres.
     """
-    from scipy.ndimage import binary_opening, label
+    from scipy.ndimage import binary_erosion, binary_opening, label
 
     rise_m = rise(frame, before_mm)
     with np.errstate(invalid="ignore"):
@@ -83,9 +85,9 @@ def new_pieces(frame: DepthFrame, before_mm: npt.NDArray[np.uint16]) -> list[Pie
             break
         mask = labels == number
         cloud = points[mask & raised]
-        pieces.append(
-            Piece(mask, PointCloud(cloud), float(areas[number]), cloud.mean(axis=0, dtype=float))
-        )
+        outline = points[mask & raised & ~binary_erosion(mask)][:, :2].astype(float)
+        centre = cloud.mean(axis=0, dtype=float)
+        pieces.append(Piece(mask, PointCloud(cloud), outline, float(areas[number]), centre))
     return pieces
 
 

@@ -32,6 +32,9 @@ JITTER_M: Final = 0.003
 JITTER_RAD: Final = np.deg2rad(1.5)
 """Largest error of a sound placement."""
 
+ROOM_M: Final = (0.105, 0.15)
+"""Half of the room around a place, x and y: nothing of one package leaves its own."""
+
 DEVIATING_SHARE: Final = 0.5
 """Far more than a real line has, so that a short demonstration shows every kind."""
 
@@ -133,15 +136,19 @@ def make_package(stop: int, product: str, truth: Truth, random: np.random.Genera
     if truth.kind == "moved":
         placed = _shift(truth.amount / 1000.0, random) @ placed
     vertices, triangles = product_mesh(product)
-    shape = (deformed(vertices, truth, random), triangles)
     nothing = (np.empty((0, 3)), np.empty((0, 3), np.int32))
+    shape, extra = (deformed(vertices, truth, random), triangles), nothing
+    if truth.kind == "missing":
+        shape = nothing
+    elif truth.kind == "extra":
+        extra = _foreign_object(vertices, planned, placed, random)
     return Package(
         product=product,
         planned=planned,
         placed=placed,
         truth=truth,
-        shape=nothing if truth.kind == "missing" else shape,
-        extra=_foreign_object(vertices, placed, random) if truth.kind == "extra" else nothing,
+        shape=shape,
+        extra=extra,
     )
 
 
@@ -195,17 +202,19 @@ def _shift(length_m: float, random: np.random.Generator) -> npt.NDArray[np.float
 
 def _foreign_object(
     vertices_m: npt.NDArray[np.float64],
+    planned: npt.NDArray[np.float64],
     placed: npt.NDArray[np.float64],
     random: np.random.Generator,
 ) -> Mesh:
-    """A block of 50 x 40 x 30 mm that lies 12 to 25 mm beside the package, towards its end."""
+    """A block of 40 x 30 x 30 mm that lies 10 to 14 mm beside the package, in the place's room."""
     half = vertices_m[:, :2].max(axis=0)
-    side = 1.0 if random.random() < 0.5 else -1.0
-    gap = random.uniform(0.012, 0.025)
-    beside = on_tray(
-        float(random.uniform(-0.3, 0.3) * half[0]),
-        float(side * (half[1] + gap + 0.032)),
-        float(random.uniform(-0.4, 0.4)),
-    )
-    vertices, triangles = box_mesh((0.050, 0.040, 0.030))
-    return moved(vertices, placed @ beside), triangles
+    while True:
+        along, side = int(random.integers(2)), random.choice([-1.0, 1.0])
+        offset = random.uniform(-0.3, 0.3, 2) * half
+        offset[along] = side * (half[along] + 0.015 + random.uniform(0.010, 0.014))
+        size = (0.030, 0.040, 0.030) if along == 0 else (0.040, 0.030, 0.030)
+        vertices, triangles = box_mesh(size)
+        beside = on_tray(offset[0], offset[1], random.uniform(-0.15, 0.15))
+        lying = moved(vertices, placed @ beside)
+        if (np.abs(lying[:, :2] - planned[:2, 3]) < ROOM_M).all():
+            return lying, triangles

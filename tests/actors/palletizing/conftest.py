@@ -1,0 +1,26 @@
+"""Products trained once per test run, and a simulated tray."""
+
+from functools import lru_cache
+
+import pytest
+
+
+@pytest.fixture(scope="session")
+def trained():
+    """Return a function from a product's name to the surface that 14 noisy views of it give."""
+    pytest.importorskip("open3d", exc_type=ImportError)
+    from actors.palletizing.evaluation import train
+    from actors.palletizing.simulation.sensors import SimulatedOrbitSensor
+
+    return lru_cache(lambda product: train(product, SimulatedOrbitSensor(seed=5)))
+
+
+@pytest.fixture(scope="session")
+def tray():
+    """Return an overhead sensor whose first package is missing."""
+    pytest.importorskip("open3d", exc_type=ImportError)
+    from actors.palletizing.evaluation import graded
+    from actors.palletizing.simulation.sensors import SimulatedTraySensor
+
+    packages = graded("missing", 0.0, 1, seed=1, products=["milk_carton"])
+    return SimulatedTraySensor(packages, seed=2)

@@ -1,0 +1,239 @@
+"""Claims about the palletizing actors, run in process on the real core."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+pytest.importorskip("open3d", exc_type=ImportError)
+
+from actors.palletizing.conveyor import Conveyor  # noqa: E402
+from actors.palletizing.deviation import DeviationDetection  # noqa: E402
+from actors.palletizing.feedback import Feedback  # noqa: E402
+from actors.palletizing.fusion import Fusion  # noqa: E402
+from actors.palletizing.perception import OnlinePerception, TrainingPerception  # noqa: E402
+from actors.palletizing.planning import Planning  # noqa: E402
+from actors.palletizing.reconstruction import Reconstruction  # noqa: E402
+from actors.palletizing.sensor import open_sensor  # noqa: E402
+from actors.palletizing.simulation.packages import VERDICT_OF_KIND, package_sequence  # noqa: E402
+from actors.palletizing.vocabulary import (  # noqa: E402
+    CLOUD,
+    CONVEYOR,
+    DEVIATIONS,
+    EMPTY,
+    NOTICES,
+    PACKAGES,
+    PLACES,
+    PRODUCTS,
+    REGION,
+    SCAN,
+    SIGHTING,
+    STOP,
+    SURFACE,
+    SYSTEM,
+    TRAY,
+    USER,
+    VIEWS,
+    product_entity,
+    view_entity,
+)
+from enact_dist import Lock, View, ViewEach, Write, testing  # noqa: E402
+
+SENSORS = "actors.palletizing.simulation.sensors"
+PACKAGE_COUNT, SEED = 10, 83
+OVERHEAD = f"{SENSORS}:tray_sensor?packages={PACKAGE_COUNT}&seed={SEED}"
+NAMES = ("milk_carton", "meal_tray")
+
+
+@pytest.fixture
+def cell(trained):
+    """A cell whose products are trained and whose tray is planned and empty."""
+    with testing.worlds("training", "online") as cell:
+        training = cell.world("training")
+        testing.run_once(Planning(PACKAGE_COUNT, " ".join(NAMES)), cell)
+        training.init(TRAY, EMPTY, open_sensor(OVERHEAD).capture_empty())
+        for name in NAMES:
+            training.init(product_entity(name), SURFACE, trained(name))
+        yield cell
+
+
+def online(cell, entity, aspect, default=None):
+    request = View(cell.world("online"), entity, aspect)
+    return cell.world("online").view(request).get(request, default)
+
+
+def each(cell, world, pattern, aspect):
+    request = ViewEach(cell.world(world), pattern, aspect)
+    return dict(cell.world(world).view(request)[request])
+
+
+def stand_at(cell, stop):
+    request = Write(cell.world("online"), CONVEYOR, STOP)
+    with Lock(request) as lock:
+        lock[request] = stop
+
+
+def test_cell_judges_a_sequence_of_packages(cell, capsys):
+    """Every package of two trays gets the right flag, and the user reads a line for each."""
+    actors = [Conveyor(), OnlinePerception(OVERHEAD), DeviationDetection(), Feedback()]
+
+    for actor in itertools.chain.from_iterable(itertools.repeat(actors, PACKAGE_COUNT)):
+        testing.run_once(actor, cell)
+
+    truths = [package.truth.kind for package in package_sequence(PACKAGE_COUNT, seed=SEED)]
+    flags = online(cell, SYSTEM, DEVIATIONS)
+    verdicts = [flags[f"place/{stop}"].verdict for stop in range(PACKAGE_COUNT)]
+    assert verdicts == [VERDICT_OF_KIND[kind] for kind in truths]
+    assert len(capsys.readouterr().out.splitlines()) == PACKAGE_COUNT
+    assert len(online(cell, USER, NOTICES)) == PACKAGE_COUNT
+    for stop, kind in enumerate(truths):
+        assert (flags[f"place/{stop}"].package == "") == (kind == "missing")
+
+
+def test_training_makes_one_entity_per_view_and_one_surface_per_product():
+    """Clouds, poses and boundary representations per view; then the product's surface, once."""
+    with testing.worlds("training", "online") as cell:
+        perception = TrainingPerception(f"{SENSORS}:orbit_sensor?seed=2", OVERHEAD)
+        fusion = Fusion()
+        testing.run_once(Planning(1, "yoghurt_cup", views=6), cell)
+
+        for _ in range(8):
+            testing.run_once(perception, cell)
+        testing.run_once(Reconstruction(), cell)
+        testing.run_once(fusion, cell)
+
+        clouds = each(cell, "training", VIEWS, CLOUD)
+        assert set(clouds) == {view_entity("yoghurt_cup", number) for number in range(6)}
+        assert set(each(cell, "training", VIEWS, SURFACE)) == set(clouds)
+        surface = each(cell, "training", PRODUCTS, SURFACE)[product_entity("yoghurt_cup")]
+        assert surface.vertices_m[:, 2].max() == pytest.approx(0.102, abs=0.003)
+        assert testing.run_once(fusion, cell) == 0
+
+
+def test_training_goes_on_after_a_crash():
+    """A new perception takes the views that are missing and none that are there."""
+    with testing.worlds("training", "online") as cell:
+        address = f"{SENSORS}:orbit_sensor?seed=2"
+        testing.run_once(Planning(1, "yoghurt_cup", views=4), cell)
+        first = TrainingPerception(address, OVERHEAD)
+        for _ in range(3):
+            testing.run_once(first, cell)
+        before = each(cell, "training", VIEWS, CLOUD)
+
+        second = TrainingPerception(address, OVERHEAD)
+        for _ in range(3):
+            testing.run_once(second, cell)
+
+        after = {
+            info.entity: info.version for info in cell.world("training").survey(VIEWS, ("cloud",))
+        }
+        assert len(before) == 2
+        assert after == {view_entity("yoghurt_cup", number): 1 for number in range(4)}
+
+
+def test_fusion_waits_for_the_last_view():
+    """While a view is missing a product has no surface."""
+    with testing.worlds("training", "online") as cell:
+        perception = TrainingPerception(f"{SENSORS}:orbit_sensor?seed=2", OVERHEAD)
+        testing.run_once(Planning(1, "yoghurt_cup", views=5), cell)
+        for _ in range(5):
+            testing.run_once(perception, cell)
+        testing.run_once(Reconstruction(), cell)
+
+        testing.run_once(Fusion(), cell)
+
+        assert each(cell, "training", PRODUCTS, SURFACE) == {}
+        assert len(each(cell, "training", PRODUCTS, SCAN)) == 1
+
+
+def test_two_perceptions_make_one_entity_of_a_package(cell):
+    """Both see the same new packages; the second finds the entities that the first has made."""
+    for stop in range(2):
+        stand_at(cell, stop)
+        for _ in range(2):
+            testing.run_once(OnlinePerception(OVERHEAD), cell)
+
+    truths = [package.truth.kind for package in package_sequence(2, seed=SEED)]
+    wanted = sum({"missing": 0, "extra": 2}.get(kind, 1) for kind in truths)
+    assert len(each(cell, "online", PACKAGES, SIGHTING)) == wanted > 0
+
+
+def test_package_keeps_its_entity_from_stop_to_stop(cell):
+    """A package that stays is seen again as itself; another tray has entities of its own."""
+    perception = OnlinePerception(OVERHEAD)
+    for stop in (0, 1, 2, 8):
+        stand_at(cell, stop)
+        testing.run_once(perception, cell)
+
+    sightings = each(cell, "online", PACKAGES, SIGHTING).values()
+
+    assert {
+        (seen.tray, seen.first_stop, seen.last_stop) for seen in sightings if seen.first_stop == 0
+    } == {(0, 0, 2)}
+    assert {seen.tray for seen in sightings if seen.first_stop == 8} == {1}
+
+
+def test_conveyor_waits_for_the_products(trained):
+    """Before every planned product is trained nothing comes."""
+    with testing.worlds("training", "online") as cell:
+        testing.run_once(Planning(4, " ".join(NAMES)), cell)
+        conveyor = Conveyor()
+        cell.world("training").init(product_entity(NAMES[0]), SURFACE, trained(NAMES[0]))
+        testing.run_once(conveyor, cell)
+        early = online(cell, CONVEYOR, STOP)
+
+        cell.world("training").init(product_entity(NAMES[1]), SURFACE, trained(NAMES[1]))
+        testing.run_once(conveyor, cell)
+
+        assert (early, online(cell, CONVEYOR, STOP)) == (None, 0)
+
+
+def test_conveyor_waits_for_the_verdict(cell):
+    """It advances by one stop per judged package, however often it runs."""
+    perception, detection = OnlinePerception(OVERHEAD), DeviationDetection()
+    for _ in range(3):
+        testing.run_once(Conveyor(), cell)
+    waiting = online(cell, CONVEYOR, STOP)
+
+    testing.run_once(perception, cell)
+    testing.run_once(detection, cell)
+    testing.run_once(Conveyor(), cell)
+
+    assert (waiting, online(cell, CONVEYOR, STOP)) == (0, 1)
+
+
+def test_detection_gives_the_same_flags_after_a_restart(cell):
+    """A detection that starts anew judges what is there again and changes no flag."""
+    for stop in range(2):
+        stand_at(cell, stop)
+        testing.run_once(OnlinePerception(OVERHEAD), cell)
+        testing.run_once(DeviationDetection(), cell)
+    before = online(cell, SYSTEM, DEVIATIONS)
+
+    again = testing.run_once(DeviationDetection(), cell)
+
+    assert again == 2
+    assert online(cell, SYSTEM, DEVIATIONS) == before
+    regions = each(cell, "online", PLACES, REGION)
+    assert all(region.dtype == np.bool_ for region in regions.values())
+
+
+def test_feedback_tells_each_verdict_once(cell, capsys):
+    """A second feedback finds in the context what the user knows already."""
+    stand_at(cell, 0)
+    testing.run_once(OnlinePerception(OVERHEAD), cell)
+    testing.run_once(DeviationDetection(), cell)
+
+    testing.run_once(Feedback(), cell)
+    testing.run_once(Feedback(), cell)
+
+    assert len(capsys.readouterr().out.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    "address", ["nothing", "actors.nowhere:sensor", "actors.palletizing.sensor:none"]
+)
+def test_sensor_address_that_leads_nowhere_is_refused(address):
+    """The error shows the address."""
+    with pytest.raises(ValueError, match=address):
+        open_sensor(address)
