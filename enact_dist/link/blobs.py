@@ -63,18 +63,19 @@ class BlobFolder:
         Raises:
             OSError: As the system reports it (disk full, I/O error); the draft is left behind.
         """
+        flat = memoryview(body).cast("B")
         self._count += 1
         name = f"{self._epoch:x}-{self._count:x}{_SUFFIX}"
         draft = self.folder / (name + _DRAFT_SUFFIX)
         descriptor = os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
         try:
-            crc = _write_all(descriptor, memoryview(body).cast("B"))
+            crc = _write_all(descriptor, flat)
             if durable:
                 os.fdatasync(descriptor)
         finally:
             os.close(descriptor)
         draft.rename(self.folder / name)
-        return Blob(name, len(body), crc, durable)
+        return Blob(name, len(flat), crc, durable)
 
     def sync_names(self) -> None:
         """Make the names of all files written so far durable.

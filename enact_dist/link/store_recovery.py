@@ -179,8 +179,8 @@ def _check_complete(folder: Path, contents: Contents, found: Found) -> None:
     if found.mark is None or contents.batch >= found.mark.batch:
         return
     log = folder / LOG_FILE
-    if log.exists():
-        # Closing the database cuts the log to what SQLite could read.
+    if log.exists() and log.stat().st_size:
+        # Closing the database cuts the log to what SQLite could read; the whole is evidence.
         shutil.copyfile(log, log.with_name(log.name + _REFUSED_SUFFIX))
     refuse(
         log,

@@ -1,0 +1,295 @@
+"""A damaged folder is refused by file and remedy; what only a power cut explains is not damage."""
+
+import random
+import shutil
+import sqlite3
+
+import pytest
+from store_writer import contents, outcome_record, persist, reopened, slot_record
+
+from enact_dist.core.datum import Slot
+from enact_dist.core.records import SlotRecord
+from enact_dist.errors import StoreError
+from enact_dist.link import store_mark
+from enact_dist.link.store import open_store
+from enact_dist.terms import Durability, NullReason
+
+FRAME_BYTES = 24 + 4096
+LOG_HEADER_BYTES = 32
+
+
+@pytest.fixture
+def crashed(tmp_path):
+    """A folder as kill -9 leaves it: everything is in the log, the last batch is durable."""
+    folder = tmp_path / "folder"
+    store, _ = open_store(folder, unix_s=1)
+    for version in range(1, 9):
+        durability = Durability.OS if 3 <= version <= 6 else Durability.DURABLE
+        store.write([persist(slot_record(f"e{version}", version), durability=durability)])
+    copy = tmp_path / "crashed"
+    shutil.copytree(folder, copy)
+    store.close()
+    return copy
+
+
+@pytest.fixture
+def closed(tmp_path):
+    """A folder as a clean end leaves it: everything is in the database and two files."""
+    folder = tmp_path / "closed"
+    store, _ = open_store(folder, unix_s=1)
+    for number in range(40):
+        store.write(
+            [persist(slot_record(f"e{number}", 1, size=37 * number), outcome_record(number, 1))]
+        )
+    store.write([persist(slot_record("forced", 5, size=70_000))])
+    store.write([persist(slot_record("unforced", 6, size=70_000), durability=Durability.OS)])
+    store.close()
+    return folder
+
+
+def refusal(folder):
+    """Return why a folder is refused, having seen that a second try is refused as well."""
+    with pytest.raises(StoreError) as refused:
+        open_store(folder, unix_s=1)
+    with pytest.raises(StoreError):
+        open_store(folder, unix_s=1)
+    return refused.value
+
+
+def flip(path, offset):
+    """Turn over one bit."""
+    content = bytearray(path.read_bytes())
+    content[offset] ^= 0x10
+    path.write_bytes(content)
+
+
+def after_power_cut(folder):
+    """Let the mark say that the folder was written before the system started anew."""
+    mark = store_mark.read_mark(folder)
+    file = store_mark.MarkFile.open(folder, mark.batch)
+    file._boot = bytes(range(16))
+    file.note(mark.batch)
+    file.close()
+
+
+def frame_offset(number):
+    return LOG_HEADER_BYTES + number * FRAME_BYTES
+
+
+def frames_of(folder):
+    return ((folder / "store.db-wal").stat().st_size - LOG_HEADER_BYTES) // FRAME_BYTES
+
+
+@pytest.mark.parametrize("within", [0, 9, 17, 24, 2000, 4119])
+def test_flipped_bit_in_mid_log_is_refused_with_its_frame(crashed, within):
+    """A bit anywhere in a frame that has frames behind it: refused, untouched, frame named."""
+    log = crashed / "store.db-wal"
+    number = frames_of(crashed) // 2
+    flip(log, frame_offset(number) + within)
+    before = log.read_bytes()
+    found = refusal(crashed)
+    assert f"{log} is damaged at byte {frame_offset(number)}" in str(found)
+    assert f"truncate -s {frame_offset(number)} {log}" in str(found)
+    assert found.path == str(log)
+    assert log.read_bytes() == before
+
+
+def test_named_way_out_of_a_damaged_log_works(crashed):
+    """Cutting the log and deleting the mark, as the message says, opens with what came before."""
+    log = crashed / "store.db-wal"
+    number = frames_of(crashed) // 2
+    flip(log, frame_offset(number) + 100)
+    refusal(crashed)
+    log.write_bytes(log.read_bytes()[: frame_offset(number)])
+    (crashed / "mark").unlink()
+    assert 0 < len(reopened(crashed).slots) < 8
+
+
+def test_flipped_bit_in_the_last_frame_is_refused(crashed):
+    """Nothing follows in the log, but the mark says that more was acknowledged; a copy is kept."""
+    log = crashed / "store.db-wal"
+    flip(log, frame_offset(frames_of(crashed) - 1) + 100)
+    spoilt = log.read_bytes()
+    found = refusal(crashed)
+    assert "cut or damaged at its end: batch 9 was acknowledged, the last one" in str(found)
+    assert (crashed / "store.db-wal.refused").read_bytes() == spoilt
+
+
+@pytest.mark.parametrize("offset", range(0, LOG_HEADER_BYTES, 3))
+def test_flipped_bit_in_the_head_of_the_log_is_refused(crashed, offset):
+    """SQLite would take the log for empty and all its commits for never made."""
+    flip(crashed / "store.db-wal", offset)
+    assert "store.db-wal is damaged at byte 0" in str(refusal(crashed))
+
+
+@pytest.mark.parametrize("file", ["store.db-wal", "store.db"])
+def test_missing_file_of_the_database_is_refused(crashed, file):
+    """A deleted log or database is no new folder; nothing else is swept away."""
+    store, _ = open_store(crashed, unix_s=1)
+    store.write([persist(slot_record("large", 1, size=70_000))])
+    copy = crashed.with_name("copy")
+    shutil.copytree(crashed, copy)
+    store.close()
+    (copy / file).unlink()
+    assert file in str(refusal(copy))
+    assert len(list((copy / "blobs").iterdir())) == 1
+
+
+def test_emptied_database_is_refused(closed):
+    """A database of no bytes would be a new one to SQLite."""
+    (closed / "store.db").write_bytes(b"")
+    assert "store.db is missing or empty, but the folder has been in use" in str(refusal(closed))
+
+
+def test_older_copy_of_the_database_is_refused(closed):
+    """A database from before the last durable batch lacks what was acknowledged."""
+    older = (closed / "store.db").read_bytes()
+    store, _ = open_store(closed, unix_s=1)
+    store.write([persist(slot_record("later", 1))])
+    store.close()
+    (closed / "store.db").write_bytes(older)
+    assert "was acknowledged" in str(refusal(closed))
+
+
+def test_flipped_bit_in_the_database_never_changes_what_is_read(closed):
+    """120 bits anywhere: refused by name, or in a part that nothing reads; both happen."""
+    rng = random.Random(9)
+    path = closed / "store.db"
+    expected = contents(reopened(closed))
+    refused = 0
+    sound = path.read_bytes()
+    for _ in range(120):
+        path.write_bytes(sound)
+        flip(path, rng.randrange(len(sound)))
+        found, refused_as = opened_or_refused(closed)
+        if refused_as:
+            refused += 1
+            assert "store.db" in refused_as.path
+            assert "restore the whole folder" in str(refused_as)
+        else:
+            assert contents(found) == expected
+        for name in ("store.db-wal", "store.db-journal"):
+            (closed / name).unlink(missing_ok=True)
+    assert 60 < refused < 120
+
+
+def opened_or_refused(folder):
+    """Return what a folder holds, or the error that refused it."""
+    try:
+        return reopened(folder), None
+    except StoreError as failure:
+        return None, failure
+
+
+def test_flipped_bit_in_a_row_is_refused_by_its_checksum(closed):
+    """SQLite sees no difference in a changed body; the row's own checksum does."""
+    path = closed / "store.db"
+    flip(path, path.read_bytes().index(slot_record("e30", 1, size=37 * 30).datum.body))
+    assert "checksum is wrong" in str(refusal(closed))
+
+
+def test_row_that_was_changed_by_hand_is_refused(closed):
+    """A row with a wrong version, type or place does not pass for a record."""
+    for change in (
+        "UPDATE record SET batch = batch + 1 WHERE id = 9",
+        "UPDATE record SET kind = 3 WHERE id = 9",
+        "UPDATE record SET kind = 99 WHERE id = 9",
+        "UPDATE record SET body = 'text' WHERE id = 9",
+        "INSERT INTO record SELECT 7777, kind, batch, key, body, crc FROM record WHERE id = 9",
+        "DELETE FROM record WHERE kind = 0",
+    ):
+        copy = closed.with_name("copy")
+        shutil.copytree(closed, copy)
+        connection = sqlite3.connect(copy / "store.db", isolation_level=None)
+        connection.execute(change)
+        connection.close()
+        assert "store.db" in str(refusal(copy)), change
+        shutil.rmtree(copy)
+
+
+def blob_of(folder, entity):
+    """Return the file of a slot's body."""
+    body = slot_record(entity, {"forced": 5, "unforced": 6}[entity], size=70_000).datum.body
+    return next(path for path in (folder / "blobs").iterdir() if path.read_bytes() == body)
+
+
+@pytest.mark.parametrize("entity", ["forced", "unforced"])
+@pytest.mark.parametrize("damage", ["missing", "short", "long", "flipped"])
+def test_damaged_file_of_a_body_is_refused_by_name(closed, entity, damage):
+    """A body's file that is missing, of another length or changed: refused, slot and file named."""
+    path = blob_of(closed, entity)
+    spoil(path, damage)
+    found = refusal(closed)
+    assert found.path == str(path)
+    assert f"online:{entity}/aspect" in str(found)
+    assert "restore the whole folder" in str(found)
+
+
+def spoil(path, damage):
+    if damage == "missing":
+        path.unlink()
+    elif damage == "short":
+        path.write_bytes(path.read_bytes()[:-1])
+    elif damage == "long":
+        path.write_bytes(path.read_bytes() + b"x")
+    else:
+        flip(path, 50_000)
+
+
+def test_power_cut_takes_unforced_bodies_and_says_so(closed):
+    """After a restart of the system an `os` body may be gone: null with the reason, for good."""
+    spoil(blob_of(closed, "unforced"), "short")
+    after_power_cut(closed)
+    for _ in range(2):
+        found = {record.slot.entity: record for record in reopened(closed).slots}
+        slot = Slot("online", "unforced", "aspect")
+        assert found["unforced"] == SlotRecord(slot, 6, 60, None, NullReason.LOST.name)
+        assert found["forced"].datum is not None
+    assert len(list((closed / "blobs").iterdir())) == 1
+
+
+def test_power_cut_does_not_excuse_a_forced_body(closed):
+    """What was forced to the disk must be there, power cut or not."""
+    spoil(blob_of(closed, "forced"), "short")
+    after_power_cut(closed)
+    assert "online:forced/aspect" in str(refusal(closed))
+
+
+def test_power_cut_may_leave_a_hole_behind_the_last_forced_batch(tmp_path):
+    """Unforced frames reach the disk in any order: what follows the hole is gone, no more."""
+    folder = tmp_path / "folder"
+    store, _ = open_store(folder, unix_s=1)
+    store.write([persist(slot_record("kept", 1))])
+    begin = (folder / "store.db-wal").stat().st_size
+    for version in range(1, 8):
+        store.write([persist(slot_record("later", version), durability=Durability.OS)])
+    copy = tmp_path / "copy"
+    shutil.copytree(folder, copy)
+    store.close()
+    flip(copy / "store.db-wal", begin + FRAME_BYTES + 30)
+    assert f"damaged at byte {begin + FRAME_BYTES}" in str(refusal(copy))
+    after_power_cut(copy)
+    found = {record.slot.entity: record.version for record in reopened(copy).slots}
+    assert found == {"kept": 1, "later": 1}
+
+
+def test_power_cut_does_not_excuse_a_hole_before_a_forced_batch(crashed):
+    """The mark says that a batch behind the hole was forced: refused, power cut or not."""
+    flip(crashed / "store.db-wal", frame_offset(frames_of(crashed) // 2) + 50)
+    after_power_cut(crashed)
+    assert "cut or damaged at its end" in str(refusal(crashed))
+
+
+def test_mark_that_cannot_be_read_excuses_nothing(crashed):
+    """Without a mark nothing proves a power cut: a hole in the log is damage."""
+    (crashed / "mark").write_bytes(b"?")
+    assert len(reopened(crashed).slots) == 8
+    store, _ = open_store(crashed, unix_s=1)
+    for version in range(1, 6):
+        store.write([persist(slot_record("e", version))])
+    copy = crashed.with_name("copy")
+    shutil.copytree(crashed, copy)
+    store.close()
+    (copy / "mark").unlink()
+    flip(copy / "store.db-wal", frame_offset(2))
+    assert "is damaged at byte" in str(refusal(copy))
