@@ -1,7 +1,54 @@
 """Messages and data as bytes, pure: nothing here waits, reads a clock or opens a socket.
 
-A frame is a msgpack header and raw bodies behind it (`frames`); a datum is a msgpack tree and raw
-arrays behind it (`payload`); both modules draw their format, so that another language can read it.
-No pickle, ever.  Everything that arrives is bounded (`limits`) and checked; what this version does
-not know is refused.
+The format, whole, so that another language can read it.  *array*, *map*, *int*, *str*, *bin*, *nil*
+and *ext* are msgpack's; all numbers outside msgpack are little-endian unless a dtype says otherwise.
+
+**Frame**: one message.  A header and, where the message holds data, a payload (in Zenoh: the
+attachment and the payload of a query, reply or put).  The header is one msgpack array::
+
+    [version = 1, code, field, field, …]
+
+`frames.CODES` lists the codes; the fields are those of the class in `core.messages`, in order.  A
+NamedTuple is the array of its fields, a tuple an array, None is nil.  A datum is the array
+``[encoding: bin, offset: int, size: int, stamp_ns: int]``; its body is the `size` bytes at
+`offset` of the payload.  Bodies follow one another in the order of the header, each at the next
+multiple of 64, zeros between, nothing after the last; an empty body has offset 0.  A reader refuses
+another version, an unknown code, one field too many, an integer over 2^63 - 1.
+
+**Datum**: `encoding` is two msgpack objects, the version 1 and a tree; `body` is raw bytes that the
+tree refers to by offset and length.  Plain values stand in the tree as themselves (int, float64,
+bool, str, bin, array for a list, map with keys all str or all int); the rest are extensions, whose
+content is again msgpack:
+
+====  ===========================================  ================================================
+ext   content                                      means
+====  ===========================================  ================================================
+1     ``[dtype, shape, order, offset, length]``    array in the body, ``"C"`` rows or ``"F"`` columns
+2     ``[offset, length]``                         bytes in the body (more than 256)
+3     ``[offset, length]``                         UTF-8 text in the body (more than 256 bytes)
+4     ``[name, [field names], [nodes]]``           dataclass; nil is allowed for a field
+5     ``[codec name, node]``                       what a registered codec made of a value
+6     ``[node, node, …]``                          tuple
+7     ``[offset, length]``                         the tree itself, in the body (more than 4 KiB)
+====  ===========================================  ================================================
+
+`dtype` is numpy's text, sign of the byte order first (``<f8``, ``>i4``, ``|u1``, ``<M8[ns]``,
+``<U5``), or a map for structures (`arrays`).  Everything in the body starts at a multiple of 64;
+`length` is in bytes and equals the dtype's size times the extents of the shape.  Extension 7 stands
+only as the whole tree; parts of the body do not overlap.  Example: the int 5 is ``01 05`` with an
+empty body; three float64 are ``01`` and ext 1 ``["<f8", [3], "C", 0, 24]`` with 24 bytes of body.
+
+Rules to keep: no pickle, ever; everything that arrives is bounded (`limits`) and checked before it
+is built; what this version does not know is refused; a change of the format raises its version.
+
+===============  =================================================================================
+module           what it decides
+===============  =================================================================================
+`frames`         message ↔ header and payload (`message_parts`: field by field; `bodies`: layout)
+`payload`        value ↔ datum (`tree_writer`, `tree_reader`: the tree; `arrays`: numpy)
+`shapes`         what a Python type means as a datum; `fingerprint` is its text
+`codecs`         types that are no plain data
+`keys`           names of shards, sessions and requests on Zenoh
+`limits`         the longest of everything
+===============  =================================================================================
 """

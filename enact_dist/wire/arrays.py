@@ -1,8 +1,9 @@
 """numpy arrays ↔ a description in the tree and raw bytes in the body.
 
 A dtype is described by numpy's text where that is whole (``<f8``, ``>i4``, ``|S5``, ``<M8[ns]``),
-else by a map: ``{"itemsize": n, "fields": [[name, dtype, offset], …]}`` for a structure and
-``{"shape": […], "item": dtype}`` for a fixed array inside one.
+else by a map: ``{"itemsize": n, "fields": [[name, dtype, offset], …]}`` for a structure (with a
+fourth part where a field has a title) and ``{"shape": […], "item": dtype}`` for a fixed array
+inside one.
 
 Rules to keep: a described dtype reads back equal, or it is refused; no array of Python objects
 ever; what a peer describes is compared with the bytes that came before anything is allocated.
@@ -32,7 +33,7 @@ def describe(dtype: np.dtype[Any]) -> object:
     """Return what stands for a dtype in the tree.
 
     Raises:
-        DtypeError: It holds Python objects, titles, or what numpy's text does not carry.
+        DtypeError: It holds Python objects, or what numpy's text does not carry.
     """
     if dtype.hasobject:
         raise DtypeError(f"dtype {dtype} holds Python objects, which never travel")
@@ -51,9 +52,9 @@ def _describe(dtype: np.dtype[Any]) -> object:
     fields = []
     for name in dtype.names or ():
         inner, offset, *title = dtype.fields[name]
-        if title:
-            raise DtypeError(f"field {name!r} has a title ({title[0]!r}), which cannot travel")
-        fields.append([name, _describe(inner), offset])
+        if title and type(title[0]) is not str:
+            raise DtypeError(f"field {name!r} has a title that is no text: {title[0]!r:.60}")
+        fields.append([name, _describe(inner), offset, *title])
     return {"itemsize": dtype.itemsize, "fields": fields}
 
 
@@ -101,11 +102,12 @@ def _read(node: object, depth: int, fields_left: list[int]) -> np.dtype[Any]:
     fields_left[0] -= len(node["fields"])
     if fields_left[0] < 0:
         raise DtypeError(f"a structured dtype has over {FIELDS_MAX} fields")
-    names, formats, offsets = [], [], []
-    for name, inner, offset in node["fields"]:
-        if type(name) is not str or type(offset) is not int:
-            raise DtypeError("a field is [name, dtype, offset]")
+    names, formats, offsets, titles = [], [], [], []
+    for name, inner, offset, *title in node["fields"]:
+        if type(name) is not str or type(offset) is not int or not _are_titles(title):
+            raise DtypeError("a field is [name, dtype, offset] or [name, dtype, offset, title]")
         names.append(name)
+        titles.append(title[0] if title else None)
         formats.append(_read(inner, depth + 1, fields_left))
         offsets.append(offset)
     if type(node["itemsize"]) is not int or not 0 <= node["itemsize"] <= _ITEM_BYTES_MAX:
@@ -116,6 +118,7 @@ def _read(node: object, depth: int, fields_left: list[int]) -> np.dtype[Any]:
                 "names": names,
                 "formats": formats,
                 "offsets": offsets,
+                "titles": titles,
                 "itemsize": node["itemsize"],
             }
         )
@@ -126,6 +129,10 @@ def _checked(dtype: np.dtype[Any]) -> np.dtype[Any]:
     if dtype.hasobject or dtype.itemsize > _ITEM_BYTES_MAX:
         raise DtypeError(f"dtype {dtype} cannot travel")
     return dtype
+
+
+def _are_titles(title: list[object]) -> bool:
+    return not title or (len(title) == 1 and type(title[0]) is str and title[0] != "")
 
 
 def _is_sequence(node: object) -> bool:

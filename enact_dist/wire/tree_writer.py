@@ -16,7 +16,7 @@ import msgpack
 import numpy as np
 
 from enact_dist.wire.arrays import DtypeError, describe, raw_bytes
-from enact_dist.wire.limits import DEPTH_MAX, INLINE_BYTES_MAX, aligned
+from enact_dist.wire.limits import DEPTH_MAX, DIMENSIONS_MAX, INLINE_BYTES_MAX, aligned
 from enact_dist.wire.shapes import (
     ArrayOf,
     CodecOf,
@@ -83,8 +83,6 @@ class TreeWriter:
         Raises:
             MisfitError: The value is not of the shape.
         """
-        if depth > DEPTH_MAX:
-            raise MisfitError(f"nested deeper than {DEPTH_MAX}")
         return self._writers[type(shape)](self, value, shape, depth)
 
     # ---------------------------------------------------------------- plain values
@@ -141,6 +139,8 @@ class TreeWriter:
     def _array(self, value: Any, shape: ArrayOf, _depth: int) -> object:
         if type(value) is not np.ndarray and type(value) is not np.memmap:
             raise _misfit("numpy.ndarray", value)
+        if value.ndim > DIMENSIONS_MAX:
+            raise MisfitError(f"an array of {value.ndim} dimensions; at most {DIMENSIONS_MAX}")
         dtype: np.dtype[Any] = value.dtype
         if shape.dtype is not None and dtype.newbyteorder("=") != shape.dtype:
             raise MisfitError(f"asked {text_of(shape)}, found dtype {dtype}")
@@ -154,6 +154,7 @@ class TreeWriter:
     def _list(self, value: Any, shape: ListOf, depth: int) -> object:
         if type(value) is not list:
             raise _misfit("list", value)
+        _check_depth(depth)
         kinds = set(map(type, value))
         if kinds in _ALIKE and shape.each in (_PLAIN, Plain(*kinds)):
             # Nothing in such a list needs a node of its own.
@@ -175,6 +176,7 @@ class TreeWriter:
     def _dict(self, value: Any, shape: DictOf, depth: int) -> object:
         if type(value) is not dict:
             raise _misfit("dict", value)
+        _check_depth(depth)
         nodes: dict[object, object] = {}
         for key, inner in value.items():
             if type(key) is not shape.key:
@@ -191,6 +193,7 @@ class TreeWriter:
     def _tuple(self, value: Any, shape: TupleOf, depth: int) -> object:
         if type(value) is not tuple:
             raise _misfit("tuple", value)
+        _check_depth(depth)
         if shape.repeated:
             return reference(TUPLE, *self._each(value, shape.parts[0], depth))
         if len(shape.parts) != len(value):
@@ -210,6 +213,7 @@ class TreeWriter:
     def _record(self, value: Any, shape: RecordOf, depth: int) -> object:
         if type(value) is not shape.kind:
             raise _misfit(shape.kind.__qualname__, value)
+        _check_depth(depth)
         names, nodes = [], []
         for name, inner in shape.fields:
             try:
@@ -245,6 +249,11 @@ class TreeWriter:
 _PLAIN: Final = Plain(object)
 _EACH_PLAIN: Final = ListOf(_PLAIN)
 _ARRAY: Final = ArrayOf(None)
+
+
+def _check_depth(depth: int) -> None:
+    if depth >= DEPTH_MAX:
+        raise MisfitError(f"nested deeper than {DEPTH_MAX}")
 
 
 def _key(key: Any) -> object:

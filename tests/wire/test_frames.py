@@ -101,7 +101,9 @@ def test_frame_views_large_bodies_and_copies_small_ones():
     small, view = (write.datum.body for write in decode_frame(header, payload).writes)
 
     assert type(small) is bytes
-    assert type(view) is memoryview and view.readonly and view.obj is payload
+    assert type(view) is memoryview
+    assert view.readonly
+    assert view.obj is payload
     assert view == large
 
 

@@ -100,7 +100,9 @@ def test_frame_with_a_field_of_another_type_is_refused(cls):
             changed = [*fields[:index], other, *fields[index + 1 :]]
             accepted(msgpack.packb(changed), payload or b"")
         with pytest.raises(ProtocolError, match=cls.__name__):
-            decode_frame(msgpack.packb([*fields[:index], 1.5, *fields[index + 1 :]]), payload or b"")
+            decode_frame(
+                msgpack.packb([*fields[:index], 1.5, *fields[index + 1 :]]), payload or b""
+            )
 
 
 @pytest.mark.parametrize("cls", CLASSES, ids=lambda cls: cls.__name__)

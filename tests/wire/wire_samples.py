@@ -52,7 +52,9 @@ def messages(kind):
         return st.binary(max_size=100)
     if kind is bool:
         return st.booleans()
-    return st.builds(lambda values: kind(*values), st.tuples(*(messages(k) for _, k in annotated(kind))))
+    return st.builds(
+        lambda values: kind(*values), st.tuples(*(messages(k) for _, k in annotated(kind)))
+    )
 
 
 def sample(kind, random):
@@ -91,5 +93,7 @@ def damaged(raw, random):
         raw[at : at + length] = random.randbytes(length)
     else:
         # The marks of msgpack that claim the most: arrays, maps, texts and extensions of 4 GiB.
-        raw[at : at + 5] = random.choice((b"\xdd", b"\xdf", b"\xdb", b"\xc6", b"\xc9")) + b"\xff" * 4
+        raw[at : at + 5] = (
+            random.choice((b"\xdd", b"\xdf", b"\xdb", b"\xc6", b"\xc9")) + b"\xff" * 4
+        )
     return bytes(raw)
