@@ -23,7 +23,7 @@ import os
 import threading
 import time
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, cast, get_args
 
 import zenoh
@@ -40,8 +40,6 @@ if TYPE_CHECKING:
 
     from enact_dist.core.messages import Request, ShardEntry
 
-    _Subscriber = zenoh.Subscriber[zenoh.Handler[zenoh.Sample]]
-
 _log = logging.getLogger("enact.link")
 _ANSWERS: Final = frozenset(get_args(Answer))
 CONTROL_BYTES_MAX: Final = 16 << 10
@@ -56,6 +54,8 @@ REACH_S: Final = 0.3
 """How long a shard has to show that it is already in reach."""
 NAMELESS: Final = "client"
 """Stands in the keys of a client that gave no name."""
+JOIN_S: Final = 1.0
+"""How long an ending carrier or feed waits for each of its threads."""
 UNCHECKED_MAX: Final = 256
 """Answered queries that are still watched for a second reply."""
 
@@ -70,14 +70,21 @@ _CONTROL, _DATA, _BULK = (
 )
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class _Link:
-    """One Zenoh session of the carrier with its token and subscriptions."""
+    """One Zenoh session of the carrier, with the token that lives as long as it is kept here."""
 
     session: zenoh.Session
     endpoints: tuple[str, ...]
     token: zenoh.LivelinessToken
-    subscribers: list[_Subscriber] = field(default_factory=list)
+
+
+@dataclass(frozen=True, slots=True)
+class _Pump:
+    """One subscription and the thread that moves its notices into a feed."""
+
+    subscriber: zenoh.Subscriber[zenoh.Handler[zenoh.Sample]]
+    thread: threading.Thread
 
 
 class ZenohCarrier:
@@ -121,8 +128,7 @@ class ZenohCarrier:
         self._links: list[_Link] = []
         self._link_of: dict[str, _Link] = {}
         self._endpoints_of: dict[str, tuple[str, ...]] = {}
-        self._feeds: list[NoticeQueue] = []
-        self._threads: list[threading.Thread] = []
+        self._feeds: dict[NoticeQueue, list[_Pump]] = {}
         self._keys: dict[tuple[str, type], str] = {}
         self._unchecked: deque[zenoh.Handler[zenoh.Reply]] = deque(maxlen=UNCHECKED_MAX)
         keep_after_fork(self)
@@ -265,8 +271,8 @@ class ZenohCarrier:
         link = _Link(session, endpoints, token)
         with self._mutex:
             self._links.append(link)
-            for feed in self._feeds:
-                self._feed(link, feed)
+            for feed, pumps in self._feeds.items():
+                pumps.append(self._pump_into(feed, link))
         return link
 
     def endpoint_of(self, shard: str) -> str:
@@ -280,32 +286,30 @@ class ZenohCarrier:
         """Open a feed of the notices of all shards, those of shards added later included."""
         self._check_usable()
         feed = NoticeQueue()
+        feed.on_close = lambda: self._unsubscribe(feed)
         with self._mutex:
-            self._feeds.append(feed)
-            ends = [self._feed(link, feed) for link in self._links]
-        feed.on_close = lambda: self._unsubscribe(feed, ends)
+            self._feeds[feed] = [self._pump_into(feed, link) for link in self._links]
         return feed
 
-    def _feed(self, link: _Link, feed: NoticeQueue) -> _Subscriber:
+    def _pump_into(self, feed: NoticeQueue, link: _Link) -> _Pump:
         subscriber = link.session.declare_subscriber(
             notice_key(self._cell, "*"), zenoh.handlers.RingChannel(QUEUED_MAX)
         )
-        link.subscribers.append(subscriber)
         thread = threading.Thread(
             target=_pump, args=(subscriber.handler, feed), name="enact-notices", daemon=True
         )
-        self._threads.append(thread)
         thread.start()
-        return subscriber
+        return _Pump(subscriber, thread)
 
-    def _unsubscribe(self, feed: NoticeQueue, subscribers: list[_Subscriber]) -> None:
+    def _unsubscribe(self, feed: NoticeQueue) -> None:
         with self._mutex:
-            if feed in self._feeds:
-                self._feeds.remove(feed)
-        if self._closed or self._pid != os.getpid():
+            pumps = self._feeds.pop(feed, [])
+        if self._pid != os.getpid():
             return
-        for subscriber in subscribers:
-            subscriber.undeclare()  # type: ignore[no-untyped-call]  # Zenoh's stub lacks it
+        for pump in pumps:
+            if not self._closed:
+                pump.subscriber.undeclare()  # type: ignore[no-untyped-call]  # as in Zenoh's stub
+                pump.thread.join(JOIN_S)
 
     # ---------------------------------------------------------------- end
 
@@ -314,12 +318,13 @@ class ZenohCarrier:
         if self._closed or self._pid != os.getpid():
             return
         self._closed = True
+        pumps = [pump for pumps in self._feeds.values() for pump in pumps]
         for feed in list(self._feeds):
             feed.close()
         for link in self._links:
             close_session(link.session)
-        for thread in self._threads:
-            thread.join(1.0)
+        for pump in pumps:
+            pump.thread.join(JOIN_S)
 
 
 def _pump(notices: zenoh.Handler[zenoh.Sample], feed: NoticeQueue) -> None:

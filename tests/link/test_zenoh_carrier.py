@@ -153,6 +153,26 @@ def test_carrier_reaches_further_shards_when_it_learns_of_them(daemon, carry, en
     assert carrier.endpoint_of("s1") == second
 
 
+def test_carrier_feeds_notices_of_shards_that_it_learns_of_later(
+    daemon, carry, make_peer, endpoint, free, until
+):
+    """A feed opened before a shard was known has its notices too; its threads end with it."""
+    second = free()
+    daemon(endpoint)
+    daemon(second, "s1")
+    threads = threading.active_count()
+    carrier = carry(endpoint)
+    feed = carrier.subscribe()
+    carrier.add_endpoints([ShardEntry("s1", (second,))])
+    peer = speak(carrier, make_peer, shard="s1")
+
+    notice = until(lambda: peer.write("cup", b"1") and feed.get(0.05))
+    feed.close()
+
+    assert notice.shard == "s1"
+    assert threading.active_count() == threads
+
+
 def test_carrier_keeps_its_link_when_a_shard_advertises_another_address(daemon, carry, endpoint):
     """A shard in reach stays reached although its advertised endpoint leads nowhere from here."""
     daemon(endpoint)
