@@ -24,7 +24,7 @@ from enact_dist.core.messages import (
 from simulated.world import MS, Host, S
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator, Sequence
+    from collections.abc import Callable, Sequence
 
     from enact_dist.core.datum import Datum, Slot
     from enact_dist.core.multilock import MultiLock

@@ -40,17 +40,19 @@ class Disk:
         self.synced = 0
         self.epoch = 0
         self._batch_end = 0
+        self._busy = False
 
     # ---------------------------------------------------------------- a running shard
 
     def submit(self, host: Host, persist: Persist, done: Callable[[int], None]) -> None:
         """Keep these records; `done(ticket)` follows when they survive what they must."""
         self.log.append(persist)
-        if self._batch_end <= self.written:
+        if not self._busy:
             self._begin_batch(host, done)
 
     def _begin_batch(self, host: Host, done: Callable[[int], None]) -> None:
         random = self._world.random
+        self._busy = True
         self._batch_end = len(self.log)
         delay_ns = random.randrange(MS // 20, MS)
         if self.faults.slow_disk and random.random() < self.faults.slow_disk:
@@ -72,6 +74,7 @@ class Disk:
         self._batch_done(host, batch, done)
 
     def _batch_done(self, host: Host, batch: list[Persist], done: Callable[[int], None]) -> None:
+        self._busy = False
         if len(self.log) > self.written:
             self._begin_batch(host, done)
         for persist in batch:
@@ -87,6 +90,7 @@ class Disk:
             keep = random.randint(self.synced, self.written)
         else:
             keep = random.randint(self.written, max(self.written, self._batch_end))
+        self._busy = False
         lost = self.log[keep:]
         del self.log[keep:]
         self.written = self.synced = self._batch_end = keep

@@ -10,6 +10,7 @@ slots of class `os` to an older state.
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 from enact_dist.core.multilock import Phase
@@ -19,7 +20,8 @@ if TYPE_CHECKING:
 
     from enact_dist.core.datum import Slot
     from simulated.history import Entry, History
-    from simulated.model import Model, Picture
+    from simulated.model import Model
+    from simulated.picture import Picture
 
 NEVER = 1 << 63
 
@@ -33,7 +35,7 @@ class Graph:
         self._entries = [entry for entry in history.entries.values() if self._counts(entry)]
         for picture in model.pictures.values():
             for chain in picture.chains.values():
-                for older, newer in zip(chain, chain[1:], strict=False):
+                for older, newer in pairwise(chain):
                     self._edge(older.writer, newer.writer, "ww")
         for entry in self._entries:
             self._add_reads(entry)

@@ -82,19 +82,25 @@ def _covers(item: Item, reading: Reading) -> bool:
     return pattern_matches(item.entity, slot.entity)
 
 
-def conflict(some: tuple[Item, ...], others: tuple[Item, ...]) -> bool:
-    """Say whether two locks may not be held at once: paper, 3.2, with readers shared."""
-    return any(_items_conflict(one, other) for one in some for other in others)
+def conflict(some: tuple[Item, ...], others: tuple[Item, ...], *, columns: bool = False) -> bool:
+    """Say whether two locks may not be held at once: paper, 3.2, with readers shared.
+
+    With `columns` a pattern counts as all entities, as the shard's lock table takes it.
+    """
+    return any(_items_conflict(one, other, columns) for one in some for other in others)
 
 
-def _items_conflict(one: Item, other: Item) -> bool:
+def _items_conflict(one: Item, other: Item, columns: bool) -> bool:
     if one.context != other.context or one.aspect != other.aspect:
         return False
     mine, theirs = Access(one.access), Access(other.access)
     if not (mine.locks and theirs.locks and (mine.writes or theirs.writes)):
         return False
+    if not (mine.each or theirs.each):
+        return one.entity == other.entity
+    if columns:
+        return True
     if mine.each and theirs.each:
         return patterns_overlap(one.entity, other.entity)
-    if mine.each or theirs.each:
-        return pattern_matches(*((one.entity, other.entity) if mine.each else (other.entity, one.entity)))
-    return one.entity == other.entity
+    pattern, name = (one.entity, other.entity) if mine.each else (other.entity, one.entity)
+    return pattern_matches(pattern, name)

@@ -7,80 +7,31 @@ The end of a run is judged by `graph`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
-from enact_dist.core.datum import Datum, LockId, Slot, Token
+from enact_dist.core.datum import Datum, LockId, Slot
 from enact_dist.core.messages import (
-    Acquire,
     Committed,
     Granted,
     Hello,
     Item,
     Notice,
-    SlotState,
+    Valid,
     Viewed,
 )
 from enact_dist.core.multilock import Phase
 from enact_dist.core.records import OutcomeRecord, Persist, Publish, Recovered, Reply
 from enact_dist.terms import Access, Durability, pattern_matches
 from simulated.history import TOLD_NOT, Entry, History, conflict
+from simulated.lock_judge import LockJudge
+from simulated.picture import Picture, State
 from simulated.workload import label_of, value_of, writer_of
 
 if TYPE_CHECKING:
-    from enact_dist.core.multilock import Reading
-    from enact_dist.core.tenures import Tenure
+    from enact_dist.core.multilock import MultiLock, Reading
     from simulated.client_host import ClientHost
     from simulated.shard_host import ShardHost
     from simulated.world import World
-
-
-class State(NamedTuple):
-    """One committed state of a slot: `writer` is a lock, or the restart that left it so."""
-
-    version: int
-    stamp_ns: int
-    writer: LockId | str
-    epoch: int
-    datum: Datum | None
-
-    @property
-    def name(self) -> tuple[int, int]:
-        """What a reader in this epoch knows the state by."""
-        return self.version, self.stamp_ns
-
-
-NEVER_SET = State(0, 0, "nobody", 0, None)
-
-
-@dataclass(slots=True)
-class Picture:
-    """What the model knows of one shard."""
-
-    epoch: int = 0
-    chains: dict[Slot, list[State]] = field(default_factory=dict)
-    columns: dict[tuple[str, str], dict[Slot, None]] = field(default_factory=dict)
-    in_flight: dict[LockId, Persist] = field(default_factory=dict)
-    applied: dict[LockId, Persist | None] = field(default_factory=dict)
-    arrivals: dict[LockId, int] = field(default_factory=dict)
-    granted: dict[LockId, Token] = field(default_factory=dict)
-    granted_ever: dict[LockId, Token] = field(default_factory=dict)
-    grants: int = 0
-    newest_token: Token = Token(0, 0)
-    notices: int = 0
-    grace_waits_for: dict[str, int] = field(default_factory=dict)
-    grace_end_ns: int = 0
-    restarts: list[tuple[str, int, int]] = field(default_factory=list)
-
-    def now(self, slot: Slot) -> State:
-        """Return the newest committed state of a slot."""
-        chain = self.chains.get(slot)
-        return chain[-1] if chain else NEVER_SET
-
-    def put(self, slot: Slot, state: State) -> None:
-        """Add a state to the chain of a slot."""
-        self.chains.setdefault(slot, []).append(state)
-        self.columns.setdefault((slot.context, slot.aspect), {})[slot] = None
 
 
 class Model:
@@ -88,6 +39,7 @@ class Model:
 
     def __init__(self, world: World, history: History, durabilities: dict[str, str]) -> None:
         self._world, self._history = world, history
+        self._locks = LockJudge(world)
         self._durabilities = {name: Durability(text) for name, text in durabilities.items()}
         self.pictures: dict[str, Picture] = {}
         self.clients: list[ClientHost] = []
@@ -117,7 +69,7 @@ class Model:
                 self._world.tally["commits found after a crash"] += 1
                 self._apply(host, lock, persist, picture, datum_of=_recorded_data(persist))
         picture.in_flight.clear()
-        picture.applied = {lock: None for lock in picture.applied}
+        picture.applied = dict.fromkeys(picture.applied)
 
     def booted(self, host: ShardHost, recovered: Recovered, *, crashed_at_ns: int) -> None:
         """A shard started: what it recovered becomes one writer of all slots in the history."""
@@ -156,10 +108,15 @@ class Model:
         if isinstance(message, Hello) and message.known_epoch == picture.epoch:
             picture.grace_waits_for.pop(message.session, None)
         self._check_commits(host, effects, picture)
-        self._check_tenures(host, message, picture)
+        self._locks.judge(host, message, picture)
         for effect in effects:
-            if isinstance(effect, Reply) and isinstance(effect.answer, Granted | Viewed):
+            if not isinstance(effect, Reply):
+                continue
+            if isinstance(effect.answer, Granted | Viewed):
                 self._check_snapshot(host, effect.answer, picture)
+            elif isinstance(effect.answer, Valid):
+                lock = effect.answer.lock
+                picture.confirmed[lock] = picture.granted_ever[lock]
 
     def _check_commits(self, host: ShardHost, effects: list[object], picture: Picture) -> None:
         told = {
@@ -195,6 +152,7 @@ class Model:
         datum_of = {slot: host.shard.state.slots[slot].datum for slot in versions}
         self._put_all(lock, versions, picture, datum_of)
         picture.applied[lock] = persist
+        picture.confirmed[lock] = picture.granted_ever[lock]
         self._world.tally["commits"] += 1
 
     def _check_on_disk(
@@ -223,6 +181,7 @@ class Model:
         versions = {slot: (version, stamp_ns) for slot, version in outcome.versions}
         self._put_all(lock, versions, picture, datum_of)
         picture.applied[lock] = persist
+        picture.confirmed[lock] = picture.granted_ever[lock]
         self._world.tally["commits"] += 1
 
     def _put_all(
@@ -241,6 +200,8 @@ class Model:
             before, datum = picture.now(slot), datum_of.get(slot)
             if version != before.version + 1:
                 self._fail("I2 versions are a chain", slot, version, before)
+            if before.epoch == picture.epoch and stamp_ns <= before.stamp_ns:
+                self._fail("stamps grow", slot, stamp_ns, before)
             if datum is not None:
                 self._check_content(lock, slot, before, datum)
             picture.put(slot, State(version, stamp_ns, lock, picture.epoch, datum))
@@ -257,49 +218,7 @@ class Model:
         if value_of(datum) != old + 1:
             self._fail("no lost update", slot, old, datum)
 
-    # ---------------------------------------------------------------- locks
-
-    def _check_tenures(self, host: ShardHost, message: object, picture: Picture) -> None:
-        tenures = host.shard.state.tenures.by_lock
-        for lock in [lock for lock in picture.arrivals if lock not in tenures]:
-            del picture.arrivals[lock]
-            picture.granted.pop(lock, None)
-        if isinstance(message, Acquire) and message.lock in tenures:
-            if message.lock not in picture.arrivals:
-                picture.grants += 1
-                picture.arrivals[message.lock] = picture.grants
-        for lock in picture.in_flight:
-            if lock not in picture.granted:
-                self._fail("I17 a commit in flight keeps its lock", lock)
-        fresh = [
-            tenure
-            for lock, tenure in tenures.items()
-            if tenure.token is not None and lock not in picture.granted
-        ]
-        for tenure in sorted(fresh, key=lambda tenure: tenure.token or Token(0, 0)):
-            self._check_grant(host, tenure, tenures, picture)
-
-    def _check_grant(
-        self, host: ShardHost, tenure: Tenure, tenures: dict[LockId, Tenure], picture: Picture
-    ) -> None:
-        lock, token = tenure.lock, tenure.token
-        assert token is not None
-        if not picture.newest_token < token or token.epoch != picture.epoch:
-            self._fail("I8 tokens grow", lock, token, picture.newest_token)
-        if lock in picture.granted_ever:
-            self._fail("I8 a seq is granted once", lock, token)
-        if picture.grace_waits_for and host.local_ns < picture.grace_end_ns:
-            self._fail("I11 no grant in the grace", lock, list(picture.grace_waits_for))
-        arrival = picture.arrivals[lock]
-        for other in tenures.values():
-            if other is tenure or not conflict(tenure.items, other.items):
-                continue
-            if other.lock in picture.granted:
-                self._fail("I1 no conflicting grants", lock, other.lock)
-            if other.token is None and picture.arrivals[other.lock] < arrival:
-                self._fail("I13 nobody is overtaken", other.lock, "by", lock)
-        picture.newest_token = token
-        picture.granted[lock] = picture.granted_ever[lock] = token
+    # ---------------------------------------------------------------- readers
 
     def _check_snapshot(self, host: ShardHost, answer: Granted | Viewed, picture: Picture) -> None:
         """I18: an answer shows one committed moment, and all of it."""
@@ -315,7 +234,8 @@ class Model:
         absent = self.absent.setdefault(answer.lock, {})
         for known in [known for known in absent if known[0] == host.name]:
             del absent[known]  # of an earlier grant, before a restart
-        for item in host.shard.state.tenures.by_lock[answer.lock].items:
+        tenure = host.shard.state.tenures.by_lock.get(answer.lock)
+        for item in tenure.items if tenure else ():
             if Access(item.access).each:
                 for slot in self._not_shown(item, shown, picture):
                     now = picture.now(slot)
@@ -378,16 +298,24 @@ class Model:
         if entry.told in TOLD_NOT and applied and not self._may_be_gone(entry):
             self._fail("I5 told not committed, but visible", entry.id, entry.told, entry.lock.cause)
 
+        if entry.told is Phase.COMMITTED:
+            self._check_confirmed(entry)
+
+    def _check_confirmed(self, entry: Entry) -> None:
+        """P3: each part was asked, at its end, whether it had been held all the time."""
+        for part in entry.lock.parts:
+            picture = self.pictures[part.shard]
+            if part.token != picture.confirmed.get(entry.id):
+                self._fail("P3 every lock is confirmed", entry.id, part.shard, part.token)
+
     def _may_be_gone(self, entry: Entry) -> bool:
         """Whether a restart may have undone the lock's writes: volatile, or `os` and power cut."""
         written = (item for item in entry.items if Access(item.access).writes)
-        volatile = all(
-            self._durabilities[item.aspect] is Durability.VOLATILE for item in written
-        )
+        volatile = all(self._durabilities[item.aspect] is Durability.VOLATILE for item in written)
         return volatile or entry.id in self.permitted_losses
 
 
-def _believed(host: ClientHost) -> list[object]:
+def _believed(host: ClientHost) -> list[MultiLock]:
     now_ns = host.local_ns
     return [lock for lock in host.client.live_locks() if lock.valid(now_ns)]
 
@@ -398,6 +326,3 @@ def _names(chain: list[State]) -> set[tuple[int, int]]:
 
 def _recorded_data(persist: Persist) -> dict[Slot, Datum | None]:
     return {r.slot: r.datum for r in persist.records if hasattr(r, "datum")}
-
-
-__all__ = ["Model", "Picture", "SlotState", "State"]

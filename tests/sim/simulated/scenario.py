@@ -54,7 +54,12 @@ class Scenario:
     """One cell and its run."""
 
     def __init__(
-        self, seed: int, *, faults: Faults | None = None, through_wire: bool = True
+        self,
+        seed: int,
+        *,
+        faults: Faults | None = None,
+        through_wire: bool = True,
+        asserts: bool = True,
     ) -> None:
         self.seed = seed
         random = Random(seed)
@@ -68,12 +73,14 @@ class Scenario:
         self.network = Network(world, self.faults, through_wire=through_wire)
         self.network.set_off = self._set_off
         self.shards = self._made_shards(count)
-        self.workload = Workload(
-            world, self.history, self.model, entities=random.choice((2, 3, 4))
-        )
+        for host in self.shards.values():
+            host.asserts = asserts
+        self.workload = Workload(world, self.history, self.model, entities=random.choice((2, 3, 4)))
         self._lanes = random.choice((1, 2, 3))
         self._clients = random.choice((2, 3, 4))
         self._named = 0
+        # Some runs end in the middle of the faults, so that nothing that comes later repairs them.
+        self._work_ns = random.choice((WORK_NS, FAULTS_NS - S // 2))
 
     def _made_shards(self, count: int) -> dict[str, ShardHost]:
         names = [f"s{index}" for index in range(count)]
@@ -126,9 +133,7 @@ class Scenario:
         except Exception as failure:  # whatever the core raises is a finding too
             violation = f"{type(failure).__name__} at {self.world.now_ns / 1e9:.6f} s: {failure}"
             trace = traceback.format_exc()
-        return Result(
-            self.seed, violation, self.world.tally, self.world.now_ns / 1e9, trace
-        )
+        return Result(self.seed, violation, self.world.tally, self.world.now_ns / 1e9, trace)
 
     def _run(self) -> None:
         for host in self.shards.values():
@@ -136,10 +141,10 @@ class Scenario:
         for _ in range(self._clients):
             self._add_client()
         self._plan_faults()
+        self.world.after(self._work_ns, self._wind_down)
         self.world.run_until(FAULTS_NS)
         self._heal()
-        self.world.run_until(WORK_NS)
-        self.world.winding_down = True
+        self.world.run_until(self._work_ns)
         while not self._quiet() and self.world.now_ns < WORK_NS + QUIET_NS:
             self.world.run_until(self.world.now_ns + POLL_NS)
         self._check_quiet()
@@ -148,6 +153,9 @@ class Scenario:
         cycle = Graph(self.history, self.model).cycle()
         if cycle is not None:
             self.world.violation("I6 strict serializability", *("\n  " + line for line in cycle))
+
+    def _wind_down(self) -> None:
+        self.world.winding_down = True
 
     def _quiet(self) -> bool:
         busy = any(host.threads_left for host in self.model.clients if host.up)
@@ -281,7 +289,12 @@ class Scenario:
     # ---------------------------------------------------------------- liveliness tokens
 
     def _visible(self, host: ClientHost, shard: ShardHost) -> bool:
-        return self.faults.tokens and host.up and not host.paused and not self.network.is_cut(host, shard)
+        return (
+            self.faults.tokens
+            and host.up
+            and not host.paused
+            and not self.network.is_cut(host, shard)
+        )
 
     def _tokens_seen(self, shard: ShardHost) -> list[str]:
         return [h.client.session for h in self.model.clients if self._visible(h, shard)]
@@ -295,6 +308,4 @@ class Scenario:
     def _show_token(self, host: ClientHost, *, present: bool) -> None:
         seen = SessionSeen(host.client.session, present and self.faults.tokens)
         for shard in self.shards.values():
-            self.world.after(
-                10 * MS, lambda shard=shard: shard.receive(lambda: shard.event(seen))
-            )
+            self.world.after(10 * MS, lambda shard=shard: shard.receive(lambda: shard.event(seen)))

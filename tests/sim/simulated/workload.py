@@ -84,7 +84,7 @@ class Workload:
             items,
             wait_ns=random.choice((0, 200 * MS, 2 * S, 8 * S)),
             hold_ns=hold_ns,
-            work_ns=random.choice((0, 0, 2 * MS, 20 * MS, 100 * MS, 500 * MS)),
+            work_ns=random.choice((0, 0, 0, 2 * MS, 20 * MS, 20 * MS, 100 * MS, 500 * MS, 2 * S)),
             abandons=random.random() < 0.08,
             expects=any(item.access == Access.VIEW for item in items) and random.random() < 0.7,
             label=f"package-{random.randrange(LABELS)}",
@@ -99,7 +99,9 @@ class Workload:
     def _written(self, random: Random, count: int) -> tuple[Item, ...]:
         """Writes stay on one shard: one entity."""
         entity = random.choice(self._entities)
-        slots = {(random.choice(CONTEXTS), entity, random.choice(PLAIN)): None for _ in range(count)}
+        slots = {
+            (random.choice(CONTEXTS), entity, random.choice(PLAIN)): None for _ in range(count)
+        }
         return tuple(Item(Access.WRITE, *slot) for slot in slots)
 
     def _besides(self, random: Random, items: tuple[Item, ...], access: Access) -> tuple[Item, ...]:
@@ -209,9 +211,7 @@ class Workload:
             (answer,) = yield Calls([(reading.shard, request)])
             if isinstance(answer, Slice):
                 self._world.tally["data fetched"] += 1
-                return replace(
-                    answer.body, encoding=answer.encoding, stamp_ns=answer.stamp_ns
-                )
+                return replace(answer.body, encoding=answer.encoding, stamp_ns=answer.stamp_ns)
             if isinstance(answer, Gone) and lock.valid(host.local_ns) and lock.parts:
                 self._world.violation("what a held lock names stays fetchable", lock.lock, state)
             if answer is not None:

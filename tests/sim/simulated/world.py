@@ -65,7 +65,7 @@ class World:
             self.now_ns, _, action = heapq.heappop(events)
             self.tally["events"] += 1
             action()
-        self.now_ns = end_ns
+        self.now_ns = max(self.now_ns, end_ns)
 
     def violation(self, rule: str, *facts: object) -> None:
         """Stop the run: a rule is broken."""

@@ -1,0 +1,97 @@
+"""The rules of locks at one shard: I1, I8, I11, I13, I17, ends in time, nobody waits in vain."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from enact_dist.core.datum import LockId, Token
+from enact_dist.core.messages import Acquire
+from enact_dist.core.records import Tick
+from simulated.history import conflict
+
+if TYPE_CHECKING:
+    from enact_dist.core.tenures import Tenure
+    from simulated.picture import Picture
+    from simulated.shard_host import ShardHost
+    from simulated.world import World
+
+
+class LockJudge:
+    """Looks at a shard's locks after each step."""
+
+    def __init__(self, world: World) -> None:
+        self._fail = world.violation
+
+    def judge(self, host: ShardHost, message: object, picture: Picture) -> None:
+        """Note who came, went and was granted, and whether that was right."""
+        tenures = host.shard.state.tenures.by_lock
+        for lock in [lock for lock in picture.arrivals if lock not in tenures]:
+            del picture.arrivals[lock]
+            picture.granted.pop(lock, None)
+        came = message.lock if isinstance(message, Acquire) else None
+        if came in tenures and came not in picture.arrivals:
+            picture.came += 1
+            picture.arrivals[came] = picture.came
+        for lock in picture.in_flight:
+            if lock not in picture.granted:
+                self._fail("I17 a commit in flight keeps its lock", lock)
+        fresh = [
+            tenure
+            for lock, tenure in tenures.items()
+            if tenure.token is not None and lock not in picture.granted
+        ]
+        for tenure in sorted(fresh, key=lambda tenure: tenure.token or Token(0, 0)):
+            self._check_grant(host, tenure, tenures, picture)
+        if isinstance(message, Tick):
+            self._check_ends(host)
+            self._check_waiters(host, picture)
+
+    def _check_grant(
+        self, host: ShardHost, tenure: Tenure, tenures: dict[LockId, Tenure], picture: Picture
+    ) -> None:
+        lock, token = tenure.lock, tenure.token
+        assert token is not None
+        newest = picture.newest_token or Token(0, 0)
+        if token <= newest or token.epoch != picture.epoch:
+            self._fail("I8 tokens grow", lock, token, newest)
+        if lock in picture.granted_ever:
+            self._fail("I8 a seq is granted once", lock, token)
+        if picture.grace_waits_for and host.local_ns < picture.grace_end_ns:
+            self._fail("I11 no grant in the grace", lock, list(picture.grace_waits_for))
+        arrival = picture.arrivals[lock]
+        for other in tenures.values():
+            if other is tenure or not conflict(tenure.items, other.items):
+                continue
+            if other.lock in picture.granted:
+                self._fail("I1 no conflicting grants", lock, other.lock)
+            if other.token is None and picture.arrivals[other.lock] < arrival:
+                self._fail("I13 nobody is overtaken", other.lock, "by", lock)
+        picture.newest_token = token
+        picture.granted[lock] = picture.granted_ever[lock] = token
+
+    def _check_ends(self, host: ShardHost) -> None:
+        """After a look at the clock no grant is left that should have ended."""
+        state = host.shard.state
+        for lock, tenure in state.tenures.by_lock.items():
+            if tenure.token is None or tenure.committing:
+                continue
+            lease_end_ns = state.sessions.by_id[lock.session].lease_end_ns(state.now_ns)
+            if min(tenure.hold_end_ns, lease_end_ns) <= state.now_ns:
+                self._fail("leases and hold limits end", lock, tenure.hold_end_ns, lease_end_ns)
+
+    def _check_waiters(self, host: ShardHost, picture: Picture) -> None:
+        """Whoever waits does so for somebody who holds or came earlier (P6)."""
+        state = host.shard.state
+        if state.sessions.in_grace(state.now_ns):
+            return
+        everybody = list(state.tenures.by_lock.values())
+        for waiter in everybody:
+            if waiter.token is not None:
+                continue
+            arrival = picture.arrivals[waiter.lock]
+            if not any(
+                conflict(waiter.items, other.items, columns=True)
+                for other in everybody
+                if other.token is not None or picture.arrivals[other.lock] < arrival
+            ):
+                self._fail("P6 nobody waits in vain", waiter.lock, waiter.items)

@@ -1,0 +1,289 @@
+"""Small wrong edits of the core, each of which the simulator must catch.
+
+A mutant is a function that replaces one decision of the core through `patch(owner, name, value)`.
+The shard's own assertions are off while mutants run: what catches them is the judge.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from enact_dist.core import lock_table, multilock, tenures
+from enact_dist.core.beliefs import Sendings
+from enact_dist.core.client import Client
+from enact_dist.core.commits import Commits
+from enact_dist.core.datum import Token
+from enact_dist.core.lock_desk import LockDesk
+from enact_dist.core.lock_table import Mode
+from enact_dist.core.messages import Commit, KeepAlive, Released
+from enact_dist.core.multilock import MultiLock, Phase
+from enact_dist.core.records import Persist, Reply
+from enact_dist.core.session_desk import SessionDesk
+from enact_dist.core.sessions import Lane, Session, SessionTable
+from enact_dist.core.stamps import Stamps
+from enact_dist.core.tenures import Tenure, Tenures
+from enact_dist.terms import Durability
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    Patch = Callable[[Any, str, Any], None]
+
+
+def no_fence(patch: Patch) -> None:
+    """A commit is applied though its lock was taken away."""
+    buried: dict[Any, Tenure] = {}
+    remove, commit = Tenures.remove, Commits.commit
+
+    def burying(self: Tenures, tenure: Tenure, *, now_ns: int) -> Any:
+        if tenure.lock in self.by_lock:
+            buried[tenure.lock] = tenure
+            yield from remove(self, tenure, now_ns=now_ns)
+
+    def digging(self: Commits, message: Commit, **options: Any) -> Any:
+        ghost = buried.get(message.lock)
+        absent = message.lock not in self._tenures.by_lock
+        if absent and ghost is not None and ghost.token == message.token:
+            self._tenures.table.enqueue(message.lock, {})
+            self._tenures.by_lock[message.lock] = ghost
+            self._tenures.by_session.setdefault(message.lock.session, {})[message.lock] = ghost
+        yield from commit(self, message, **options)
+
+    patch(Tenures, "remove", burying)
+    patch(Commits, "commit", digging)
+
+
+def expires_early(patch: Patch) -> None:
+    """A lease ends a tenth of its TTL too early."""
+    lease_end_ns = Session.lease_end_ns
+    patch(Session, "lease_end_ns", lambda s, now_ns: lease_end_ns(s, now_ns) - s.ttl_ns // 10)
+
+
+def barges(patch: Patch) -> None:
+    """A newcomer passes waiters that conflict with it."""
+    patch(
+        lock_table._Queue,
+        "admits",
+        lambda q, mode: not any(q.held_modes[other] for other in lock_table.CONFLICTS[mode]),
+    )
+    patch(lock_table._Queue, "_first_conflicting_ticket", lambda _q, _mode: 1 << 62)
+
+
+def forgets_to_wake(patch: Patch) -> None:
+    """A release does not look for who may go on."""
+    patch(lock_table._Queue, "newly_eligible", lambda _queue: [])
+
+
+def readers_do_not_block(patch: Patch) -> None:
+    """A writer does not wait for readers."""
+    wrong = tuple(
+        tuple(m for m in conflicts if m is not Mode.S) for conflicts in lock_table.CONFLICTS
+    )
+    patch(lock_table, "CONFLICTS", wrong)
+
+
+def patterns_lock_nothing(patch: Patch) -> None:
+    """A pattern does not lock its column against newcomers."""
+    wants_of = tenures.wants_of
+
+    def wrong(items: Any) -> Any:
+        return wants_of([item for item in items if item.access < 4])
+
+    patch(tenures, "wants_of", wrong)
+
+
+def blind_acknowledgement(patch: Patch) -> None:
+    """Any hello counts as an acknowledgement of the new epoch."""
+    hello = SessionTable.hello
+
+    def wrong(self: SessionTable, message: Any, **options: Any) -> Any:
+        session, unrecorded = hello(self, message, **options)
+        session.acknowledged = True
+        return session, unrecorded
+
+    patch(SessionTable, "hello", wrong)
+
+
+def no_grace(patch: Patch) -> None:
+    """A restarted shard grants at once."""
+    patch(SessionTable, "in_grace", lambda _table, _now_ns: False)
+
+
+def keeps_old_grants(patch: Patch) -> None:
+    """A client acknowledges a new epoch without dropping what it holds."""
+    patch(Client, "_drop_grants", lambda _client, _shard: None)
+
+
+def believes_from_newest_sending(patch: Patch) -> None:
+    """A client counts its belief from the newest message it sent, seen or not."""
+
+    def wrong(self: Sendings, _count_seen: int, duration_ns: int) -> int:
+        return self._sent.get(self.count, 0) + duration_ns
+
+    patch(Sendings, "believe_until_ns", wrong)
+
+
+def view_counts_without_renewing(patch: Patch) -> None:
+    """A view is counted as a sign of life that the lease does not know of."""
+    on_take_view = LockDesk.on_take_view
+
+    def wrong(self: LockDesk, message: Any, reply_to: int) -> Any:
+        session = self._state.sessions.by_id.get(message.lock.session)
+        before_ns = session.renewed_ns if session else 0
+        yield from on_take_view(self, message, reply_to)
+        if session:
+            session.renewed_ns = before_ns
+
+    patch(LockDesk, "on_take_view", wrong)
+
+
+def no_record_of_outcomes(patch: Patch) -> None:
+    """A repeated commit or question finds no record of the first."""
+    patch(Commits, "_recorded", lambda _commits, _lock: None)
+
+
+def guesses_lost_answers(patch: Patch) -> None:
+    """A client takes the silence after a commit for a no."""
+    silent = MultiLock._silent
+
+    def wrong(self: MultiLock, shard: str, request: Any, now_ns: int) -> None:
+        if isinstance(request, Commit):
+            self._end(Phase.LOST)
+        else:
+            silent(self, shard, request, now_ns)
+
+    patch(MultiLock, "_silent", wrong)
+
+
+def no_reconciliation(patch: Patch) -> None:
+    """Keep-alives free nothing: lost releases and orphan grants stay."""
+    on_keep_alive = SessionDesk.on_keep_alive
+
+    def wrong(self: SessionDesk, message: KeepAlive, reply_to: int) -> Any:
+        blind = KeepAlive(message.session, message.epoch, message.count, (), message.report)
+        yield from on_keep_alive(self, blind, reply_to)
+
+    patch(SessionDesk, "on_keep_alive", wrong)
+
+
+def no_hold_limit(patch: Patch) -> None:
+    """A hung holder that stays alive keeps its lock."""
+    patch(Tenures, "held_too_long", lambda _tenures, _now_ns: [])
+
+
+def tells_before_it_is_kept(patch: Patch) -> None:
+    """A commit is applied and told while the disk still works on it."""
+
+    def wrong(self: Commits, commit: Any, *, now_ns: int) -> Any:
+        yield Persist(0, (*self._records(commit), commit.outcome), Durability.DURABLE)
+        yield from self._apply(commit, now_ns=now_ns)
+
+    patch(Commits, "_make_durable", wrong)
+
+
+def commits_in_flight_expire(patch: Patch) -> None:
+    """A lease that ends takes the lock of a commit that the disk works on."""
+    held = Tenure.committing
+    patch(Tenure, "committing", property(lambda _t: False, lambda _t, _v: None))
+    assert held is not None
+
+
+def grants_a_seq_again(patch: Patch) -> None:
+    """A seq that was granted and given back is queued again."""
+    patch(Lane, "top", property(lambda _lane: 0, lambda _lane, _value: None))
+
+
+def expects_only_what_is_visible(patch: Patch) -> None:
+    """An expected view does not fail on a commit in flight."""
+    patch(Commits, "_newest_version", lambda self, slot: self._slots[slot].version)
+
+
+def skips_validation(patch: Patch) -> None:
+    """Reads on other shards, and read-only locks, are not validated at the end."""
+
+    def wrong(self: MultiLock) -> None:
+        self._validate_left.clear()
+        after_validation(self)
+
+    after_validation = MultiLock._after_validation
+    patch(MultiLock, "_after_validation", wrong)
+
+
+def welcomes_early(patch: Patch) -> None:
+    """Welcome and Registered do not wait for the disk."""
+
+    def wrong(self: SessionDesk, reply_to: int, answer: Any, records: Any) -> Any:
+        for session in self._state.sessions:
+            session.present = session.durable = True
+        self._ticket -= 1
+        yield Reply(reply_to, answer)
+        if records:
+            yield Persist(0, records, Durability.DURABLE)
+
+    patch(SessionDesk, "_answer_when_durable", wrong)
+
+
+def stamps_follow_the_wall_clock(patch: Patch) -> None:
+    """Stamps are what the wall clock says, also when it was set back."""
+    patch(Stamps, "next", lambda _stamps, *, seen_ns, wall_ns: wall_ns)
+
+
+def releases_in_flight(patch: Patch) -> None:
+    """A late release ends a commit that the disk works on."""
+
+    def wrong(self: LockDesk, message: Any, reply_to: int) -> Any:
+        tenure = self._state.tenures.by_lock.get(message.lock)
+        if tenure is not None:
+            yield from self._state.tenures.remove(tenure, now_ns=self._state.now_ns)
+        yield Reply(reply_to, Released())
+
+    patch(LockDesk, "on_release", wrong)
+
+
+def numbers_start_anew(patch: Patch) -> None:
+    """Tokens say nothing of the epoch, so they repeat after a restart."""
+    grant_ready = Tenures.grant_ready
+
+    def wrong(self: Tenures, **options: Any) -> Any:
+        effects = list(grant_ready(self, **options))
+        for tenure in self.by_lock.values():
+            if tenure.token is not None:
+                tenure.token = Token(1, tenure.token.number)
+        yield from effects
+
+    patch(Tenures, "grant_ready", wrong)
+
+
+def retries_with_another_commit(patch: Patch) -> None:
+    """A client that hears nothing takes its lock for lost and its thread starts over."""
+    patch(multilock, "RETRY_NS_MIN", 1)
+    patch(MultiLock, "_on_outcome", lambda lock, _answer, _now_ns: lock._end(Phase.LOST))
+
+
+ALL = (
+    no_fence,
+    expires_early,
+    barges,
+    forgets_to_wake,
+    readers_do_not_block,
+    patterns_lock_nothing,
+    blind_acknowledgement,
+    no_grace,
+    keeps_old_grants,
+    believes_from_newest_sending,
+    view_counts_without_renewing,
+    no_record_of_outcomes,
+    guesses_lost_answers,
+    no_reconciliation,
+    no_hold_limit,
+    tells_before_it_is_kept,
+    commits_in_flight_expire,
+    grants_a_seq_again,
+    expects_only_what_is_visible,
+    skips_validation,
+    welcomes_early,
+    stamps_follow_the_wall_clock,
+    releases_in_flight,
+    numbers_start_anew,
+    retries_with_another_commit,
+)

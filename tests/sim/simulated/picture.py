@@ -1,0 +1,60 @@
+"""The model's own picture of one shard: committed states by slot, grants, arrivals, restarts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, NamedTuple
+
+from enact_dist.core.datum import Datum, LockId, Slot, Token
+
+if TYPE_CHECKING:
+    from enact_dist.core.records import Persist
+
+
+class State(NamedTuple):
+    """One committed state of a slot: `writer` is a lock, or the restart that left it so."""
+
+    version: int
+    stamp_ns: int
+    writer: LockId | str
+    epoch: int
+    datum: Datum | None
+
+    @property
+    def name(self) -> tuple[int, int]:
+        """What a reader in this epoch knows the state by."""
+        return self.version, self.stamp_ns
+
+
+NEVER_SET = State(0, 0, "nobody", 0, None)
+
+
+@dataclass(slots=True)
+class Picture:
+    """What the model knows of one shard."""
+
+    epoch: int = 0
+    chains: dict[Slot, list[State]] = field(default_factory=dict)
+    columns: dict[tuple[str, str], dict[Slot, None]] = field(default_factory=dict)
+    in_flight: dict[LockId, Persist] = field(default_factory=dict)
+    applied: dict[LockId, Persist | None] = field(default_factory=dict)
+    arrivals: dict[LockId, int] = field(default_factory=dict)
+    granted: dict[LockId, Token] = field(default_factory=dict)
+    granted_ever: dict[LockId, Token] = field(default_factory=dict)
+    confirmed: dict[LockId, Token] = field(default_factory=dict)
+    came: int = 0
+    newest_token: Token | None = None
+    notices: int = 0
+    grace_waits_for: dict[str, int] = field(default_factory=dict)
+    grace_end_ns: int = 0
+    restarts: list[tuple[str, int, int]] = field(default_factory=list)
+
+    def now(self, slot: Slot) -> State:
+        """Return the newest committed state of a slot."""
+        chain = self.chains.get(slot)
+        return chain[-1] if chain else NEVER_SET
+
+    def put(self, slot: Slot, state: State) -> None:
+        """Add a state to the chain of a slot."""
+        self.chains.setdefault(slot, []).append(state)
+        self.columns.setdefault((slot.context, slot.aspect), {})[slot] = None
