@@ -26,6 +26,7 @@ from enact_dist.cli.verbs import (
     verbs_of,
     whole,
 )
+from enact_dist.errors import DatumTypeError
 from enact_dist.terms import Entities, Entity
 
 if TYPE_CHECKING:
@@ -80,7 +81,7 @@ def _add_get(verbs: argparse._SubParsersAction[Verb]) -> None:
 
 def _add_put(verbs: argparse._SubParsersAction[Verb]) -> None:
     put = add_verb(
-        verbs, "put", "set one datum under a lock, checked against its aspect's type", run=put_datum,
+        verbs, "put", "set one datum under a lock, checked by its aspect's type", run=put_datum,
         example="enact world put online work_bench/contact_count 3\n"
         "enact world put online camera/intrinsics @intrinsics.npy",
     )  # fmt: skip
@@ -198,43 +199,46 @@ def _slot_line(info: SlotInfo) -> str:
 
 def get_datum(arguments: argparse.Namespace) -> int:
     """Print or save one datum."""
-    from enact_dist.cli import data
+    from enact_dist.cli import showing
 
     entity, aspect = arguments.slot
     with open_cell(arguments) as cell:
         datum = cell.world(arguments.world).raw(Entity(entity), aspect)
     if arguments.out:
-        print(data.save(datum, arguments.out))
+        print(showing.save(datum, arguments.out))
     elif arguments.json:
-        print_json(data.plain(datum))
+        print_json(showing.plain(datum))
     else:
-        for line in data.lines(datum):
+        for line in showing.lines(datum):
             print(line)
     return DONE
 
 
 def put_datum(arguments: argparse.Namespace) -> int:
     """Set one datum under a write lock."""
-    from enact_dist.cli import data
+    from enact_dist.cli import literals
     from enact_dist.lock import Lock
     from enact_dist.terms import Aspect, Write
 
     entity, name = arguments.slot
     with open_cell(arguments, observer=False) as cell:
         world = cell.world(arguments.world)
-        datum_type = data.type_to_put(name, cell.aspects(), arguments.value, new=arguments.new)
-        value = data.read(arguments.value, datum_type)
+        datum_type = literals.type_to_put(name, cell.aspects(), arguments.value, new=arguments.new)
+        value = literals.read(arguments.value, datum_type)
         request = Write(world, Entity(entity), Aspect(name, datum_type))
-        with Lock(request, wait_s=arguments.wait) as lock:
-            version = lock.version(request) + 1
-            if value is data.NOTHING:
-                del lock[request]
-            else:
-                lock[request] = value
+        try:
+            with Lock(request, wait_s=arguments.wait) as lock:
+                version = lock.version(request) + 1
+                if value is literals.NOTHING:
+                    del lock[request]
+                else:
+                    lock[request] = value
+        except DatumTypeError as error:
+            raise DatumTypeError(f"{world.name}:{entity}/{name} is not set: {error}") from error
     if arguments.json:
         print_json({"world": world.name, "entity": entity, "aspect": name, "version": version})
     else:
-        done = "is null" if value is data.NOTHING else "set"
+        done = "is null" if value is literals.NOTHING else "set"
         print(f"{world.name}:{entity}/{name} {done}, v{version}")
     return DONE
 

@@ -1,0 +1,145 @@
+"""Data as people read them on a command line: lines, JSON, files; arrays are summarised."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from enact_dist.errors import ConfigError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
+TEXT_SHOWN_MAX: Final = 400
+"""Characters of a text that are printed; the rest is counted."""
+VALUES_SHOWN_MAX: Final = 16
+"""Arrays up to this many elements are printed whole."""
+
+
+def lines(datum: object, name: str = "", indent: str = "") -> Iterator[str]:
+    """Yield a datum as lines for people; arrays are summarised."""
+    head = f"{indent}{name}: " if name else indent
+    if isinstance(datum, dict):
+        title = str(datum.get("__type__", "")) if "__type__" in datum else ""
+        fields = {key: value for key, value in datum.items() if key != "__type__"}
+        below = indent
+        if name or title:
+            yield f"{head}{title}" if title else f"{indent}{name}:"
+            below = indent + "  "
+        if not fields:
+            yield f"{below}{{}}"
+        for key, value in fields.items():
+            yield from lines(value, str(key), below)
+    elif isinstance(datum, list | tuple) and any(_is_long(each) for each in datum):
+        yield f"{head}{len(datum)} elements"
+        for index, value in enumerate(datum):
+            yield from lines(value, f"[{index}]", indent + "  ")
+    else:
+        yield head + summary(datum)
+
+
+def _is_long(value: object) -> bool:
+    return isinstance(value, dict | list | tuple | np.ndarray)
+
+
+def summary(value: object) -> str:
+    """Return one line about a value that is no dict."""
+    if isinstance(value, np.ndarray):
+        return _array_summary(value)
+    if isinstance(value, bytes):
+        return f"{len(value)} bytes {value[:16].hex(' ')}{' …' if len(value) > 16 else ''}"
+    text = value if isinstance(value, str) else repr(value)
+    more = len(text) - TEXT_SHOWN_MAX
+    return text if more <= 0 else f"{text[:TEXT_SHOWN_MAX]}… ({more} more characters)"
+
+
+def _array_summary(array: NDArray[Any]) -> str:
+    shape = " x ".join(map(str, array.shape)) or "scalar"
+    text = f"array {shape} {array.dtype}"
+    if array.size == 0:
+        return f"{text}, empty"
+    if array.size <= VALUES_SHOWN_MAX:
+        return f"{text} {array.tolist()}"
+    if array.dtype.kind in "iufb":
+        finite = array[np.isfinite(array)] if array.dtype.kind == "f" else array
+        text += f", {finite.min()} to {finite.max()}" if finite.size else ", none finite"
+        lost = array.size - finite.size
+        text += f", {lost} not finite" if lost else ""
+    return text
+
+
+def plain(datum: object) -> object:
+    """Return a datum as JSON can carry it; arrays as their description with summary values."""
+    if isinstance(datum, dict):
+        return {str(key): plain(value) for key, value in datum.items()}
+    if isinstance(datum, list | tuple):
+        return [plain(value) for value in datum]
+    if isinstance(datum, np.ndarray):
+        return _array_facts(datum)
+    if isinstance(datum, bytes):
+        return {"bytes": len(datum), "hex": datum[:64].hex()}
+    return datum
+
+
+def _array_facts(array: NDArray[Any]) -> dict[str, object]:
+    facts: dict[str, object] = {"dtype": str(array.dtype), "shape": list(array.shape)}
+    if array.size <= VALUES_SHOWN_MAX:
+        facts["values"] = plain(array.tolist())
+    elif array.dtype.kind in "iufb":
+        finite = array[np.isfinite(array)] if array.dtype.kind == "f" else array
+        if finite.size:
+            facts["min"], facts["max"] = finite.min().item(), finite.max().item()
+        facts["finite"] = int(finite.size)
+    return facts
+
+
+def save(datum: object, name: str) -> str:
+    """Write a datum to a file whose ending says how; return a line about what was written.
+
+    Raises:
+        ConfigError: The ending is unknown, or the datum has nothing that the format can hold.
+    """
+    path = Path(name).expanduser()
+    arrays: dict[str, Any] = {key or "datum": array for key, array in _arrays(datum, "")}
+    if path.suffix == ".npz":
+        if not arrays:
+            raise ConfigError(f"the datum holds no array for {path}; save it as .json")
+        np.savez(path, **arrays)
+        return f"{path}: {', '.join(f'{key} {array.shape}' for key, array in arrays.items())}"
+    if path.suffix == ".npy":
+        if not isinstance(datum, np.ndarray):
+            raise ConfigError(f"the datum is no array; save its arrays as .npz, not {path}")
+        np.save(path, datum, allow_pickle=False)
+        return f"{path}: {_array_summary(datum)}"
+    if path.suffix == ".json":
+        path.write_text(json.dumps(_whole(datum), ensure_ascii=False, indent=2), encoding="utf-8")
+        return f"{path}: {path.stat().st_size} bytes"
+    raise ConfigError(f"{path}: the ending says how to save: .npz, .npy or .json")
+
+
+def _arrays(datum: object, where: str) -> Iterator[tuple[str, NDArray[Any]]]:
+    """Yield every array of a datum with its path in it."""
+    if isinstance(datum, np.ndarray):
+        yield where, datum
+    elif isinstance(datum, dict):
+        for key, value in datum.items():
+            yield from _arrays(value, f"{where}.{key}" if where else str(key))
+    elif isinstance(datum, list | tuple):
+        for index, value in enumerate(datum):
+            yield from _arrays(value, f"{where}.{index}" if where else str(index))
+
+
+def _whole(datum: object) -> object:
+    """Return a datum as JSON can carry it, with every element of every array."""
+    if isinstance(datum, dict):
+        return {str(key): _whole(value) for key, value in datum.items()}
+    if isinstance(datum, list | tuple):
+        return [_whole(value) for value in datum]
+    if isinstance(datum, np.ndarray):
+        return _whole(datum.tolist())
+    return datum.hex() if isinstance(datum, bytes) else datum

@@ -1,0 +1,188 @@
+"""`enact actor` and `enact up`: real actors in processes of their own."""
+
+import signal
+
+import pytest
+
+MODULE = """\
+from enact_dist import Actor, Aspect, Entity, Entities, View, World, Write
+
+COUNT = Aspect("count", int)
+TWICE = Aspect("twice", int)
+
+
+class Beat(Actor):
+    online = World("online")
+    count = Write(online, Entity("beat"), COUNT)
+    every_s = 0.05
+
+    def __init__(self, step: int = 1) -> None:
+        self.step = step
+
+    def update(self, lock):
+        lock[self.count] = lock.get(self.count, 0) + self.step
+
+
+class Double(Actor):
+    online = World("online")
+    seen = View(online, Entities("beat"), COUNT)
+    twice = Write(online, Entities("beat"), TWICE)
+    triggers = (seen,)
+
+    def update(self, lock):
+        lock[self.twice] = 2 * lock[self.seen]
+
+
+class Rival(Beat):
+    pass
+
+
+class Broken(Actor):
+    online = World("online")
+    count = Write(online, Entity("broken"), COUNT)
+
+    def update(self, lock):
+        raise RuntimeError("no light")
+"""
+
+ACTORS = """
+[actors.beat]
+class = "my_actors:Beat"
+worlds = { online = "online" }
+options = { step = 5 }
+every_s = 0.1
+
+[actors.double]
+class = "my_actors:Double"
+worlds = { online = "online" }
+"""
+
+
+@pytest.fixture
+def module(tmp_path):
+    """The actors' module in the working folder, as a user would have it."""
+    (tmp_path / "my_actors.py").write_text(MODULE, encoding="utf-8")
+
+
+def test_run_takes_options_and_roles_from_the_command_line(module, spawn, until, cell_file, enact):
+    """A running actor is listed with what it reports, and ends with status 0 on SIGTERM."""
+    actor = spawn("actor", "run", "my_actors:Beat", "--cell", cell_file, "--world",
+                  "online=training", "--option", "step=100", "--name", "heart")  # fmt: skip
+    until(actor, "ready: actor heart in cell clitest")
+    watch = enact("world", "watch", "training", "--aspect", "count", "--count", "3",
+                  "--cell", cell_file)  # fmt: skip
+    value = enact("world", "get", "training", "beat/count", "--json", "--cell", cell_file).json
+    listed = {
+        info["actor"]: info for info in enact("actor", "ls", "--json", "--cell", cell_file).json
+    }
+    table = enact("actor", "ls", "--cell", cell_file).out
+    actor.send_signal(signal.SIGTERM)
+    rest = actor.stdout.read()
+
+    assert watch.status == 0
+    assert value % 100 == 0
+    assert listed["heart"]["pid"] == actor.pid
+    assert "heart" in table
+    assert actor.wait(10) == 0
+    assert "stopped: actor heart after" in rest
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (("my_actors:Beta",), "Beat"),
+        (("no_such_module:Beat",), "no module no_such_module"),
+        (("my_actors:Beat", "--option", "stp=1"), "no option 'stp'"),
+        (("my_actors:Beat", "--option", "step=fast"), "must be a whole number"),
+        (
+            ("my_actors:Beat", "--option", "step=1", "--option", "step=2"),
+            "--option step is given twice",
+        ),
+        (("heart",), "has no actor 'heart' (known: none)"),
+    ],
+)
+def test_run_refuses_a_wrong_command_line(module, enact, cell_file, words, reason):
+    """What names no actor or option is status 2 before anything is joined."""
+    result = enact("actor", "run", *words, "--cell", cell_file)
+
+    assert result.status == 2
+    assert reason in result.err
+
+
+def test_run_refuses_an_unknown_role(module, enact, cell_file):
+    """A role that the class does not have is named."""
+    result = enact(
+        "actor", "run", "my_actors:Beat", "--world", "offline=online", "--cell", cell_file
+    )
+
+    assert result.status == 1
+    assert "offline" in result.err
+
+
+def test_check_accepts_actors_that_fit(module, enact, write_cell):
+    """Two actors that read and write past each other are fine."""
+    result = enact("actor", "check", "--cell", write_cell(ACTORS))
+
+    assert (result.status, result.out) == (0, "ok: 2 actors of cell clitest fit together\n")
+
+
+def test_check_reports_two_writers_with_status_1(module, enact, write_cell):
+    """Two actors that write one slot are an error, also as JSON."""
+    rival = '\n[actors.rival]\nclass = "my_actors:Rival"\nworlds = { online = "online" }\n'
+    file = write_cell(ACTORS + rival)
+
+    result = enact("actor", "check", "--cell", file, "--json")
+
+    assert result.status == 1
+    assert [finding["kind"] for finding in result.json if finding["level"] == "error"] == [
+        "two writers"
+    ]
+    up = enact("up", file)
+    assert up.status == 2
+    assert "beat" in up.err
+
+
+def test_up_runs_the_cell_restarts_what_dies_and_drains_in_order(
+    module, spawn, until, write_cell, enact
+):
+    """Shards, then actors; a killed actor comes back; a signal ends actors, then shards."""
+    file = write_cell(ACTORS)
+    up = spawn("up", file)
+    lines = until(up, "ready: actor double")
+    watch = enact("world", "watch", "online", "--aspect", "twice", "--count", "3", "--cell", file)
+    listed = {
+        info["actor"]: info["pid"] for info in enact("actor", "ls", "--json", "--cell", file).json
+    }
+    import os
+
+    os.kill(listed["beat"], signal.SIGKILL)
+    lines += until(up, "ended by SIGKILL; started again in 0.2 s")
+    lines += until(up, "ready: actor beat")
+    up.send_signal(signal.SIGINT)
+    rest = up.stdout.read().splitlines()
+
+    assert watch.status == 0
+    assert up.wait(20) == 0
+    assert lines[0].startswith("enact  | up: cell clitest on ")
+    assert any(line.startswith("left   | ready: shard left") for line in lines)
+    ends = [index for index, line in enumerate(rest) if "stopped: actor" in line]
+    drained = [index for index, line in enumerate(rest) if "SIGTERM received" in line]
+    assert len(ends) == 2
+    assert max(ends) < min(drained)
+    assert rest[-1] == "enact  | down"
+
+
+def test_up_refuses_a_host_that_runs_nothing(enact, write_cell):
+    """A host name without any shard or actor is a mistake."""
+    pinned = (
+        write_cell()
+        .read_text()
+        .replace("[shards.right]", '[shards.right]\nhost = "b"')
+        .replace("[shards.left]", '[shards.left]\nhost = "a"')
+    )
+    write_cell().write_text(pinned, encoding="utf-8")
+
+    result = enact("up", "--host", "c")
+
+    assert result.status == 2
+    assert "runs on host 'c'" in result.err

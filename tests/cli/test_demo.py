@@ -1,0 +1,46 @@
+"""`enact demo`: which options belong together, and what is said when the extra is missing."""
+
+import sys
+
+import pytest
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (("--model", "m.ply"), "--model and --scene belong together"),
+        (("--scene", "s.ply"), "--model and --scene belong together"),
+        (("--views", "d", "--model", "m", "--scene", "s"), "--views trains"),
+        (("--views", "d", "--packages", "3"), "--packages belongs to the simulated sensor"),
+        (("--views", "d", "--keep-running"), "--keep-running belongs to the simulated sensor"),
+    ],
+)
+def test_options_that_do_not_fit_are_refused(enact, words, reason):
+    """A mixture of simulated and real input is refused before anything is loaded."""
+    result = enact("demo", "palletizing", *words)
+
+    assert result.status == 2
+    assert reason in result.err
+
+
+def test_missing_extra_is_named_with_its_command(enact, monkeypatch):
+    """Without Open3D the error says which extra to install."""
+    monkeypatch.setitem(sys.modules, "actors.palletizing.demo", None)
+    error = ModuleNotFoundError("No module named 'open3d'", name="open3d")
+
+    class Finder:
+        @staticmethod
+        def find_spec(name, *_):
+            if name == "actors.palletizing.demo":
+                raise error
+
+    monkeypatch.delitem(sys.modules, "actors.palletizing.demo")
+    monkeypatch.setattr(sys, "meta_path", [Finder, *sys.meta_path])
+
+    result = enact("demo", "palletizing")
+
+    assert result.status == 2
+    assert result.err == (
+        "enact: the demo needs open3d, which is not installed; install the actors extra:"
+        " pip install 'enact-dist[actors]'\n"
+    )

@@ -1,0 +1,134 @@
+"""`enact`: usage, exit statuses, one line per error, and what it does not import."""
+
+import argparse
+import subprocess
+import sys
+
+import pytest
+
+from enact_dist.cli.main import build_parser, main
+
+
+def walk_verbs(parser, words=()):
+    """Yield the words and the parser of every verb."""
+    groups = [a for a in parser._actions if isinstance(a, argparse._SubParsersAction)]
+    if words and not groups:
+        yield list(words), parser
+    for group in groups:
+        for name, below in group.choices.items():
+            yield from walk_verbs(below, (*words, name))
+
+
+@pytest.mark.parametrize("words", [w for w, _ in walk_verbs(build_parser())], ids=" ".join)
+def test_help_of_every_verb_ends_with_an_example(words, capsys):
+    """Whoever asks a verb for help sees a command line that can be typed."""
+    with pytest.raises(SystemExit) as ended:
+        main([*words, "--help"])
+
+    out = capsys.readouterr().out
+    assert ended.value.code == 0
+    assert f"  enact {' '.join(words)}" in out.partition("example")[2]
+
+
+@pytest.mark.parametrize(
+    ("words", "example"),
+    [
+        (w, line)
+        for w, p in walk_verbs(build_parser())
+        for line in (p.epilog or "").splitlines()[1:]
+    ],
+)
+def test_examples_of_the_help_can_be_parsed(words, example):
+    """No example names an option that does not exist."""
+    import shlex
+
+    line = shlex.split(example)[1:]
+    line = line[: line.index("--")] if "--" in line else line
+
+    assert isinstance(build_parser().parse_args(line), argparse.Namespace)
+
+
+def test_readers_all_have_json():
+    """Every verb that only looks can be read by a program."""
+    readers = {"ls", "tree", "get", "watch", "doctor", "check"}
+    found = {
+        words[-1]: "--json" in parser.format_help()
+        for words, parser in walk_verbs(build_parser())
+        if words[-1] in readers
+    }
+    assert found == dict.fromkeys(readers, True)
+
+
+@pytest.mark.parametrize(
+    "words", [["shard"], ["nonsense"], ["world", "get", "online"], ["lock", "break", "x"]]
+)
+def test_usage_is_refused_with_status_2(words, capsys):
+    """A command line that cannot be read ends with status 2 and says how to write it."""
+    with pytest.raises(SystemExit) as ended:
+        main(words)
+
+    assert ended.value.code == 2
+    assert "usage: enact" in capsys.readouterr().err
+
+
+def test_no_command_prints_help_and_is_usage(enact):
+    """`enact` alone shows what there is."""
+    result = enact()
+    assert result.status == 2
+    assert "commands:" in result.out
+
+
+def test_missing_cell_is_named_with_its_remedies(enact, tmp_path):
+    """Without a cell.toml the error says where it looked and how to name one."""
+    result = enact("world", "ls")
+
+    assert result.status == 2
+    assert result.err == (
+        f"enact: no cell: there is no cell.toml in {tmp_path}; name one with --cell FILE or"
+        " --cell tcp/host:7447, or set ENACT_CELL\n"
+    )
+
+
+def test_config_error_is_one_line_with_file_and_line(enact, tmp_path):
+    """A mistake in cell.toml is status 2 and one line on the error stream."""
+    (tmp_path / "cell.toml").write_text('name = "c"\nshard = 1\n', encoding="utf-8")
+
+    result = enact("shard", "run", "left")
+
+    assert result.status == 2
+    assert result.err.startswith("enact: cell.toml, line 2: unknown key 'shard'")
+    assert result.err.count("\n") == 1
+
+
+def test_cell_variable_names_the_cell(enact, tmp_path, monkeypatch):
+    """ENACT_CELL stands for --cell."""
+    monkeypatch.setenv("ENACT_CELL", str(tmp_path / "elsewhere.toml"))
+
+    assert "elsewhere.toml" in enact("world", "ls").err
+
+
+def test_debug_shows_the_traceback(tmp_path):
+    """--debug lets the exception through, before and after the verb."""
+    from enact_dist.errors import ConfigError
+
+    for words in (["--debug", "world", "ls"], ["world", "ls", "--debug"]):
+        with pytest.raises(ConfigError):
+            main(words)
+
+
+def test_unreachable_cell_is_status_3(enact):
+    """Where nothing listens the status is 3 and the endpoint is named."""
+    result = enact("world", "ls", "--cell", "tcp/127.0.0.1:9", "--timeout", "0.5")
+
+    assert result.status == 3
+    assert "tcp/127.0.0.1:9" in result.err
+
+
+def test_help_loads_neither_zenoh_nor_open3d_nor_rich():
+    """Asking for help costs no slow import."""
+    code = (
+        "import sys; from enact_dist.cli.main import build_parser; build_parser().format_help();"
+        "print(sorted({'zenoh', 'open3d', 'rich', 'scipy', 'cv2'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"

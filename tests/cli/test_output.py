@@ -1,0 +1,54 @@
+"""Units, tables and trees: plain into a pipe, drawn on a terminal."""
+
+import pytest
+
+from enact_dist.cli import output
+
+
+@pytest.mark.parametrize(
+    ("value_s", "text"),
+    [
+        (0.0003, "0.3 ms"),
+        (0.25, "250 ms"),
+        (3.42, "3.4 s"),
+        (125, "2 min 5 s"),
+        (7500, "2 h 5 min"),
+        (90_000, "1 d 1 h"),
+    ],
+)
+def test_durations_have_the_unit_that_fits(value_s, text):
+    """People read two figures, not nine."""
+    assert output.shown_s(value_s) == text
+
+
+@pytest.mark.parametrize(
+    ("size", "text"),
+    [(0, "0 B"), (999, "999 B"), (1400, "1.4 kB"), (123e6, "123 MB"), (5e12, "5000 GB")],
+)
+def test_sizes_have_the_unit_that_fits(size, text):
+    """Sizes are decimal, as disks and networks count."""
+    assert output.shown_bytes(size) == text
+
+
+def test_plain_table_is_aligned(capsys):
+    """Into a pipe a table is columns of text."""
+    output.print_table(("name", "n"), [("a", 1), ("longer", 22)], empty="none")
+
+    assert capsys.readouterr().out == "name    n\na       1\nlonger  22\n"
+
+
+def test_table_and_tree_are_drawn_on_a_terminal(capsys, monkeypatch):
+    """On a terminal the same content is drawn; brackets in data are no markup."""
+    from enact_dist.cli.world import _Branch
+
+    monkeypatch.setattr(output, "on_terminal", lambda: True)
+    root = _Branch("online")
+    root.at(["tray", "1"]).children[" count"] = _Branch("count [bold]v1[/]")
+
+    output.print_tree(root)
+    output.print_table(("name",), [("[red]a[/]",)], empty="none")
+
+    out = capsys.readouterr().out
+    assert "└── tray/" in out
+    assert "count [bold]v1[/]" in out
+    assert "[red]a[/]" in out

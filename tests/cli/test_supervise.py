@@ -1,0 +1,157 @@
+"""The supervisor: order of start and end, restarts, and children that never outlive it."""
+
+import os
+import subprocess
+import sys
+import threading
+
+import pytest
+
+from enact_dist import supervise
+from enact_dist.supervise import Supervisor, Task
+
+
+def task(name, kind, code):
+    return Task(name, kind, (sys.executable, "-c", code))
+
+
+SERVE = (
+    "import signal, sys; signal.signal(signal.SIGTERM, lambda *_: sys.exit(print('leaving')));"
+    "print('ready: serving'); signal.pause()"
+)
+
+
+class Story:
+    """Lines of the log; `stop` is set when one contains the mark for the wanted time."""
+
+    def __init__(self, mark, times=1):
+        self.lines = []
+        self.stop = threading.Event()
+        self._mark, self._left = mark, times
+
+    def __call__(self, name, line):
+        self.lines.append(f"{name}: {line}")
+        if self._mark in self.lines[-1]:
+            self._left -= 1
+            if self._left == 0:
+                self.stop.set()
+
+    def run(self, *tasks, **options):
+        return Supervisor(tasks, self).run(self.stop, **options)
+
+
+def test_actors_start_after_the_shards_are_ready_and_leave_before_them():
+    """The first line of an actor comes after the shard's; at the end it is the other way round."""
+    story = Story("actor: ready")
+
+    status = story.run(task("actor", "actor", SERVE), task("shard", "shard", SERVE))
+
+    assert status == 0
+    assert story.lines == [
+        "shard: ready: serving", "actor: ready: serving", "actor: leaving", "shard: leaving"
+    ]  # fmt: skip
+
+
+def test_child_that_failed_is_started_again_with_growing_pauses():
+    """A crash is logged with its status, and each pause is twice the one before."""
+    story = Story("exit status 5", times=3)
+
+    story.run(task("shard", "shard", "raise SystemExit(5)"))
+
+    assert story.lines == [
+        f"shard: exit status 5; started again in {pause_s:.1f} s" for pause_s in (0.2, 0.4, 0.8)
+    ]
+
+
+def test_killed_child_is_started_again_by_name_of_the_signal():
+    """A child that was killed from outside is reported as such."""
+    story = Story("started again")
+
+    story.run(task("shard", "shard", "import os; os.kill(os.getpid(), 9)"))
+
+    assert "shard: ended by SIGKILL; started again in 0.2 s" in story.lines
+
+
+def test_actor_that_is_done_is_not_started_again():
+    """An actor that ends with status 0 has finished; the shards go on."""
+    story = Story("shard: beat", times=3)
+    beat = "import time; print('ready:')\nwhile True: print('beat'); time.sleep(0.3)"
+
+    story.run(task("shard", "shard", beat), task("once", "actor", "print('worked')"))
+
+    assert story.lines.count("once: worked") == 1
+    assert "once: done; it is not started again" in story.lines
+
+
+def test_shard_that_can_never_run_ends_everything():
+    """Status 2 is a wrong configuration: the run ends with status 1 and says which shard."""
+    story = Story("never")
+
+    status = story.run(task("good", "shard", SERVE), task("bad", "shard", "raise SystemExit(2)"))
+
+    assert status == 1
+    assert story.lines[-1] == ": stopped: shard bad cannot run"
+
+
+def test_second_signal_kills_what_does_not_leave():
+    """Whoever asks twice does not wait for a child that ignores SIGTERM."""
+    deaf = "import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('ready:'); signal.pause()"
+    story = Story("ready:")
+
+    story.run(task("deaf", "shard", deaf), count=lambda: 2)
+
+    assert "deaf: did not end in time and is killed" in story.lines
+
+
+def test_pids_name_the_running_children():
+    """Who looks on can find the processes."""
+    story = Story("ready:")
+    supervisor = Supervisor([task("shard", "shard", SERVE)], story)
+    seen = {}
+
+    def count():
+        seen.update(supervisor.pids())
+        return 1
+
+    supervisor.run(story.stop, count=count)
+
+    assert set(seen) == {"shard"}
+    assert supervisor.pids() == {}
+
+
+def test_child_ends_when_its_supervisor_was_killed(tmp_path):
+    """Even kill -9 of the supervisor leaves no child behind."""
+    child = (
+        "from enact_dist.supervise import end_with_supervisor; end_with_supervisor();"
+        "import os, signal; print('ready:', os.getpid()); signal.pause()"
+    )
+    code = (
+        "import sys, threading; from enact_dist.supervise import Supervisor, Task;"
+        f"Supervisor([Task('x', 'shard', (sys.executable, '-c', {child!r}))],"
+        "lambda name, line: print(line, flush=True)).run(threading.Event())"
+    )
+    above = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    try:
+        pid = int(above.stdout.readline().removeprefix("ready:"))
+        child_end = os.pidfd_open(pid)
+        above.kill()
+        above.wait()
+
+        import select
+
+        assert select.select([child_end], [], [], 10)[0] == [child_end]
+        os.close(child_end)
+    finally:
+        above.kill()
+        above.wait()
+        above.stdout.close()
+
+
+def test_child_of_a_supervisor_that_is_gone_refuses_to_start(monkeypatch):
+    """Between fork and the first line the supervisor may have died."""
+    from enact_dist.errors import EnactError
+
+    monkeypatch.setenv(supervise.SUPERVISOR_VARIABLE, "1")
+    monkeypatch.setattr(os, "getppid", lambda: 4711)
+    with pytest.raises(EnactError, match="is gone"):
+        supervise.end_with_supervisor()
