@@ -46,6 +46,9 @@ PAIRS_PER_VIEW: Final = 1500
 TRUNCATION_VOXELS: Final = 4.0
 """Reach of a measured surface into the grid: four spreads of the noise at 2 mm."""
 
+WITNESSES_MIN: Final = 2
+"""Views that must have seen a place; of three, the walls under a rim stay full of holes."""
+
 CARVED_M: Final = 2.0
 """Distance that stands for nothing there: beyond everything the arm can see of a product."""
 
@@ -76,7 +79,7 @@ def fuse_views(
         Surface in the product frame, outward normals, open where no view saw it.
 
     Raises:
-        ValueError: No view, another number of acquisitions, or nothing seen by three views.
+        ValueError: No view, another number of acquisitions, or nothing that two views saw.
     """
     if not views or len(views) != len(acquisitions):
         raise ValueError(
@@ -94,7 +97,7 @@ def fuse_views(
     )
     vertices, triangles = _large_pieces(mesh)
     if len(triangles) == 0:
-        raise ValueError(f"{len(views)} views have no surface that three of them saw")
+        raise ValueError(f"{len(views)} views have no surface that two of them saw")
     planes = _merged_planes(views, poses)
     return Surface(
         vertices_m=vertices.astype(np.float32),
@@ -254,7 +257,7 @@ def _integrated(frames: Sequence[tuple[Any, Any, Pose]], voxel_m: float) -> Any:
     blocks = tensor(np.unique(np.concatenate(touched), axis=0))
     for image, intrinsic, extrinsic in prepared:
         grid.integrate(blocks, image, intrinsic, extrinsic, 1.0, CARVED_M + 1.0, TRUNCATION_VOXELS)
-    return grid.extract_triangle_mesh(weight_threshold=2.5)
+    return grid.extract_triangle_mesh(weight_threshold=WITNESSES_MIN - 0.5)
 
 
 def _image(depth_m: npt.NDArray[np.floating]) -> Any:

@@ -113,12 +113,15 @@ def find_patches(
     return patch, np.array(planes).reshape(-1, 4)
 
 
-def grid_triangles(grid_m: npt.NDArray[np.float32], camera: Camera) -> npt.NDArray[np.int64]:
+def grid_triangles(
+    grid_m: npt.NDArray[np.float32], camera: Camera, *, broken: bool = False
+) -> npt.NDArray[np.int64]:
     """Join neighbouring pixels to triangles unless the surface breaks between them.
 
     Args:
         grid_m: (H, W, 3) float32, metres, camera frame, NaN off the object.
         camera: Gives the size of a pixel.
+        broken: Join also where the surface breaks, as a curtain hung over it would.
 
     Returns:
         (M, 3), flat pixel numbers, counter-clockwise seen from the camera.
@@ -134,7 +137,7 @@ def grid_triangles(grid_m: npt.NDArray[np.float32], camera: Camera) -> npt.NDArr
     near = np.minimum(np.minimum(one, other), third)
     step_max = far * (GRAZING_TANGENT / camera.fx_px) + 2.0 * spread_m(far)
     with np.errstate(invalid="ignore"):
-        return np.asarray(triangles[far - near < step_max])
+        return np.asarray(triangles[np.isfinite(far) if broken else far - near < step_max])
 
 
 def _window(mask: npt.NDArray[np.bool_], *, margin_px: int) -> tuple[slice, slice]:

@@ -7,16 +7,16 @@ import pytest
 
 pytest.importorskip("open3d", exc_type=ImportError)
 
-from actors.palletizing.conveyor import Conveyor  # noqa: E402
-from actors.palletizing.deviation import DeviationDetection  # noqa: E402
-from actors.palletizing.feedback import Feedback  # noqa: E402
-from actors.palletizing.fusion import Fusion  # noqa: E402
-from actors.palletizing.perception import OnlinePerception, TrainingPerception  # noqa: E402
-from actors.palletizing.planning import Planning  # noqa: E402
-from actors.palletizing.reconstruction import Reconstruction  # noqa: E402
-from actors.palletizing.sensor import open_sensor  # noqa: E402
-from actors.palletizing.simulation.packages import VERDICT_OF_KIND, package_sequence  # noqa: E402
-from actors.palletizing.vocabulary import (  # noqa: E402
+from actors.palletizing.conveyor import Conveyor
+from actors.palletizing.deviation import DeviationDetection
+from actors.palletizing.feedback import Feedback
+from actors.palletizing.fusion import Fusion
+from actors.palletizing.perception import OnlinePerception, TrainingPerception
+from actors.palletizing.planning import Planning
+from actors.palletizing.reconstruction import Reconstruction
+from actors.palletizing.sensor import open_sensor
+from actors.palletizing.simulation.packages import VERDICT_OF_KIND, package_sequence
+from actors.palletizing.vocabulary import (
     CLOUD,
     CONVEYOR,
     DEVIATIONS,
@@ -37,7 +37,7 @@ from actors.palletizing.vocabulary import (  # noqa: E402
     product_entity,
     view_entity,
 )
-from enact_dist import Lock, View, ViewEach, Write, testing  # noqa: E402
+from enact_dist import Lock, View, ViewEach, Write, testing
 
 SENSORS = "actors.palletizing.simulation.sensors"
 PACKAGE_COUNT, SEED = 10, 83

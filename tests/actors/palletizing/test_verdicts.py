@@ -7,15 +7,15 @@ import pytest
 
 pytest.importorskip("open3d", exc_type=ImportError)
 
-from actors.palletizing.evaluation import confusion, graded, judge  # noqa: E402
-from actors.palletizing.simulation.packages import (  # noqa: E402
+from actors.palletizing.evaluation import confusion, graded, judge
+from actors.palletizing.simulation.packages import (
     KINDS,
     VERDICT_OF_KIND,
     Truth,
     on_the_tray,
     package_sequence,
 )
-from actors.palletizing.simulation.sensors import SimulatedTraySensor  # noqa: E402
+from actors.palletizing.simulation.sensors import SimulatedTraySensor
 
 SEED = 22
 PRODUCTS = ("milk_carton", "meal_tray")

@@ -1,0 +1,196 @@
+"""`enact demo palletizing`: the whole cell as processes, watched from outside and scored.
+
+Two shard daemons and eight actors run as processes of their own under `enact up`; this process
+only looks: it shows progress, and at the end sets the verdicts beside the truth.  Files in `out`:
+
+===================  =========================================================
+model_<product>.png  the trained surface, each planar patch in its colour
+tray_<n>.png         each tray with the deviating regions in red
+report.json          the table
+cell.toml, cell.log  what ran, and what it said
+===================  =========================================================
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+import time
+from typing import TYPE_CHECKING, Any, Final
+
+from actors.geometry.files import write_whole
+from actors.geometry.picture import png_bytes
+from actors.palletizing.demo_cell import DemoError, RunningCell
+from actors.palletizing.demo_pictures import latest, model_picture, tray_picture
+from actors.palletizing.demo_report import report_bytes, rows_of, score_of, table_of
+from actors.palletizing.simulation.packages import package_sequence
+from actors.palletizing.vocabulary import (
+    DEVIATIONS,
+    EMPTY,
+    NOTICES,
+    OBSERVATION,
+    PLACES,
+    PLAN,
+    PRODUCTS,
+    REGION,
+    SCAN,
+    SURFACE,
+    SYSTEM,
+    TRAY,
+    USER,
+    VIEWS,
+    place_entity,
+)
+from enact_dist import View, ViewEach
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from rich.console import Console
+
+    from actors.palletizing.demo_report import Row
+    from actors.palletizing.simulation.packages import Package
+    from enact_dist import Cell
+
+LOOK_S: Final = 0.2
+"""How often the demonstration looks at the cell."""
+STALL_S: Final = 120.0
+"""Without any progress for this long something is wrong; a view takes less than a second."""
+SEED: Final = 59
+"""A seed whose first twelve packages show every kind of deviation."""
+
+
+def run_demo(*, out: Path, packages: int = 12, seed: int = SEED, keep_running: bool = False) -> int:
+    """Run the demonstration and report.
+
+    Args:
+        out: Folder for pictures and report; made if missing.
+        packages: How many packages come, at least 1.
+        seed: Seed of packages and sensors.
+        keep_running: Leave the cell up afterwards, until Ctrl-C.
+
+    Returns:
+        Exit status: 0 done, 1 the cell failed; wrong verdicts are the score's matter.
+    """
+    from rich.console import Console
+
+    console = Console(highlight=False)
+    if packages < 1:
+        print(f"--packages is {packages}; at least one has to come", file=sys.stderr)
+        return 1
+    started_s = time.monotonic()
+    out.mkdir(parents=True, exist_ok=True)
+    truths = package_sequence(packages, seed=seed)
+    try:
+        with RunningCell(out, packages=packages, seed=seed) as running, running.joined() as cell:
+            console.print(f"cell up: 2 shards, 8 actors, each a process; log in {running.log}")
+            _follow(cell, running, truths, console)
+            rows = _report(cell, out, truths, seed)
+            console.print()
+            console.print(table_of(rows))
+            console.print(f"\n{score_of(rows)}")
+            console.print(f"pictures in {out}; {time.monotonic() - started_s:.0f} s in all")
+            if keep_running:
+                console.print(f"the cell stays up: enact world tree --cell {running.config}")
+                _until_interrupted(running)
+    except DemoError as error:
+        print(f"enact demo: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def _follow(cell: Cell, running: RunningCell, truths: Sequence[Package], console: Console) -> None:
+    """Show progress until the user was told of every package.
+
+    Raises:
+        DemoError: The processes ended, or nothing moved for `STALL_S`.
+    """
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+
+    training, online = cell.world("training"), cell.world("online")
+    notices, scans = View(online, USER, NOTICES), ViewEach(training, PRODUCTS, SCAN)
+    told: set[str] = set()
+    trained: set[str] = set()
+    moved_s, before = time.monotonic(), (0, 0, 0)
+    columns = TextColumn("{task.description:<22}"), BarColumn(), MofNCompleteColumn()
+    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
+        views_bar = progress.add_task("training: views", total=None)
+        models_bar = progress.add_task("training: products", total=None)
+        packages_bar = progress.add_task("online: packages", total=len(truths))
+        while len(told) < len(truths):
+            running.check()
+            snapshot = online.view(notices).get(notices, {})
+            for place, notice in snapshot.items():
+                if place not in told:
+                    console.print(notice.text)
+            told |= snapshot.keys()
+            views = len(training.survey(VIEWS, ("surface",)))
+            models = {slot.entity.name for slot in training.survey(PRODUCTS, ("surface",))}
+            for product in sorted(models - trained):
+                console.print(f"{product} is trained")
+            trained |= models
+            orders = training.view(scans)[scans]
+            progress.update(views_bar, completed=views, total=sum(orders.values()) or None)
+            progress.update(models_bar, completed=len(models), total=len(orders) or None)
+            progress.update(packages_bar, completed=len(told))
+            now = views, len(models), len(told)
+            moved_s, before = (moved_s, before) if now == before else (time.monotonic(), now)
+            if time.monotonic() - moved_s > STALL_S:
+                raise DemoError(f"nothing moved for {STALL_S:.0f} s; see {running.log}")
+            time.sleep(LOOK_S)
+
+
+def _report(cell: Cell, out: Path, truths: Sequence[Package], seed: int) -> list[Row]:
+    """Read the outcome from the world contexts, write all files, return the rows."""
+    training, online = cell.world("training"), cell.world("online")
+    flags, notices = View(online, SYSTEM, DEVIATIONS), View(online, USER, NOTICES)
+    told = online.view(flags, notices)
+    rows = rows_of(truths, told[flags], told[notices])
+    contents = {out / "report.json": report_bytes(rows, seed=seed)}
+    surfaces = ViewEach(training, PRODUCTS, SURFACE)
+    for product, surface in training.view(surfaces)[surfaces].items():
+        name = product.name.removeprefix("product/")
+        contents[out / f"model_{name}.png"] = png_bytes(model_picture(name, surface))
+    for tray, picture in _tray_pictures(cell, told[flags]).items():
+        contents[out / f"tray_{tray + 1}.png"] = png_bytes(picture)
+    for stale in [*out.glob("tray_[0-9]*.png"), *out.glob("model_*.png")]:
+        stale.unlink()
+    write_whole(contents)
+    return rows
+
+
+def _tray_pictures(cell: Cell, flags: dict[str, Any]) -> dict[int, Any]:
+    """Return the picture of each tray, by its number."""
+    training, online = cell.world("training"), cell.world("online")
+    plans, empty = ViewEach(training, PLACES, PLAN), View(training, TRAY, EMPTY)
+    seen, regions = ViewEach(online, PLACES, OBSERVATION), ViewEach(online, PLACES, REGION)
+    reference, observed = training.view(plans, empty), online.view(seen, regions)
+    stops = {stop: place_entity(stop) for stop in range(len(flags))}
+    trays = {stop: reference[plans][place].tray for stop, place in stops.items()}
+    frames = {stop: observed[seen][place].frame for stop, place in stops.items()}
+    pictures = {}
+    for tray, frame in latest(frames, trays).items():
+        deviating = [
+            (place.name, flags[place.name], observed[regions][place])
+            for stop, place in stops.items()
+            if trays[stop] == tray and flags[place.name].verdict != "ok"
+        ]
+        pictures[tray] = tray_picture(frame, reference[empty].depth_mm, deviating)
+    return pictures
+
+
+def _until_interrupted(running: RunningCell) -> None:
+    """Wait for Ctrl-C or SIGTERM, or until the cell goes down by itself."""
+    over = threading.Event()
+    before = {
+        number: signal.signal(number, lambda *_: over.set())
+        for number in (signal.SIGINT, signal.SIGTERM)
+    }
+    try:
+        while not over.wait(1.0):
+            running.check()
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

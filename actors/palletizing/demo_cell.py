@@ -1,0 +1,171 @@
+"""The cell of one demonstration: its `cell.toml` and the processes that `enact up` starts.
+
+Rule a change must keep: every process ends with the demonstration, also when that is killed, and
+a run starts from an empty data folder of its own.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+import tomllib
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from actors.geometry.files import write_whole
+from enact_dist import connect
+from enact_dist.errors import LinkError
+
+if TYPE_CHECKING:
+    from types import TracebackType
+
+    from enact_dist import Cell
+
+TEMPLATE: Final = Path(__file__).with_name("cell.toml")
+UP_S: Final = 30.0
+"""How long the shards may take to answer; one needs half a second on an idle machine."""
+DOWN_S: Final = 20.0
+"""How long actors and shards may take to drain."""
+
+
+class DemoError(RuntimeError):
+    """The demonstration cannot go on; the message says where to look."""
+
+
+class RunningCell:
+    """The palletizing cell, up between entering and leaving the block.
+
+    Args:
+        out: Folder for `cell.toml` and `cell.log`.
+        packages: How many packages come.
+        seed: Seed of all simulated sensors.
+    """
+
+    def __init__(self, out: Path, *, packages: int, seed: int) -> None:
+        self.config = out / "cell.toml"
+        self.log = out / "cell.log"
+        self._packages, self._seed = packages, seed
+        self._data = Path()
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def __enter__(self) -> RunningCell:
+        self._data = Path(tempfile.mkdtemp(prefix="enact-palletizing-"))
+        text = configured(
+            TEMPLATE.read_text(), packages=self._packages, seed=self._seed, data=self._data
+        )
+        write_whole({self.config: text.encode()})
+        command = [sys.executable, "-m", "enact_dist.cli.main", "up", str(self.config)]
+        with self.log.open("wb") as log:
+            self._process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                env={**os.environ, "ENACT_SUPERVISOR_PID": str(os.getpid())},
+                process_group=0,  # Ctrl-C is this process's to pass on
+            )
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        if self._process is not None:
+            self._process.send_signal(signal.SIGTERM)
+            try:
+                self._process.wait(DOWN_S)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.wait()
+        shutil.rmtree(self._data, ignore_errors=True)
+
+    def joined(self) -> Cell:
+        """Join the cell as soon as its shards answer.
+
+        Raises:
+            DemoError: The processes ended, or no shard answered within `UP_S`.
+        """
+        deadline_s = time.monotonic() + UP_S
+        while True:
+            self.check()
+            try:
+                return connect(self.config, actor="demo", timeout_s=2.0)
+            except LinkError as error:
+                if time.monotonic() > deadline_s:
+                    raise DemoError(f"no shard within {UP_S:.0f} s: {error}") from error
+
+    def check(self) -> None:
+        """Raise `DemoError` with the end of the log if the processes are gone."""
+        if self._process is not None and self._process.poll() is not None:
+            lines = self.log.read_text(errors="replace").splitlines()[-8:]
+            raise DemoError("\n".join([f"the cell went down; the end of {self.log}:", *lines]))
+
+
+def configured(template: str, *, packages: int, seed: int, data: Path) -> str:
+    """Return a `cell.toml` for one run: free ports, own data folder, packages and seed.
+
+    Args:
+        template: The text of the `cell.toml` of the application.
+        packages: How many packages come.
+        seed: Seed of all simulated sensors.
+        data: Parent of the shards' folders.
+    """
+    config = tomllib.loads(template)
+    config["data_folder"] = str(data)
+    for shard, port in zip(
+        config["shards"].values(), _free_ports(len(config["shards"])), strict=True
+    ):
+        shard["listen"] = f"tcp/127.0.0.1:{port}"
+    sensors = "actors.palletizing.simulation.sensors"
+    overhead = f"{sensors}:tray_sensor?packages={packages}&seed={seed}"
+    actors = config["actors"]
+    actors["planning"]["options"]["packages"] = packages
+    actors["training-perception"]["options"] = {
+        "sensor": f"{sensors}:orbit_sensor?seed={seed}",
+        "tray_sensor": overhead,
+    }
+    actors["online-perception"]["options"] = {"sensor": overhead}
+    return _toml(config)
+
+
+def _free_ports(count: int) -> list[int]:
+    """Return ports of this host that nobody listens at; all are held until all are chosen."""
+    sockets = [socket.create_server(("127.0.0.1", 0)) for _ in range(count)]
+    try:
+        return [int(each.getsockname()[1]) for each in sockets]
+    finally:
+        for each in sockets:
+            each.close()
+
+
+def _toml(config: dict[str, Any]) -> str:
+    """Write tables of two levels, lists of tables and plain values as TOML."""
+    lines = [f"{key} = {_value(value)}" for key, value in config.items() if not _nested(value)]
+    for name, tables in config.items():
+        if isinstance(tables, dict):
+            named = [(f"[{name}.{key}]", table) for key, table in tables.items()]
+        else:
+            named = [(f"[[{name}]]", table) for table in tables] if _nested(tables) else []
+        for head, table in named:
+            lines += ["", head, *(f"{key} = {_value(value)}" for key, value in table.items())]
+    return "\n".join(lines) + "\n"
+
+
+def _nested(value: object) -> bool:
+    return isinstance(value, dict) or (isinstance(value, list) and isinstance(value[0], dict))
+
+
+def _value(value: object) -> str:
+    """Write one value; strings, numbers, truth values and lists of them look as in JSON."""
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{key} = {_value(item)}" for key, item in value.items()) + " }"
+    return json.dumps(value)

@@ -1,0 +1,133 @@
+"""Claims about the demonstration around the cell: its configuration, its report, its run."""
+
+import json
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("open3d", exc_type=ImportError)
+
+from actors.geometry.shapes import Surface
+from actors.palletizing.demo import SEED, run_demo
+from actors.palletizing.demo_cell import TEMPLATE, configured
+from actors.palletizing.demo_pictures import model_picture, tray_picture
+from actors.palletizing.demo_report import report_bytes, rows_of, score_of
+from actors.palletizing.feedback import sentence
+from actors.palletizing.simulation.packages import KINDS, package_sequence
+from actors.palletizing.simulation.products import product_mesh
+from actors.palletizing.vocabulary import Deviation, Notice
+
+
+def flag(verdict, product="milk_carton"):
+    return Deviation("package/1", product, verdict, 12.3, 450.0, 1.5, 0.4, 7)
+
+
+def test_cell_of_a_run_differs_only_in_what_a_run_chooses():
+    """Ports, data folder, packages and seed are the run's; all else is the shipped cell."""
+    shipped = tomllib.loads(TEMPLATE.read_text())
+
+    run = tomllib.loads(configured(TEMPLATE.read_text(), packages=5, seed=3, data=Path("/data")))
+
+    assert run["data_folder"] == "/data"
+    ports = {run["shards"][name].pop("listen") for name in ("left", "right")}
+    assert len(ports) == 2
+    for name in ("left", "right"):
+        shipped["shards"][name].pop("listen")
+    assert run["actors"]["planning"]["options"]["packages"] == 5
+    assert "packages=5&seed=3" in run["actors"]["online-perception"]["options"]["sensor"]
+    for config in (shipped, run):
+        config.pop("data_folder")
+        for actor in ("planning", "training-perception", "online-perception"):
+            config["actors"][actor].pop("options")
+    assert run == shipped
+
+
+def test_shipped_cell_fits_together():
+    """No two actors write one slot, every trigger is written, every option can be read."""
+    from enact_dist.actor_check import check_cell
+    from enact_dist.config import load_config
+
+    assert [f.text for f in check_cell(load_config(TEMPLATE)) if f.level == "error"] == []
+
+
+def test_default_seed_shows_every_deviation():
+    """The twelve packages of a plain run hold each kind of deviation and sound ones."""
+    kinds = [package.truth.kind for package in package_sequence(12, seed=SEED)]
+
+    assert set(kinds) == {"ok", *KINDS}
+
+
+def test_report_counts_wrong_verdicts_and_false_alarms():
+    """A sound package that was flagged is a false alarm; the score says so."""
+    packages = package_sequence(3, seed=SEED)
+    flags = {f"place/{stop}": flag("deformed") for stop in range(3)}
+    notices = {place: Notice("text", 7, 100.0) for place in flags}
+
+    rows = rows_of(packages, flags, notices)
+
+    sound = sum(package.truth.kind == "ok" for package in packages)
+    assert f"{sound} false alarms on {sound} sound packages" in score_of(rows)
+    assert json.loads(report_bytes(rows, seed=SEED))["right"] == sum(row.correct for row in rows)
+
+
+@pytest.mark.parametrize("verdict", ["ok", "missing", "extra", "moved", "deformed"])
+def test_sentence_names_place_and_product(verdict):
+    """Whatever was found, the user reads where and what."""
+    text = sentence("place/3", flag(verdict))
+
+    assert text.startswith("place/3: ")
+    assert "milk_carton" in text
+
+
+def test_model_picture_shows_faces_in_colours():
+    """Two planar patches have two colours, free form a third."""
+    vertices, triangles = product_mesh("milk_carton")
+    patch = np.where(vertices[:, 2] > 0.069, 0, np.where(vertices[:, 1] < -0.047, 1, -1))
+    surface = Surface(
+        vertices.astype(np.float32), triangles, patch.astype(np.int32), np.zeros((2, 4))
+    )
+
+    picture = model_picture("milk_carton", surface)
+
+    colourful = np.ptp(picture.astype(int), axis=2) > 40
+    assert colourful.mean() > 0.02
+
+
+def test_tray_picture_shows_the_region_in_red(tray):
+    """A deviating region is red in the picture, and nothing else is."""
+    frame = tray.capture_empty()
+    region = np.zeros(frame.depth_mm.shape, bool)
+    region[200:260, 300:360] = True
+
+    with_region = tray_picture(frame, frame.depth_mm, [("place/0", flag("missing"), region)])
+    without = tray_picture(frame, frame.depth_mm, [])
+
+    def red(picture):
+        return np.mean((picture[..., 0] > 150) & (picture[..., 1] < 110))
+
+    assert red(with_region) > 0.003
+    assert red(without) == 0.0
+
+
+def test_demo_refuses_to_run_without_packages(tmp_path, capsys):
+    """Nothing to judge is said so, before anything starts."""
+    assert run_demo(out=tmp_path / "out", packages=0) == 1
+    assert "--packages is 0" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_demo_runs_from_training_to_table(tmp_path, capsys):
+    """Ten processes train two products and judge three packages; table, pictures and report."""
+    status = run_demo(out=tmp_path, packages=3)
+
+    printed = capsys.readouterr().out
+    assert status == 0
+    assert "3 of 3 verdicts right" in " ".join(printed.split())
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert [row["correct"] for row in report["packages"]] == [True] * 3
+    for name in ("model_milk_carton.png", "model_meal_tray.png", "tray_1.png"):
+        assert (tmp_path / name).stat().st_size > 20_000
+    assert "Traceback" not in (tmp_path / "cell.log").read_text()
