@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -16,6 +17,22 @@ if TYPE_CHECKING:
 
     from enact_dist.cli.verbs import StopOnSignal
 
+_START: Final = """\
+import ctypes, os, signal, sys
+parent, *command = sys.argv[1:]
+ctypes.CDLL(None).prctl(1, signal.SIGKILL, 0, 0, 0)
+if os.getppid() != int(parent):
+    sys.exit(1)
+signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+signal.signal(signal.SIGXFSZ, signal.SIG_DFL)
+os.execvp(command[0], command)
+"""
+"""Runs the command so that it dies with us: the kernel keeps PR_SET_PDEATHSIG (1) over exec.
+
+A `preexec_fn` would do the same without 20 ms for an interpreter, but must not be used here, where
+Zenoh's threads run.
+"""
+
 GRACE_S: Final = 2.0
 """How long a command may react to SIGTERM once its lock is lost."""
 
@@ -25,7 +42,8 @@ class HeldCommand:
 
     The command leads a process group of its own, so that a shell's children end with it.  On a
     terminal that group is put into the foreground: Ctrl-C goes to the command, as if it had been
-    typed alone.
+    typed alone.  It dies with this process, however that ends; only while this process itself is
+    stopped (SIGSTOP) can it run on past the lease, as nobody is there to see the loss.
 
     Raises:
         ConfigError: There is no such command.
@@ -34,10 +52,10 @@ class HeldCommand:
     def __init__(self, command: Sequence[str]) -> None:
         self._foreground = sys.stdin.isatty()
         self._passed = 0
-        try:
-            self._process = subprocess.Popen(list(command), process_group=0)
-        except OSError as error:
-            raise ConfigError(f"cannot run {command[0]!r}: {error.strerror}") from error
+        if shutil.which(command[0]) is None:
+            raise ConfigError(f"cannot run {command[0]!r}: no such command")
+        start = [sys.executable, "-I", "-S", "-c", _START, str(os.getpid())]
+        self._process = subprocess.Popen([*start, *command], process_group=0)
 
     @property
     def status(self) -> int:

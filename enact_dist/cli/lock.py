@@ -180,6 +180,8 @@ def _hold(cell: Cell, arguments: argparse.Namespace, stop: StopOnSignal) -> int:
 
     items = [_item(cell, request, arguments.world) for request in arguments.requests]
     client = cell.world(items[0].context).session.client
+    entries = client.aspect_entries()
+    client.register(aspects=[entries[item.aspect] for item in items])  # a pattern is on every shard
     lock = client.acquire(
         items, wait_s=arguments.wait, hold_s=arguments.hold, check_plan=lambda: None
     )

@@ -98,6 +98,17 @@ def test_hold_kills_its_command_and_fails_when_the_lock_is_broken(at, spawn, unt
     assert "survived" not in rest
 
 
+def test_command_dies_with_whoever_held_its_lock(spawn, until, at, cell_file):
+    """Even kill -9 of `lock hold` leaves no command that believes it is locked."""
+    hold = spawn("lock", "hold", "--cell", cell_file, "online:piece/count:write", "--",
+                 "sh", "-c", "echo running; exec sleep 60")  # fmt: skip
+    until(hold, "running")
+    hold.kill()
+
+    # The pipe ends only when the command, which writes to it, is gone, too.
+    assert hold.stdout.read() == ""
+
+
 def test_hold_of_a_pattern_keeps_newcomers_out(at, cell, spawn, until, cell_file):
     """An entity with a star stands for all that match, those yet to come included."""
     hold = spawn("lock", "hold", "--cell", cell_file, "online:box/*/count:write", "--",
