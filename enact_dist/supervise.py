@@ -180,7 +180,11 @@ class Supervisor:
 
     def _say(self, name: str, line: str) -> None:
         with self._mutex:
-            self._sink(name, line)
+            try:
+                self._sink(name, line)
+            except BrokenPipeError:
+                # Nobody reads the log any more; that is no reason to stop a robot.
+                self._sink = _say_nothing
 
     def _of(self, kind: str) -> list[_Child]:
         return [child for child in self._children if child.task.kind == kind]
@@ -250,6 +254,10 @@ class Supervisor:
                 event.child.ended()
                 if event.status:
                     self._say(event.child.task.name, f"ended with status {event.status}")
+
+
+def _say_nothing(_name: str, _line: str) -> None:
+    pass
 
 
 def _once() -> int:

@@ -142,6 +142,7 @@ def test_check_reports_two_writers_with_status_1(module, enact, write_cell):
     assert "beat" in up.err
 
 
+@pytest.mark.slow
 def test_up_runs_the_cell_restarts_what_dies_and_drains_in_order(
     module, spawn, until, write_cell, enact
 ):

@@ -103,6 +103,20 @@ def test_second_signal_kills_what_does_not_leave():
     assert "deaf: did not end in time and is killed" in story.lines
 
 
+def test_children_go_on_when_nobody_reads_the_log():
+    """A closed pipe behind the log stops neither the children nor the orderly end."""
+    stop = threading.Event()
+    said = []
+
+    def say(name, line):
+        said.append(line)
+        stop.set()
+        raise BrokenPipeError
+
+    assert Supervisor([task("shard", "shard", SERVE)], say).run(stop) == 0
+    assert said == ["ready: serving"]
+
+
 def test_pids_name_the_running_children():
     """Who looks on can find the processes."""
     story = Story("ready:")
