@@ -1,7 +1,7 @@
 """Messages and data as bytes, pure: nothing here waits, reads a clock or opens a socket.
 
-The format, whole, so that another language can read it.  *array*, *map*, *int*, *str*, *bin*, *nil*
-and *ext* are msgpack's; all numbers outside msgpack are little-endian unless a dtype says otherwise.
+The format, whole, so that another language can read it (array, map, int, str, bin, nil and ext are
+msgpack's):
 
 **Frame**: one message.  A header and, where the message holds data, a payload (in Zenoh: the
 attachment and the payload of a query, reply or put).  The header is one msgpack array::
@@ -23,7 +23,7 @@ content is again msgpack:
 ====  ===========================================  ================================================
 ext   content                                      means
 ====  ===========================================  ================================================
-1     ``[dtype, shape, order, offset, length]``    array in the body, ``"C"`` rows or ``"F"`` columns
+1     ``[dtype, shape, order, offset, length]``    array in the body; order ``"C"`` or ``"F"``
 2     ``[offset, length]``                         bytes in the body (more than 256)
 3     ``[offset, length]``                         UTF-8 text in the body (more than 256 bytes)
 4     ``[name, [field names], [nodes]]``           dataclass; nil is allowed for a field

@@ -164,9 +164,11 @@ def test_codec_can_be_registered_again_under_its_name():
             self.size = size
 
     register_codec(Grid, "grid", encode=lambda _: 0, decode=Grid)
+    assert decode_datum(encode_datum([Grid(5)], list[Grid]), list[Grid])[0].size == 0
     register_codec(Grid, "grid", encode=lambda grid: grid.size, decode=Grid)
 
     assert decode_datum(encode_datum(Grid(5), Grid), Grid).size == 5
+    assert decode_datum(encode_datum([Grid(5)], list[Grid]), list[Grid])[0].size == 5
 
 
 def test_codec_name_belongs_to_one_type():

@@ -105,6 +105,18 @@ def test_frame_with_a_field_of_another_type_is_refused(cls):
             )
 
 
+@pytest.mark.parametrize("entry", [1, None, 1.5, b"a", True, ["a"]])
+def test_frame_with_a_list_of_other_types_is_refused(entry):
+    """The entries of a list are checked too: texts here, integers in a holder's list."""
+    waits_for = "a" if entry == 1 and entry is not True else entry
+    holder = [list(LOCK), 1, "a", "h", 1, True, "w", 0, 0, 0, [], [7, waits_for]]
+
+    with pytest.raises(ProtocolError, match="a list of str"):
+        decode_frame(header_of(13, ["online", entry], [], []))
+    with pytest.raises(ProtocolError, match="a list of int"):
+        decode_frame(header_of(49, 1, [holder]))
+
+
 @pytest.mark.parametrize("cls", CLASSES, ids=lambda cls: cls.__name__)
 def test_frame_with_a_field_more_or_less_is_refused(cls):
     """The number of fields is part of the version."""

@@ -240,6 +240,8 @@ def test_datum_moves_long_text_and_bytes_into_the_body():
     """Up to 256 bytes stay in the tree; longer ones are referred to."""
     assert encode_datum("x" * INLINE_BYTES_MAX, str).size == 0
     assert encode_datum("x" * (INLINE_BYTES_MAX + 1), str).body == b"x" * (INLINE_BYTES_MAX + 1)
+    assert encode_datum("ü" * (INLINE_BYTES_MAX // 2), str).size == 0
+    assert encode_datum("ü" * (INLINE_BYTES_MAX // 2 + 1), str).size == INLINE_BYTES_MAX + 2
     assert encode_datum(b"x" * (INLINE_BYTES_MAX + 1), bytes).size == INLINE_BYTES_MAX + 1
 
 
@@ -443,6 +445,13 @@ def test_datum_of_a_changed_dataclass_is_refused_with_both_sides():
     class Pose2:
         matrix: np.ndarray
 
+    @dataclass(frozen=True)
+    class Other:
+        world_from_body: np.ndarray
+        valid: bool
+
+    with pytest.raises(DatumTypeError, match=r"asked Other\(world_from_body, valid\), .* Pose\("):
+        decode_datum(sent, Other)
     Pose2.__name__ = Pose2.__qualname__ = "Pose"
     with pytest.raises(
         DatumTypeError, match=r"asked Pose\(matrix\), .* holds Pose\(world_from_body, valid\)"
