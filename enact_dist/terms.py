@@ -34,7 +34,7 @@ NAME_LENGTH_MAX: Final = 200
 """Longest name of an entity, aspect or world context; keeps every key of the wire below 1 kB."""
 
 _SEGMENT = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.\-]*\Z")
-_PATTERN_SEGMENT = re.compile(r"(?:\*\*|[A-Za-z0-9_*][A-Za-z0-9_.\-*]*)\Z")
+_PATTERN_SEGMENT = re.compile(r"(?:\*\*|(?!.*\*\*)[A-Za-z0-9_*][A-Za-z0-9_.\-*]*)\Z")
 
 
 def checked_name(kind: str, name: object, *, slashes: bool) -> str:
@@ -170,6 +170,12 @@ def _segment_overlaps(one: str, other: str) -> bool:
 
 def _pattern_source(pattern: str) -> str:
     segments = pattern.split("/")
+    # "**/**" stands for what "**" does.
+    segments = [
+        s
+        for s, before in zip(segments, ["", *segments], strict=False)
+        if (s, before) != ("**", "**")
+    ]
     source = ""
     for index, segment in enumerate(segments):
         last = index == len(segments) - 1

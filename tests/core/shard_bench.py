@@ -108,9 +108,7 @@ class ShardBench:
             self.ask(Register("admin", (), ASPECTS))
 
     def _boot(self, recovered: Recovered) -> None:
-        self.shard = Shard(
-            self.settings, recovered, now_ns=self.now_ns, wall_ns=self.wall_ns
-        )
+        self.shard = Shard(self.settings, recovered, now_ns=self.now_ns, wall_ns=self.wall_ns)
 
     # ---------------------------------------------------------------- messages
 
@@ -240,7 +238,11 @@ class ShardBench:
         return answer
 
     def commit(
-        self, lock: LockId, token: Token, *writes: tuple[Slot, str | None], expects: dict[Slot, int] | None = None
+        self,
+        lock: LockId,
+        token: Token,
+        *writes: tuple[Slot, str | None],
+        expects: dict[Slot, int] | None = None,
     ) -> Answer | None:
         """Commit values under a lock."""
         items = tuple(WriteItem(s, None if text is None else datum(text)) for s, text in writes)

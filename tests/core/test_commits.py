@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from shard_bench import S, datum, item, lock_id, slot
 
 from enact_dist.core.messages import (
     OUTCOME_EXPIRED,
@@ -17,7 +18,6 @@ from enact_dist.core.messages import (
 )
 from enact_dist.core.records import OutcomeRecord, SlotRecord
 from enact_dist.terms import Access, Durability
-from shard_bench import S, datum, item, lock_id, slot
 
 R, W, V, WE = Access.READ, Access.WRITE, Access.VIEW, Access.WRITE_EACH
 ANN, BOB = lock_id("ann"), lock_id("bob")

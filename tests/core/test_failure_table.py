@@ -6,6 +6,8 @@ restarts, a message is lost, a message comes twice or late, the lease ends.
 
 from __future__ import annotations
 
+from shard_bench import MS, TTL_NS, S, ShardBench, item, lock_id, slot
+
 from enact_dist.core.messages import (
     OUTCOME_COMMITTED,
     OUTCOME_PENDING,
@@ -28,7 +30,6 @@ from enact_dist.core.messages import (
 )
 from enact_dist.core.records import SessionSeen, Tick
 from enact_dist.terms import Access
-from shard_bench import MS, TTL_NS, S, ShardBench, item, lock_id, slot
 
 READ, WRITE = item(Access.READ), item(Access.WRITE)
 ANN, BOB = lock_id("ann"), lock_id("bob")
@@ -416,12 +417,12 @@ class TestCommit:
         bench.disk_is_done = False
         bench.commit(ANN, grant.token, (slot(), "2"))
         assert bench.commit(ANN, grant.token, (slot(), "2")) is None
-        first, second = sorted(bench.answers)[-1] + 1, sorted(bench.answers)[-1] + 2
+        last = max(bench.answers)
 
         bench.finish_disk()
 
-        assert isinstance(bench.answers[first], Committed)
-        assert bench.answers[first] == bench.answers[second]
+        assert isinstance(bench.answers[last + 1], Committed)
+        assert bench.answers[last + 1] == bench.answers[last + 2]
 
     def test_outcome_in_flight_is_pending(self, bench):
         """Lost answer: while the disk works nobody can say more than pending."""

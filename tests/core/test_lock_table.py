@@ -180,13 +180,15 @@ class _Plain:
 
 
 def _clash(some, others):
-    return any(others.get(resource) in CONFLICTS[mode] for resource, mode in some.items() if resource in others)
+    return any(
+        others.get(resource) in CONFLICTS[mode]
+        for resource, mode in some.items()
+        if resource in others
+    )
 
 
 LINE = st.tuples(st.sampled_from([R, W, RE, WE]), st.sampled_from(["a", "b", "c"]))
-STEP = st.one_of(
-    st.lists(LINE, min_size=1, max_size=3), st.integers(min_value=0, max_value=30)
-)
+STEP = st.one_of(st.lists(LINE, min_size=1, max_size=3), st.integers(min_value=0, max_value=30))
 
 
 @settings(max_examples=300, deadline=None)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from shard_bench import MS, TTL_NS, S, item, lock_id, slot
+
 from enact_dist.core.beliefs import shortened_ns
 from enact_dist.core.datum import Datum
 from enact_dist.core.messages import (
@@ -15,8 +17,8 @@ from enact_dist.core.messages import (
     Commit,
     Committed,
     EpochChanged,
-    Fetch,
     Fenced,
+    Fetch,
     Gone,
     Goodbye,
     Granted,
@@ -38,7 +40,6 @@ from enact_dist.core.messages import (
 )
 from enact_dist.core.records import Drain, SessionEnded, SessionSeen
 from enact_dist.terms import Access
-from shard_bench import MS, TTL_NS, S, item, lock_id, slot
 
 R, W, V = Access.READ, Access.WRITE, Access.VIEW
 ANN, BOB = lock_id("ann"), lock_id("bob")

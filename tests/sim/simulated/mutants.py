@@ -13,9 +13,8 @@ from enact_dist.core.beliefs import Sendings
 from enact_dist.core.client import Client
 from enact_dist.core.commits import Commits
 from enact_dist.core.datum import Token
-from enact_dist.core.lock_desk import LockDesk
 from enact_dist.core.lock_table import Mode
-from enact_dist.core.messages import Commit, KeepAlive, Released
+from enact_dist.core.messages import Commit, KeepAlive
 from enact_dist.core.multilock import MultiLock, Phase
 from enact_dist.core.records import Persist, Reply
 from enact_dist.core.session_desk import SessionDesk
@@ -123,20 +122,6 @@ def believes_from_newest_sending(patch: Patch) -> None:
     patch(Sendings, "believe_until_ns", wrong)
 
 
-def view_counts_without_renewing(patch: Patch) -> None:
-    """A view is counted as a sign of life that the lease does not know of."""
-    on_take_view = LockDesk.on_take_view
-
-    def wrong(self: LockDesk, message: Any, reply_to: int) -> Any:
-        session = self._state.sessions.by_id.get(message.lock.session)
-        before_ns = session.renewed_ns if session else 0
-        yield from on_take_view(self, message, reply_to)
-        if session:
-            session.renewed_ns = before_ns
-
-    patch(LockDesk, "on_take_view", wrong)
-
-
 def no_record_of_outcomes(patch: Patch) -> None:
     """A repeated commit or question finds no record of the first."""
     patch(Commits, "_recorded", lambda _commits, _lock: None)
@@ -225,19 +210,7 @@ def welcomes_early(patch: Patch) -> None:
 
 def stamps_follow_the_wall_clock(patch: Patch) -> None:
     """Stamps are what the wall clock says, also when it was set back."""
-    patch(Stamps, "next", lambda _stamps, *, seen_ns, wall_ns: wall_ns)
-
-
-def releases_in_flight(patch: Patch) -> None:
-    """A late release ends a commit that the disk works on."""
-
-    def wrong(self: LockDesk, message: Any, reply_to: int) -> Any:
-        tenure = self._state.tenures.by_lock.get(message.lock)
-        if tenure is not None:
-            yield from self._state.tenures.remove(tenure, now_ns=self._state.now_ns)
-        yield Reply(reply_to, Released())
-
-    patch(LockDesk, "on_release", wrong)
+    patch(Stamps, "next", lambda _stamps, *, wall_ns, **_options: wall_ns)
 
 
 def numbers_start_anew(patch: Patch) -> None:
@@ -271,7 +244,6 @@ ALL = (
     no_grace,
     keeps_old_grants,
     believes_from_newest_sending,
-    view_counts_without_renewing,
     no_record_of_outcomes,
     guesses_lost_answers,
     no_reconciliation,
@@ -283,7 +255,6 @@ ALL = (
     skips_validation,
     welcomes_early,
     stamps_follow_the_wall_clock,
-    releases_in_flight,
     numbers_start_anew,
     retries_with_another_commit,
 )
