@@ -6,6 +6,7 @@ import enum
 import subprocess
 import sys
 from dataclasses import dataclass
+from pathlib import Path as Folder
 from typing import Any, ClassVar, Optional
 
 import numpy as np
@@ -82,8 +83,9 @@ def test_fingerprint_is_the_structure(datum_type, text):
 
 def test_fingerprint_is_the_same_in_another_process():
     """Nothing of hashing or import order is in it."""
+    folder = Folder(__file__).resolve().parent
     script = (
-        "import sys; sys.path[:0] = ['tests/wire']\n"
+        f"import sys; sys.path[:0] = {[str(folder), str(folder.parents[1])]}\n"
         "from enact_dist.wire.fingerprint import fingerprint\n"
         "from test_codecs_fingerprint import Path\n"
         "print(fingerprint(Path))"
