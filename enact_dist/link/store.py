@@ -81,6 +81,7 @@ LOG_BYTES: Final = 8 << 20
 """About so much is written to the log before it is carried into the database."""
 _ROW_LOG_BYTES: Final = 8 << 10
 _FULL_ERRNOS: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
+_DENIED_ERRNOS: Final = frozenset({errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR})
 
 
 def open_store(folder: Path, *, unix_s: int) -> tuple[Store, Recovered]:
@@ -361,15 +362,22 @@ def open_memory_store(*, unix_s: int) -> tuple[MemoryStore, Recovered]:
 def _store_error(folder: Path, failure: OSError | sqlite3.Error) -> StoreError:
     """Return what an operator must read about an error of the system."""
     path = str(getattr(failure, "filename", None) or folder)
-    full = (
-        failure.errno in _FULL_ERRNOS
-        if isinstance(failure, OSError)
-        else getattr(failure, "sqlite_errorcode", 0) == sqlite3.SQLITE_FULL
-    )
-    if full:
-        text = f"no room for the data of {folder} ({failure}): free space on its disk, or raise its"
-        text += " quota, and start the shard again"
+    code = getattr(failure, "sqlite_errorcode", 0) & 0xFF
+    number = failure.errno if isinstance(failure, OSError) else None
+    if number in _FULL_ERRNOS or code == sqlite3.SQLITE_FULL:
+        found = f"no room for the data of {folder}"
+        remedy = "free space on its disk, or raise its quota"
+    elif code in {sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED}:
+        found = f"the database in {folder} is open in another program"
+        remedy = "close that one (a database browser, a backup)"
+    elif number in _DENIED_ERRNOS or code in {sqlite3.SQLITE_READONLY, sqlite3.SQLITE_CANTOPEN}:
+        found = f"{folder} cannot be written by this process"
+        remedy = "let the folder and all in it belong to the user that runs the shard"
     else:
-        text = f"the disk or file system below {folder} fails ({failure}): look at the system's log"
-        text += " and start the shard again when it is sound"
-    return StoreError(f"{text}; everything acknowledged before is kept", path=path)
+        found = f"the disk or file system below {folder} fails"
+        remedy = "look at the system's log, make it sound"
+    return StoreError(
+        f"{found} ({failure}): {remedy}, and start the shard again; everything acknowledged before"
+        " is kept",
+        path=path,
+    )

@@ -188,6 +188,19 @@ def test_flipped_bit_in_a_row_is_refused_by_its_checksum(closed):
     assert "checksum is wrong" in str(refusal(closed))
 
 
+def test_row_that_drops_out_of_its_page_is_refused(closed):
+    """A page that says it has one row fewer: no row is wrong, one is missing."""
+    path = closed / "store.db"
+    sound = path.read_bytes()
+    leaves = [begin for begin in range(4096, len(sound), 4096) if sound[begin] == 0x0D]
+    assert leaves
+    for begin in leaves:
+        spoilt = bytearray(sound)
+        spoilt[begin + 4] -= 1
+        path.write_bytes(spoilt)
+        assert "store.db is damaged" in str(refusal(closed))
+
+
 def test_row_that_was_changed_by_hand_is_refused(closed):
     """A row with a wrong version, type or place does not pass for a record."""
     for change in (
@@ -273,11 +286,52 @@ def test_power_cut_may_leave_a_hole_behind_the_last_forced_batch(tmp_path):
     assert found == {"kept": 1, "later": 1}
 
 
+def test_power_cut_may_take_any_of_the_unforced_frames(tmp_path):
+    """40 seeded subsets of the frames behind the last forced batch: a prefix from there on."""
+    folder = tmp_path / "folder"
+    store, _ = open_store(folder, unix_s=1)
+    store.write([persist(slot_record("e", 1))])
+    begin = (folder / "store.db-wal").stat().st_size
+    for version in range(2, 9):
+        records = [slot_record(f"{name}{version}", version) for name in "ab"]
+        store.write([persist(slot_record("e", version), *records, durability=Durability.OS)])
+    shutil.copytree(folder, tmp_path / "cut")
+    store.close()
+    log = (tmp_path / "cut" / "store.db-wal").read_bytes()
+    rng = random.Random(8)
+    reached = set()
+    for _ in range(40):
+        copy = tmp_path / "copy"
+        shutil.copytree(tmp_path / "cut", copy)
+        spoilt = bytearray(log)
+        for offset in range(begin, len(log), FRAME_BYTES):
+            if rng.random() < 0.2:
+                spoilt[offset : offset + FRAME_BYTES] = bytes(FRAME_BYTES)
+        (copy / "store.db-wal").write_bytes(spoilt)
+        after_power_cut(copy)
+        found = {record.slot.entity: record.version for record in reopened(copy).slots}
+        last = found["e"]
+        later = {f"{name}{version}": version for name in "ab" for version in range(2, last + 1)}
+        assert found == {"e": last} | later
+        reached.add(last)
+        shutil.rmtree(copy)
+    assert len(reached) > 3
+
+
 def test_power_cut_does_not_excuse_a_hole_before_a_forced_batch(crashed):
     """The mark says that a batch behind the hole was forced: refused, power cut or not."""
     flip(crashed / "store.db-wal", frame_offset(frames_of(crashed) // 2) + 50)
     after_power_cut(crashed)
     assert "cut or damaged at its end" in str(refusal(crashed))
+
+
+def test_database_in_use_by_another_program_is_refused_as_such(closed):
+    """A database browser that holds the file is named as the cause, not a broken disk."""
+    browser = sqlite3.connect(closed / "store.db", isolation_level=None)
+    browser.execute("BEGIN EXCLUSIVE")
+    assert "is open in another program" in str(refusal(closed))
+    browser.close()
+    reopened(closed)
 
 
 def test_mark_that_cannot_be_read_excuses_nothing(crashed):
