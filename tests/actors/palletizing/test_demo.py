@@ -99,10 +99,12 @@ def test_tray_picture_shows_the_region_in_red(tray):
     """A deviating region is red in the picture, and nothing else is."""
     frame = tray.capture_empty()
     region = np.zeros(frame.depth_mm.shape, bool)
-    region[200:260, 300:360] = True
+    region[180:290, 280:390] = True
 
-    with_region = tray_picture(frame, frame.depth_mm, [("place/0", flag("missing"), region)])
-    without = tray_picture(frame, frame.depth_mm, [])
+    with_region = tray_picture(
+        frame, frame.depth_mm, [("place/0", flag("missing"), region)], size_px=(480, 360)
+    )
+    without = tray_picture(frame, frame.depth_mm, [], size_px=(480, 360))
 
     def red(picture):
         return np.mean((picture[..., 0] > 150) & (picture[..., 1] < 110))

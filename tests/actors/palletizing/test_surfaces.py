@@ -5,6 +5,9 @@ import pytest
 
 o3d = pytest.importorskip("open3d", exc_type=ImportError)
 
+from scipy.ndimage import binary_erosion  # noqa: E402
+
+from actors.geometry.depth import points_grid  # noqa: E402
 from actors.geometry.deviation import inspect_place  # noqa: E402
 from actors.geometry.fusion import fuse_views, refined_poses  # noqa: E402
 from actors.geometry.poses import inverse, moved, on_tray, small_motion, yaw_between, yaw_of  # noqa: E402
@@ -57,7 +60,7 @@ def test_triangles_do_not_bridge_an_edge():
     """No triangle joins a product's top to what is seen past its edge."""
     depth = np.full(VGA.shape, 0.60, np.float32)
     depth[:, 320:] = 0.64
-    grid = render_free(depth)
+    grid = grid_of(depth)
 
     view = reconstruct_view(PointCloud(grid.reshape(-1, 3)), VGA)
 
@@ -65,9 +68,7 @@ def test_triangles_do_not_bridge_an_edge():
     assert (corners.max(axis=1) - corners.min(axis=1)).max() < 0.03
 
 
-def render_free(depth_m: np.ndarray) -> np.ndarray:
-    from actors.geometry.depth import points_grid
-
+def grid_of(depth_m: np.ndarray) -> np.ndarray:
     return points_grid(depth_m, VGA)
 
 
@@ -97,7 +98,7 @@ def test_refined_poses_fit_better_than_the_robot():
 
 def test_refined_poses_keep_to_the_prior_where_views_say_nothing():
     """Views of one plane alone leave three freedoms open: those poses stay where they were."""
-    grid = render_free(np.full(VGA.shape, 0.5, np.float32))[100:300:4, 200:400:4]
+    grid = grid_of(np.full(VGA.shape, 0.5, np.float32))[100:300:4, 200:400:4]
     rows = np.arange(50 * 50).reshape(50, 50)
     a, b, c = rows[:-1, :-1].ravel(), rows[1:, :-1].ravel(), rows[:-1, 1:].ravel()
     view = Surface.free_form(grid.reshape(-1, 3), np.column_stack([a, b, c]))
@@ -141,9 +142,9 @@ def test_fusion_refuses_views_without_poses():
 def test_registration_finds_a_shifted_product(trained, product):
     """A product 40 mm and 25 degrees off its place is found within 3 mm and 2 degrees."""
     true = on_tray(0.08, -0.12, 0.5)
-    cloud = seen_from_above(product, true)
+    cloud, outline = seen_from_above(product, true)
 
-    found = register(cloud, trained(product), on_tray(0.05, -0.09, 0.1)).tray_from_product
+    found = register(cloud, outline, trained(product), on_tray(0.05, -0.09, 0.1)).tray_from_product
 
     assert np.hypot(*(found[:2, 3] - true[:2, 3])) < 0.003
     assert abs(yaw_between(yaw_of(found), 0.5)) < np.deg2rad(2.0)
@@ -151,32 +152,33 @@ def test_registration_finds_a_shifted_product(trained, product):
 
 def test_registration_of_a_symmetric_product_takes_the_nearer_turn(trained):
     """A tray that looks the same after half a turn is not taken for a turned one."""
-    cloud = seen_from_above("meal_tray", on_tray(0.0, 0.1, 0.02))
+    cloud, outline = seen_from_above("meal_tray", on_tray(0.0, 0.1, 0.02))
 
-    found = register(cloud, trained("meal_tray"), on_tray(0.0, 0.1, 0.0)).tray_from_product
+    found = register(cloud, outline, trained("meal_tray"), on_tray(0.0, 0.1, 0.0)).tray_from_product
 
     assert abs(yaw_of(found)) < np.deg2rad(5.0)
 
 
 def test_registration_is_upright(trained):
     """Height and tilt are the tray's: the result turns about z only and stays on it."""
-    cloud = seen_from_above("milk_carton", on_tray(0.0, 0.0, 0.3))
+    cloud, outline = seen_from_above("milk_carton", on_tray(0.0, 0.0, 0.3))
 
-    found = register(cloud, trained("milk_carton"), np.eye(4)).tray_from_product
+    found = register(cloud, outline, trained("milk_carton"), np.eye(4)).tray_from_product
 
     np.testing.assert_allclose(found[2], [0.0, 0.0, 1.0, 0.0], atol=1e-12)
 
 
-def seen_from_above(product: str, pose: np.ndarray) -> PointCloud:
-    """Points of a true product as an overhead sensor of 1.7 mm spread has them, tray frame."""
+def seen_from_above(product: str, pose: np.ndarray) -> tuple[PointCloud, np.ndarray]:
+    """Points and outline of a true product as an overhead sensor has them, tray frame."""
     above = np.diag([1.0, -1.0, -1.0, 1.0])
     above[2, 3] = 0.95
-    depth = render_depth(
-        [(Surface.free_form(*product_mesh(product)), pose)], Acquisition(VGA, above)
-    )
+    true = Surface.free_form(*product_mesh(product))
+    depth = render_depth([(true, pose)], Acquisition(VGA, above))
+    known = np.isfinite(depth)
     depth += np.random.default_rng(4).normal(0.0, 0.0017, depth.shape).astype(np.float32)
-    points = moved(render_free(depth)[np.isfinite(depth)], above)
-    return PointCloud(points[points[:, 2] > 0.01].astype(np.float32))
+    points = moved(grid_of(depth).reshape(-1, 3), above).reshape(*depth.shape, 3)
+    outline = points[known & ~binary_erosion(known)][:, :2]
+    return PointCloud(points[known].astype(np.float32)), outline
 
 
 def test_pieces_are_matched_once_and_within_reach():
