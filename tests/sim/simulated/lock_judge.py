@@ -21,6 +21,7 @@ class LockJudge:
 
     def __init__(self, world: World) -> None:
         self._fail = world.violation
+        self._waits: dict[str, dict[LockId, list[LockId]]] = {}
 
     def judge(self, host: ShardHost, message: object, picture: Picture) -> None:
         """Note who came, went and was granted, and whether that was right."""
@@ -80,18 +81,34 @@ class LockJudge:
                 self._fail("leases and hold limits end", lock, tenure.hold_end_ns, lease_end_ns)
 
     def _check_waiters(self, host: ShardHost, picture: Picture) -> None:
-        """Whoever waits does so for somebody who holds or came earlier (P6)."""
+        """Whoever waits does so for somebody who holds or came earlier, and nobody in a circle."""
         state = host.shard.state
-        if state.sessions.in_grace(state.now_ns):
-            return
         everybody = list(state.tenures.by_lock.values())
+        waits = self._waits[host.name] = {}
         for waiter in everybody:
             if waiter.token is not None:
                 continue
             arrival = picture.arrivals[waiter.lock]
-            if not any(
-                conflict(waiter.items, other.items, columns=True)
+            waits[waiter.lock] = [
+                other.lock
                 for other in everybody
-                if other.token is not None or picture.arrivals[other.lock] < arrival
-            ):
+                if (other.token is not None or picture.arrivals[other.lock] < arrival)
+                and conflict(waiter.items, other.items, columns=True)
+            ]
+            if not waits[waiter.lock] and not state.sessions.in_grace(state.now_ns):
                 self._fail("P6 nobody waits in vain", waiter.lock, waiter.items)
+        for waiter in waits:
+            self._check_circle(waiter)
+
+    def _check_circle(self, first: LockId) -> None:
+        """Follow who waits for whom over all shards, as they last looked at the time."""
+        reached, ahead = {first}, [first]
+        while ahead:
+            lock = ahead.pop()
+            for waits in self._waits.values():
+                for other in waits.get(lock, ()):
+                    if other == first:
+                        self._fail("no deadlock", first, self._waits)
+                    if other not in reached:
+                        reached.add(other)
+                        ahead.append(other)

@@ -15,13 +15,14 @@ from enact_dist.core.commits import Commits
 from enact_dist.core.datum import Token
 from enact_dist.core.lock_table import Mode
 from enact_dist.core.messages import Commit, KeepAlive
-from enact_dist.core.multilock import MultiLock, Phase
+from enact_dist.core.multilock import MultiLock, Phase, Plan
 from enact_dist.core.records import Persist, Reply
 from enact_dist.core.session_desk import SessionDesk
 from enact_dist.core.sessions import Lane, Session, SessionTable
+from enact_dist.core.slots import Content
 from enact_dist.core.stamps import Stamps
 from enact_dist.core.tenures import Tenure, Tenures
-from enact_dist.terms import Durability
+from enact_dist.terms import Durability, NullReason
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -233,6 +234,62 @@ def retries_with_another_commit(patch: Patch) -> None:
     patch(MultiLock, "_on_outcome", lambda lock, _answer, _now_ns: lock._end(Phase.LOST))
 
 
+def shows_before_it_is_kept(patch: Patch) -> None:
+    """Readers see a commit while the disk still works on it."""
+    make_durable = Commits._make_durable
+
+    def wrong(self: Commits, commit: Any, *, now_ns: int) -> Any:
+        for write, (slot, version) in zip(commit.writes, commit.outcome.versions, strict=True):
+            stamp_ns = commit.outcome.position.stamp_ns
+            self._slots.set(slot, Content(version, stamp_ns, write.datum, NullReason.DELETED))
+        yield from make_durable(self, commit, now_ns=now_ns)
+
+    patch(Commits, "_make_durable", wrong)
+
+
+def takes_old_grants(patch: Patch) -> None:
+    """A client takes a late grant of an epoch that is over."""
+    on_acquiring = MultiLock._on_acquiring
+
+    def wrong(self: MultiLock, shard: str, answer: Any, now_ns: int) -> None:
+        peer = self.client._peer(shard)
+        known, peer.epoch = peer.epoch, getattr(answer, "epoch", peer.epoch)
+        on_acquiring(self, shard, answer, now_ns)
+        peer.epoch = known
+
+    patch(MultiLock, "_on_acquiring", wrong)
+
+
+def asks_shards_in_the_order_of_the_request(patch: Patch) -> None:
+    """A lock over several shards acquires them in the order in which they are named."""
+    plan = Client.plan
+
+    def wrong(self: Client, items: Any) -> Plan:
+        sorted_plan = plan(self, items)
+        first = {item.entity: number for number, item in enumerate(items)}
+        locks = sorted(sorted_plan.locks, key=lambda part: first[part[1][0].entity])
+        return Plan(tuple(locks), sorted_plan.views)
+
+    patch(Client, "plan", wrong)
+
+
+def keeps_one_outcome_per_session(patch: Patch) -> None:
+    """The outcome table forgets a thread's commit when another thread commits."""
+    recorded = Commits._recorded
+    newest: dict[str, Any] = {}
+    apply = Commits._apply
+
+    def applying(self: Commits, commit: Any, *, now_ns: int) -> Any:
+        newest[commit.tenure.lock.session] = commit.tenure.lock
+        yield from apply(self, commit, now_ns=now_ns)
+
+    def wrong(self: Commits, lock: Any) -> Any:
+        return recorded(self, lock) if newest.get(lock.session, lock) == lock else None
+
+    patch(Commits, "_apply", applying)
+    patch(Commits, "_recorded", wrong)
+
+
 ALL = (
     no_fence,
     expires_early,
@@ -257,4 +314,8 @@ ALL = (
     stamps_follow_the_wall_clock,
     numbers_start_anew,
     retries_with_another_commit,
+    shows_before_it_is_kept,
+    takes_old_grants,
+    asks_shards_in_the_order_of_the_request,
+    keeps_one_outcome_per_session,
 )

@@ -45,7 +45,7 @@ class Network:
         self.faults = faults
         self._through_wire = through_wire
         self._cuts: dict[tuple[str, str], int] = {}
-        self.set_off: Callable[[Host, Host], bool] = lambda _source, _target: False
+        self.set_off: Callable[[Host, Host], int | None] = lambda _source, _target: 0
 
     def cut(self, source: Host, target: Host, *, duration_ns: int) -> None:
         """Let nothing pass from one host to another for a while."""
@@ -70,13 +70,14 @@ class Network:
         world.tally["messages"] += 1
         if self._through_wire:
             message = passed_through_wire(message)
+        late_ns: int | None = 0
         decisive = faults.triggered and isinstance(message, DECISIVE)
-        if decisive and random.random() < faults.triggered and self.set_off(source, target):
-            return
+        if decisive and random.random() < faults.triggered:
+            late_ns = self.set_off(source, target)
         if self.is_cut(source, target):
             world.tally["cut"] += 1
             return
-        if faults.loss and random.random() < faults.loss:
+        if late_ns is None or (faults.loss and random.random() < faults.loss):
             world.tally["lost"] += 1
             return
         copies = 1
@@ -84,7 +85,7 @@ class Network:
             copies = 2
             world.tally["duplicated"] += 1
         for _ in range(copies):
-            delay_ns = random.randrange(MS // 10, 2 * MS)
+            delay_ns = late_ns + random.randrange(MS // 10, 2 * MS)
             if faults.delay and random.random() < faults.delay:
                 delay_ns += int(random.expovariate(1 / 0.8) * 1e9)
                 world.tally["delayed"] += 1

@@ -261,25 +261,24 @@ class Scenario:
 
     # ---------------------------------------------------------------- faults by state
 
-    def _set_off(self, source: Host, target: Host) -> bool:
-        """Let something happen at a decisive message; return whether the message is lost."""
+    def _set_off(self, source: Host, target: Host) -> int | None:
+        """Let something happen at a decisive message; return how late it is, None if lost."""
         random, world = self.world.random, self.world
         if world.now_ns >= FAULTS_NS:
-            return False
+            return 0
         world.tally["faults set off"] += 1
-        kind = random.choice(("lose", "pause", "crash", "partition", "twice"))
+        kind = random.choice(("lose", "late", "pause", "crash", "late, crash", "partition"))
         host = random.choice((source, target))
         if kind == "lose":
-            world.tally["lost"] += 1
-            return True
+            return None
         if kind == "pause":
             self._pause(host)
-        elif kind == "crash":
-            shard = next(h for h in (source, target) if isinstance(h, ShardHost))
-            world.after(random.choice((0, MS // 2, MS, 3 * MS)), lambda: self._crash(shard))
         elif kind == "partition":
             self.network.cut(target, source, duration_ns=random.choice((300 * MS, self.ttl_ns)))
-        return False
+        if "crash" in kind:
+            shard = next(h for h in (source, target) if isinstance(h, ShardHost))
+            world.after(random.choice((0, MS // 2, MS, 3 * MS)), lambda: self._crash(shard))
+        return random.choice((50 * MS, 300 * MS, self.ttl_ns)) if "late" in kind else 0
 
     def _on_persist(self, host: ShardHost) -> None:
         random = self.world.random
