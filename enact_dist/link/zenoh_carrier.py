@@ -125,6 +125,7 @@ class ZenohCarrier:
         self._pid = os.getpid()
         self._closed = False
         self._mutex = threading.Lock()
+        self._inside = _Inside()
         self._links: list[_Link] = []
         self._link_of: dict[str, _Link] = {}
         self._endpoints_of: dict[str, tuple[str, ...]] = {}
@@ -150,10 +151,11 @@ class ZenohCarrier:
             ProtocolError: An answer cannot be read, or two daemons answer for one shard.
             MisuseError: The carrier is closed or was opened before a fork.
         """
-        self._check_usable()
-        replies = self._send(shard, message, timeout_s)
-        self._check_answered_once()
-        return self._receive(shard, replies)
+        with self._inside:
+            self._check_usable()
+            replies = self._send(shard, message, timeout_s)
+            self._check_answered_once()
+            return self._receive(shard, replies)
 
     def request_all(
         self, requests: Sequence[tuple[str, Request]], *, timeout_s: float
@@ -164,11 +166,12 @@ class ZenohCarrier:
             ProtocolError: As `request`.
             MisuseError: As `request`.
         """
-        self._check_usable()
-        sent = [(shard, self._send(shard, message, timeout_s)) for shard, message in requests]
-        for _ in sent:
-            self._check_answered_once()
-        return [self._receive(shard, replies) for shard, replies in sent]
+        with self._inside:
+            self._check_usable()
+            sent = [(shard, self._send(shard, message, timeout_s)) for shard, message in requests]
+            for _ in sent:
+                self._check_answered_once()
+            return [self._receive(shard, replies) for shard, replies in sent]
 
     def _send(
         self, shard: str, message: Request, timeout_s: float
@@ -325,6 +328,33 @@ class ZenohCarrier:
             close_session(link.session)
         for pump in pumps:
             pump.thread.join(JOIN_S)
+        # A thread that comes back from Zenoh while the interpreter ends would abort the process.
+        self._inside.wait_empty(JOIN_S)
+
+
+class _Inside:
+    """Counts the threads that are inside Zenoh, so that an end can wait for them."""
+
+    __slots__ = ("_changed", "_count")
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition(threading.Lock())
+        self._count = 0
+
+    def __enter__(self) -> None:
+        with self._changed:
+            self._count += 1
+
+    def __exit__(self, *_: object) -> None:
+        with self._changed:
+            self._count -= 1
+            if not self._count:
+                self._changed.notify_all()
+
+    def wait_empty(self, timeout_s: float) -> bool:
+        """Wait until no thread is inside; say whether that came true in time."""
+        with self._changed:
+            return self._changed.wait_for(lambda: not self._count, timeout_s)
 
 
 def _pump(notices: zenoh.Handler[zenoh.Sample], feed: NoticeQueue) -> None:
