@@ -167,7 +167,15 @@ def _after_fork() -> None:
 
 
 def _at_exit() -> None:
-    """Close what was left open: the interpreter would wait for it for ever."""
+    """Close what was left open: the interpreter would wait for it for ever.
+
+    Carriers first: they wait for the threads that are inside Zenoh, which must not come back while
+    the interpreter ends (that aborts the process).
+    """
+    for owner in (*_owners,):
+        close = getattr(owner, "close", None)
+        if close is not None:
+            close()
     for _, session in (*_open_sessions,):
         close_session(session)
 
