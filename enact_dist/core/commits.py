@@ -150,7 +150,9 @@ class Commits:
             yield Reply(reply_to, refusal)
             return
         assert tenure is not None
-        moved = next((e for e in message.expects if self._newest_version(e.slot) != e.version), None)
+        moved = next(
+            (e for e in message.expects if self._newest_version(e.slot) != e.version), None
+        )
         if moved is not None:
             self._count("commits_changed")
             yield from self._tenures.remove(tenure, now_ns=now_ns)
@@ -214,7 +216,10 @@ class Commits:
             changes.append(Change(slot, version, stamp_ns, write.datum is None))
         lanes = self._sessions.lanes_of(lock.session)
         if lanes is not None:
-            lanes.setdefault(lock.lane, Lane()).outcome = outcome
+            lane = lanes.setdefault(lock.lane, Lane())
+            # A commit whose client gave up may end after a newer one of its lane.
+            if lane.outcome is None or lane.outcome.lock.seq < lock.seq:
+                lane.outcome = outcome
         yield from self._tenures.remove(commit.tenure, now_ns=now_ns)
         self._count("commits")
         self._count("bytes_written", sum(w.datum.size for w in commit.writes if w.datum))

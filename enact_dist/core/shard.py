@@ -54,6 +54,7 @@ from enact_dist.core.records import (
 )
 from enact_dist.core.session_desk import SessionDesk
 from enact_dist.core.shard_state import ShardSettings, ShardState
+from enact_dist.core.tenures import WAIT_SLICE_NS_MAX
 from enact_dist.terms import Durability
 
 if TYPE_CHECKING:
@@ -182,7 +183,8 @@ class Shard:
 
     def _on_await_stamp(self, message: AwaitStamp, reply_to: int) -> Iterator[Effect]:
         self._parked_stamps[reply_to] = message
-        self._parked_stamp_ends[reply_to] = self.state.now_ns + max(0, message.wait_ns)
+        wait_ns = max(0, min(message.wait_ns, WAIT_SLICE_NS_MAX))
+        self._parked_stamp_ends[reply_to] = self.state.now_ns + wait_ns
         yield from self._answer_reached()
 
     def _answer_reached(self) -> Iterator[Effect]:

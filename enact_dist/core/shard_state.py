@@ -27,6 +27,9 @@ if TYPE_CHECKING:
 FETCH_BYTES_MAX: Final = 4 << 20
 """Largest part of a datum in one answer, so that small answers never wait long behind it."""
 
+ANSWER_FETCHES: Final = 2
+"""The small data of one grant may have as many bytes as two fetched parts of a large one."""
+
 
 @dataclass(frozen=True, slots=True)
 class ShardSettings:
@@ -69,7 +72,9 @@ class ShardState:
         self.draining = False
         self.counters: dict[str, int] = {}
         self.pins: dict[LockId, dict[tuple[Slot, int], Datum]] = {}
-        self.slots = SlotMap(recovered.slots)
+        self.slots = SlotMap(
+            recovered.slots, answer_bytes_max=ANSWER_FETCHES * settings.fetch_bytes_max
+        )
         self.catalogue = Catalogue(
             configured=settings.aspects,
             recovered=recovered.aspects,

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 INLINE_BYTES_MAX: Final = 64 * 1024
 """Data up to this size travel with the grant; larger ones are fetched when they are read."""
+ANSWER_BYTES_MAX: Final = 8 << 20
+"""So many bytes of small data travel with one grant; a pattern's further ones count as large."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,9 +43,12 @@ NOTHING: Final = Content(0, 0, None, NullReason.NEVER_SET)
 class SlotMap:
     """All slots of one shard by context and aspect."""
 
-    __slots__ = ("_columns", "bytes", "count")
+    __slots__ = ("_answer_bytes_max", "_columns", "bytes", "count")
 
-    def __init__(self, recovered: Iterable[SlotRecord]) -> None:
+    def __init__(
+        self, recovered: Iterable[SlotRecord], *, answer_bytes_max: int = ANSWER_BYTES_MAX
+    ) -> None:
+        self._answer_bytes_max = answer_bytes_max
         self._columns: dict[Column, dict[str, Content]] = {}
         self.count = 0
         self.bytes = 0
@@ -92,21 +97,31 @@ class SlotMap:
     def states(self, items: Iterable[Item]) -> list[SlotState]:
         """Return what a grant or view shows of `items`: slots in order, patterns expanded."""
         found: list[SlotState] = []
+        left = self._answer_bytes_max
         for item in items:
-            if Access(item.access).each:
-                column = Column(item.context, item.aspect)
-                found += [
-                    state_of(slot, content)
-                    for slot, content in self.matching(column, item.entity)
-                    if content.datum is not None
-                ]
-            else:
-                slot = Slot(item.context, item.entity, item.aspect)
-                found.append(state_of(slot, self[slot], known=item.known))
+            for slot, content in self._shown_by(item):
+                state = state_of(slot, content, known=item.known, inline_max=left)
+                if state.datum is not None:
+                    left -= state.datum.size
+                found.append(state)
         return found
 
+    def _shown_by(self, item: Item) -> Iterable[tuple[Slot, Content]]:
+        if not Access(item.access).each:
+            slot = Slot(item.context, item.entity, item.aspect)
+            return ((slot, self[slot]),)
+        matching = self.matching(Column(item.context, item.aspect), item.entity)
+        return [(slot, content) for slot, content in matching if content.datum is not None]
 
-def state_of(slot: Slot, content: Content, *, known: int = 0, with_datum: bool = True) -> SlotState:
+
+def state_of(
+    slot: Slot,
+    content: Content,
+    *,
+    known: int = 0,
+    with_datum: bool = True,
+    inline_max: int = INLINE_BYTES_MAX,
+) -> SlotState:
     """Return what travels of a slot: its datum where that is small and not known already."""
     datum = content.datum
     if datum is None:
@@ -114,7 +129,7 @@ def state_of(slot: Slot, content: Content, *, known: int = 0, with_datum: bool =
             slot, content.version, content.stamp_ns, 0, None, False, False, content.null_reason.name
         )
     same = with_datum and known == content.version > 0
-    large = datum.size > INLINE_BYTES_MAX
+    large = datum.size > min(INLINE_BYTES_MAX, max(0, inline_max))
     if same or not with_datum:
         shown = None
     else:
