@@ -13,6 +13,7 @@ from enact_dist.reading import slot_of
 from enact_dist.terms import Entity, LockRequest, World
 
 if TYPE_CHECKING:
+    import threading
     from collections.abc import Mapping
 
 T = TypeVar("T")
@@ -29,6 +30,7 @@ class ActorLock(Lock):
         entity: The triggering entity, if there is one.
         wait_s: As for `Lock`.
         hold_s: As for `Lock`.
+        stop: Ends the waiting for the lock within 0.2 s once it is set.
     """
 
     def __init__(
@@ -38,8 +40,10 @@ class ActorLock(Lock):
         entity: Entity | None,
         wait_s: float,
         hold_s: float,
+        stop: threading.Event | None = None,
     ) -> None:
         super().__init__(*bound.values(), wait_s=wait_s, hold_s=hold_s)
+        self._interrupt = stop
         self._entity = entity
         self._bound = bound
 
@@ -76,6 +80,10 @@ class ActorLock(Lock):
     def expect(self, view: LockRequest[Any]) -> None:
         """`Lock.expect` of a declared request."""
         super().expect(self._own(view))
+
+    def is_null(self, request: LockRequest[Any]) -> bool:
+        """`Lock.is_null` of a declared request."""
+        return super().is_null(self._own(request))
 
     def version(self, request: LockRequest[Any]) -> int:
         """`Lock.version` of a declared request."""

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator, MutableMapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeVar, overload
 
@@ -27,7 +26,10 @@ from enact_dist.errors import (
     ReadonlyError,
 )
 from enact_dist.reading import EachData, Readings, check_requested, slot_of
+from enact_dist.session import session_of
 from enact_dist.terms import Access, Entity, refuse_duplicates
+from enact_dist.wire.limits import BODY_BYTES_MAX, ITEMS_MAX
+from enact_dist.writable import WritableEach
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -35,7 +37,6 @@ if TYPE_CHECKING:
 
     from enact_dist.core.datum import Position
     from enact_dist.core.multilock import MultiLock
-    from enact_dist.session import Session
     from enact_dist.terms import (
         Aspect,
         LockRequest,
@@ -53,9 +54,12 @@ _thread = threading.local()
 
 
 def refuse_inside_lock(what: str) -> None:
-    """Raise `LockHeldError` if this thread holds a lock: `what` waits, and so could wait for it."""
+    """Raise `LockHeldError` if this thread holds a lock: `what` waits, and so could wait for it.
+
+    A lock that was left in another thread, or that a forked child inherited, is not held here.
+    """
     held: Lock | None = getattr(_thread, "lock", None)
-    if held is not None:
+    if held is not None and held.running:
         raise LockHeldError(
             f"{what} inside a lock would hold and wait; this thread holds {held!r};"
             " leave its block first"
@@ -110,6 +114,11 @@ class Lock:
     ) -> None:
         if not requests:
             raise MisuseError("a lock of nothing: name at least one request")
+        if len(requests) > ITEMS_MAX:
+            raise MisuseError(
+                f"a lock of {len(requests)} requests; at most {ITEMS_MAX}: name a pattern"
+                " (ReadEach, WriteEach, ViewEach) instead"
+            )
         if not wait_s >= 0.0:
             raise MisuseError(f"wait_s is {wait_s!r}; it must be 0 or more seconds")
         if not 0.0 < hold_s <= HOLD_S_MAX:
@@ -122,9 +131,12 @@ class Lock:
         self._requests = {request: request for request in requests}
         self._wait_s, self._hold_s = wait_s, hold_s
         self._lock: MultiLock | None = None
-        self._over = False
+        self._asking = self._over = False
+        self._interrupt: threading.Event | None = None
         self._readings: Readings
+        self._each: dict[LockRequest[Any], EachData[Any]] = {}
         self._writes: dict[Slot, Datum | None] = {}
+        self._edits = self._bytes = 0
         self._expects: dict[Slot, SlotVersion] = {}
         self._entity: Entity | None = None
         self._asked_s = self._granted_s = self._ended_s = 0.0
@@ -132,29 +144,47 @@ class Lock:
 
     # ---------------------------------------------------------------- the block
 
+    @property
+    def running(self) -> bool:
+        """Whether the lock is asked for or held in this process."""
+        asked = self._asking or self._lock is not None
+        return asked and not self._over and not self._session.client.forked
+
     def __enter__(self) -> Lock:
-        if self._lock is not None:
-            raise LockReleasedError(f"{self!r} was used already; make a new lock")
         refuse_inside_lock("a second lock")
-        self._session.client.check_usable()
+        if self._lock is not None or self._asking:
+            raise LockReleasedError(f"{self!r} was used already; make a new lock")
+        client = self._session.client
+        client.check_usable()
         aspects = {request.aspect.name: request.aspect for request in self._requests}
-        self._session.register_aspects(aspects.values())
-        _thread.lock = self
+        self._session.register_aspects(
+            aspects.values(), requests=self._requests, wait_s=self._wait_s
+        )
+        begun: list[MultiLock] = []
         self._asked_s = time.monotonic()
         try:
-            self._lock = self._session.client.acquire(
+            self._asking = True
+            _thread.lock = self
+            lock = client.acquire(
                 [self._session.item_of(request) for request in self._requests],
                 wait_s=self._wait_s,
                 hold_s=self._hold_s,
                 check_plan=self._check_one_writing_shard,
+                interrupt=self._interrupt,
+                begun=begun,
             )
+            self._granted_s = time.monotonic()
+            self._readings = Readings(
+                client, self._session.cache, lock.lock, lock.states, self._use
+            )
+            self._lock = lock
+            self._asking = False
         except BaseException:
-            _thread.lock = None
+            _thread.lock = self._lock = None
+            self._asking = False
+            if begun:
+                client.release(begun[-1])  # only does something if interrupted after the grant
             raise
-        self._granted_s = time.monotonic()
-        self._readings = Readings(
-            self._session.client, self._session.cache, self._lock.lock, self._lock.states, self._use
-        )
         return self
 
     def __exit__(
@@ -163,18 +193,22 @@ class Lock:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        assert self._lock is not None
-        _thread.lock = None
-        self._over = True
-        self._ended_s = time.monotonic()
-        client = self._session.client
-        if client.forked:
-            return
-        if kind is not None:
-            client.release(self._lock)
-            return
-        client.finish(self._lock, self._writes_by_shard(), tuple(self._expects.values()))
-        self.position = self._lock.position
+        lock, client = self._lock, self._session.client
+        if lock is None or self._over:
+            raise LockReleasedError(f"{self!r} is not held, so it cannot be left")
+        try:
+            self._over = True
+            self._ended_s = time.monotonic()
+            if getattr(_thread, "lock", None) is self:
+                _thread.lock = None
+            if kind is None:
+                client.check_usable()
+                client.finish(lock, self._writes_by_shard(), tuple(self._expects.values()))
+                self.position = lock.position
+        finally:
+            # After a commit this is nothing; after an exception, an interrupt too, nothing is held.
+            if not client.forked:
+                client.release(lock)
 
     def _check_one_writing_shard(self) -> None:
         slots = [slot_of(r) for r in self._requests if r.access is Access.WRITE]
@@ -193,6 +227,7 @@ class Lock:
         """Raise unless the block is running and the lock not known to be lost."""
         if self._lock is None or self._over:
             raise LockReleasedError(f"{self!r} is used outside its `with` block")
+        self._session.client.check_usable()
         if self._lock.phase is not Phase.HELD:
             self.check()
 
@@ -213,14 +248,27 @@ class Lock:
             LeaseLostError: The lock is lost.
         """
         self._check(request)
-        if request.access is Access.WRITE_EACH:
-            return WritableEach(self, self._readings, request)
         if request.access.each:
-            return EachData(self._readings, request)
+            return self._each_data(request)
         slot = slot_of(request)
         if slot in self._writes:
             return self._written(slot, request.aspect)
         return self._readings.value(slot, request.aspect)
+
+    def _each_data(self, request: LockRequest[T]) -> EachData[T]:
+        """Return the mapping of a pattern, made once: `lock[each][entity]` is used in loops."""
+        data = self._each.get(request)
+        if data is None:
+            writable = request.access is Access.WRITE_EACH
+            data = (
+                WritableEach(self, self._readings, request)
+                if writable
+                else EachData(self._readings, request)
+            )
+            self._each[request] = data
+        if isinstance(data, WritableEach):
+            data.follow()
+        return data
 
     @overload
     def get(self, request: LockRequestOne[T]) -> T | None: ...
@@ -233,6 +281,11 @@ class Lock:
         if self._is_null(slot):
             return default
         return self[request]
+
+    def is_null(self, request: LockRequestOne[Any]) -> bool:
+        """Whether the datum is null; fetches nothing."""
+        self._check(request)
+        return self._is_null(slot_of(request))
 
     def _is_null(self, slot: Slot) -> bool:
         if slot in self._writes:
@@ -272,8 +325,27 @@ class Lock:
     def _put(self, slot: Slot, aspect: Aspect[T], datum: T, *, stamp_ns: int = 0) -> None:
         from enact_dist.wire.payload import encode_datum
 
-        self._session.refuse_several_shards([*self._writes, slot])
-        self._writes[slot] = encode_datum(datum, aspect.datum_type, stamp_ns=stamp_ns)
+        self._refuse_second_shard(slot)
+        self._note_write(slot, encode_datum(datum, aspect.datum_type, stamp_ns=stamp_ns))
+
+    def _note_write(self, slot: Slot, datum: Datum | None) -> None:
+        old = self._writes.get(slot)
+        size = self._bytes - (old.size if old else 0) + (datum.size if datum else 0)
+        if slot not in self._writes and len(self._writes) >= ITEMS_MAX:
+            raise MisuseError(f"one lock writes at most {ITEMS_MAX} data; use several locks")
+        if size > BODY_BYTES_MAX:
+            raise MisuseError(
+                f"the writes of one lock have {size} bytes; at most {BODY_BYTES_MAX}: use several"
+                " locks"
+            )
+        self._writes[slot] = datum
+        self._bytes = size
+        self._edits += 1
+
+    def _refuse_second_shard(self, slot: Slot) -> None:
+        """Raise if `slot` lies elsewhere than what is written already, which is on one shard."""
+        first = next(iter(self._writes), slot)
+        self._session.refuse_several_shards([first, slot])
 
     def __delitem__(self, request: Write[Any]) -> None:
         """Write null when the block ends cleanly."""
@@ -281,8 +353,8 @@ class Lock:
         self._delete(slot_of(request))
 
     def _delete(self, slot: Slot) -> None:
-        self._session.refuse_several_shards([*self._writes, slot])
-        self._writes[slot] = None
+        self._refuse_second_shard(slot)
+        self._note_write(slot, None)
 
     def expect(self, view: View[Any]) -> None:
         """Let the commit fail with `ChangedError` if the viewed slot has moved on by then.
@@ -385,91 +457,3 @@ class Lock:
 
     def __repr__(self) -> str:
         return f"Lock({', '.join(map(repr, self._requests))})"
-
-
-class WritableEach(EachData[T], MutableMapping[Entity, T]):
-    """The data of a `WriteEach` by entity; assigning one publishes it when the block ends.
-
-    Assigning to an entity that did not exist creates it: the pattern is locked, so nobody else
-    could have.
-    """
-
-    def __init__(self, lock: Lock, readings: Readings, request: LockRequest[T]) -> None:
-        super().__init__(readings, request)
-        self._lock = lock
-        for slot, datum in lock._writes.items():  # noqa: SLF001 - one class in two parts
-            if (slot.context, slot.aspect) == (request.address[0], request.address[2]):
-                self._note(Entity(slot.entity), slot, null=datum is None)
-
-    def _note(self, entity: Entity, slot: Slot, *, null: bool) -> None:
-        if null:
-            self._slots.pop(entity, None)
-        else:
-            self._slots[entity] = slot
-
-    def _slot(self, entity: Entity) -> Slot:
-        context, pattern, aspect = self._request.address
-        if not isinstance(entity, Entity):
-            raise MisuseError(f"a pattern's data are set by Entity, not by {entity!r}")
-        from enact_dist.terms import pattern_matches
-
-        if not pattern_matches(pattern, entity.name):
-            raise MisuseError(f"{entity.name!r} does not match {pattern!r}, which is locked")
-        return Slot(context, entity.name, aspect)
-
-    def __getitem__(self, entity: Entity) -> T:
-        slot = self._slots.get(entity)
-        if slot is None:
-            raise KeyError(entity)
-        if slot in self._lock._writes:  # noqa: SLF001
-            return self._lock._written(slot, self._request.aspect)  # noqa: SLF001
-        return super().__getitem__(entity)
-
-    def __setitem__(self, entity: Entity, datum: T) -> None:
-        self.put(entity, datum)
-
-    def put(self, entity: Entity, datum: T, *, stamp_ns: int = 0) -> None:
-        """Set one entity's datum when the block ends cleanly; see `Lock.put`."""
-        slot = self._slot(entity)
-        self._lock._use()  # noqa: SLF001
-        self._lock._put(slot, self._request.aspect, datum, stamp_ns=stamp_ns)  # noqa: SLF001
-        self._note(entity, slot, null=False)
-
-    def __delitem__(self, entity: Entity) -> None:
-        if entity not in self._slots:
-            raise KeyError(entity)
-        slot = self._slot(entity)
-        self._lock._use()  # noqa: SLF001
-        self._lock._delete(slot)  # noqa: SLF001
-        self._note(entity, slot, null=True)
-
-    def __iter__(self) -> Iterator[Entity]:
-        return iter(list(self._slots))
-
-
-def session_of(requests: tuple[LockRequest[Any], ...]) -> Session:
-    """Return the one cell session that all requests belong to.
-
-    Raises:
-        MisuseError: A request names an unbound role, or two cells are mixed.
-    """
-    from enact_dist.terms import LockRequest
-
-    sessions: list[Session] = []
-    for request in requests:
-        if not isinstance(request, LockRequest):
-            raise MisuseError(f"{request!r} is no lock request; use Read, Write, View or …Each")
-        session = getattr(request.world, "session", None)
-        if session is None:
-            raise MisuseError(
-                f"{request!r} names {request.world!r}, which is a role and not a world context of"
-                " a cell; use cell.world(name), or run the actor with its roles bound"
-            )
-        if not request.access.each and not isinstance(request.entity, Entity):
-            raise MisuseError(
-                f"{request!r} names a pattern; outside an actor use {type(request).__name__}Each"
-            )
-        sessions.append(session)
-    if any(session is not sessions[0] for session in sessions):
-        raise MisuseError("one lock names world contexts of two connections; connect once")
-    return sessions[0]

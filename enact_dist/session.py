@@ -8,6 +8,8 @@ from enact_dist.core.messages import AspectEntry, Item
 from enact_dist.core.placement import shard_of
 from enact_dist.errors import MisuseError
 from enact_dist.link.fetching import DatumCache
+from enact_dist.link.session_client import CALL_S, FINISH_S
+from enact_dist.terms import Entity, LockRequest
 from enact_dist.wire.fingerprint import fingerprint
 
 if TYPE_CHECKING:
@@ -15,7 +17,7 @@ if TYPE_CHECKING:
 
     from enact_dist.core.datum import Slot
     from enact_dist.link.client import CellClient
-    from enact_dist.terms import Aspect, LockRequest
+    from enact_dist.terms import Aspect
 
 
 class Session:
@@ -26,13 +28,41 @@ class Session:
         self.cache = DatumCache()
         self._entries: dict[int, tuple[Aspect[Any], AspectEntry]] = {}
 
-    def register_aspects(self, aspects: Iterable[Aspect[Any]]) -> None:
-        """Make sure that all shards know these aspects with these datum types.
+    def register_aspects(
+        self,
+        aspects: Iterable[Aspect[Any]],
+        *,
+        requests: Iterable[LockRequest[Any]] | None = None,
+        wait_s: float = FINISH_S,
+    ) -> None:
+        """Make sure that shards know these aspects with these datum types.
+
+        Args:
+            aspects: The aspects.
+            requests: What they are wanted for: only the shards of these are asked; None: all.
+            wait_s: How long the caller would wait; no shard gets less than one call's time.
 
         Raises:
             DatumTypeError: A shard knows one with another type.
+            ShardUnreachableError: A shard that is asked does not answer.
         """
-        self.client.register(aspects=[self._entry(aspect) for aspect in aspects])
+        entries = [self._entry(aspect) for aspect in aspects]
+        timeout_s = min(FINISH_S, max(wait_s, CALL_S))
+        if requests is None:
+            self.client.register(aspects=entries)
+        else:
+            self.client.register(
+                aspects=entries, needed=lambda: self.shards_of(requests), timeout_s=timeout_s
+            )
+
+    def shards_of(self, requests: Iterable[LockRequest[Any]]) -> set[str]:
+        """Return the shards on which the requests lie; a pattern lies on all."""
+        shards: set[str] = set()
+        for request in requests:
+            if request.access.each:
+                return set(self.client.shards())
+            shards.add(shard_of(str(request.entity), self.client.core.placement))
+        return shards
 
     def _entry(self, aspect: Aspect[Any]) -> AspectEntry:
         """Return the aspect's catalogue entry; computed once per aspect object."""
@@ -75,3 +105,29 @@ class Session:
                 " shard at a time: pin these entities to one shard ([placement] in cell.toml) or"
                 " write them in separate locks"
             )
+
+
+def session_of(requests: tuple[LockRequest[Any], ...]) -> Session:
+    """Return the one cell session that all requests belong to.
+
+    Raises:
+        MisuseError: A request names an unbound role, or two cells are mixed.
+    """
+    sessions: list[Session] = []
+    for request in requests:
+        if not isinstance(request, LockRequest):
+            raise MisuseError(f"{request!r} is no lock request; use Read, Write, View or …Each")
+        session = getattr(request.world, "session", None)
+        if session is None:
+            raise MisuseError(
+                f"{request!r} names {request.world!r}, which is a role and not a world context of"
+                " a cell; use cell.world(name), or run the actor with its roles bound"
+            )
+        if not request.access.each and not isinstance(request.entity, Entity):
+            raise MisuseError(
+                f"{request!r} names a pattern; outside an actor use {type(request).__name__}Each"
+            )
+        sessions.append(session)
+    if any(session is not sessions[0] for session in sessions):
+        raise MisuseError("one lock names world contexts of two connections; connect once")
+    return sessions[0]

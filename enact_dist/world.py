@@ -12,10 +12,12 @@ from typing import TYPE_CHECKING, Any, TypeVar, overload
 from enact_dist.core.datum import Position
 from enact_dist.core.messages import Survey, Surveyed
 from enact_dist.errors import MisuseError, NullDatumError, ProtocolError
-from enact_dist.lock import Lock, refuse_inside_lock, session_of
+from enact_dist.lock import Lock, refuse_inside_lock
 from enact_dist.reading import EachData, Readings, check_requested, null_error, slot_of
+from enact_dist.session import session_of
 from enact_dist.terms import Aspect, Context, Entities, Entity, NullReason, View, Write
 from enact_dist.watch import Watch
+from enact_dist.wire.limits import ITEMS_MAX
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -59,7 +61,7 @@ class WorldContext(Context):
         self.session = session
 
     def init(self, entity: Entity, aspect: Aspect[T], datum: T) -> bool:
-        """Set a datum if none was ever set; from here on only through a lock (ENACT 3.3).
+        """Set a datum where there is none; from here on only through a lock (ENACT 3.3).
 
         Args:
             entity: The entity; it exists from here on.
@@ -67,7 +69,8 @@ class WorldContext(Context):
             datum: The initial value; arrays are copied, as nobody can take them away in Python.
 
         Returns:
-            Whether this call set it; False leaves the datum that was there.
+            Whether this call set it; False leaves the datum that was there.  One that was deleted,
+            or lost with a volatile shard, is set anew.
 
         Raises:
             LockHeldError: This thread holds a lock.
@@ -76,7 +79,7 @@ class WorldContext(Context):
         refuse_inside_lock("init")
         request = Write(self, entity, aspect)
         with Lock(request) as lock:
-            if lock.version(request) > 0 and lock.get(request) is not None:
+            if not lock.is_null(request):
                 return False
             lock[request] = datum
         return True
@@ -155,6 +158,9 @@ class WorldContext(Context):
                 f"no aspect {aspect!r} is registered; known: {', '.join(sorted(known)) or 'none'}"
             )
         request = View(self, entity, Aspect(aspect, object))
+        # Its shard may never have held this aspect; then the datum is null, not the aspect unknown.
+        client = self.session.client
+        client.register(aspects=[known[aspect]], needed=lambda: self.session.shards_of((request,)))
         snapshot = take_snapshot((request,), register=False)
         return decode_untyped(snapshot.encoded(request))
 
@@ -176,6 +182,8 @@ def take_snapshot(requests: tuple[LockRequest[Any], ...], *, register: bool = Tr
     """Take a view of `requests`; large data are fetched before this returns."""
     if not requests:
         raise MisuseError("a view of nothing: name at least one View or ViewEach")
+    if len(requests) > ITEMS_MAX:
+        raise MisuseError(f"a view of {len(requests)} requests; at most {ITEMS_MAX}: use ViewEach")
     session = session_of(requests)
     session.client.check_usable()
     for request in requests:
@@ -183,7 +191,7 @@ def take_snapshot(requests: tuple[LockRequest[Any], ...], *, register: bool = Tr
             raise MisuseError(f"{request!r} locks; view(…) takes View and ViewEach, or use Lock(…)")
     if register:
         aspects = {request.aspect.name: request.aspect for request in requests}
-        session.register_aspects(aspects.values())
+        session.register_aspects(aspects.values(), requests=requests)
     items: list[Item] = [session.item_of(request) for request in requests]
     client = session.client
     lock = client.acquire(items, wait_s=VIEW_WAIT_S, hold_s=VIEW_WAIT_S, check_plan=lambda: None)

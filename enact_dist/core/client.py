@@ -125,7 +125,7 @@ class Client:
             self._epoch_changed(shard, answer.epoch)
             return False
         if isinstance(answer, Alive) and isinstance(request, KeepAlive):
-            self._alive(shard, request, answer)
+            self._alive(shard, request, answer, now_ns)
             return True
         return False
 
@@ -178,7 +178,7 @@ class Client:
         count = self.sendings.next(now_ns)
         return KeepAlive(self.session, self.epoch(shard), count, view, self.report)
 
-    def _alive(self, shard: str, request: KeepAlive, answer: Alive) -> None:
+    def _alive(self, shard: str, request: KeepAlive, answer: Alive, now_ns: int) -> None:
         if answer.epoch != self.epoch(shard):
             return
         self.saw_stamp(answer.stamp_ns)
@@ -195,7 +195,8 @@ class Client:
                         part.hold_until_ns, believe(answer.count_seen, grant.hold_left_ns)
                     )
                 elif part.granted_count < request.count and lock.phase in _GRANTS_COUNT:
-                    lock.lose(f"shard {shard} holds it for this session no more")
+                    cause = f"shard {shard} holds it for this session no more"
+                    lock.lose(cause, asked_of=part)
 
     # ---------------------------------------------------------------- locks
 

@@ -49,7 +49,8 @@ class LockDesk:
             yield Reply(reply_to, refusal or EpochChanged(self._state.epoch))
             return
         if session.observer:
-            yield Reply(reply_to, Refused("protocol", "an observer session cannot lock"))
+            text = "this session only observes and cannot lock; connect without observer=True"
+            yield Reply(reply_to, Refused("value", text))
             return
         session.renewed_ns = max(session.renewed_ns, self._state.now_ns)
         session.count_seen = max(session.count_seen, message.count)

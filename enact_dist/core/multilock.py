@@ -62,6 +62,9 @@ WAIT_SLICE_NS: Final = 900_000_000
 RETRY_NS_MIN: Final = 20_000_000
 RETRY_NS_MAX: Final = 300_000_000
 """Pause after a call without an answer; doubles up to the second figure."""
+FREE_CALLS: Final = 3
+"""Calls after a step forward that are made though the time to wait is over: a lock that does not
+want to wait asks each shard once, and again where a shard has restarted."""
 
 
 class Phase(enum.Enum):
@@ -144,17 +147,21 @@ class MultiLock:
     refusal: Refused | None = None
     silent_shard: str = ""
     blockers: tuple[Holder, ...] = ()
+    taken_from: Part | None = None
     position: Position | None = None
     versions: tuple[SlotVersion, ...] = ()
     states: list[Reading] = field(default_factory=list)
     parts: list[Part] = field(default_factory=list)
     sent_commit: bool = False
+    slice_ns: int = WAIT_SLICE_NS
+    lane_free: bool = False
     _views_left: dict[str, tuple[Item, ...]] = field(default_factory=dict)
     _writer: str = ""
     _writes: tuple[WriteItem, ...] = ()
     _expects: tuple[SlotVersion, ...] = ()
     _validate_left: dict[str, Part] = field(default_factory=dict)
     _ask_outcome: bool = False
+    _free_calls: int = FREE_CALLS
     _retry_at_ns: int = 0
     _retry_ns: int = RETRY_NS_MIN
     _farewells: list[tuple[str, Request]] = field(default_factory=list)
@@ -173,7 +180,8 @@ class MultiLock:
         """
         if not self.phase.busy:
             return [], 0
-        if now_ns >= self.give_up_ns and self._gives_up():
+        if now_ns >= self.give_up_ns and not self._free_calls:
+            self._gives_up()
             return [], 0
         if now_ns < self._retry_at_ns:
             return [], min(self._retry_at_ns, self.give_up_ns)
@@ -214,7 +222,7 @@ class MultiLock:
             self.client.placement.version,
             self.client.sendings.next(now_ns),
             part.items,
-            min(WAIT_SLICE_NS, left_ns),
+            min(self.slice_ns, left_ns),
             hold_ns,
             self.client.seen_stamp_ns,
         )
@@ -265,6 +273,7 @@ class MultiLock:
 
     def _silent(self, shard: str, request: Request, now_ns: int) -> None:
         self.silent_shard = shard
+        self._free_calls = 0
         if isinstance(request, Commit | Outcome):
             self._ask_outcome = True
         self._pause(now_ns)
@@ -275,6 +284,7 @@ class MultiLock:
 
     def _epoch_changed(self, request: Request) -> None:
         """The shard restarted or forgot the session; `client` has dropped our grants there."""
+        self._free_calls = max(0, self._free_calls - 1)
         if isinstance(request, Commit | Outcome):
             self._ask_outcome = True
         # Otherwise: a first acquire or view is simply asked again after the new Hello; a lost
@@ -297,6 +307,7 @@ class MultiLock:
             self._advance()
         elif isinstance(answer, Waiting):
             self.blockers = answer.blockers
+            self._free_calls = 0
             if now_ns >= self.give_up_ns:
                 self._gives_up()
         elif isinstance(answer, Stale):
@@ -310,6 +321,7 @@ class MultiLock:
 
     def _advance(self) -> None:
         """Go on when everything of this phase has arrived."""
+        self._free_calls = FREE_CALLS
         if self.phase is Phase.ACQUIRING and all(part.token is not None for part in self.parts):
             self.phase = Phase.VIEWING
         if self.phase is Phase.VIEWING and not self._views_left:
@@ -323,25 +335,42 @@ class MultiLock:
             now_ns < min(part.until_ns, part.hold_until_ns) for part in self.parts
         )
 
-    def lose(self, cause: str) -> None:
-        """A shard has ended this lock; give the rest back."""
+    def lose(self, cause: str, *, asked_of: Part | None = None) -> None:
+        """A shard has ended this lock; give the rest back.
+
+        Args:
+            cause: Why, as far as it is known here.
+            asked_of: The part whose shard knows more (`ask_cause`).
+        """
         if self.phase is Phase.COMMITTING or not (self.phase.busy or self.phase is Phase.HELD):
             return
         self.cause = cause
+        self.taken_from = asked_of
         self._end(Phase.LOST)
+
+    def ask_cause(self) -> tuple[str, Request] | None:
+        """Return the call that tells why a lock was lost, once; for messages to people."""
+        part, self.taken_from = self.taken_from, None
+        if part is None or part.token is None:
+            return None
+        return part.shard, Validate(self.lock, part.token)
+
+    def told_cause(self, answer: Answer | None) -> None:
+        """Take the answer to `ask_cause`."""
+        if isinstance(answer, Fenced) and answer.lock == self.lock:
+            self.cause = answer.cause
 
     def _part(self, shard: str) -> Part:
         return next(part for part in self.parts if part.shard == shard)
 
-    def _gives_up(self) -> bool:
-        """The deadline has passed; return whether that ends the lock in this phase."""
+    def _gives_up(self) -> None:
+        """The deadline has passed: rest in what that means in this phase."""
         if self.phase is Phase.COMMITTING:
             self._end(Phase.UNKNOWN if self.sent_commit else Phase.UNREACHABLE)
         elif self.phase is Phase.VALIDATING or self.silent_shard:
             self._end(Phase.UNREACHABLE)
         else:
             self._end(Phase.TIMED_OUT)
-        return True
 
     def _end(self, phase: Phase) -> None:
         """Rest in `phase`; whatever may still be held or awaited is given back."""
@@ -375,7 +404,7 @@ class MultiLock:
         if self.phase is not Phase.HELD:
             return
         self.give_up_ns = give_up_ns
-        self._retry_at_ns = 0
+        self._free_calls = self._retry_at_ns = 0
         self._expects = tuple(expects)
         for shard, items in writes.items():
             self._writer, self._writes = shard, tuple(items)
@@ -430,6 +459,7 @@ class MultiLock:
         elif answer.kind == OUTCOME_PENDING:
             self._pause(now_ns)
         elif answer.kind == OUTCOME_EXPIRED:
+            self.cause = "its shard has no record of this session any more"
             self._end(Phase.UNKNOWN)
         elif answer.epoch == token.epoch:
             self._ask_outcome = False  # it never arrived: send it (again)

@@ -1,315 +1,152 @@
-"""The client's working half: drives `core.Client` over a carrier, keeps the session alive.
+"""The client's working half for locks: drives `core.MultiLock` over a carrier until it rests.
 
-Threads: the caller's own thread makes its lock's calls; one keep-alive thread per cell renews the
-session and reconciles.  `_mutex` guards the pure core and is never held during a call.
+The caller's own thread makes its lock's calls.  Rules a change must keep:
 
-The lease itself also rides on the transport's liveliness token, which native threads renew: a
-Python thread alone would starve for as long as a library holds the interpreter lock.
+  * The mutex of the session guards the pure core and is never held during a call.
+  * Whatever ends a thread's way through here, an interrupt too, leaves nothing held at a shard
+    that nobody would give back, and gives the lane back exactly once.
+  * A commit that was sent ends in an answer or in `CommitUnknownError`.
 """
 
 from __future__ import annotations
 
-import os
-import threading
-import weakref
+import itertools
+import logging
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.core.messages import (
-    Acquire,
-    Alive,
-    Answer,
-    AspectEntry,
-    Commit,
-    Fetch,
-    Goodbye,
-    Hello,
-    KeepAlive,
-    Refused,
-    Register,
-    Registered,
-    Welcome,
-)
 from enact_dist.core.multilock import MultiLock, Phase
-from enact_dist.errors import MisuseError
-from enact_dist.link.clock import boottime_ns
-from enact_dist.link.refusals import error_of, not_committed, not_granted, unreachable
+from enact_dist.errors import EnactError, MisuseError
+from enact_dist.link.refusals import not_committed, not_granted
+from enact_dist.link.session_client import (
+    BYTES_PER_S_MIN,
+    CALL_S,
+    CALLS_S_MAX,
+    FINISH_S,
+    SessionClient,
+)
 
 if TYPE_CHECKING:
+    import threading
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
-    from enact_dist.core.client import Client
-    from enact_dist.core.messages import Item, Request, SlotVersion, WriteItem
-    from enact_dist.link.carrier import Carrier, NoticeFeed
+    from enact_dist.core.messages import Item, SlotVersion, WriteItem
 
-CALL_S: Final = 1.0
-"""How long one call may stay unanswered before it counts as unknown and is made again."""
-BYTES_PER_S_MIN: Final = 10e6
-"""A call that carries data gets this much more time per byte."""
-FINISH_S: Final = 10.0
-"""How long a commit may stay without an answer before `CommitUnknownError`."""
+INTERRUPTIBLE_SLICE_NS: Final = 120_000_000
+"""How long one call of a lock that may be told to stop waiting is parked."""
+RESTARTS_AT_ONCE: Final = 1
+"""How often a lock that was lost before it was held is asked for anew without a pause."""
+RESTART_S_MAX: Final = 0.3
+REGISTRATIONS_MAX: Final = 3
+"""How often one lock registers its aspects again at a shard that says not to know them."""
 
-_alive: weakref.WeakSet[CellClient] = weakref.WeakSet()
-
-
-def _after_fork() -> None:
-    for client in list(_alive):
-        client.forked = True
+_log = logging.getLogger("enact.link")
 
 
-os.register_at_fork(after_in_child=_after_fork)
-
-
-class CellClient:
-    """One session of this process with one cell."""
-
-    def __init__(
-        self,
-        carrier: Carrier,
-        client: Client,
-        *,
-        now_ns: Callable[[], int] = boottime_ns,
-        keep_alive: bool = True,
-    ) -> None:
-        self.carrier = carrier
-        self.core = client
-        self.forked = False
-        self.closed = False
-        self.notice_numbers: dict[str, tuple[int, int]] = {}
-        self.counters: dict[str, int] = {}
-        self._now_ns = now_ns
-        self._mutex = threading.RLock()
-        self._stopping = threading.Event()
-        self._lanes_free: list[int] = []
-        self._lanes_made = 0
-        self._aspects: dict[str, dict[str, AspectEntry]] = {}
-        self._registered: dict[str, AspectEntry] = {}
-        self._worlds: dict[str, tuple[str, ...]] = {}
-        self._renewer: threading.Thread | None = None
-        if keep_alive:
-            self._renewer = threading.Thread(
-                target=self._renew, name="enact-keep-alive", daemon=True
-            )
-        _alive.add(self)
-
-    # ---------------------------------------------------------------- start and end
-
-    def start(self, welcome: Welcome) -> None:
-        """Take the first welcome and begin to keep the session alive."""
-        hello = self.core.hello(welcome.shard)
-        self._take(welcome.shard, hello, welcome)
-        self.carrier.add_endpoints(welcome.placement.shards)
-        if self._renewer is not None:
-            self._renewer.start()
-
-    def close(self) -> None:
-        """Say goodbye to every shard and end; twice is harmless."""
-        if self.closed or self.forked:
-            return
-        self.closed = True
-        self._stopping.set()
-        if self._renewer is not None and self._renewer.is_alive():
-            self._renewer.join()
-        goodbyes = [(shard, Goodbye(self.core.session)) for shard in self.core.shards_in_use()]
-        self.carrier.request_all(goodbyes, timeout_s=CALL_S / 2)
-        self.carrier.close()
-        _alive.discard(self)
-
-    def check_usable(self) -> None:
-        """Raise `MisuseError` if this client is closed or belongs to the parent process."""
-        if self.forked:
-            raise MisuseError(
-                "this cell was connected before a fork and belongs to the parent process;"
-                " connect anew in the child, or start it with the 'spawn' method"
-            )
-        if self.closed:
-            raise MisuseError("this cell is closed; connect again")
-
-    # ---------------------------------------------------------------- calls
-
-    def call(self, shard: str, request: Request, *, timeout_s: float = FINISH_S) -> Answer:
-        """Make one idempotent call, again until it is answered.
-
-        Raises:
-            ShardUnreachableError: No answer within `timeout_s`.
-        """
-        return self.call_all([(shard, request)], timeout_s=timeout_s)[0]
-
-    def call_all(
-        self, calls: Sequence[tuple[str, Request]], *, timeout_s: float = FINISH_S
-    ) -> list[Answer]:
-        """Make idempotent calls at once, each again until it is answered.
-
-        Raises:
-            ShardUnreachableError: One stays without an answer for `timeout_s`.
-        """
-        self.check_usable()
-        answers: dict[int, Answer] = {}
-        deadline_ns = self._now_ns() + int(timeout_s * 1e9)
-        pause_s = 0.02
-        while True:
-            left = [index for index in range(len(calls)) if index not in answers]
-            sent = [calls[index] for index in left]
-            for index, answer in zip(left, self._send(sent), strict=True):
-                if answer is not None:
-                    self._take(*calls[index], answer)
-                    answers[index] = answer
-            if len(answers) == len(calls):
-                return [answers[index] for index in range(len(calls))]
-            if self._now_ns() >= deadline_ns:
-                missing = next(index for index in left if index not in answers)
-                raise unreachable(calls[missing][0], timeout_s, self.carrier.endpoint_of)
-            self._stopping.wait(pause_s)
-            pause_s = min(2 * pause_s, 0.3)
-
-    def call_once(
-        self, calls: Sequence[tuple[str, Request]], *, timeout_s: float = CALL_S
-    ) -> list[Answer | None]:
-        """Make calls at once, none of them twice; None stands for no answer."""
-        self.check_usable()
-        answers = self.carrier.request_all(calls, timeout_s=timeout_s)
-        for (shard, request), answer in zip(calls, answers, strict=True):
-            if answer is not None:
-                self._take(shard, request, answer)
-        return answers
-
-    def _send(self, calls: Sequence[tuple[str, Request]]) -> list[Answer | None]:
-        if len(calls) == 1:
-            shard, request = calls[0]
-            return [self.carrier.request(shard, request, timeout_s=_patience_s(request))]
-        patience_s = max((_patience_s(request) for _, request in calls), default=CALL_S)
-        return self.carrier.request_all(calls, timeout_s=patience_s)
-
-    def _take(self, shard: str, request: Request, answer: Answer) -> None:
-        """Let the session learn from an answer."""
-        with self._mutex:
-            self._learn(shard, answer)
-            self.core.answered(shard, request, answer, self._now_ns())
-
-    def _learn(self, shard: str, answer: Answer) -> None:
-        if isinstance(answer, Welcome):
-            known = self.core.placement
-            self._worlds[shard] = answer.worlds
-            self._aspects[shard] = {entry.name: entry for entry in answer.aspects}
-            self.notice_numbers[shard] = (answer.epoch, answer.notice_number)
-            if known.version != answer.placement.version:
-                self.carrier.add_endpoints(answer.placement.shards)
-        elif isinstance(answer, Registered):
-            self._worlds[shard] = answer.worlds
-            self._aspects[shard] = {entry.name: entry for entry in answer.aspects}
-        elif isinstance(answer, Alive):
-            self.notice_numbers[shard] = (answer.epoch, answer.notice_number)
-
-    # ---------------------------------------------------------------- catalogue
-
-    def shards(self) -> tuple[str, ...]:
-        """Return the names of all shards of the cell."""
-        return tuple(shard.name for shard in self.core.placement.shards)
-
-    def greet(self, *, timeout_s: float = FINISH_S) -> None:
-        """Say hello to every shard (again), which refreshes the catalogue."""
-        self.call_all(
-            [(shard, self.core.hello(shard)) for shard in self.shards()], timeout_s=timeout_s
-        )
-
-    def worlds(self) -> tuple[str, ...]:
-        """Return the world contexts that every greeted shard knows."""
-        known = [set(worlds) for worlds in self._worlds.values()]
-        return tuple(sorted(set.intersection(*known))) if known else ()
-
-    def aspect_entries(self) -> dict[str, AspectEntry]:
-        """Return the registered aspects of all greeted shards by name."""
-        merged: dict[str, AspectEntry] = {}
-        for aspects in self._aspects.values():
-            merged.update(aspects)
-        return merged
-
-    def register(self, *, worlds: Iterable[str] = (), aspects: Iterable[AspectEntry] = ()) -> None:
-        """Make sure that every shard knows these world contexts and aspects.
-
-        Raises:
-            DatumTypeError: An aspect is registered with another type or durability.
-            ShardUnreachableError: A shard does not answer.
-        """
-        worlds, aspects = tuple(worlds), tuple(aspects)
-        self._registered.update((entry.name, entry) for entry in aspects)
-        missing = [
-            shard
-            for shard in self.shards()
-            if not all(_agrees(self._aspects.get(shard, {}).get(e.name), e) for e in aspects)
-            or not set(worlds) <= set(self._worlds.get(shard, ()))
-        ]
-        if missing:
-            request = Register(self.core.session, worlds, aspects)
-            for answer in self.call_all([(shard, request) for shard in missing]):
-                if isinstance(answer, Refused):
-                    raise error_of(answer)
-
-    # ---------------------------------------------------------------- locks
+class CellClient(SessionClient):
+    """One session of this process with one cell, and its locks."""
 
     def acquire(
-        self, items: Iterable[Item], *, wait_s: float, hold_s: float, check_plan: Callable[[], None]
+        self,
+        items: Iterable[Item],
+        *,
+        wait_s: float,
+        hold_s: float,
+        check_plan: Callable[[], None],
+        interrupt: threading.Event | None = None,
+        begun: list[MultiLock] | None = None,
     ) -> MultiLock:
         """Acquire a lock; it rests in HELD when this returns.
 
         Args:
             items: What to lock and view.
-            wait_s: How long to wait for the grant.
+            wait_s: How long to wait for the grant; with 0 each shard is asked once.
             hold_s: Hold limit after the last grant.
             check_plan: Called with each plan before anything is asked; may raise.
+            interrupt: Ends the waiting within 0.2 s once it is set.
+            begun: Gets the lock before anything is asked, so that its caller can release it when
+                an exception comes between the return and the assignment.
 
         Raises:
             LockTimeoutError: Not granted in time; nothing is held.
             ShardUnreachableError: A shard stayed without an answer.
+            MisuseError: Too many threads hold or await locks.
             EnactError: The shard refused the request.
         """
         self.check_usable()
         items = tuple(items)
-        lane = self._take_lane()
-        started_ns = now_ns = self._now_ns()
-        wait_ns = int(wait_s * 1e9)
-        try:
-            while True:
-                with self._mutex:
-                    plan = self.core.plan(items)
-                    check_plan()
-                    left_ns = started_ns + wait_ns - now_ns
-                    lock = self.core.begin(
-                        lane, plan, now_ns=now_ns, wait_ns=left_ns, hold_ns=int(hold_s * 1e9)
-                    )
-                self._drive(lock)
+        started_ns = self._now_ns()
+        give_up_ns = started_ns + int(min(wait_s, CALLS_S_MAX) * 1e9)
+
+        def begin() -> MultiLock:
+            with self._mutex:
+                plan = self.core.plan(items)
+                check_plan()
                 now_ns = self._now_ns()
-                restart = lock.phase in (Phase.LOST, Phase.MISPLACED)
-                if lock.refusal is not None and lock.refusal.code == "unknown_aspect":
-                    # A shard that keeps nothing restarted since: its catalogue is empty again.
-                    self.greet()
-                    self.register(aspects=self._registered.values())
-                    restart = True
-                if not restart or now_ns >= started_ns + wait_ns:
-                    break
-            if lock.phase is not Phase.HELD:
-                raise not_granted(lock, (now_ns - started_ns) / 1e9, self.carrier.endpoint_of)
+                wait_ns, hold_ns = max(0, give_up_ns - now_ns), int(hold_s * 1e9)
+                lock = self.core.begin(lane, plan, now_ns=now_ns, wait_ns=wait_ns, hold_ns=hold_ns)
+            if interrupt is not None:
+                lock.slice_ns = INTERRUPTIBLE_SLICE_NS
+            if begun is not None:
+                begun.append(lock)
+            return lock
+
+        lane = self._lanes.take()
+        try:
+            lock = begin()
         except BaseException:
-            self._lanes_free.append(lane)
+            self._lanes.give_back(lane)
             raise
-        return lock
+        try:
+            for attempt in itertools.count():
+                self._drive(lock, interrupt=interrupt)
+                if lock.phase is Phase.HELD:
+                    return lock
+                over = attempt > 0 and self._now_ns() >= give_up_ns
+                if over or not self._begins_anew(lock, attempt):
+                    break
+                lock = begin()
+            waited_s = (self._now_ns() - started_ns) / 1e9
+            raise not_granted(lock, waited_s, self.carrier.endpoint_of)
+        except BaseException:
+            self.release(lock)
+            raise
 
-    def _take_lane(self) -> int:
-        with self._mutex:
-            if self._lanes_free:
-                return self._lanes_free.pop()
-            self._lanes_made += 1
-            return self._lanes_made - 1
+    def _begins_anew(self, lock: MultiLock, attempt: int) -> bool:
+        """Whether a lock that came to rest should be asked for once more; pauses before that."""
+        if lock.phase in (Phase.LOST, Phase.MISPLACED):
+            if attempt >= RESTARTS_AT_ONCE:
+                self._pause(min(0.02 * 2 ** min(attempt, 8), RESTART_S_MAX))
+            return True
+        refusal = lock.refusal
+        if refusal is None or refusal.code != "unknown_aspect" or attempt >= REGISTRATIONS_MAX:
+            return False
+        # A shard that keeps nothing restarted since: its catalogue is empty again.
+        shards = {shard for shard, _ in (*lock.plan.locks, *lock.plan.views)}
+        named = {i.aspect for _, its in (*lock.plan.locks, *lock.plan.views) for i in its}
+        for shard in shards:
+            self._catalogue.forget(shard)
+        aspects = [entry for name, entry in self._registered.items() if name in named]
+        self.register(aspects=aspects, needed=lambda: shards)
+        return bool(aspects)
 
-    def _drive(self, lock: MultiLock) -> None:
+    def _pause(self, pause_s: float) -> None:
+        """Wait before asking again; raises if the cell is closed meanwhile."""
+        if self._stopping.wait(pause_s):
+            self.check_usable()
+
+    def _drive(self, lock: MultiLock, *, interrupt: threading.Event | None = None) -> None:
         """Make the lock's calls until it rests."""
         try:
             while True:
                 with self._mutex:
+                    if interrupt is not None and interrupt.is_set():
+                        lock.release()
                     calls, wait_until_ns = lock.next_calls(self._now_ns())
                     if not calls and not lock.phase.busy:
                         return
                 if not calls:
-                    self._stopping.wait(max(0.001, (wait_until_ns - self._now_ns()) / 1e9))
+                    pause_s = (wait_until_ns - self._now_ns()) / 1e9
+                    self._pause(max(0.001, min(pause_s, lock.slice_ns / 1e9)))
                     continue
                 answers = self._send(calls)
                 with self._mutex:
@@ -317,13 +154,23 @@ class CellClient:
                         if answer is not None:
                             self._learn(shard, answer)
                         lock.answered(shard, request, answer, self._now_ns())
+                self._follow_placement()
         except BaseException:
-            lock.release()
+            with self._mutex:
+                lock.release()
             raise
         finally:
-            farewells = lock.take_farewells()
-            if farewells:
+            self._say_farewell(lock)
+
+    def _say_farewell(self, lock: MultiLock) -> None:
+        """Send the releases of a lock that rests; the keep-alives repair what gets lost."""
+        farewells = lock.take_farewells()
+        if farewells:
+            try:
                 self.carrier.request_all(farewells, timeout_s=CALL_S)
+            except EnactError as error:
+                self._count("releases_unsent")
+                _log.info("lock %s was not released by message: %s", lock.lock, error)
 
     def finish(
         self,
@@ -339,32 +186,66 @@ class CellClient:
             CommitUnknownError: The commit was sent and never answered.
             ShardUnreachableError: A shard does not answer; nothing was written.
         """
+        started_ns = self._now_ns()
         try:
             with self._mutex:
                 if lock.phase is Phase.HELD:
+                    self._check_open(lock)
                     size = sum(w.datum.size for ws in writes.values() for w in ws if w.datum)
                     finish_s = FINISH_S + size / BYTES_PER_S_MIN
-                    give_up_ns = self._now_ns() + int(finish_s * 1e9)
+                    give_up_ns = started_ns + int(finish_s * 1e9)
                     lock.finish(writes, give_up_ns=give_up_ns, expects=expects)
-            self._drive(lock)
+            try:
+                self._drive(lock)
+            except EnactError as error:
+                if lock.phase is not Phase.RELEASED or not lock.sent_commit:
+                    raise
+                # The cell was closed, or the answer could not be read: the commit may stand.
+                lock.phase, lock.cause = Phase.UNKNOWN, f"then: {error}"
+                raise self._not_committed(lock, started_ns) from error
             if lock.phase is not Phase.COMMITTED:
-                raise not_committed(lock, FINISH_S, self.carrier.endpoint_of)
+                raise self._not_committed(lock, started_ns)
         finally:
-            self._lanes_free.append(lock.lock.lane)
+            self.release(lock)  # only the lane, unless something broke in between
+
+    def _check_open(self, lock: MultiLock) -> None:
+        try:
+            self.check_usable()
+        except MisuseError:
+            lock.release()
+            raise
+
+    def _not_committed(self, lock: MultiLock, started_ns: int) -> EnactError:
+        waited_s = (self._now_ns() - started_ns) / 1e9
+        self._ask_cause(lock)
+        return not_committed(lock, waited_s, self.carrier.endpoint_of)
 
     def release(self, lock: MultiLock) -> None:
-        """Give the lock back without writing; never raises for a lock already lost."""
+        """Give the lock back without writing, and its lane; nothing where that is done already.
+
+        Never raises for a lock or cell already lost.
+        """
+        if lock.lane_free:
+            return
         try:
             with self._mutex:
                 lock.release()
-            self._drive(lock)
+            self._say_farewell(lock)
         finally:
-            self._lanes_free.append(lock.lock.lane)
+            lock.lane_free = True
+            self._lanes.give_back(lock.lock.lane)
 
     def valid(self, lock: MultiLock) -> bool:
-        """Whether the client may still believe in the lock, without asking anybody."""
+        """Whether the client may still believe in the lock, without asking over a network."""
+        if self.forked or self.closed:
+            return False
         with self._mutex:
-            return lock.valid(self._now_ns())
+            valid = lock.valid(self._now_ns())
+        if not valid and lock.phase is Phase.HELD and self._renewer is None:
+            self.renew_once()
+            with self._mutex:
+                valid = lock.valid(self._now_ns())
+        return valid
 
     def check(self, lock: MultiLock) -> None:
         """Make sure that the lock is held, asking its shards where belief has run out.
@@ -383,60 +264,14 @@ class CellClient:
                 calls = [(shard, self.core.keep_alive(shard, now_ns)) for shard in shards]
             self.call_all(calls)
         if lock.phase is not Phase.HELD:
+            self._ask_cause(lock)
             raise not_committed(lock, FINISH_S, self.carrier.endpoint_of)
 
-    def fetch_call(self, request: Fetch, shard: str) -> Answer | None:
-        """Ask once for a part of a datum."""
-        return self.carrier.request(shard, request, timeout_s=CALL_S)
-
-    def subscribe(self) -> NoticeFeed:
-        """Open a feed of the notices of all shards."""
-        self.check_usable()
-        return self.carrier.subscribe()
-
-    # ---------------------------------------------------------------- keep-alive
-
-    def _renew(self) -> None:
-        while not self._stopping.wait(self.core.ttl_ns / 4e9):
-            self.renew_once()
-
-    def renew_once(self) -> None:
-        """Send one keep-alive to every shard in use and take the answers."""
-        with self._mutex:
-            now_ns = self._now_ns()
-            calls = [
-                (shard, self.core.keep_alive(shard, now_ns)) for shard in self.core.shards_in_use()
-            ]
-        answers = self.carrier.request_all(calls, timeout_s=max(0.1, self.core.ttl_ns / 4e9))
-        for (shard, request), answer in zip(calls, answers, strict=True):
-            if answer is not None:
-                self._take(shard, request, answer)
-            else:
-                self.counters["keep_alives_unanswered"] = (
-                    self.counters.get("keep_alives_unanswered", 0) + 1
-                )
-
-    def set_report(self, report: bytes) -> None:
-        """Let the next keep-alives carry this actor's statistics (msgpack)."""
-        with self._mutex:
-            self.core.report = report
-
-
-def _patience_s(request: Request) -> float:
-    """Return how long to wait for the answer to one call."""
-    if isinstance(request, Acquire):
-        return request.wait_ns / 1e9 + CALL_S
-    if isinstance(request, Commit):
-        size = sum(write.datum.size for write in request.writes if write.datum is not None)
-        return CALL_S + size / BYTES_PER_S_MIN
-    if isinstance(request, Hello | KeepAlive):
-        return CALL_S / 2
-    return CALL_S
-
-
-def _agrees(known: AspectEntry | None, wanted: AspectEntry) -> bool:
-    return (
-        known is not None
-        and known.fingerprint == wanted.fingerprint
-        and wanted.durability in ("", known.durability)
-    )
+    def _ask_cause(self, lock: MultiLock) -> None:
+        """Let the shard say why it took a lock away whose absence a keep-alive has shown."""
+        call = lock.ask_cause()
+        if call is not None:
+            try:
+                lock.told_cause(self.call_once([call])[0])
+            except EnactError as error:
+                _log.info("why lock %s was lost cannot be asked: %s", lock.lock, error)

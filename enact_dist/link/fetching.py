@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from enact_dist.core.datum import Datum, Slot
 from enact_dist.core.messages import EpochChanged, Fetch, Gone, Refused, Slice, SlotState
 from enact_dist.errors import LeaseLostError, ProtocolError
-from enact_dist.link.client import FINISH_S
 from enact_dist.link.refusals import error_of
+from enact_dist.link.session_client import FINISH_S
 from enact_dist.wire.limits import BODY_BYTES_MAX
 
 if TYPE_CHECKING:

@@ -39,6 +39,7 @@ from enact_dist.core.records import (
 from enact_dist.core.shard import Shard
 from enact_dist.errors import StoreError
 from enact_dist.link.clock import Clock, SystemClock
+from enact_dist.link.uninterrupted import Uninterrupted
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -110,6 +111,7 @@ class ShardHost:
         self._clock: Clock = clock or SystemClock()
         self._on_failure = on_failure
         self._mutex = threading.RLock()  # reentrant for `count` in reply callbacks only
+        self._uninterrupted = Uninterrupted()
         self._replies: dict[int, Callable[[Answer], None]] = {}
         self._handles = 0
         self._kept_at_once: deque[int] = deque()
@@ -198,13 +200,17 @@ class ShardHost:
 
     def _handle(self, message: Request | Event, handle: int) -> None:
         """Let the shard decide and do what it says.  The mutex is held."""
-        try:
-            self._perform(self._decide(message, handle))
-            while self._kept_at_once:
-                self._perform(self._decide(Persisted(self._kept_at_once.popleft()), 0))
-        except Exception as failure:  # noqa: BLE001 - half a decision must not be served
-            _log.exception("the shard failed on %s", type(message).__name__)
-            self._end_failed(failure)
+        with self._uninterrupted:
+            try:
+                self._perform(self._decide(message, handle))
+                while self._kept_at_once:
+                    self._perform(self._decide(Persisted(self._kept_at_once.popleft()), 0))
+            except BaseException as failure:
+                # Half a decision must not be served.
+                _log.exception("the shard failed on %s", type(message).__name__)
+                self._end_failed(failure)
+                if not isinstance(failure, Exception):
+                    raise
 
     def _decide(self, message: Request | Event, handle: int) -> list[Effect]:
         clock = self._clock
@@ -245,9 +251,10 @@ class ShardHost:
         with self._mutex:
             self._end_failed(failure)
 
-    def _end_failed(self, failure: Exception) -> None:
+    def _end_failed(self, reason: BaseException) -> None:
         if self._failure is not None:
             return
+        failure = reason if isinstance(reason, Exception) else RuntimeError(repr(reason))
         self._failure = failure
         self._ended = True
         self._replies.clear()

@@ -5,6 +5,7 @@ Each text says what was asked, what was found, who holds it and what to do.
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING
 
 from enact_dist.core.multilock import MultiLock, Phase
@@ -50,10 +51,21 @@ def not_granted(lock: MultiLock, waited_s: float, endpoint_of: Callable[[str], s
         return unreachable(lock.silent_shard, waited_s, endpoint_of)
     wanted = _wanted(lock)
     holders = tuple(holder_line(holder) for holder in lock.blockers)
-    if holders:
-        why = "; ".join(holders)
-    elif lock.phase is Phase.LOST:
+    if lock.phase is Phase.MISPLACED:
+        return LinkError(
+            f"the shards do not agree on where {wanted} lies: they were started with different"
+            " cell.toml files; start all of them with the same one"
+        )
+    if lock.phase is Phase.RELEASED:
+        return LockTimeoutError(
+            f"told to stop after waiting {waited_s:.1f} s for {wanted}; nothing is held",
+            holders=holders,
+            waited_s=waited_s,
+        )
+    if lock.phase is Phase.LOST:
         why = f"granted and lost again each time: {lock.cause}"
+    elif holders:
+        why = "; ".join(holders)
     else:
         why = "the shard grants nothing yet: it restarted and waits for older leases to end"
     return LockTimeoutError(
@@ -70,9 +82,10 @@ def not_committed(
     if lock.phase is Phase.REFUSED and lock.refusal is not None:
         return error_of(lock.refusal)
     if lock.phase is Phase.UNKNOWN:
+        why = lock.cause or f"no answer came for {finish_s:.1f} s"
         return CommitUnknownError(
-            f"the commit of lock {lock.lock} ({_wanted(lock)}) was sent and not answered for"
-            f" {finish_s:g} s; it may stand or not; read the data before writing them again",
+            f"the commit of lock {lock.lock} ({_wanted(lock)}) was sent, and {why}; it may stand or"
+            " not; read the data before writing them again",
             lock_id=str(lock.lock),
         )
     if lock.phase is Phase.UNREACHABLE:
@@ -109,12 +122,15 @@ def error_of(refused: Refused) -> EnactError:
     """Return the exception that a refusal stands for."""
     if refused.code == "unknown_world":
         known = refused.text.partition("known: ")[2]
-        return UnknownWorldError(refused.text, known=tuple(known.split(", ")) if known else ())
+        names = tuple(name for name in known.split(", ") if name not in ("", "none"))
+        return UnknownWorldError(refused.text, known=names)
+    if refused.code == "clock_skew":
+        ahead = re.search(r"(\d+\.\d+) s ahead", refused.text)
+        return ClockSkewError(refused.text, ahead_s=float(ahead[1]) if ahead else 0.0)
     classes: dict[str, type[EnactError]] = {
         "datum_type": DatumTypeError,
         "unknown_aspect": MisuseError,
         "value": MisuseError,
-        "clock_skew": ClockSkewError,
         "protocol": ProtocolError,
         "overload": LinkError,
     }

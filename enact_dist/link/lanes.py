@@ -1,0 +1,46 @@
+"""Lanes: small numbers for the threads of a session that hold or await a lock at the same time.
+
+A shard keeps a few facts per lane (the exactly-once table), so their number is bounded.  A lane is
+used again after its lock has ended, by any thread.
+"""
+
+from __future__ import annotations
+
+import threading
+
+from enact_dist.core.sessions import LANES_MAX
+from enact_dist.errors import MisuseError
+
+
+class Lanes:
+    """The lanes of one session.  Thread-safe."""
+
+    def __init__(self) -> None:
+        self._mutex = threading.Lock()
+        self._free: list[int] = []
+        self._made = 0
+
+    def take(self) -> int:
+        """Return a lane that no live lock has.
+
+        Raises:
+            MisuseError: As many locks as a session may have are held or awaited.
+        """
+        try:
+            return self._free.pop()
+        except IndexError:
+            return self._make()
+
+    def _make(self) -> int:
+        with self._mutex:
+            if self._made >= LANES_MAX:
+                raise MisuseError(
+                    f"{LANES_MAX} threads of this process hold or await a lock or view of this"
+                    " cell, the most that one session may; use fewer threads, or several processes"
+                )
+            self._made += 1
+            return self._made - 1
+
+    def give_back(self, lane: int) -> None:
+        """Let the lane be used again; to be called once per `take`, or two locks would share it."""
+        self._free.append(lane)

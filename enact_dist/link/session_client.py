@@ -1,0 +1,322 @@
+"""One session of this process with a cell: calls, what the shards know, the sign of life.
+
+Threads: any thread may call; one keep-alive thread per cell renews the session and reconciles.
+`_mutex` guards the pure core and is never held during a call.  Where the shard lives in this
+process there is no such thread: it is asked when its word is needed.
+
+The lease itself also rides on the transport's liveliness token, which native threads renew: a
+Python thread alone would starve for as long as a library holds the interpreter lock.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+import weakref
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.core.messages import (
+    Acquire,
+    Alive,
+    Answer,
+    AspectEntry,
+    Commit,
+    Goodbye,
+    Hello,
+    KeepAlive,
+    Refused,
+    Register,
+    Welcome,
+)
+from enact_dist.core.placement import shard_of
+from enact_dist.errors import EnactError, MisuseError
+from enact_dist.link.catalogue import KnownCatalogue
+from enact_dist.link.clock import boottime_ns
+from enact_dist.link.lanes import Lanes
+from enact_dist.link.refusals import error_of, unreachable
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Sequence
+
+    from enact_dist.core.client import Client
+    from enact_dist.core.messages import Request
+    from enact_dist.link.carrier import Carrier, NoticeFeed
+
+CALL_S: Final = 1.0
+"""How long one call may stay unanswered before it counts as unknown and is made again."""
+BYTES_PER_S_MIN: Final = 10e6
+"""A call that carries data gets this much more time per byte."""
+FINISH_S: Final = 10.0
+"""How long calls are made again before their shard counts as unreachable."""
+
+CALLS_S_MAX: Final = 1e8
+"""Three years; whoever waits longer means for ever."""
+
+_log = logging.getLogger("enact.link")
+
+_alive: weakref.WeakSet[SessionClient] = weakref.WeakSet()
+
+
+def _after_fork() -> None:
+    for client in list(_alive):
+        client.forked = True
+
+
+os.register_at_fork(after_in_child=_after_fork)
+
+
+class SessionClient:
+    """Calls, catalogue and life of one session of this process with one cell."""
+
+    def __init__(
+        self,
+        carrier: Carrier,
+        client: Client,
+        *,
+        now_ns: Callable[[], int] = boottime_ns,
+        keep_alive: bool = True,
+    ) -> None:
+        self.carrier = carrier
+        self.core = client
+        self.forked = False
+        self.closed = False
+        self.notice_numbers: dict[str, tuple[int, int]] = {}
+        self.counters: dict[str, int] = {}
+        self._now_ns = now_ns
+        self._mutex = threading.RLock()
+        self._stopping = threading.Event()
+        self._lanes = Lanes()
+        self._catalogue = KnownCatalogue()
+        self._registered: dict[str, AspectEntry] = {}
+        self._linked = client.placement
+        self._renewer: threading.Thread | None = None
+        if keep_alive:
+            self._renewer = threading.Thread(
+                target=self._renew, name="enact-keep-alive", daemon=True
+            )
+        _alive.add(self)
+
+    # ---------------------------------------------------------------- start and end
+
+    def start(self, welcome: Welcome) -> None:
+        """Take the first welcome and begin to keep the session alive."""
+        self._take(welcome.shard, self.core.hello(welcome.shard), welcome)
+        if self._renewer is not None:
+            self._renewer.start()
+
+    def close(self) -> None:
+        """Say goodbye to every shard and end; twice is harmless."""
+        if self.closed or self.forked:
+            return
+        self.closed = True
+        self._stopping.set()
+        if self._renewer is not None and self._renewer.is_alive():
+            self._renewer.join()
+        goodbyes = [(shard, Goodbye(self.core.session)) for shard in self.core.shards_in_use()]
+        try:
+            self.carrier.request_all(goodbyes, timeout_s=CALL_S / 2)
+        except EnactError as error:
+            _log.info("session %s ends without goodbye: %s", self.core.session[:8], error)
+        finally:
+            self.carrier.close()
+            _alive.discard(self)
+
+    def check_usable(self) -> None:
+        """Raise `MisuseError` if this client is closed or belongs to the parent process."""
+        if self.forked:
+            raise MisuseError(
+                "this cell was connected before a fork and belongs to the parent process;"
+                " connect anew in the child, or start it with the 'spawn' method"
+            )
+        if self.closed:
+            raise MisuseError("this cell is closed; connect again")
+
+    # ---------------------------------------------------------------- calls
+
+    def call(self, shard: str, request: Request, *, timeout_s: float = FINISH_S) -> Answer:
+        """Make one idempotent call, again until it is answered.
+
+        Raises:
+            ShardUnreachableError: No answer within `timeout_s`.
+        """
+        return self.call_all([(shard, request)], timeout_s=timeout_s)[0]
+
+    def call_all(
+        self, calls: Sequence[tuple[str, Request]], *, timeout_s: float = FINISH_S
+    ) -> list[Answer]:
+        """Make idempotent calls at once, each again until it is answered.
+
+        Raises:
+            ShardUnreachableError: One stays without an answer for `timeout_s`.
+        """
+        self.check_usable()
+        answers: dict[int, Answer] = {}
+        deadline_ns = self._now_ns() + int(min(timeout_s, CALLS_S_MAX) * 1e9)
+        pause_s = 0.02
+        while True:
+            left = [index for index in range(len(calls)) if index not in answers]
+            sent = [calls[index] for index in left]
+            for index, answer in zip(left, self._send(sent), strict=True):
+                if answer is not None:
+                    self._take(*calls[index], answer)
+                    answers[index] = answer
+            if len(answers) == len(calls):
+                return [answers[index] for index in range(len(calls))]
+            if self._now_ns() >= deadline_ns:
+                missing = next(index for index in left if index not in answers)
+                raise unreachable(calls[missing][0], timeout_s, self.carrier.endpoint_of)
+            self._stopping.wait(pause_s)
+            pause_s = min(2 * pause_s, 0.3)
+
+    def call_once(
+        self, calls: Sequence[tuple[str, Request]], *, timeout_s: float = CALL_S
+    ) -> list[Answer | None]:
+        """Make calls at once, none of them twice; None stands for no answer."""
+        self.check_usable()
+        answers = self.carrier.request_all(calls, timeout_s=timeout_s)
+        for (shard, request), answer in zip(calls, answers, strict=True):
+            if answer is not None:
+                self._take(shard, request, answer)
+        return answers
+
+    def _send(self, calls: Sequence[tuple[str, Request]]) -> list[Answer | None]:
+        if len(calls) == 1:
+            shard, request = calls[0]
+            return [self.carrier.request(shard, request, timeout_s=_patience_s(request))]
+        patience_s = max((_patience_s(request) for _, request in calls), default=CALL_S)
+        return self.carrier.request_all(calls, timeout_s=patience_s)
+
+    def _take(self, shard: str, request: Request, answer: Answer) -> None:
+        """Let the session learn from an answer."""
+        with self._mutex:
+            self._learn(shard, answer)
+            self.core.answered(shard, request, answer, self._now_ns())
+        self._follow_placement()
+
+    def _learn(self, shard: str, answer: Answer) -> None:
+        self._catalogue.learn(shard, answer)
+        if isinstance(answer, Welcome | Alive):
+            self.notice_numbers[shard] = (answer.epoch, answer.notice_number)
+
+    def _follow_placement(self) -> None:
+        """Connect to the shards of a placement that was just learned; outside the mutex."""
+        placement = self.core.placement
+        if placement is not self._linked and placement != self._linked:
+            self._linked = placement
+            self.carrier.add_endpoints(placement.shards)
+
+    # ---------------------------------------------------------------- catalogue
+
+    def shards(self) -> tuple[str, ...]:
+        """Return the names of all shards of the cell."""
+        return tuple(shard.name for shard in self.core.placement.shards)
+
+    def shard_of(self, entity: str) -> str:
+        """Return the shard on which an entity of that name lies."""
+        return shard_of(entity, self.core.placement)
+
+    def greet(self, *, timeout_s: float = FINISH_S) -> None:
+        """Say hello to every shard (again), which refreshes the catalogue."""
+        self.call_all(
+            [(shard, self.core.hello(shard)) for shard in self.shards()], timeout_s=timeout_s
+        )
+
+    def worlds(self) -> tuple[str, ...]:
+        """Return the world contexts that every greeted shard knows."""
+        return self._catalogue.worlds()
+
+    def aspect_entries(self) -> dict[str, AspectEntry]:
+        """Return the registered aspects of all greeted shards by name."""
+        return self._catalogue.aspects()
+
+    def register(
+        self,
+        *,
+        worlds: Iterable[str] = (),
+        aspects: Iterable[AspectEntry] = (),
+        needed: Callable[[], Iterable[str]] | None = None,
+        timeout_s: float = FINISH_S,
+    ) -> None:
+        """Make sure that shards know these world contexts and aspects.
+
+        Args:
+            worlds: Names of world contexts, made where there is none.
+            aspects: Entries of aspects.
+            needed: Returns the shards that matter; None stands for all.  Only asked when some
+                shard lacks something, so that one that is away stops nobody who can do without.
+            timeout_s: How long a shard may stay without an answer.
+
+        Raises:
+            DatumTypeError: An aspect is registered with another type or durability.
+            ShardUnreachableError: A shard does not answer.
+        """
+        worlds, aspects = tuple(worlds), tuple(aspects)
+        self._registered.update((entry.name, entry) for entry in aspects)
+        missing = [
+            shard for shard in self.shards() if self._catalogue.lacks(shard, worlds, aspects)
+        ]
+        if missing and needed is not None:
+            wanted = set(needed())
+            missing = [shard for shard in missing if shard in wanted]
+        if missing:
+            request = Register(self.core.session, worlds, aspects)
+            for answer in self.call_all(
+                [(shard, request) for shard in missing], timeout_s=timeout_s
+            ):
+                if isinstance(answer, Refused):
+                    raise error_of(answer)
+
+    def subscribe(self) -> NoticeFeed:
+        """Open a feed of the notices of all shards."""
+        self.check_usable()
+        return self.carrier.subscribe()
+
+    # ---------------------------------------------------------------- keep-alive
+
+    def _renew(self) -> None:
+        while not self._stopping.wait(self.core.ttl_ns / 4e9):
+            try:
+                self.renew_once()
+            except Exception as error:  # noqa: BLE001 - a bad answer must not end the renewal
+                self._count("keep_alives_failed")
+                _log.warning("keep-alive of session %s: %s", self.core.session[:8], error)
+
+    def renew_once(self) -> None:
+        """Send one keep-alive to every shard in use and take the answers."""
+        with self._mutex:
+            now_ns = self._now_ns()
+            calls = [
+                (shard, self.core.keep_alive(shard, now_ns)) for shard in self.core.shards_in_use()
+            ]
+        answers = self.carrier.request_all(calls, timeout_s=max(0.1, self.core.ttl_ns / 4e9))
+        for (shard, request), answer in zip(calls, answers, strict=True):
+            if answer is not None:
+                self._take(shard, request, answer)
+            else:
+                self._count("keep_alives_unanswered")
+
+    def set_report(self, report: bytes) -> None:
+        """Let the next keep-alives carry this actor's statistics (msgpack)."""
+        if self.forked or self.closed:
+            return
+        with self._mutex:
+            self.core.report = report
+        if self._renewer is None:
+            self.renew_once()
+
+    def _count(self, name: str) -> None:
+        with self._mutex:
+            self.counters[name] = self.counters.get(name, 0) + 1
+
+
+def _patience_s(request: Request) -> float:
+    """Return how long to wait for the answer to one call."""
+    if isinstance(request, Acquire):
+        return request.wait_ns / 1e9 + CALL_S
+    if isinstance(request, Commit):
+        size = sum(write.datum.size for write in request.writes if write.datum is not None)
+        return CALL_S + size / BYTES_PER_S_MIN
+    if isinstance(request, Hello | KeepAlive):
+        return CALL_S / 2
+    return CALL_S
