@@ -36,7 +36,10 @@ def count_contacts() -> None:
         online = cell.world("online")
         online.init(piece, MESH, Mesh(-0.1))
         mesh, count = Read(online, piece, MESH), Write(online, bench, COUNT)
-        each, all_counts = ReadEach(online, Entities("view/*"), MESH), WriteEach(online, Entities("*"), COUNT)
+        each, all_counts = (
+            ReadEach(online, Entities("view/*"), MESH),
+            WriteEach(online, Entities("*"), COUNT),
+        )
         with Lock(mesh, count, each, all_counts) as lock:
             assert_type(lock[mesh], Mesh)
             assert_type(lock.get(mesh), Mesh | None)

@@ -2,7 +2,18 @@
 
 from dataclasses import dataclass
 
-from enact_dist import Aspect, Entities, Entity, Lock, Read, ReadEach, View, Write, WriteEach, connect
+from enact_dist import (
+    Aspect,
+    Entities,
+    Entity,
+    Lock,
+    Read,
+    ReadEach,
+    View,
+    Write,
+    WriteEach,
+    connect,
+)
 
 
 @dataclass(frozen=True)

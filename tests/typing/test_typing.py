@@ -10,7 +10,15 @@ HERE = Path(__file__).parent
 
 def mypy(file):
     done = subprocess.run(
-        [sys.executable, "-m", "mypy", "--strict", "--no-error-summary", "--hide-error-context", str(file)],
+        [
+            sys.executable,
+            "-m",
+            "mypy",
+            "--strict",
+            "--no-error-summary",
+            "--hide-error-context",
+            str(file),
+        ],
         capture_output=True,
         text=True,
         cwd=HERE.parents[1],
