@@ -6,6 +6,7 @@ import pytest
 from shard_bench import S, datum, item, lock_id, slot
 
 from enact_dist.core.messages import (
+    OUTCOME_COMMITTED,
     OUTCOME_EXPIRED,
     Changed,
     Commit,
@@ -182,6 +183,20 @@ class TestOutcome:
         bench.write("ann", 2, "2")
 
         assert bench.ask(Outcome(lock_id("ann", 9, 1))).kind == OUTCOME_EXPIRED
+
+    def test_older_commit_that_ends_later_does_not_hide_the_newer_one(self, bench):
+        """A thread that gave up on a slow commit and made another learns about the other."""
+        bench.hello("ann")
+        first = bench.granted(ANN, item(W))
+        bench.disk_is_done = False
+        bench.commit(ANN, first.token, (slot(), "1"))
+        newer = lock_id("ann", 0, 2)
+        second = bench.granted(newer, item(W, "a", "frame"))
+        bench.commit(newer, second.token, (slot("a", "frame"), "2"))
+        bench.finish_disk()
+
+        assert bench.ask(Outcome(newer)).kind == OUTCOME_COMMITTED
+        assert bench.value() == "1"
 
     def test_outcome_survives_the_session(self, bench):
         """A client that comes back late still learns what became of its commit."""

@@ -1,4 +1,8 @@
-"""Run the simulator by hand: `python tests/sim/run.py --seed 17`, or `--first 0 --seconds 60`."""
+"""Run the simulator by hand.
+
+`python tests/sim/run.py --seed 17` runs one seed again, `--first 0 --seconds 60` a series,
+`--mutants` every wrong edit of the core until it is caught.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +11,7 @@ import sys
 import time
 from collections import Counter
 
+from simulated import mutants
 from simulated.scenario import Result, Scenario
 
 
@@ -19,7 +24,10 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=20.0, help="how long to go on")
     parser.add_argument("--keep-going", action="store_true", help="do not stop at a violation")
     parser.add_argument("--no-wire", action="store_true", help="leave the wire format out")
+    parser.add_argument("--mutants", action="store_true", help="show what catches wrong edits")
     options = parser.parse_args()
+    if options.mutants:
+        return _mutants()
     if options.seed is not None:
         options.first, options.count = options.seed, 1
     return _series(options)
@@ -39,14 +47,39 @@ def _series(options: argparse.Namespace) -> int:
                 break
         if time.perf_counter() - started_s > options.seconds:
             break
-    took_s = time.perf_counter() - started_s
+    took_s, cpu_s = time.perf_counter() - started_s, time.process_time()
     for name, count in sorted(tally.items()):
         print(f"{count:>10,}  {name}")
     print(
         f"{seeds} seeds, {simulated_s:.0f} s simulated in {took_s:.1f} s,"
-        f" {tally['commits'] / took_s:.0f} commits/s, {bad} with violations"
+        f" {tally['commits']} commits, {tally['commits'] / cpu_s:.0f} per second of one core,"
+        f" {bad} with violations"
     )
     return 1 if bad else 0
+
+
+def _mutants(seeds: int = 600) -> int:
+    """Run each wrong edit until it is caught; print the table of the README."""
+    survived = 0
+    print("| wrong edit | seeds | caught by |\n|---|---|---|")
+    for mutant in mutants.ALL:
+        undo: list[tuple[object, str, object]] = []
+
+        def patch(owner: object, name: str, value: object, undo: list = undo) -> None:
+            undo.append((owner, name, vars(owner)[name]))
+            setattr(owner, name, value)
+
+        mutant(patch)
+        rule, seed = "", 0
+        while not rule and seed < seeds:
+            violation = Scenario(seed, through_wire=False, asserts=False).run().violation
+            rule, seed = violation.partition(" broken at ")[0].partition(" at ")[0], seed + 1
+        for owner, name, value in reversed(undo):
+            setattr(owner, name, value)
+        survived += not rule
+        print(f"| {mutant.__doc__} | {seed if rule else 'survived'} | {rule} |", flush=True)
+    print(f"\n{len(mutants.ALL) - survived} of {len(mutants.ALL)} caught")
+    return 1 if survived else 0
 
 
 def _tell(result: Result) -> None:

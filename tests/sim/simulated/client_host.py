@@ -167,6 +167,12 @@ class ClientHost(Host):
         take, call.take = call.take, None
         take(None)
 
+    def notices_end_of(self, shard: str) -> None:
+        """The link to a shard broke: whoever waits for its answer is told that none will come."""
+        for number, call in list(self._calls.items()):
+            if call.shard == shard:
+                self._time_is_up(number)
+
     def _late(self, number: int, call: _Call, answer: Answer) -> None:
         """Deliver an answer that nobody waits for any more, where the faults say so."""
         del self._calls[number]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from enact_dist.core.datum import LockId, Token
-from enact_dist.core.messages import Acquire
+from enact_dist.core.messages import Acquire, KeepAlive
 from enact_dist.core.records import Tick
 from simulated.history import conflict
 
@@ -43,6 +43,8 @@ class LockJudge:
         ]
         for tenure in sorted(fresh, key=lambda tenure: tenure.token or Token(0, 0)):
             self._check_grant(host, tenure, tenures, picture)
+        if isinstance(message, KeepAlive) and message.epoch == picture.epoch:
+            self._check_wanted(message, tenures)
         if isinstance(message, Tick):
             self._check_ends(host)
             self._check_waiters(host, picture)
@@ -70,6 +72,14 @@ class LockJudge:
         picture.newest_token = token
         picture.granted[lock] = picture.granted_ever[lock] = token
 
+    def _check_wanted(self, message: KeepAlive, tenures: dict[LockId, Tenure]) -> None:
+        """A keep-alive leaves nothing that its client does not want any more."""
+        lowest = dict(message.view)
+        for lock, tenure in tenures.items():
+            unwanted = lock.session == message.session and lock.seq < lowest.get(lock.lane, 0)
+            if unwanted and not tenure.committing:
+                self._fail("orphans are freed", lock, message.view)
+
     def _check_ends(self, host: ShardHost) -> None:
         """After a look at the clock no grant is left that should have ended."""
         state = host.shard.state
@@ -95,7 +105,8 @@ class LockJudge:
                 if (other.token is not None or picture.arrivals[other.lock] < arrival)
                 and conflict(waiter.items, other.items, columns=True)
             ]
-            if not waits[waiter.lock] and not state.sessions.in_grace(state.now_ns):
+            closed = state.draining or state.sessions.in_grace(state.now_ns)
+            if not waits[waiter.lock] and not closed:
                 self._fail("P6 nobody waits in vain", waiter.lock, waiter.items)
         for waiter in waits:
             self._check_circle(waiter)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from enact_dist.core.datum import Datum, LockId, Slot
 from enact_dist.core.messages import (
     Committed,
+    Goodbye,
     Granted,
     Hello,
     Item,
@@ -105,7 +106,8 @@ class Model:
     def handled(self, host: ShardHost, message: object, effects: list[object]) -> None:
         """Judge one step: what came in, and what the shard decided."""
         picture = self.pictures[host.name]
-        if isinstance(message, Hello) and message.known_epoch == picture.epoch:
+        acknowledged = isinstance(message, Hello) and message.known_epoch == picture.epoch
+        if acknowledged or isinstance(message, Goodbye):
             picture.grace_waits_for.pop(message.session, None)
         self._check_commits(host, effects, picture)
         self._locks.judge(host, message, picture)

@@ -247,19 +247,6 @@ def shows_before_it_is_kept(patch: Patch) -> None:
     patch(Commits, "_make_durable", wrong)
 
 
-def takes_old_grants(patch: Patch) -> None:
-    """A client takes a late grant of an epoch that is over."""
-    on_acquiring = MultiLock._on_acquiring
-
-    def wrong(self: MultiLock, shard: str, answer: Any, now_ns: int) -> None:
-        peer = self.client._peer(shard)
-        known, peer.epoch = peer.epoch, getattr(answer, "epoch", peer.epoch)
-        on_acquiring(self, shard, answer, now_ns)
-        peer.epoch = known
-
-    patch(MultiLock, "_on_acquiring", wrong)
-
-
 def asks_shards_in_the_order_of_the_request(patch: Patch) -> None:
     """A lock over several shards acquires them in the order in which they are named."""
     plan = Client.plan
@@ -268,7 +255,7 @@ def asks_shards_in_the_order_of_the_request(patch: Patch) -> None:
         sorted_plan = plan(self, items)
         first = {item.entity: number for number, item in enumerate(items)}
         locks = sorted(sorted_plan.locks, key=lambda part: first[part[1][0].entity])
-        return Plan(tuple(locks), sorted_plan.views)
+        return Plan(tuple(locks), sorted_plan.views, sorted_plan.map_version)
 
     patch(Client, "plan", wrong)
 
@@ -315,7 +302,6 @@ ALL = (
     numbers_start_anew,
     retries_with_another_commit,
     shows_before_it_is_kept,
-    takes_old_grants,
     asks_shards_in_the_order_of_the_request,
     keeps_one_outcome_per_session,
 )

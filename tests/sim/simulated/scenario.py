@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 from random import Random
 from typing import TYPE_CHECKING
 
-from enact_dist.core.messages import PlacementMap, ShardEntry
-from enact_dist.core.records import SessionSeen
+from enact_dist.core.messages import Goodbye, PlacementMap, ShardEntry
+from enact_dist.core.records import Drain, SessionSeen
 from enact_dist.core.shard_state import ShardSettings
 from simulated import faults as fault_options
 from simulated.client_host import ClientHost
@@ -75,7 +75,9 @@ class Scenario:
         self.shards = self._made_shards(count)
         for host in self.shards.values():
             host.asserts = asserts
-        self.workload = Workload(world, self.history, self.model, entities=random.choice((2, 3, 4)))
+        self.workload = Workload(
+            world, self.history, self.model, entities=random.choice((1, 2, 3, 4))
+        )
         self._lanes = random.choice((1, 2, 3))
         self._clients = random.choice((2, 3, 4))
         self._named = 0
@@ -183,6 +185,7 @@ class Scenario:
         faults, random = self.faults, self.world.random
         for rate, act in (
             (faults.crashes_per_s, self._crash_one),
+            (faults.crashes_per_s / 4, self._drain_one),
             (faults.kills_per_s, self._kill_one),
             (faults.pauses_per_s, self._pause_one),
             (faults.partitions_per_s, self._partition),
@@ -209,15 +212,38 @@ class Scenario:
 
     def _crash(self, host: ShardHost) -> None:
         random = self.world.random
-        if self.world.now_ns < FAULTS_NS:
-            host.crash(
-                power_cut=random.random() < self.faults.power_cut,
-                down_ns=random.choice((20 * MS, 300 * MS, 2 * S)),
-            )
+        if self.world.now_ns >= FAULTS_NS:
+            return
+        power_cut = random.random() < self.faults.power_cut
+        down_ns = random.choice((20 * MS, 20 * MS, 300 * MS, 2 * S))
+        host.crash(power_cut=power_cut, down_ns=down_ns)
+        for client in self._up_clients():
+            # A link that breaks is often noticed at once, and then nobody waits for an answer.
+            if random.random() < 0.5:
+                client.receive(lambda client=client: client.notices_end_of(host.name))
+
+    def _drain_one(self) -> None:
+        """Stop a shard as a signal does: it answers who is parked, grants no more, and ends."""
+        host = self.world.random.choice(list(self.shards.values()))
+        if host.up:
+            self.world.tally["drains"] += 1
+            host.receive(lambda: host.event(Drain()))
+            life, delay_ns = host.life, self.world.random.randrange(S)
+            self.world.after(delay_ns, lambda: self._end_drained(host, life))
+
+    @staticmethod
+    def _end_drained(host: ShardHost, life: int) -> None:
+        if host.life == life:
+            host.crash(power_cut=False, down_ns=300 * MS)
 
     def _kill_one(self) -> None:
         host = self.world.random.choice(self._up_clients())
-        self.world.tally["clients killed"] += 1
+        if self.world.random.random() < 0.3:
+            self.world.tally["goodbyes"] += 1
+            for shard in host.client.shards_in_use():
+                host.call(shard, Goodbye(host.client.session), lambda _answer: None)
+        else:
+            self.world.tally["clients killed"] += 1
         host.dies()
         self._show_token(host, present=False)
         self._add_client()
@@ -227,7 +253,8 @@ class Scenario:
 
     def _pause(self, host: Host) -> None:
         random, world = self.world.random, self.world
-        duration_ns = random.choice((self.ttl_ns // 4, self.ttl_ns, 3 * self.ttl_ns))
+        ttl_ns = self.ttl_ns
+        duration_ns = random.choice((ttl_ns // 4, ttl_ns, 3 * ttl_ns, 7 * ttl_ns))
         world.tally["pauses"] += 1
         host.pause(min(duration_ns, max(0, FAULTS_NS - world.now_ns)))
         if isinstance(host, ClientHost) and random.random() >= self.faults.busy:
@@ -278,7 +305,8 @@ class Scenario:
         if "crash" in kind:
             shard = next(h for h in (source, target) if isinstance(h, ShardHost))
             world.after(random.choice((0, MS // 2, MS, 3 * MS)), lambda: self._crash(shard))
-        return random.choice((50 * MS, 300 * MS, self.ttl_ns)) if "late" in kind else 0
+        late_ns = (50 * MS, self.ttl_ns // 2, self.ttl_ns * 3 // 4, self.ttl_ns)
+        return random.choice(late_ns) if "late" in kind else 0
 
     def _on_persist(self, host: ShardHost) -> None:
         random = self.world.random
