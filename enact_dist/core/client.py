@@ -244,6 +244,7 @@ class Client:
         return Plan(
             tuple((shard, tuple(locks[shard])) for shard in sorted(locks)),
             tuple((shard, tuple(views[shard])) for shard in sorted(views)),
+            self.placement.version,
         )
 
     def assert_invariants(self) -> None:

@@ -127,10 +127,13 @@ class Plan:
     """What one lock asks of which shard; both in the order of the shards' names.
 
     A shard appears once in each.  Locks on several shards take their views afterwards.
+    `map_version` names the placement that it was made by: the client may learn another meanwhile,
+    and a shard refuses what was placed by any other than its own.
     """
 
     locks: tuple[tuple[str, tuple[Item, ...]], ...]
     views: tuple[tuple[str, tuple[Item, ...]], ...]
+    map_version: int
 
 
 @dataclass(slots=True, eq=False)
@@ -219,7 +222,7 @@ class MultiLock:
         return part.shard, Acquire(
             self.lock,
             self.client.epoch(part.shard),
-            self.client.placement.version,
+            self.plan.map_version,
             self.client.sendings.next(now_ns),
             part.items,
             min(self.slice_ns, left_ns),
@@ -231,7 +234,7 @@ class MultiLock:
         return TakeView(
             self.lock,
             self.client.epoch(shard),
-            self.client.placement.version,
+            self.plan.map_version,
             self.client.sendings.next(now_ns),
             self._views_left[shard],
             self.client.seen_stamp_ns,
