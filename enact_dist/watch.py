@@ -29,6 +29,8 @@ POLL_S: Final = 0.1
 """How often a quiet watch looks whether it missed the last notices; also how soon `close` acts."""
 RESYNC_S: Final = 1.0
 """How long one attempt to list the slots of a shard again may take."""
+VANISHED: Final = (0, 0)
+"""Version and stamp of a slot that its shard does not know any more."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +96,7 @@ class Watch:
         """Return the next change, or None when there is none in time or the watch is closed.
 
         Args:
-            timeout_s: How long to wait; None waits until `close`.
+            timeout_s: How long to wait; None waits until `close`, 0 takes what has arrived.
 
         Raises:
             MisuseError: The cell was closed.
@@ -103,18 +105,16 @@ class Watch:
         while not self._closed.is_set():
             if self._pending:
                 return self._pending.popleft()
-            wait_s = POLL_S
-            if deadline_s is not None:
-                wait_s = min(wait_s, deadline_s - time.monotonic())
-                if wait_s < 0:
-                    return None
-            notice = self._feed.get(timeout_s=wait_s)
+            left_s = POLL_S if deadline_s is None else deadline_s - time.monotonic()
+            notice = self._feed.get(timeout_s=max(0.0, min(POLL_S, left_s)))
             if notice is not None:
                 self._take(notice)
-            else:
-                # A closed cell's feed answers None at once: without this the loop would spin.
-                self._client.check_usable()
-                self._look_for_missed_tail()
+                continue
+            # A closed cell's feed answers None at once: without this the loop would spin.
+            self._client.check_usable()
+            self._look_for_missed_tail()
+            if left_s <= 0 and not self._pending:
+                return None
         return None
 
     def _take(self, notice: Notice) -> None:
@@ -164,7 +164,15 @@ class Watch:
             if null and state.slot not in self._known:
                 continue
             self._note(shard, state.slot, state.version, state.stamp_ns, null=null)
+        self._note_vanished(shard, {state.slot for state in states})
         self._following[shard] = _Following(answer.epoch, answer.notice_number, listed=True)
+
+    def _note_vanished(self, shard: str, listed: set[Slot]) -> None:
+        """Tell of slots that the shard lists no more: it kept them in memory and restarted."""
+        for slot, known in list(self._known.items()):
+            gone = slot not in listed and known != VANISHED
+            if gone and self._client.shard_of(slot.entity) == shard:
+                self._note(shard, slot, *VANISHED, null=True)
 
     def _note(self, shard: str, slot: Slot, version: int, stamp_ns: int, *, null: bool) -> None:
         """Add a change unless it is known.

@@ -1,0 +1,139 @@
+"""What a user of `watch` may rely on: a snapshot, then every change, nothing missed unknowingly."""
+
+import threading
+
+import pytest
+
+from enact_dist import Aspect, Entities, Entity, Lock, Write
+from enact_dist.errors import MisuseError
+from enact_dist.link import notices
+
+COUNT, NAME = Aspect("count", int), Aspect("name", str)
+bench, piece = Entity("work_bench"), Entity("work_piece")
+SOON_S = 5.0
+
+
+def write(request, datum):
+    with Lock(request) as lock:
+        lock[request] = datum
+
+
+def rest(watch):
+    """Return what is there now: a quiet watch answers None at once."""
+    return [(c.entity.name, c.version, c.gap, c.null) for c in iter(lambda: watch.next(0), None)]
+
+
+def test_watch_yields_what_is_there_then_each_change(online):
+    """First the present state in the order of its commits, then every commit in order."""
+    online.init(piece, COUNT, 1)
+    online.init(bench, COUNT, 1)
+    count = Write(online, bench, COUNT)
+    with online.watch("**", COUNT) as watch:
+        assert rest(watch) == [("work_piece", 1, 0, False), ("work_bench", 1, 0, False)]
+        for value in (2, 3):
+            write(count, value)
+        with Lock(count) as lock:
+            del lock[count]
+        assert [watch.next(SOON_S).version for _ in range(3)] == [2, 3, 4]
+        assert watch.next(0) is None
+        assert watch.missed == 0
+
+
+def test_watch_follows_only_what_it_names(cell, online):
+    """Other entities, aspects and world contexts are left out."""
+    with online.watch(Entities("work_*"), NAME) as watch:
+        online.init(bench, COUNT, 1)
+        online.init(Entity("tray"), NAME, "x")
+        cell.world("training").init(bench, NAME, "x")
+        online.init(bench, NAME, "x")
+        change = watch.next(SOON_S)
+        assert (change.entity, change.aspect, change.version) == (bench, "name", 1)
+        assert watch.next(0) is None
+
+
+def test_watch_of_one_entity_takes_all_its_aspects(online):
+    """No aspect named means all of them."""
+    with online.watch(bench) as watch:
+        online.init(bench, COUNT, 1)
+        online.init(bench, NAME, "x")
+        assert [watch.next(SOON_S).aspect for _ in range(2)] == ["count", "name"]
+
+
+def test_change_tells_the_position_of_its_commit(cell, online):
+    """A change's position is the one that the commit returned."""
+    count = Write(online, bench, COUNT)
+    with online.watch("**", COUNT) as watch:
+        with Lock(count) as lock:
+            lock[count] = 1
+        assert watch.next(SOON_S).position == lock.position
+
+
+def test_slow_watch_says_how_much_it_missed_and_has_the_newest(online, monkeypatch):
+    """A reader that was away while its queue overflowed gets the newest state with its gap."""
+    monkeypatch.setattr(notices.NoticeQueue.__init__, "__kwdefaults__", {"notices_max": 4})
+    count, other = Write(online, bench, COUNT), Write(online, piece, COUNT)
+    with online.watch("**", COUNT) as watch:
+        for value in range(20):
+            write(count, value)
+        write(other, 1)
+        seen = rest(watch)
+        assert seen == [("work_bench", 20, 19, False), ("work_piece", 1, 0, False)]
+        assert watch.missed == 19
+        write(count, 21)
+        assert watch.next(SOON_S).gap == 0
+
+
+def test_deleted_and_made_again_slot_is_told_in_order(online):
+    """Deletion is a change; a slot made again goes on counting."""
+    count = Write(online, bench, COUNT)
+    with online.watch("**", COUNT) as watch:
+        online.init(bench, COUNT, 1)
+        with Lock(count) as lock:
+            del lock[count]
+        online.init(bench, COUNT, 2)
+        assert [(c.version, c.null) for c in (watch.next(SOON_S) for _ in range(3))] == [
+            (1, False),
+            (2, True),
+            (3, False),
+        ]
+
+
+def test_watch_leaves_out_what_was_deleted_before_it(online):
+    """A slot that is null at the start is no news."""
+    count = Write(online, bench, COUNT)
+    online.init(bench, COUNT, 1)
+    with Lock(count) as lock:
+        del lock[count]
+    with online.watch("**") as watch:
+        assert watch.next(0) is None
+
+
+def test_closed_watch_ends_its_iteration(online):
+    """`close` from another thread ends a loop that waits."""
+    watch = online.watch("**")
+    seen = []
+    reader = threading.Thread(target=lambda: seen.extend(watch))
+    reader.start()
+    online.init(bench, COUNT, 1)
+    while not seen:
+        assert reader.is_alive()
+    watch.close()
+    watch.close()
+    reader.join(SOON_S)
+    assert not reader.is_alive()
+    assert watch.next() is None
+
+
+def test_watch_raises_when_its_cell_is_closed(cell, online):
+    """A watch of a closed cell is a misuse, not silence."""
+    watch = online.watch("**")
+    cell.close()
+    with pytest.raises(MisuseError, match="closed"):
+        watch.next(SOON_S)
+
+
+def test_two_watches_do_not_take_from_each_other(online):
+    """Each watch sees every change."""
+    with online.watch("**") as one, online.watch("**") as other:
+        online.init(bench, COUNT, 1)
+        assert one.next(SOON_S) == other.next(SOON_S)
