@@ -7,13 +7,12 @@ the same core, the same locks and, given a folder, the same durability.
 from __future__ import annotations
 
 import atexit
-import socket
+import contextlib
 import time
-import weakref
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from enact_dist.core.datum import Position
 from enact_dist.core.messages import (
     AwaitStamp,
     Break,
@@ -24,7 +23,7 @@ from enact_dist.core.messages import (
     Reached,
     Sessions,
 )
-from enact_dist.errors import MisuseError, ShardUnreachableError, UnknownWorldError
+from enact_dist.errors import EnactError, MisuseError, UnknownWorldError
 from enact_dist.lock import refuse_inside_lock
 from enact_dist.session import Session
 from enact_dist.terms import checked_name
@@ -33,11 +32,11 @@ from enact_dist.world import WorldContext
 if TYPE_CHECKING:
     from types import TracebackType
 
-    from enact_dist.core.datum import Position
     from enact_dist.core.messages import Holder
     from enact_dist.link.client import CellClient
 
-_open: weakref.WeakSet[Cell] = weakref.WeakSet()
+_open: set[Cell] = set()
+"""Held strongly: handles made by a cell work on when nobody keeps the cell itself."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,6 +121,10 @@ class Cell:
         self._client = client
         self._host = host
         _open.add(self)
+        # What is registered last runs first: before the transport's own end, over which the
+        # goodbyes have to go.
+        atexit.unregister(_close_all)
+        atexit.register(_close_all)
 
     # ---------------------------------------------------------------- world contexts
 
@@ -169,8 +172,15 @@ class Cell:
         Raises:
             LockHeldError: This thread holds a lock.
             ShardUnreachableError: The position's shard does not answer.
+            MisuseError: `position` is none of this cell; a lock that wrote nothing has none.
         """
         refuse_inside_lock("wait")
+        self._client.check_usable()
+        if not isinstance(position, Position) or position.shard not in self._client.shards():
+            raise MisuseError(
+                f"{position!r} is no position of cell {self.name!r}; a lock has one after its block"
+                " if it wrote something"
+            )
         deadline_s = time.monotonic() + timeout_s
         while True:
             left_s = max(0.0, deadline_s - time.monotonic())
@@ -251,8 +261,6 @@ class Cell:
         Raises:
             ShardUnreachableError: A shard does not answer.
         """
-        import msgpack
-
         shards = self._client.shards()
         answers = self._client.call_all([(shard, ListSessions()) for shard in shards])
         found: dict[str, ActorInfo] = {}
@@ -261,7 +269,7 @@ class Cell:
                 if not info.actor:
                     continue
                 before = found.get(info.session)
-                report = msgpack.unpackb(info.report) if info.report else {}
+                report = _report(info.report)
                 found[info.session] = ActorInfo(
                     info.actor,
                     info.host,
@@ -293,10 +301,12 @@ class Cell:
     def close(self) -> None:
         """Give back everything and end the connection; twice is harmless."""
         _open.discard(self)
-        self._client.close()
-        if self._host is not None and not self._client.forked:
-            self._host.close()
-            self._host = None
+        try:
+            self._client.close()
+        finally:
+            if self._host is not None and not self._client.forked:
+                self._host.close()
+                self._host = None
 
     def __enter__(self) -> Cell:
         return self
@@ -332,10 +342,18 @@ def lock_info(shard: str, holder: Holder) -> LockInfo:
     )
 
 
-@atexit.register
+def _report(encoded: bytes) -> dict[str, Any]:
+    """Return an actor's report; empty where it is none, as any client may send anything."""
+    import msgpack
+
+    try:
+        report = msgpack.unpackb(encoded) if encoded else {}
+    except (ValueError, msgpack.UnpackException):
+        return {}
+    return report if isinstance(report, dict) else {}
+
+
 def _close_all() -> None:
     for cell in list(_open):
-        cell.close()
-
-
-__all__ = ["ActorInfo", "Cell", "LockInfo", "Path", "ShardInfo", "ShardUnreachableError", "socket"]
+        with contextlib.suppress(EnactError):
+            cell.close()

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Final
 from enact_dist.cell import Cell
 from enact_dist.core.client import Client
 from enact_dist.core.messages import PlacementMap, ShardEntry, Welcome
-from enact_dist.errors import LinkError
+from enact_dist.errors import ConfigError, LinkError, MisuseError
+from enact_dist.terms import checked_name
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -39,15 +40,16 @@ def connect(
 
     Raises:
         ShardUnreachableError: No shard answered in time; the message names shards and endpoints.
-        ConfigError: The `cell.toml` cannot be used.
+        ConfigError: The `cell.toml` cannot be used, or `target` is neither file nor endpoint.
     """
     from enact_dist.link.joining import join
 
     name, ttl_s = "", TTL_S
     endpoints: tuple[str, ...] = (str(target),)
-    if not _is_endpoint(str(target)):
+    if not _is_endpoint(target):
         from enact_dist.config import load_config
 
+        _refuse_no_file(target)
         config = load_config(Path(target))
         name, ttl_s = config.name, config.ttl_s
         endpoints = tuple(e for entry in config.placement_map().shards for e in entry.endpoints)
@@ -81,13 +83,14 @@ def local(
 
     Raises:
         StoreError: The folder is in use, unreadable or corrupt.
+        MisuseError: `worlds` holds no names of world contexts.
     """
     from enact_dist.core.shard_state import ShardSettings
     from enact_dist.link.client import CellClient
     from enact_dist.link.embedded import EmbeddedCarrier
     from enact_dist.link.host import open_host
 
-    names = dict.fromkeys((*worlds, *(config.worlds if config else ())))
+    names = dict.fromkeys((*_world_names(worlds), *(config.worlds if config else ())))
     settings = ShardSettings(
         LOCAL_SHARD,
         PlacementMap(1, (ShardEntry(LOCAL_SHARD, ()),), ()),
@@ -96,20 +99,59 @@ def local(
         fetch_bytes_max=1 << 40,
     )
     host = open_host(settings, Path(path) if path is not None else None, clock=clock)
-    client = _client(actor, ttl_s=config.ttl_s if config else TTL_S, observer=False)
-    carrier = EmbeddedCarrier(host, client.session)
-    options = {} if clock is None else {"now_ns": clock.monotonic_ns}
-    cell_client = CellClient(carrier, client, keep_alive=False, **options)
-    welcome = cell_client.call(LOCAL_SHARD, client.hello(LOCAL_SHARD))
-    if not isinstance(welcome, Welcome):
-        raise LinkError(f"{type(welcome).__name__} came as the answer to Hello")
-    cell_client.start(welcome)
+    try:
+        client = _client(actor, ttl_s=config.ttl_s if config else TTL_S, observer=False)
+        carrier = EmbeddedCarrier(host, client.session)
+        options = {} if clock is None else {"now_ns": clock.monotonic_ns}
+        cell_client = CellClient(carrier, client, keep_alive=False, **options)
+        welcome = cell_client.call(LOCAL_SHARD, client.hello(LOCAL_SHARD))
+        if not isinstance(welcome, Welcome):
+            raise LinkError(f"{type(welcome).__name__} came as the answer to Hello")
+        cell_client.start(welcome)
+    except BaseException:
+        host.close()
+        raise
     return Cell(config.name if config else LOCAL_SHARD, cell_client, host=host)
 
 
-def _is_endpoint(target: str) -> bool:
+def _world_names(worlds: Sequence[str]) -> tuple[str, ...]:
+    if isinstance(worlds, str):
+        raise MisuseError(f"worlds={worlds!r} is one string; write worlds=[{worlds!r}]")
+    try:
+        return tuple(checked_name("world context", name, slashes=False) for name in worlds)
+    except ValueError as error:
+        raise MisuseError(str(error)) from None
+
+
+def _is_endpoint(target: str | Path) -> bool:
+    """Say whether `target` is written as an endpoint, with a port that there can be.
+
+    Raises:
+        ConfigError: It is, and its port is none.
+    """
+    if isinstance(target, Path):
+        return False
     protocol, slash, address = target.partition("/")
-    return bool(slash) and protocol in _PROTOCOLS and ":" in address
+    if not slash or protocol not in _PROTOCOLS:
+        return False
+    host, colon, port = address.partition("?")[0].partition("#")[0].rpartition(":")
+    if protocol == "unixsock-stream":
+        return True
+    if not host or not colon or not port.isdecimal() or not 0 < int(port) < 1 << 16:
+        raise ConfigError(f"endpoint {target!r} lacks a host or a port; {_ENDPOINT}")
+    return True
+
+
+def _refuse_no_file(target: str | Path) -> None:
+    if not str(target) or not Path(target).exists():
+        raise ConfigError(
+            f"{str(target)!r} is neither a file nor an endpoint; {_ENDPOINT}, a cell is described"
+            " in a cell.toml",
+            path=str(target),
+        )
+
+
+_ENDPOINT: Final = "an endpoint looks like 'tcp/host:7447'"
 
 
 _PROTOCOLS: Final = frozenset(("tcp", "udp", "tls", "quic", "ws", "unixsock-stream"))

@@ -36,6 +36,8 @@ def join(
             f"a shard of cell {found!r} answers at {', '.join(endpoints)}, not one of {name!r};"
             " two cells use one endpoint, or cell.toml was renamed while shards run"
         )
+    # The link's lease follows the session's, which the shard may have shortened.
+    client.ttl_ns = min(client.ttl_ns, welcome.ttl_ns)
     reachable = [e for entry in welcome.placement.shards for e in entry.endpoints]
     carrier = ZenohCarrier(
         found,
@@ -44,5 +46,9 @@ def join(
         tuple(dict.fromkeys((*endpoints, *reachable))),
         ttl_s=client.ttl_ns / 1e9,
     )
-    carrier.add_endpoints(welcome.placement.shards)
+    try:
+        carrier.add_endpoints(welcome.placement.shards)
+    except BaseException:
+        carrier.close()
+        raise
     return found, CellClient(carrier, client), welcome

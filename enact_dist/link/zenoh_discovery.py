@@ -59,7 +59,7 @@ def discover(endpoints: Sequence[str], hello: Hello, *, timeout_s: float) -> tup
         ProtocolError: An answer cannot be read, or is none to a hello.
     """
     deadline_s = time.monotonic() + timeout_s
-    session = open_session(connect=endpoints, lease_s=PROBE_LEASE_S)
+    session = open_session(connect=endpoints, lease_s=PROBE_LEASE_S, open_s=timeout_s)
     try:
         while time.monotonic() < deadline_s:
             for found in _find(session, deadline_s):

@@ -1,0 +1,209 @@
+"""What a user of `Cell` may rely on: contexts, people's views of it, and its end."""
+
+import threading
+
+import msgpack
+import pytest
+
+from enact_dist import Aspect, Entity, Lock, Position, Read, View, Write, connect, local
+from enact_dist.errors import (
+    ConfigError,
+    LockHeldError,
+    MisuseError,
+    ShardUnreachableError,
+    StoreError,
+    UnknownWorldError,
+)
+
+COUNT = Aspect("count", int)
+bench, piece = Entity("work_bench"), Entity("work_piece")
+
+
+def test_create_world_makes_it_once_and_for_good(tmp_path):
+    """create_world is idempotent, and its context is there after a restart."""
+    with local(tmp_path) as cell:
+        made = cell.create_world("what_if")
+        made.init(bench, COUNT, 1)
+        again = cell.create_world("what_if")
+        assert again.view(View(again, bench, COUNT))[View(again, bench, COUNT)] == 1
+    with local(tmp_path, worlds=["online"]) as cell:
+        assert cell.worlds() == ("online", "what_if")
+        assert cell.world("what_if").entities() == (bench,)
+
+
+@pytest.mark.parametrize("name", ["", "a b", "a/b", "-a", "x" * 300])
+def test_create_world_refuses_a_name_that_cannot_be(cell, name):
+    """A name that no key can carry is refused where it is made."""
+    with pytest.raises(ValueError, match="world context"):
+        cell.create_world(name)
+
+
+def test_local_refuses_worlds_that_are_no_names():
+    """One string is not a sequence of names, and each name is checked."""
+    with pytest.raises(MisuseError, match=r"worlds=\['online'\]"):
+        local(worlds="online")
+    with pytest.raises(MisuseError, match="on line"):
+        local(worlds=["on line"])
+
+
+def test_unknown_world_says_none_when_there_is_none():
+    """An empty cell says so instead of listing nothing."""
+    with local() as cell, pytest.raises(UnknownWorldError, match="it has none") as caught:
+        cell.world("online")
+    assert caught.value.known == ()
+
+
+def test_second_cell_on_a_folder_is_refused_and_the_first_goes_on(tmp_path):
+    """Two cells never share a folder; the refusal names it."""
+    with local(tmp_path, worlds=["online"]) as cell:
+        with pytest.raises(StoreError, match=str(tmp_path)):
+            local(tmp_path)
+        assert cell.world("online").init(bench, COUNT, 1)
+
+
+def test_folder_is_free_again_when_opening_failed_half_way(tmp_path, monkeypatch):
+    """A cell that could not be opened leaves its folder to the next one."""
+    from enact_dist.link import client
+
+    with monkeypatch.context() as patch, pytest.raises(RuntimeError):
+        patch.setattr(client, "CellClient", lambda *_, **__: (_ for _ in ()).throw(RuntimeError))
+        local(tmp_path)
+    with local(tmp_path):
+        pass
+
+
+def test_closed_cell_leaves_no_grace_to_the_next(tmp_path):
+    """Goodbye removes the session for good: the next shard waits for nobody."""
+    with local(tmp_path, worlds=["online"]) as cell:
+        cell.world("online").init(bench, COUNT, 1)
+    with local(tmp_path) as cell:
+        assert cell.shards()[0].open
+        assert cell.shards()[0].sessions == 1
+
+
+def test_close_twice_is_harmless(cell):
+    """A closed cell may be closed again."""
+    cell.close()
+    cell.close()
+
+
+def test_two_cells_in_one_process_are_apart(cell, online):
+    """Each cell has its data; one lock cannot name two; a thread holds one lock over both."""
+    with local(worlds=["online"]) as other:
+        there = other.world("online")
+        there.init(bench, COUNT, 1)
+        assert online.entities() == ()
+        with pytest.raises(MisuseError, match="two connections"):
+            Lock(Read(online, bench, COUNT), Read(there, bench, COUNT))
+        with Lock(Read(online, bench, COUNT)), pytest.raises(LockHeldError):
+            Lock(Read(there, bench, COUNT)).__enter__()
+
+
+def test_wait_says_whether_a_position_is_visible(cell, online):
+    """A committed position is visible at once; one in the future is not, in time."""
+    count = Write(online, bench, COUNT)
+    with Lock(count) as lock:
+        lock[count] = 1
+    assert cell.wait(lock.position)
+    far = Position(lock.position.stamp_ns + 3600 * 10**9, lock.position.shard)
+    assert not cell.wait(far, timeout_s=0.05)
+
+
+def test_wait_refuses_what_is_no_position_of_the_cell(cell, online):
+    """A lock that wrote nothing has no position to wait for; an unknown shard has none either."""
+    with Lock(Read(online, bench, COUNT)) as lock:
+        pass
+    for position in (lock.position, Position(1, "elsewhere")):
+        with pytest.raises(MisuseError, match="no position of cell"):
+            cell.wait(position)
+
+
+def test_locks_show_holder_and_waiter(cell, online):
+    """Who holds, who waits for whom, how, and for how long it may last."""
+    waiting = threading.Thread(target=lambda: Lock(Read(online, bench, COUNT)).__enter__())
+    with Lock(Write(online, bench, COUNT), hold_s=30.0):
+        waiting.start()
+        while len(cell.locks()) < 2:
+            assert waiting.is_alive()
+        holder, waiter = cell.locks()
+    waiting.join()
+    assert (holder.granted, holder.modes, holder.waits_for) == (True, "write", ())
+    assert (waiter.granted, waiter.modes, waiter.waits_for) == (False, "read", (holder.number,))
+    assert holder.slots == ("online:work_bench/count (write)",)
+    assert holder.pid == waiter.pid > 0
+    assert 29.0 < holder.hold_left_s <= 30.0
+
+
+def test_break_lock_tells_whether_there_was_one(cell, online):
+    """An unknown number breaks nothing; an unknown shard is a misuse that lists those known."""
+    assert cell.break_lock(12345, shard="local") is None
+    with pytest.raises(MisuseError, match="it has local"):
+        cell.break_lock(1, shard="elsewhere")
+
+
+def test_shards_show_what_a_shard_is_doing(cell, online):
+    """Slots, bytes, sessions, locks and counters come from the shard itself."""
+    online.init(bench, COUNT, 1)
+    online.init(piece, Aspect("name", bytes), bytes(1000))
+    with Lock(Read(online, bench, COUNT)):
+        shard = cell.shards()[0]
+    assert (shard.name, shard.reachable, shard.open) == ("local", True, True)
+    assert (shard.slots, shard.sessions, shard.locks) == (2, 1, 1)
+    assert shard.size_bytes >= 1000
+    assert shard.counters["commits"] == 2
+    assert abs(shard.clock_ahead_s) < 1.0
+
+
+def test_actors_show_the_newest_report(cell):
+    """A report reaches the shard at once where that is in the process."""
+    cell.set_report(msgpack.packb({"updates": 3}))
+    cell.set_report(msgpack.packb({"updates": 4}))
+    (actor,) = cell.actors()
+    assert actor.report == {"updates": 4}
+    assert actor.shards == ("local",)
+    assert actor.lease_left_s > 0
+
+
+@pytest.mark.parametrize("report", [b"\xc1", b"\x93\x01", msgpack.packb([1, 2]), b"\x81\xa1a"])
+def test_actors_are_listed_when_a_report_cannot_be_read(cell, report):
+    """Any client may send anything as its report; the list stays readable."""
+    cell.set_report(report)
+    assert [actor.report for actor in cell.actors()] == [{}]
+
+
+def test_set_report_is_quiet_when_cell_is_closed(cell):
+    """A last report after the end is no error."""
+    cell.close()
+    cell.set_report(b"\x80")
+
+
+def test_aspects_show_types_and_durability(cell, online):
+    """The catalogue names each aspect's type; in memory everything is volatile."""
+    online.init(bench, COUNT, 1)
+    assert cell.aspects()["count"][0] == "int"
+
+
+@pytest.mark.parametrize(
+    "target",
+    [
+        "tcp/127.0.0.1",
+        "tcp/127.0.0.1:",
+        "tcp/:7447",
+        "tcp/127.0.0.1:x",
+        "tcp/127.0.0.1:99999",
+        "tpc/127.0.0.1:7447",
+        "127.0.0.1:7447",
+        "tcp://127.0.0.1:7447",
+        "",
+    ],
+)
+def test_connect_says_what_an_endpoint_looks_like_when_it_gets_none(target):
+    """A mistyped endpoint is refused at once, with one that is right."""
+    with pytest.raises(ConfigError, match="tcp/host:7447"):
+        connect(target)
+
+
+def test_connect_names_the_endpoint_when_nobody_listens():
+    """Nobody there: the error comes in time and names what was asked."""
+    with pytest.raises(ShardUnreachableError, match=r"127.0.0.1:9 .*waited 0.2 s"):
+        connect("tcp/127.0.0.1:9", timeout_s=0.2)
