@@ -15,6 +15,7 @@ from enact_dist.errors import MisuseError
 from enact_dist.terms import Entities, Entity, refuse_duplicates
 
 if TYPE_CHECKING:
+    import threading
     from collections.abc import Mapping
 
     from enact_dist.cell import Cell
@@ -64,12 +65,19 @@ class BoundActor:
         self.contexts = {role: cell.world(name) for role, name in names.items()}
         self._check(names)
 
-    def lock(self, entity: Entity | None, *, wait_s: float | None = None) -> ActorLock:
+    def lock(
+        self,
+        entity: Entity | None,
+        *,
+        wait_s: float | None = None,
+        stop: threading.Event | None = None,
+    ) -> ActorLock:
         """Return the lock of one update, not yet taken.
 
         Args:
             entity: The triggering entity; None for a source or an actor that runs once.
             wait_s: How long to wait for it; None: as long as the actor says.
+            stop: Ends the waiting once it is set.
         """
         bound = {
             declared: self._bound(declared, entity)
@@ -80,6 +88,7 @@ class BoundActor:
             entity=entity,
             wait_s=self.actor.wait_s if wait_s is None else wait_s,
             hold_s=self.actor.hold_s,
+            stop=stop,
         )
 
     def check_usable(self) -> None:
