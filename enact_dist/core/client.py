@@ -137,8 +137,9 @@ class Client:
             self._drop_grants(shard)
             first = peer.epoch == 0
             peer.epoch = answer.epoch
-            # The first Hello of a session leaves nothing older to be acknowledged.
-            peer.acknowledged = answer.epoch if first else -1
+            # The first Hello of a session leaves nothing older to be acknowledged, unless the shard
+            # restarted before its first answer came through and now waits for us.
+            peer.acknowledged = answer.epoch if first and answer.open else -1
         elif request.known_epoch == answer.epoch:
             peer.acknowledged = answer.epoch
         self.ttl_ns = min(self.ttl_ns, answer.ttl_ns)

@@ -115,7 +115,7 @@ class SessionTable:
                 if session is not None
                 else self._retired.setdefault(outcome.lock.session, {})
             )
-            lanes[outcome.lock.lane] = Lane(outcome=outcome)
+            lanes[outcome.lock.lane] = Lane(top=outcome.lock.seq, outcome=outcome)
         longest_ns = max((session.ttl_ns for session in self.by_id.values()), default=0)
         self.grace_end_ns = now_ns + longest_ns * (100 + 2 * DRIFT_PER_CENT) // 100
 

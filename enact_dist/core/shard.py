@@ -139,8 +139,10 @@ class Shard:
             deadlines.append(soonest)
         deadlines += [
             self.state.sessions.by_id[session].lease_end_ns(now_ns)
-            for session in self.state.tenures.by_session
+            for session, tenures in self.state.tenures.by_session.items()
             if session in self.state.sessions.by_id
+            # A lease cannot end a commit in flight: looking again and again would help nobody.
+            and not all(tenure.committing for tenure in tenures.values())
         ]
         return min(deadlines)
 

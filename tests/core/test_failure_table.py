@@ -450,6 +450,25 @@ class TestCommit:
         assert bench.value() == "2"
         assert isinstance(bench.acquire(BOB, WRITE), Granted)
 
+    def test_shard_sleeps_while_only_the_disk_can_help(self, bench):
+        """Lease ends while the disk works: the next look at the clock is not overdue at once."""
+        seeded(bench)
+        grant = bench.granted(ANN, WRITE)
+        bench.disk_is_done = False
+        bench.commit(ANN, grant.token, (slot(), "2"))
+        bench.wait(2 * TTL_NS, keep=["bob"])
+
+        assert bench.shard.next_deadline_ns() > bench.now_ns
+
+    def test_committed_seq_is_stale_after_a_restart(self, bench):
+        """Shard restarts: a seq that is known to have committed is not granted again."""
+        seeded(bench)
+        bench.write("ann", 1, "2")
+        bench.restart()
+        bench.hello("ann", "bob", "eve", known_epoch=bench.shard.epoch)
+
+        assert isinstance(bench.acquire(lock_id("ann", 9, 1), WRITE), Stale)
+
     def test_forgotten_session_does_not_end_a_commit_in_flight(self, bench):
         """Session stays away for good while the disk works: the commit is done and recorded."""
         seeded(bench)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from client_bench import ANSWER, NOTHING, REQUEST, CellBench
+from client_bench import ANSWER, NOTHING, REQUEST, CellBench, ClientBench
 from shard_bench import MS, TTL_NS, S, item, slot
 
 from enact_dist.core.datum import Slot
@@ -198,6 +198,22 @@ class TestRestart:
         bob.drive(lock)
 
         assert lock.phase is Phase.HELD
+
+    def test_client_whose_first_welcome_was_lost_ends_the_grace_too(self, cell):
+        """A session that is on disk but never got an answer acknowledges the epoch it finds."""
+        ann = cell.client("ann")
+        bob = ClientBench(cell, "bob")
+        bob.lose = lambda _shard, _request: ANSWER
+        bob.call("s0", bob.core.hello("s0"))
+        bob.lose = lambda _shard, _request: NOTHING
+        cell.shards["s0"].restart()
+        ann.keep_alive()
+        ann.keep_alive()
+        bob.call("s0", bob.core.hello("s0"))
+        lock = bob.locked(item(W))
+
+        assert lock.phase is Phase.HELD
+        assert bob.kinds_sent() == ["Hello", "Hello", "Hello", "Acquire"]
 
     def test_commit_that_never_arrived_is_lost(self, cell):
         """In the new epoch an unseen commit can never come true any more."""

@@ -30,9 +30,9 @@ if TYPE_CHECKING:
 
     from simulated.faults import Faults
 
-FAULTS_NS = 14 * S
+FAULTS_NS = 20 * S
 """How long faults go on."""
-WORK_NS = 18 * S
+WORK_NS = 25 * S
 """How long new locks are begun."""
 QUIET_NS = 30 * S
 """How long after that everything must have come to rest."""

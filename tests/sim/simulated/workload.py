@@ -46,10 +46,10 @@ LABELS = 40
 KINDS = {
     "increment": 26,
     "derive": 14,
-    "across": 8,
+    "across": 12,
     "cross": 8,
-    "read": 10,
-    "view": 10,
+    "read": 8,
+    "view": 8,
     "read each": 8,
     "write each": 4,
     "create": 12,
