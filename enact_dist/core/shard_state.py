@@ -78,7 +78,12 @@ class ShardState:
         self.catalogue = Catalogue(
             configured=settings.aspects,
             recovered=recovered.aspects,
-            worlds=(*settings.worlds, *recovered.worlds),
+            # Contexts that were only configured once have data, which must stay in reach.
+            worlds=(
+                *settings.worlds,
+                *recovered.worlds,
+                *dict.fromkeys(record.slot.context for record in recovered.slots),
+            ),
         )
         self.sessions = SessionTable(recovered.sessions, outcomes=recovered.outcomes, now_ns=now_ns)
         self.shortest_ttl_ns = min(

@@ -62,7 +62,7 @@ class EmbeddedCarrier:
         host.event(SessionSeen(session, present=True))
 
     def request(self, shard: str, message: Request, *, timeout_s: float) -> Answer | None:
-        """Call the shard; None if it is parked for longer than `timeout_s` or has failed.
+        """Call the shard; None if it is parked for longer than `timeout_s` or fails meanwhile.
 
         Raises:
             ShardUnreachableError: `shard` is not the shard of this process.
@@ -123,8 +123,13 @@ class EmbeddedCarrier:
         """Do nothing: there is no other shard."""
 
     def endpoint_of(self, shard: str) -> str:
-        """Return where the shard is."""
-        return f"this process, for shard {shard}"
+        """Return where the shard is, and why it answers no more."""
+        failure = self._host.failure
+        if failure is not None:
+            return (
+                f"this process, where it has stopped ({failure}; close the cell and open it anew)"
+            )
+        return "this process"
 
     def close(self) -> None:
         """End the session's token and all feeds; twice is harmless."""

@@ -218,9 +218,10 @@ class SessionClient:
 
     def greet(self, *, timeout_s: float = FINISH_S) -> None:
         """Say hello to every shard (again), which refreshes the catalogue."""
-        self.call_all(
-            [(shard, self.core.hello(shard)) for shard in self.shards()], timeout_s=timeout_s
-        )
+        hellos = [(shard, self.core.hello(shard)) for shard in self.shards()]
+        for answer in self.call_all(hellos, timeout_s=timeout_s):
+            if isinstance(answer, Refused):
+                raise error_of(answer)
 
     def worlds(self) -> tuple[str, ...]:
         """Return the world contexts that every greeted shard knows."""

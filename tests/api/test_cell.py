@@ -1,6 +1,7 @@
 """What a user of `Cell` may rely on: contexts, people's views of it, and its end."""
 
 import threading
+import time
 
 import msgpack
 import pytest
@@ -79,6 +80,58 @@ def test_closed_cell_leaves_no_grace_to_the_next(tmp_path):
     with local(tmp_path) as cell:
         assert cell.shards()[0].open
         assert cell.shards()[0].sessions == 1
+
+
+def test_failed_shard_in_process_is_told_with_its_reason(tmp_path):
+    """A full disk ends the shard; calls say so, and nothing that was kept is lost."""
+    with local(tmp_path, worlds=["online"]) as cell:
+        online = cell.world("online")
+        online.init(bench, COUNT, 1)
+        cell._host._fail(OSError("no space left on device"))
+        with pytest.raises(ShardUnreachableError, match=r"no space left on device.*open it anew"):
+            Lock(Read(online, bench, COUNT), wait_s=0.05).__enter__()
+    with local(tmp_path) as cell:
+        assert cell.world("online").entities() == (bench,)
+
+
+def test_cell_survives_a_long_rest():
+    """A session in process lives on without keep-alives, far beyond its lease."""
+    from enact_dist import testing
+
+    clock = testing.ManualClock()
+    with testing.worlds("online", clock=clock) as resting:
+        online = resting.world("online")
+        online.init(bench, COUNT, 1)
+        clock.advance(600.0)
+        with Lock(Read(online, bench, COUNT), wait_s=0) as lock:
+            assert lock[Read(online, bench, COUNT)] == 1
+        assert resting.shards()[0].sessions == 1
+
+
+class JumpingClock:
+    """A host whose wall clock people set."""
+
+    ahead_ns = 0
+
+    def monotonic_ns(self):
+        return time.monotonic_ns()
+
+    def wall_ns(self):
+        return time.time_ns() + self.ahead_ns
+
+
+def test_nothing_happens_when_the_wall_clock_is_set():
+    """Two hours forward and back: locks, commits and waiting for positions go on, in order."""
+    clock, stamps = JumpingClock(), []
+    with local(worlds=["online"], clock=clock) as cell:
+        count = Write(cell.world("online"), bench, COUNT)
+        for ahead_h in (0, 2, -2, 0):
+            with Lock(count) as lock:
+                clock.ahead_ns = ahead_h * 3600 * 10**9
+                lock[count] = ahead_h
+            assert cell.wait(lock.position)
+            stamps.append(lock.position.stamp_ns)
+    assert stamps == sorted(set(stamps))
 
 
 def test_close_twice_is_harmless(cell):
