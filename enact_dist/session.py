@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from enact_dist.core.messages import AspectEntry, Item
 from enact_dist.core.placement import shard_of
@@ -18,6 +18,10 @@ if TYPE_CHECKING:
     from enact_dist.core.datum import Slot
     from enact_dist.link.client import CellClient
     from enact_dist.terms import Aspect
+
+
+ENTRIES_MAX: Final = 1024
+"""Aspect objects whose catalogue entries are remembered."""
 
 
 class Session:
@@ -68,6 +72,8 @@ class Session:
         """Return the aspect's catalogue entry; computed once per aspect object."""
         known = self._entries.get(id(aspect))
         if known is None or known[0] is not aspect:
+            if len(self._entries) >= ENTRIES_MAX:
+                self._entries.clear()  # programs that make an aspect anew for each lock
             durability = aspect.durability.value if aspect.durability is not None else ""
             entry = AspectEntry(aspect.name, fingerprint(aspect.datum_type), durability)
             known = self._entries[id(aspect)] = (aspect, entry)

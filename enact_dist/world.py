@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, overload
 
 from enact_dist.core.datum import Position
 from enact_dist.core.messages import Survey, Surveyed
-from enact_dist.errors import MisuseError, NullDatumError, ProtocolError
+from enact_dist.errors import LeaseLostError, MisuseError, NullDatumError, ProtocolError
 from enact_dist.lock import Lock, refuse_inside_lock
 from enact_dist.reading import EachData, Readings, check_requested, null_error, slot_of
 from enact_dist.session import session_of
@@ -30,6 +30,8 @@ T = TypeVar("T")
 
 VIEW_WAIT_S = 10.0
 """How long a view waits for its shards before they count as unreachable."""
+VIEWS_MAX = 3
+"""How often a view is taken anew when its data are gone before they were fetched."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,19 +194,30 @@ def take_snapshot(requests: tuple[LockRequest[Any], ...], *, register: bool = Tr
     if register:
         aspects = {request.aspect.name: request.aspect for request in requests}
         session.register_aspects(aspects.values(), requests=requests)
-    items: list[Item] = [session.item_of(request) for request in requests]
+    for attempt in range(1, VIEWS_MAX + 1):
+        try:
+            return Snapshot(_view(session, requests), requests)
+        except LeaseLostError:
+            # A shard restarted, or the session rested too long, between the view and its data.
+            if attempt == VIEWS_MAX:
+                raise
+    raise AssertionError("a view ends in its data or an error")
+
+
+def _view(session: Session, requests: tuple[LockRequest[Any], ...]) -> Readings:
+    """Take one view and fetch what is large."""
     client = session.client
+    items: list[Item] = [session.item_of(request) for request in requests]
     lock = client.acquire(items, wait_s=VIEW_WAIT_S, hold_s=VIEW_WAIT_S, check_plan=lambda: None)
-    readings = Readings(client, session.cache, lock.lock, lock.states, lambda: None)
     try:
+        readings = Readings(client, session.cache, lock.lock, lock.states, lambda: None)
         for reading in lock.states:
             if reading.state.large or reading.state.same:
                 readings.keep(reading.state.slot)
-    except BaseException:
+        client.finish(lock, {})
+    finally:
         client.release(lock)
-        raise
-    client.finish(lock, {})
-    return Snapshot(readings, requests)
+    return readings
 
 
 class Snapshot:

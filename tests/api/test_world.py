@@ -6,8 +6,14 @@ import numpy as np
 import pytest
 
 from enact_dist import Aspect, Entities, Entity, Lock, Read, View, ViewEach, Write
-from enact_dist.core.messages import Fetch, Release, TakeView
-from enact_dist.errors import DatumTypeError, MisuseError, NotRequestedError, NullDatumError
+from enact_dist.core.messages import Fetch, Gone, Release, TakeView
+from enact_dist.errors import (
+    DatumTypeError,
+    LeaseLostError,
+    MisuseError,
+    NotRequestedError,
+    NullDatumError,
+)
 
 COUNT, SIZE = Aspect("count", int), Aspect("size", float)
 CLOUD = Aspect("cloud", np.ndarray)
@@ -139,6 +145,35 @@ def test_view_of_small_data_costs_one_round_trip(cell, online):
     for _ in range(2):
         online.view(View(online, piece, CLOUD))
     assert asked == [TakeView, Fetch, Release, TakeView, Release]
+
+
+def test_view_is_taken_anew_when_its_data_are_gone_before_they_came(cell, online):
+    """A shard that restarts between a view and its large data costs a second look, no error."""
+    online.init(piece, CLOUD, np.arange(50_000))
+    view = View(online, piece, CLOUD)
+    request = cell._client.carrier.request
+    gone = iter([True, True])
+
+    def forget(shard, message, **options):
+        if isinstance(message, Fetch) and next(gone, False):
+            return Gone(message.slot, message.version)
+        return request(shard, message, **options)
+
+    cell._client.carrier.request = forget
+    assert online.view(view)[view][-1] == 49_999
+    gone = iter([True] * 3)
+    online.init(bench, CLOUD, np.arange(50_000))
+    with pytest.raises(LeaseLostError, match="kept for lock"):
+        online.view(View(online, bench, CLOUD))
+    assert cell._client.core.live_locks() == []
+
+
+def test_aspects_made_anew_for_each_view_are_not_kept(online):
+    """A program may write `Aspect(…)` in its loop; nothing grows with it."""
+    online.init(bench, COUNT, 1)
+    for _ in range(1_100):
+        online.view(View(online, bench, Aspect("count", int)))
+    assert len(online.session._entries) <= 1_024
 
 
 def test_view_takes_views_of_this_view_only(online):
