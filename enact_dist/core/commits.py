@@ -150,9 +150,7 @@ class Commits:
             yield Reply(reply_to, refusal)
             return
         assert tenure is not None
-        moved = next(
-            (e for e in message.expects if self._newest_version(e.slot) != e.version), None
-        )
+        moved = next((e for e in message.expects if self._moved(e, tenure)), None)
         if moved is not None:
             self._count("commits_changed")
             yield from self._tenures.remove(tenure, now_ns=now_ns)
@@ -170,6 +168,17 @@ class Commits:
         )
         commit = _InFlight(tenure, message.writes, outcome, [reply_to])
         yield from self._make_durable(commit, now_ns=now_ns)
+
+    def _moved(self, expected: SlotVersion, tenure: Tenure) -> bool:
+        """Whether an expected view does not stand, or may have to come after a later write.
+
+        A writer that was granted before the view was taken comes before us: if it also reads on
+        other shards, it may have released those reads already, and others built on that.  Seeing
+        its slot unchanged would put us before it as well.
+        """
+        if self._newest_version(expected.slot) != expected.version:
+            return True
+        return self._tenures.earlier_writer(tenure, expected.slot) is not None
 
     def _newest_version(self, slot: Slot) -> int:
         """Return the version of a slot, one in flight included: it comes before us in the log.

@@ -125,6 +125,7 @@ class LockDesk:
         # Whatever is counted renews: the client believes from the newest counter that was seen.
         session.renewed_ns = max(session.renewed_ns, self._state.now_ns)
         session.count_seen = max(session.count_seen, message.count)
+        self._state.tenures.took_views(message.lock)
         states = self._state.slots.states(message.items)
         pins = self._state.tenures.pins_of(states)
         if pins:

@@ -216,6 +216,15 @@ class LockTable:
                         self._ready[eligible.lock] = eligible
         return claim
 
+    def writers(self, slot: Slot) -> list[Claim]:
+        """Return the granted claims that may write a slot, by its name or by a pattern."""
+        found: list[Claim] = []
+        for resource in (slot, Column(slot.context, slot.aspect)):
+            queue = self._queues.get(resource)
+            if queue is not None and queue.held_modes[Mode.X]:
+                found += [self.claims[lock] for lock, mode in queue.held.items() if mode is Mode.X]
+        return found
+
     def overtook(self, claim: Claim) -> bool:
         """Whether a conflicting earlier claim still waits: never, by law 2; counted still."""
         for resource, mode in claim.wants.items():

@@ -449,7 +449,9 @@ class MultiLock:
             self.cause = answer.cause
             self._end(Phase.LOST)
         elif isinstance(answer, Changed):
-            self.cause = f"{answer.slot} moved on to version {answer.version}"
+            unchanged = (answer.slot, answer.version) in self._expects
+            how = "has been held for writing, at" if unchanged else "moved on to"
+            self.cause = f"{answer.slot} {how} version {answer.version}"
             self._end(Phase.CHANGED)
         elif isinstance(answer, OutcomeIs):
             self._on_outcome(answer, now_ns)

@@ -45,7 +45,12 @@ BLOCKERS_TOLD_MAX: Final = 8
 
 @dataclass(slots=True, eq=False)
 class Tenure:
-    """One lock at this shard."""
+    """One lock at this shard.
+
+    Attributes:
+        views_number: How many grants this shard had given when the lock's views were taken: they
+            come with the grant, or, for a lock over several shards, after its last one.
+    """
 
     lock: LockId
     claim: Claim
@@ -55,6 +60,8 @@ class Tenure:
     token: Token | None = None
     granted_ns: int = 0
     hold_end_ns: int = 0
+    views_number: int = 0
+    views_taken: bool = False
     committing: bool = False
     parked: int | None = None
     pins: dict[tuple[Slot, int], Datum] = field(default_factory=dict)
@@ -170,6 +177,7 @@ class Tenures:
             tenure = self.by_lock[claim.lock]
             self._granted += 1
             tenure.token = Token(self._epoch, self._granted)
+            tenure.views_number = self._granted
             tenure.granted_ns = now_ns
             tenure.hold_end_ns = now_ns + tenure.hold_ns
             if len(self._hold_ends) > 2 * len(self.by_lock) + STALE_ENDS_MAX:
@@ -203,6 +211,21 @@ class Tenures:
             stamp_ns,
             tuple(states),
         )
+
+    def took_views(self, lock: LockId) -> None:
+        """Note that a lock takes views after its grant; only the first time counts."""
+        tenure = self.by_lock.get(lock)
+        if tenure is not None and tenure.token is not None and not tenure.views_taken:
+            tenure.views_taken = True
+            tenure.views_number = self._granted
+
+    def earlier_writer(self, tenure: Tenure, slot: Slot) -> Tenure | None:
+        """Return who may write `slot` and was granted before the views of `tenure` were taken."""
+        for claim in self.table.writers(slot):
+            other = self.by_lock[claim.lock]
+            if other is not tenure and other.token and other.token.number <= tenure.views_number:
+                return other
+        return None
 
     def pins_of(self, states: Iterable[SlotState]) -> dict[tuple[Slot, int], Datum]:
         """Return the data that `states` name without carrying, to keep them fetchable."""
