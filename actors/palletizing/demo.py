@@ -13,9 +13,7 @@ cell.toml, cell.log  what ran, and what it said
 
 from __future__ import annotations
 
-import signal
 import sys
-import threading
 import time
 from typing import TYPE_CHECKING, Final
 
@@ -43,6 +41,7 @@ from actors.palletizing.vocabulary import (
     place_entity,
 )
 from enact_dist import View, ViewEach
+from enact_dist.link.signals import StopSignals
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -189,14 +188,6 @@ def _tray_pictures(cell: Cell) -> dict[int, Picture]:
 
 def _until_interrupted(running: RunningCell) -> None:
     """Wait for Ctrl-C or SIGTERM, or until the cell goes down by itself."""
-    over = threading.Event()
-    before = {
-        number: signal.signal(number, lambda *_: over.set())
-        for number in (signal.SIGINT, signal.SIGTERM)
-    }
-    try:
-        while not over.wait(1.0):
+    with StopSignals() as signals:
+        while not signals.event.wait(1.0):
             running.check()
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

@@ -11,7 +11,6 @@ from enact_dist.cli.output import print_json, print_table, shown_s
 from enact_dist.cli.verbs import (
     DONE,
     FAILED,
-    StopOnSignal,
     add_cell,
     add_noun,
     add_reader,
@@ -26,6 +25,7 @@ from enact_dist.cli.verbs import (
     verbs_of,
 )
 from enact_dist.errors import ConfigError, ProtocolError
+from enact_dist.link.signals import StopSignals
 
 if TYPE_CHECKING:
     import argparse
@@ -102,7 +102,7 @@ def run_actor(arguments: argparse.Namespace) -> int:
 
     see_working_folder()
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
-    with StopOnSignal() as stop:
+    with StopSignals() as stop:
         actor, name, worlds = _made(arguments)
         with open_cell(arguments, observer=False, actor=name) as cell:
             print(f"ready: actor {name} in cell {cell.name}", flush=True)

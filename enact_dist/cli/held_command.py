@@ -15,7 +15,7 @@ from enact_dist.errors import ConfigError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from enact_dist.cli.verbs import StopOnSignal
+    from enact_dist.link.signals import StopSignals
 
 _START: Final = """\
 import ctypes, os, signal, sys
@@ -71,7 +71,7 @@ class HeldCommand:
             return False
         return True
 
-    def pass_on(self, stop: StopOnSignal) -> None:
+    def pass_on(self, stop: StopSignals) -> None:
         """Send the command each signal that came to us as SIGTERM, once."""
         if stop.count > self._passed:
             self._passed = stop.count

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Final
 from enact_dist.cli.output import print_json, print_table, shown_s
 from enact_dist.cli.verbs import (
     DONE,
-    StopOnSignal,
     add_cell,
     add_noun,
     add_reader,
@@ -23,6 +22,7 @@ from enact_dist.cli.verbs import (
     whole,
 )
 from enact_dist.errors import ConfigError, LeaseLostError, MisuseError
+from enact_dist.link.signals import StopSignals
 from enact_dist.terms import Access, Entities, Entity, checked_name
 
 if TYPE_CHECKING:
@@ -169,13 +169,13 @@ def hold_lock(arguments: argparse.Namespace) -> int:
     if not arguments.command:
         raise ConfigError("lock hold needs a command: enact lock hold REQUEST … -- COMMAND …")
     with (
-        StopOnSignal() as stop,
+        StopSignals() as stop,
         open_cell(arguments, observer=False, actor=_command_name(arguments)) as cell,
     ):
         return _hold(cell, arguments, stop)
 
 
-def _hold(cell: Cell, arguments: argparse.Namespace, stop: StopOnSignal) -> int:
+def _hold(cell: Cell, arguments: argparse.Namespace, stop: StopSignals) -> int:
     from enact_dist.cli.held_command import HeldCommand
 
     items = [_item(cell, request, arguments.world) for request in arguments.requests]

@@ -7,8 +7,9 @@ import sys
 from typing import TYPE_CHECKING
 
 from enact_dist.cli.output import coloured
-from enact_dist.cli.verbs import StopOnSignal, add_verb, cell_config, see_working_folder
+from enact_dist.cli.verbs import add_verb, cell_config, see_working_folder
 from enact_dist.errors import ConfigError
+from enact_dist.link.signals import StopSignals
 
 if TYPE_CHECKING:
     import argparse
@@ -49,7 +50,7 @@ def run_up(arguments: argparse.Namespace) -> int:
     tasks = [*_shard_tasks(config, shards), *_actor_tasks(config, actors)]
     say = _Log([task.name for task in tasks])
     say("", f"up: cell {config.name} on {host}, {len(shards)} shards, {len(actors)} actors")
-    with StopOnSignal() as stop:
+    with StopSignals() as stop:
         status = Supervisor(tasks, say).run(stop.event, count=lambda: stop.count)
     say("", "down")
     return status

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import argparse
 import os
-import signal
 import sys
-import threading
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Self
+from typing import TYPE_CHECKING, Final
 
 from enact_dist.errors import ConfigError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from types import FrameType
 
     from enact_dist.cell import Cell
     from enact_dist.config_types import CellConfig
@@ -209,33 +206,3 @@ def see_working_folder() -> None:
     folder = os.getcwd()  # noqa: PTH109 (sys.path holds text)
     if folder not in sys.path:
         sys.path.insert(0, folder)
-
-
-# ---------------------------------------------------------------- signals
-
-
-class StopOnSignal:
-    """Turns SIGTERM and SIGINT into an event while its block runs.  Main thread only.
-
-    Attributes:
-        event: Set by the first signal.
-        count: How many signals came.
-    """
-
-    _NUMBERS = (signal.SIGTERM, signal.SIGINT)
-
-    def __init__(self) -> None:
-        self.event = threading.Event()
-        self.count = 0
-
-    def __enter__(self) -> Self:
-        self._before = {number: signal.signal(number, self._take) for number in self._NUMBERS}
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
-
-    def _take(self, _number: int, _frame: FrameType | None) -> None:
-        self.count += 1
-        self.event.set()

@@ -16,7 +16,6 @@ from enact_dist.cli.output import (
 )
 from enact_dist.cli.verbs import (
     DONE,
-    StopOnSignal,
     add_noun,
     add_reader,
     add_verb,
@@ -27,6 +26,7 @@ from enact_dist.cli.verbs import (
     whole,
 )
 from enact_dist.errors import DatumTypeError
+from enact_dist.link.signals import StopSignals
 from enact_dist.terms import Entities, Entity
 
 if TYPE_CHECKING:
@@ -248,7 +248,7 @@ def put_datum(arguments: argparse.Namespace) -> int:
 
 def watch_world(arguments: argparse.Namespace) -> int:
     """Print changes as they come until a signal, or until there were enough."""
-    with StopOnSignal() as stop, open_cell(arguments) as cell:
+    with StopSignals() as stop, open_cell(arguments) as cell:
         world = cell.world(arguments.world)
         shown = 0
         with world.watch(Entities(arguments.pattern)) as watch:

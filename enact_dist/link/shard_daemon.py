@@ -11,25 +11,23 @@ import gc
 import json
 import logging
 import queue
-import signal
 import socket
 import sys
 import threading
 import time
 from dataclasses import dataclass
 from logging.handlers import QueueHandler, QueueListener
-from typing import TYPE_CHECKING, Final, Self
+from typing import TYPE_CHECKING, Final
 
 from enact_dist.errors import ConfigError, EnactError, LinkError
 from enact_dist.link.host import open_host
+from enact_dist.link.signals import StopSignals
 from enact_dist.link.zenoh_config import close_session, open_session
 from enact_dist.link.zenoh_discovery import FoundShard, find_shards
 from enact_dist.link.zenoh_service import ZenohService
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
     from pathlib import Path
-    from types import FrameType
 
     from enact_dist.core.shard_state import ShardSettings
     from enact_dist.link.host import ShardHost
@@ -173,20 +171,25 @@ def _reachable(endpoint: str) -> str:
 
 def run_shard(settings: DaemonSettings) -> int:
     """Run a shard until SIGTERM or SIGINT; return the exit status.  Main thread only."""
-    with _Log(settings.log_format), _Signals() as signalled:
+    with _Log(settings.log_format), StopSignals() as signals:
         try:
             shard = start_shard(settings)
         except EnactError as error:
             print(f"shard {settings.shard.name}: {error}", file=sys.stderr, flush=True)
             return 1
         try:
-            signalled.call(shard.end)
+            signals.call(lambda name: _stop(shard, name))
             _say_ready(shard)
             _stay_responsive()
             shard.wait()
         finally:
             shard.stop()
         return 1 if shard.failure is not None else 0
+
+
+def _stop(shard: RunningShard, name: str) -> None:
+    _log.info("%s received", name, extra={"event": "shard.stop"})
+    shard.end()
 
 
 def _say_ready(shard: RunningShard) -> None:
@@ -209,36 +212,6 @@ def _stay_responsive() -> None:
     gc.collect()
     gc.freeze()
     gc.set_threshold(*GC_THRESHOLDS)
-
-
-class _Signals:
-    """Turns SIGTERM and SIGINT into one call, also when they came before there was one."""
-
-    _NUMBERS = (signal.SIGTERM, signal.SIGINT)
-
-    def __init__(self) -> None:
-        self._received = ""
-        self._act: Callable[[], None] | None = None
-
-    def __enter__(self) -> Self:
-        self._before = {number: signal.signal(number, self._take) for number in self._NUMBERS}
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
-
-    def call(self, act: Callable[[], None]) -> None:
-        """Call `act` at the first signal, at once if there was one already."""
-        self._act = act
-        if self._received:
-            act()
-
-    def _take(self, number: int, _: FrameType | None) -> None:
-        self._received = signal.Signals(number).name
-        _log.info("%s received", self._received, extra={"event": "shard.stop"})
-        if self._act is not None:
-            self._act()
 
 
 class _Log:
