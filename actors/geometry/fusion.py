@@ -1,25 +1,25 @@
 """All views of a product to one complete surface.
 
-views and poses -> poses refined against each other -> truncated signed distances -> triangles
+views and poses -> poses refined against each other -> what they leave of the space (`solid`)
                 -> large pieces -> planar patches of the views carried over
 
 Rules a change must keep: refined poses stay within what the robot is off (a prior holds them, for
-a flat lid alone leaves three freedoms open); the open underside stays open, so nothing may trust
-the sign of a distance to the result.
+a flat lid alone leaves three freedoms open); the underside on the plate, z = 0, stays open, so
+nothing may trust the sign of a distance to the result.
 
 Source: ENACT 4.2 (fusion actor); distances after Curless and Levoy 1996.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from actors.geometry.depth import depth_of_points
-from actors.geometry.open3d_on_use import open3d
 from actors.geometry.poses import inverse, moved, small_motion
 from actors.geometry.shapes import FREE_FORM, Acquisition, Surface
+from actors.geometry.solid import SeenDepth, solid_surface
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -43,23 +43,17 @@ PAIR_REACH_M: Final = 0.006
 PAIRS_PER_VIEW: Final = 1500
 """Points of a view that seek partners: 1,500 hold six freedoms to 0.05 mm."""
 
-TRUNCATION_VOXELS: Final = 4.0
-"""Reach of a measured surface into the grid: four spreads of the noise at 2 mm."""
-
-WITNESSES_MIN: Final = 2
-"""Views that must have seen a place; of three, the walls under a rim stay full of holes."""
-
-CARVED_M: Final = 2.0
-"""Distance that stands for nothing there: beyond everything the arm can see of a product."""
-
-CARVED_BAND_PX: Final = 1
-"""Width of the unknown band along an outline; see `_carving`."""
+UNKNOWN_BAND_PX: Final = 1
+"""Width of the unknown band along an outline; see `_seen`."""
 
 PIECE_SHARE_MIN: Final = 0.03
 """Connected pieces below this share of all triangles are crumbs."""
 
-PATCH_REACH_M: Final = 0.0015
-"""A fused vertex nearer to a patch's plane belongs to it."""
+PATCH_REACH_M: Final = 0.0025
+"""A fused vertex nearer to a patch's plane belongs to it: as far as fusion rounds an edge."""
+
+PATCH_FACING_COS: Final = 0.7
+"""Its normal lies within 45 degrees: two faces share their rounded edge."""
 
 
 def fuse_views(
@@ -76,10 +70,10 @@ def fuse_views(
         voxel_m: Edge of the fusion grid in metres, > 0.
 
     Returns:
-        Surface in the product frame, outward normals, open where no view saw it.
+        Surface in the product frame, outward normals, closed but for its foot on z = 0.
 
     Raises:
-        ValueError: No view, another number of acquisitions, or nothing that two views saw.
+        ValueError: No view, another number of acquisitions, or nothing in them.
     """
     if not views or len(views) != len(acquisitions):
         raise ValueError(
@@ -87,22 +81,33 @@ def fuse_views(
             f" {len(acquisitions)} poses"
         )
     poses = refined_poses(views, [each.world_from_camera for each in acquisitions])
-    cameras = [each.camera for each in acquisitions]
-    mesh = _integrated(
+    seen = np.concatenate(
         [
-            (depth_of_points(view.vertices_m, camera), camera, pose)
-            for view, camera, pose in zip(views, cameras, poses, strict=True)
-        ],
-        voxel_m,
+            moved(view.vertices_m[np.unique(view.triangles)], pose)
+            for view, pose in zip(views, poses, strict=True)
+        ]
     )
-    vertices, triangles = _large_pieces(mesh)
+    if len(seen) == 0:
+        raise ValueError(f"asked for a surface, found {len(views)} views with nothing in them")
+    vertices, triangles = _large_pieces(
+        *solid_surface(
+            [
+                _seen(view, Acquisition(each.camera, pose))
+                for view, each, pose in zip(views, acquisitions, poses, strict=True)
+            ],
+            (seen.min(axis=0), seen.max(axis=0)),
+            voxel_m=voxel_m,
+        )
+    )
     if len(triangles) == 0:
-        raise ValueError(f"{len(views)} views have no surface that two of them saw")
+        raise ValueError(f"{len(views)} views contradict each other: no surface is left")
     planes = _merged_planes(views, poses)
     return Surface(
         vertices_m=vertices.astype(np.float32),
         triangles=triangles.astype(np.int32),
-        patch_of_vertex=_patches_of(vertices, vertex_normals(vertices, triangles), planes),
+        patch_of_vertex=_patches_of(
+            vertices.astype(np.float64), vertex_normals(vertices, triangles), planes
+        ),
         patch_planes=planes,
     )
 
@@ -229,71 +234,38 @@ def _without_common_drift(refined: Sequence[Pose], poses: Sequence[Pose]) -> lis
     return [inverse(common) @ pose for pose in refined]
 
 
-def _integrated(frames: Sequence[tuple[Any, Any, Pose]], voxel_m: float) -> Any:
-    """Return the triangle mesh (Open3D) of depth images after volumetric integration."""
-    o3d = open3d()
+def _seen(view: Surface, acquisition: Acquisition) -> SeenDepth:
+    """Return what a view shows, and the pixels that surely look past the product.
 
-    tensor = o3d.core.Tensor
-    grid = o3d.t.geometry.VoxelBlockGrid(
-        ("tsdf", "weight"), (o3d.core.float32, o3d.core.float32), ((1,), (1,)), voxel_m, 16, 4096
-    )
-    prepared, touched = [], []
-    for depth_m, camera, pose in frames:
-        intrinsic = tensor(
-            np.array(
-                [
-                    [camera.fx_px, 0.0, camera.cx_px],
-                    [0.0, camera.fy_px, camera.cy_px],
-                    [0.0, 0.0, 1.0],
-                ]
-            )
-        )
-        view = intrinsic, tensor(inverse(pose))
-        blocks = grid.compute_unique_block_coordinates(
-            _image(np.nan_to_num(depth_m)), *view, 1.0, CARVED_M, TRUNCATION_VOXELS
-        )
-        touched.append(blocks.numpy())
-        prepared.append((_image(_carving(depth_m)), *view))
-    blocks = tensor(np.unique(np.concatenate(touched), axis=0))
-    for image, intrinsic, extrinsic in prepared:
-        grid.integrate(blocks, image, intrinsic, extrinsic, 1.0, CARVED_M + 1.0, TRUNCATION_VOXELS)
-    return grid.extract_triangle_mesh(weight_threshold=WITNESSES_MIN - 0.5)
-
-
-def _image(depth_m: npt.NDArray[np.floating]) -> Any:
-    o3d = open3d()
-
-    return o3d.t.geometry.Image(o3d.core.Tensor(depth_m.astype(np.float32)[..., None]))
-
-
-def _carving(depth_m: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-    """Return the depth image with emptiness beside the object, for the grid to carve away.
-
-    Without it what lies beyond an edge is unknown to every view, and the surface grows a fringe
-    there (1.6 mm root mean square on a tray with a rim, 0.5 with it). A band of 3 pixels along
-    the outline stays unknown: there the sensor confuses object and background.
+    Without these what lies beyond an edge is unknown to every view, and the surface grows a
+    fringe there. A band along the outline stays unknown: there the sensor confuses object and
+    background. So do holes in the view, and what it sees of the plate's neighbourhood is decided
+    by `solid_surface`.
     """
     from scipy.ndimage import binary_closing, binary_dilation
 
+    depth_m = depth_of_points(view.vertices_m, acquisition.camera)
     known = np.isfinite(depth_m)
-    near = binary_dilation(binary_closing(known, iterations=3), iterations=CARVED_BAND_PX)
-    return np.where(known, depth_m, np.where(near, 0.0, CARVED_M)).astype(np.float32)
+    near = binary_dilation(binary_closing(known, iterations=3), iterations=UNKNOWN_BAND_PX)
+    return SeenDepth(depth_m, ~near, acquisition)
 
 
-def _large_pieces(mesh: Any) -> tuple[Pose, npt.NDArray[np.int64]]:
-    """Return vertices and triangles of the connected pieces of an Open3D mesh that matter.
+def _large_pieces(
+    vertices: npt.NDArray[np.float32], triangles: npt.NDArray[np.int64]
+) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int64]]:
+    """Return the connected pieces of a mesh that matter: noise makes crumbs."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
 
-    A wall under a rim is a piece of its own, for no view sees how they join; noise makes crumbs.
-    """
-    legacy = mesh.to_legacy()
-    labels, counts, _ = legacy.cluster_connected_triangles()
-    triangles = np.asarray(legacy.triangles)
     if len(triangles) == 0:
-        return np.empty((0, 3)), np.empty((0, 3), np.int64)
-    large = np.asarray(counts) > PIECE_SHARE_MIN * len(triangles)
-    triangles = triangles[large[np.asarray(labels)]]
+        return vertices, triangles
+    ends = triangles[:, [0, 1]], triangles[:, [1, 2]]
+    start, end = np.concatenate(ends).T
+    graph = coo_matrix((np.ones(len(start), bool), (start, end)), shape=(len(vertices),) * 2)
+    piece = connected_components(graph, directed=False)[1][triangles[:, 0]]
+    triangles = triangles[np.bincount(piece)[piece] > PIECE_SHARE_MIN * len(triangles)]
     used, renumbered = np.unique(triangles, return_inverse=True)
-    return np.asarray(legacy.vertices)[used], renumbered.reshape(-1, 3)
+    return vertices[used], renumbered.reshape(-1, 3)
 
 
 def _merged_planes(views: Sequence[Surface], poses: Sequence[Pose]) -> Pose:
@@ -328,7 +300,7 @@ def _patches_of(vertices_m: Pose, normals: Pose, planes: Pose) -> npt.NDArray[np
     if len(planes) == 0:
         return np.full(len(vertices_m), FREE_FORM, np.int32)
     distance = np.abs(vertices_m @ planes[:, :3].T + planes[:, 3])
-    distance[normals @ planes[:, :3].T < 0.9] = np.inf
+    distance[normals @ planes[:, :3].T < PATCH_FACING_COS] = np.inf
     nearest = distance.argmin(axis=1)
     near = distance[np.arange(len(nearest)), nearest] < PATCH_REACH_M
     return np.where(near, nearest, FREE_FORM).astype(np.int32)

@@ -49,6 +49,13 @@ Averaged over 9x9 pixels noise alone leaves 0.13; a film that rises 4 mm over 12
 GRAZING_TANGENT: Final = 4.0
 """Steepest surface that is joined across two pixels, slope along the viewing ray (76 degrees)."""
 
+ISLAND_SHARE: Final = 0.02
+"""Pieces of an image below this share of its largest are no part of the object."""
+
+SLIDE_M_MAX: Final = 0.01
+"""Farthest that a point moves along its ray, by the median or onto its patch: where a ray only
+grazes a plane, sliding leads nowhere."""
+
 
 def reconstruct_view(cloud: PointCloud, camera: Camera) -> Surface:
     """Build the boundary representation of what one view shows.
@@ -58,23 +65,32 @@ def reconstruct_view(cloud: PointCloud, camera: Camera) -> Surface:
         camera: The camera that took the image.
 
     Returns:
-        Surface in the camera frame; vertices that no triangle uses are left out. Empty if the
-        cloud is.
+        Surface in the camera frame; empty if the cloud is. A point too grazing for triangles stays
+        as a vertex, since it says that its viewing ray does not pass the object.
     """
-    depth_m = depth_of_points(cloud.points_m, camera)
+    depth_m = _without_strays(depth_of_points(cloud.points_m, camera))
     window = _window(np.isfinite(depth_m), margin_px=6)
-    part_m = np.where(np.isfinite(depth_m[window]), median_known(depth_m[window], 3), np.nan)
+    part_m = depth_m[window]
+    median_m = median_known(part_m, 3)
+    # Beside the outline the median counts unknown pixels as 0: there the measured value stays.
+    with np.errstate(invalid="ignore"):
+        part_m = np.where(np.abs(median_m - part_m) < SLIDE_M_MAX, median_m, part_m)
     corner_px = window[0].start, window[1].start
     grid = points_grid(part_m, camera, corner_px=corner_px)
     smooth = points_grid(mean_known(part_m, 5), camera, corner_px=corner_px)
     patch, planes = find_patches(grid, grid_normals(smooth, reach_px=3))
     on_patch = patch != FREE_FORM
-    grid[on_patch] = _slid(grid[on_patch], planes[patch[on_patch]])
+    slid = _slid(grid[on_patch], planes[patch[on_patch]])
+    too_far = np.abs(slid[:, 2] - grid[on_patch][:, 2]) > SLIDE_M_MAX
+    patch[on_patch] = np.where(too_far, FREE_FORM, patch[on_patch])
+    grid[on_patch] = np.where(too_far[:, None], grid[on_patch], slid)
     triangles = grid_triangles(grid, camera)
-    used, renumbered = np.unique(triangles, return_inverse=True)
+    used = np.flatnonzero(np.isfinite(grid[..., 2]))
+    renumbered = np.zeros(grid[..., 2].size, np.int32)
+    renumbered[used] = np.arange(len(used))
     return Surface(
         vertices_m=grid.reshape(-1, 3)[used],
-        triangles=renumbered.reshape(-1, 3).astype(np.int32),
+        triangles=renumbered[triangles],
         patch_of_vertex=patch.reshape(-1)[used],
         patch_planes=planes,
     )
@@ -148,6 +164,16 @@ def _window(mask: npt.NDArray[np.bool_], *, margin_px: int) -> tuple[slice, slic
         low, high = (hit[0], hit[-1] + 1) if len(hit) else (0, 0)
         spans.append(slice(max(0, int(low) - margin_px), int(high) + margin_px))
     return spans[0], spans[1]
+
+
+def _without_strays(depth_m: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """Return the image without small islands: pixels of the plate that noise lifted over it."""
+    from scipy.ndimage import label
+
+    pieces, count = label(np.isfinite(depth_m), np.ones((3, 3)))
+    sizes = np.bincount(pieces.ravel(), minlength=count + 1)
+    sizes[0] = 0
+    return np.where(sizes[pieces] > ISLAND_SHARE * sizes.max(), depth_m, np.float32(np.nan))
 
 
 def _plane_bins(points_m: Points, normals: Points) -> npt.NDArray[np.int64]:

@@ -100,7 +100,10 @@ class SimulatedOrbitSensor:
 
 
 def orbit_direction(view: int, views: int) -> npt.NDArray[np.float64]:
-    """Return the unit vector from the product to a viewpoint: rings at 30 and 60 degrees, the top.
+    """Return the unit vector from the product to a viewpoint: rings at 12 to 60 degrees, the top.
+
+    The lower ring rises and falls between 12 and 30 degrees: flat views see under rims and down to
+    the plate, steeper ones see the upper edges.
 
     Args:
         view: Number of the viewpoint; the last one is the top.
@@ -110,7 +113,7 @@ def orbit_direction(view: int, views: int) -> npt.NDArray[np.float64]:
     if view == views - 1:
         turn, rise = 0.0, np.deg2rad(89.0)
     elif view < low:
-        turn, rise = 2.0 * np.pi * view / low, np.deg2rad(30.0)
+        turn, rise = 2.0 * np.pi * view / low, np.deg2rad(30.0 if view % 2 else 12.0)
     else:
         turn, rise = 2.0 * np.pi * (view - low + 0.5) / (views - 1 - low), np.deg2rad(60.0)
     return np.array([np.cos(turn) * np.cos(rise), np.sin(turn) * np.cos(rise), np.sin(rise)])
