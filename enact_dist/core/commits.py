@@ -181,10 +181,7 @@ class Commits:
         return self._tenures.earlier_writer(tenure, expected.slot) is not None
 
     def _newest_version(self, slot: Slot) -> int:
-        """Return the version of a slot, one in flight included: it comes before us in the log.
-
-        Otherwise two locks that each expect what the other writes could both commit.
-        """
+        """Return the version of a slot, one in flight included: its stamp comes before ours."""
         for commit in self._in_flight.values():
             for written, version in commit.outcome.versions:
                 if written == slot:

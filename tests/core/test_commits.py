@@ -127,6 +127,18 @@ class TestExpect:
 
         assert answer == Changed(BOB, slot("a"), 1)
 
+    def test_commit_in_flight_counts_as_a_newer_version(self, bench):
+        """What the disk is busy with comes before us in the log, and so in the order of stamps."""
+        bench.hello("ann", "bob")
+        ann = bench.granted(ANN, item(W, "b"), item(V, "a"))
+        bob = bench.granted(BOB, item(W, "a"))
+        bench.disk_is_done = False
+        bench.commit(BOB, bob.token, (slot("a"), "1"))
+
+        answer = bench.commit(ANN, ann.token, (slot("b"), "1"), expects={slot("a"): 0})
+
+        assert answer == Changed(ANN, slot("a"), 1)
+
     def test_view_that_an_earlier_lock_may_still_write_does_not_stand(self, bench):
         """A writer that was there first counts as first, though nothing is to be seen of it yet.
 
