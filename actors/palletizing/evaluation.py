@@ -18,6 +18,10 @@ training             4.2 s per product: 14 views rendered, reconstructed, fused
 check                median 0.33 s
 ===================  ==========================================================================
 
+Since surfaces are closed down to the plate (`actors.geometry.solid`) only 150 mixed packages, seed
+51, were measured again: 100 % right, 68 sound ones among them; position of sound ones median
+0.6 mm, 95th percentile 1.3 mm. The table is of the surfaces before.
+
 Cannot be seen from above: dents in a side, dents of 2 mm and less (1.2 spreads), what lies in the
 shadow of a taller package, and damage within 13 mm of an outline.
 """
