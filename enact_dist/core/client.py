@@ -54,6 +54,7 @@ class Client:
         "_locks",
         "_peers",
         "_seqs",
+        "_unsettled",
         "actor",
         "host",
         "observer",
@@ -86,6 +87,7 @@ class Client:
         self._peers: dict[str, Peer] = {}
         self._locks: dict[LockId, MultiLock] = {}
         self._seqs: dict[int, int] = {}
+        self._unsettled: dict[str, int] = {}
 
     # ---------------------------------------------------------------- shards
 
@@ -156,7 +158,7 @@ class Client:
     def _drop_grants(self, shard: str) -> None:
         for lock in list(self._locks.values()):
             if any(part.shard == shard and part.token is not None for part in lock.parts):
-                lock.lose(f"shard {shard} restarted or forgot this session")
+                lock.lose_at(shard, f"shard {shard} restarted or forgot this session")
 
     def learn_placement(self, placement: PlacementMap) -> None:
         """Take over the shard's placement map; where shards differ, the newest answer counts."""
@@ -165,6 +167,15 @@ class Client:
     def saw_stamp(self, stamp_ns: int) -> None:
         """Remember the largest stamp seen: later commits come after it everywhere."""
         self.seen_stamp_ns = max(self.seen_stamp_ns, stamp_ns)
+
+    def committed(self, participants: Iterable[str], stamp_ns: int) -> None:
+        """Note that these shards may not show a commit of ours yet."""
+        self._unsettled.update(dict.fromkeys(participants, stamp_ns))
+
+    def viewed(self, shard: str, until_ns: int) -> None:
+        """Note that a shard shows everything up to a stamp."""
+        if self._unsettled.get(shard, until_ns + 1) <= until_ns:
+            del self._unsettled[shard]
 
     # ---------------------------------------------------------------- keep-alive
 
@@ -226,26 +237,32 @@ class Client:
         """Return the locks that are not at rest."""
         return list(self._locks.values())
 
-    def plan(self, items: Iterable[Item]) -> Plan:
+    def plan(self, items: Iterable[Item], *, lock_views: bool = False) -> Plan:
         """Split requested items by shard, in the one global order of acquisition.
 
-        A pattern goes to every shard.  Views ride with the locks where one shard has them all.
+        A pattern goes to every shard.  Views ride with the locks where one shard has them all,
+        unless it may not show a commit of ours yet.  With `lock_views` they become reads.
         """
         locks: dict[str, list[Item]] = {}
         views: dict[str, list[Item]] = {}
         every = [shard.name for shard in self.placement.shards]
         for item in items:
             access = Access(item.access)
+            if lock_views and not access.locks:
+                access = Access.READ_EACH if access.each else Access.READ
+                item = item._replace(access=access)  # noqa: PLW2901 - the same, but locked
             shards = every if access.each else [shard_of(item.entity, self.placement)]
             for shard in shards:
                 (locks if access.locks else views).setdefault(shard, []).append(item)
         if len(locks) == 1:
             only = next(iter(locks))
-            locks[only] += views.pop(only, [])
+            if only not in self._unsettled and set(views) <= {only}:
+                locks[only] += views.pop(only, [])
         return Plan(
             tuple((shard, tuple(locks[shard])) for shard in sorted(locks)),
             tuple((shard, tuple(views[shard])) for shard in sorted(views)),
             self.placement.version,
+            max((self._unsettled.get(shard, 0) for shard in views), default=0),
         )
 
     def assert_invariants(self) -> None:

@@ -11,6 +11,13 @@ sends after it lost its lock is refused, so the safety of data depends on no clo
        │
        ├─ all aspects volatile ──> applied and answered at once
        └─ else committing ── Persist ── Persisted ──> applied, released, answered
+                                                      └─ participants told (see `decisions`)
+
+Expected views are compared in the step that commits, prepares or validates, and nobody else may
+hold the slot for writing then, unless that lock lies on this shard alone.  So all that a lock has
+read and expected was current together at the moment in which its client began to finish it (or,
+for a lock on one shard alone, at its commit), and these moments are a serial order: whoever
+overwrites something later got its own lock later.
 
 Between `Persist` and `Persisted` the tenure cannot end (I17) and nobody sees its writes.  Writes
 and outcome are one record of the store, so an outcome is known exactly when the writes stand (I5).
@@ -43,6 +50,7 @@ from enact_dist.core.messages import (
     WriteItem,
 )
 from enact_dist.core.records import (
+    DecisionRecord,
     Effect,
     OutcomeRecord,
     Persist,
@@ -56,9 +64,11 @@ from enact_dist.core.slots import Catalogue, Content, SlotMap
 from enact_dist.terms import Durability, NullReason
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterable, Iterator
 
     from enact_dist.core.datum import LockId, Token
+    from enact_dist.core.decisions import Decisions
+    from enact_dist.core.messages import Prepare
     from enact_dist.core.sessions import SessionTable
     from enact_dist.core.stamps import Stamps
     from enact_dist.core.tenures import Tenure, Tenures
@@ -76,6 +86,8 @@ class _InFlight:
     writes: tuple[WriteItem, ...]
     outcome: OutcomeRecord
     reply_to: list[int] = field(default_factory=list)
+    decision: DecisionRecord | None = None
+    durability: Durability = Durability.VOLATILE
 
 
 class Commits:
@@ -84,6 +96,7 @@ class Commits:
     __slots__ = (
         "_catalogue",
         "_count",
+        "_decisions",
         "_epoch",
         "_in_flight",
         "_sessions",
@@ -105,8 +118,10 @@ class Commits:
         sessions: SessionTable,
         tenures: Tenures,
         stamps: Stamps,
+        decisions: Decisions,
         count: Callable[..., None],
     ) -> None:
+        self._decisions = decisions
         self._shard = shard
         self._epoch = epoch
         self._slots = slots
@@ -124,11 +139,23 @@ class Commits:
         """How many commits the store is working on."""
         return len(self._in_flight)
 
-    def earliest_in_flight_stamp_ns(self) -> int | None:
-        """Return the smallest stamp whose commit is not visible yet."""
-        return min(
-            (commit.outcome.position.stamp_ns for commit in self._in_flight.values()), default=None
-        )
+    def undecided(self) -> Iterator[tuple[int, tuple[WriteItem, ...]]]:
+        """Yield stamp and writes of each commit that the store is working on."""
+        for commit in self._in_flight.values():
+            yield commit.outcome.position.stamp_ns, commit.writes
+
+    def new_ticket(self) -> int:
+        """Return a number for the store to report under."""
+        self._ticket += 1
+        return self._ticket
+
+    def position_of(self, lock: LockId) -> Position | None:
+        """Return where a lock has committed for good, as far as is still known."""
+        decision = self._decisions.by_lock.get(lock)
+        if decision is not None:
+            return decision.position
+        recorded = self._recorded(lock)
+        return recorded.position if recorded is not None else None
 
     # ---------------------------------------------------------------- commit
 
@@ -145,17 +172,16 @@ class Commits:
         if tenure is not None and tenure.committing:
             self._in_flight_of(tenure).reply_to.append(reply_to)
             return
-        refusal = self._refusal(message, tenure, wall_ns=wall_ns)
+        refusal = self.refusal(message, tenure, wall_ns=wall_ns)
         if refusal is not None:
             yield Reply(reply_to, refusal)
             return
         assert tenure is not None
-        moved = next((e for e in message.expects if self._moved(e, tenure)), None)
+        moved = self.moved_on(message.expects, message.lock)
         if moved is not None:
             self._count("commits_changed")
             yield from self._tenures.remove(tenure, now_ns=now_ns)
-            found = self._newest_version(moved.slot)
-            yield Reply(reply_to, Changed(message.lock, moved.slot, found))
+            yield Reply(reply_to, Changed(message.lock, *moved))
             return
         stamp_ns = self._stamps.next(seen_ns=message.seen_stamp_ns, wall_ns=wall_ns)
         outcome = OutcomeRecord(
@@ -167,18 +193,26 @@ class Commits:
             ),
         )
         commit = _InFlight(tenure, message.writes, outcome, [reply_to])
+        if message.participants:
+            commit.decision = DecisionRecord(message.lock, outcome.position, message.participants)
+            commit.durability = Durability(message.durability or Durability.OS.value)
         yield from self._make_durable(commit, now_ns=now_ns)
 
-    def _moved(self, expected: SlotVersion, tenure: Tenure) -> bool:
-        """Whether an expected view does not stand, or may have to come after a later write.
+    def moved_on(self, expects: Iterable[SlotVersion], lock: LockId) -> SlotVersion | None:
+        """Return an expected slot that has moved on, or that somebody may be about to change."""
+        for slot, version in expects:
+            found = self._newest_version(slot)
+            if found != version or self._in_the_way(slot, lock):
+                return SlotVersion(slot, found)
+        return None
 
-        A writer that was granted before the view was taken comes before us: if it also reads on
-        other shards, it may have released those reads already, and others built on that.  Seeing
-        its slot unchanged would put us before it as well.
-        """
-        if self._newest_version(expected.slot) != expected.version:
-            return True
-        return self._tenures.earlier_writer(tenure, expected.slot) is not None
+    def _in_the_way(self, slot: Slot, lock: LockId) -> bool:
+        """Whether a lock that is no single step on this shard may write an expected slot."""
+        for other in self._tenures.table.writers_of(slot):
+            tenure = self._tenures.by_lock[other]
+            if other != lock and (tenure.prepared is not None or not tenure.alone):
+                return True
+        return False
 
     def _newest_version(self, slot: Slot) -> int:
         """Return the version of a slot, one in flight included: its stamp comes before ours."""
@@ -190,36 +224,38 @@ class Commits:
 
     def _make_durable(self, commit: _InFlight, *, now_ns: int) -> Iterator[Effect]:
         """Hand the commit to the store, or apply it at once where nothing is to survive."""
-        durability = max(
-            (self._catalogue.durability(write.slot.aspect) for write in commit.writes),
-            key=_STRICTNESS.index,
-            default=Durability.VOLATILE,
-        )
-        records = self._records(commit)
+        durability = self.strictest(commit.writes, at_least=commit.durability)
+        stamp_ns = commit.outcome.position.stamp_ns
+        records = self.records(commit.writes, commit.outcome.versions, stamp_ns)
         if durability is Durability.VOLATILE:
             if records:
                 yield Persist(0, records, Durability.OS)
             yield from self._apply(commit, now_ns=now_ns)
             return
-        self._ticket += 1
+        ticket = self.new_ticket()
         commit.tenure.committing = True
-        self._in_flight[self._ticket] = commit
-        yield Persist(self._ticket, (*records, commit.outcome), durability)
+        self._in_flight[ticket] = commit
+        decision = (commit.decision,) if commit.decision is not None else ()
+        yield Persist(ticket, (*records, commit.outcome, *decision), durability)
+
+    def strictest(self, writes: Iterable[WriteItem], *, at_least: Durability) -> Durability:
+        """Return what a commit of these writes must survive."""
+        durabilities = [self._catalogue.durability(write.slot.aspect) for write in writes]
+        return max((at_least, *durabilities), key=_STRICTNESS.index)
 
     def persisted(self, ticket: int, *, now_ns: int) -> Iterator[Effect]:
         """The store is done: apply, release and answer."""
-        commit = self._in_flight.pop(ticket, None)
-        if commit is not None:
-            commit.tenure.committing = False
-            yield from self._apply(commit, now_ns=now_ns)
+        commit = self._in_flight.pop(ticket)
+        commit.tenure.committing = False
+        yield from self._apply(commit, now_ns=now_ns)
+
+    def is_commit(self, ticket: int) -> bool:
+        """Whether the store was asked to keep a commit under this number."""
+        return ticket in self._in_flight
 
     def _apply(self, commit: _InFlight, *, now_ns: int) -> Iterator[Effect]:
         lock, outcome = commit.tenure.lock, commit.outcome
-        changes = []
-        for write, (slot, version) in zip(commit.writes, outcome.versions, strict=True):
-            stamp_ns = outcome.position.stamp_ns
-            self._slots.set(slot, Content(version, stamp_ns, write.datum, NullReason.DELETED))
-            changes.append(Change(slot, version, stamp_ns, write.datum is None))
+        changes = self.apply_writes(commit.writes, outcome.versions, outcome.position.stamp_ns)
         lanes = self._sessions.lanes_of(lock.session)
         if lanes is not None:
             lane = lanes.setdefault(lock.lane, Lane())
@@ -228,35 +264,58 @@ class Commits:
                 lane.outcome = outcome
         yield from self._tenures.remove(commit.tenure, now_ns=now_ns)
         self._count("commits")
-        self._count("bytes_written", sum(w.datum.size for w in commit.writes if w.datum))
         for reply_to in commit.reply_to:
             yield Reply(reply_to, _committed(outcome))
+        yield from self.publish(changes)
+        if commit.decision is not None:
+            yield from self._decisions.decided(commit.decision, now_ns=now_ns)
+
+    def apply_writes(
+        self, writes: tuple[WriteItem, ...], versions: tuple[SlotVersion, ...], stamp_ns: int
+    ) -> list[Change]:
+        """Make writes visible; return what a notice tells of them."""
+        changes = []
+        for write, (slot, version) in zip(writes, versions, strict=True):
+            self._slots.replace(slot, Content(version, stamp_ns, write.datum, NullReason.DELETED))
+            changes.append(Change(slot, version, stamp_ns, write.datum is None))
+        self._count("bytes_written", sum(w.datum.size for w in writes if w.datum))
+        return changes
+
+    def publish(self, changes: list[Change]) -> Iterator[Effect]:
+        """Tell everybody who watches."""
         if changes:
             self.notice_number += 1
             yield Publish(Notice(self._shard, self._epoch, self.notice_number, tuple(changes)))
 
-    def _records(self, commit: _InFlight) -> tuple[Record, ...]:
+    def records(
+        self, writes: tuple[WriteItem, ...], versions: tuple[SlotVersion, ...], stamp_ns: int
+    ) -> tuple[Record, ...]:
         """Return what the store must keep: durable states, and that volatile slots exist."""
         records: list[Record] = []
-        for write, (slot, version) in zip(commit.writes, commit.outcome.versions, strict=True):
+        for write, (slot, version) in zip(writes, versions, strict=True):
             volatile = self._catalogue.durability(slot.aspect) is Durability.VOLATILE
             if volatile and self._slots.exists(slot):
                 continue
             reason = "" if write.datum else NullReason.DELETED.name
-            stamp_ns = commit.outcome.position.stamp_ns
             datum = None if volatile else write.datum
             records.append(SlotRecord(slot, version, stamp_ns, datum, reason, volatile))
         return tuple(records)
 
     # ---------------------------------------------------------------- fence
 
-    def _refusal(
-        self, message: Commit, tenure: Tenure | None, *, wall_ns: int
+    def refusal(
+        self, message: Commit | Prepare, tenure: Tenure | None, *, wall_ns: int
     ) -> Fenced | EpochChanged | Refused | None:
+        """Return why this holder may not write this now, None if it may."""
+        twice = duplicate_slot(message.writes)
+        if twice is not None:
+            return Refused("protocol", f"{twice} is written twice in one commit")
         fenced = self._fence(message.lock, message.token, tenure)
         if fenced is not None:
             return fenced
         assert tenure is not None
+        if tenure.bound:
+            return Refused("protocol", f"{message.lock} is being committed in another way")
         uncovered = [write.slot for write in message.writes if not tenure.covers(write.slot)]
         if uncovered:
             return Refused("protocol", f"{message.lock} does not hold {uncovered[0]} for writing")
@@ -289,7 +348,10 @@ class Commits:
     # ---------------------------------------------------------------- validate, outcome
 
     def validate(self, message: Validate, *, reply_to: int, now_ns: int) -> Iterator[Effect]:
-        """Confirm that reads were protected until now, and release them."""
+        """Confirm that reads and expectations hold until now, and release the reads."""
+        if not message.token.number:
+            yield Reply(reply_to, self._expected(message))
+            return
         session = self._sessions.known(message.lock.session)
         if session is not None:
             lane = session.lane(message.lock.lane)
@@ -298,14 +360,31 @@ class Commits:
                 return
         tenure = self._tenures.by_lock.get(message.lock)
         fenced = self._fence(message.lock, message.token, tenure)
-        if fenced is None and tenure is not None and not tenure.committing:
+        if fenced is None and tenure is not None and not tenure.bound:
             assert session is not None
+            moved = self.moved_on(message.expects, message.lock)
+            if moved is not None:
+                self._count("commits_changed")
+                yield from self._tenures.remove(tenure, now_ns=now_ns)
+                yield Reply(reply_to, Changed(message.lock, *moved))
+                return
             session.lane(message.lock.lane).validated = (message.lock, message.token)
             yield from self._tenures.remove(tenure, now_ns=now_ns)
             self._count("locks_validated")
             yield Reply(reply_to, Valid(message.lock))
         else:
             yield Reply(reply_to, fenced or Fenced(message.lock, NOT_HELD))
+
+    def _expected(self, message: Validate) -> Valid | Changed | EpochChanged:
+        """Compare the expectations of a lock that holds nothing here."""
+        if message.token.epoch != self._epoch or not self._sessions.known(message.lock.session):
+            self._count("epoch_refusals")
+            return EpochChanged(self._epoch)
+        moved = self.moved_on(message.expects, message.lock)
+        if moved is None:
+            return Valid(message.lock)
+        self._count("commits_changed")
+        return Changed(message.lock, *moved)
 
     def outcome(self, message: Outcome, *, reply_to: int) -> Iterator[Effect]:
         """Say what became of a commit: committed, pending, never seen, or too old to tell."""

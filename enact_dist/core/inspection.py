@@ -40,6 +40,9 @@ def holder(state: ShardState, tenure: Tenure, *, now_ns: int) -> Holder:
     ]
     waits_for = state.tenures.table.blockers(tenure.claim, count_max=WAITS_TOLD_MAX)
     granted = tenure.token is not None
+    words = [_WORDS[mode] for mode in modes]
+    if tenure.prepared is not None:
+        words.append(f"in doubt until {tenure.prepared.primary} decides")
     return Holder(
         tenure.lock,
         tenure.claim.ticket,
@@ -47,7 +50,7 @@ def holder(state: ShardState, tenure: Tenure, *, now_ns: int) -> Holder:
         session.host if session else "?",
         session.pid if session else 0,
         granted,
-        ", ".join(_WORDS[mode] for mode in modes),
+        ", ".join(words),
         now_ns - (tenure.granted_ns if granted else tenure.asked_ns),
         max(0, session.lease_end_ns(now_ns) - now_ns) if session else 0,
         max(0, tenure.hold_end_ns - now_ns) if granted else tenure.hold_ns,

@@ -1,4 +1,4 @@
-"""Locks at the shard's door: acquire, view, fetch, release."""
+"""Locks at the shard's door: acquire, fetch, release."""
 
 from __future__ import annotations
 
@@ -16,8 +16,6 @@ from enact_dist.core.messages import (
     Released,
     Slice,
     Stale,
-    TakeView,
-    Viewed,
     WrongShard,
 )
 from enact_dist.core.records import Effect, Reply
@@ -27,6 +25,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from enact_dist.core.messages import Item
+    from enact_dist.core.prepares import PrepareDesk
     from enact_dist.core.shard_state import ShardState
 
 ITEMS_MAX: Final = 4096
@@ -38,13 +37,14 @@ WAITERS_MAX: Final = 100_000
 class LockDesk:
     """Everything about who gets which lock, and the data that come with it."""
 
-    def __init__(self, state: ShardState) -> None:
+    def __init__(self, state: ShardState, prepares: PrepareDesk) -> None:
         self._state = state
+        self._prepares = prepares
 
     def on_acquire(self, message: Acquire, reply_to: int) -> Iterator[Effect]:
         """Queue a lock, or return to one that is queued or granted already."""
         session = self._state.session_in_epoch(message.lock.session, message.epoch)
-        refusal = self._placement_or_items_refused(session, message.map_version, message.items)
+        refusal = self.refused(session, message.map_version, message.items)
         if refusal is not None or session is None:
             yield Reply(reply_to, refusal or EpochChanged(self._state.epoch))
             return
@@ -84,7 +84,7 @@ class LockDesk:
         """A newer lock of a lane ends the older ones: their release was lost."""
         for tenure in self._state.tenures.of_session(lock.session):
             older = tenure.lock.lane == lock.lane and tenure.lock.seq < lock.seq
-            if older and not tenure.committing:
+            if older and not tenure.bound:
                 self._state.count("superseded")
                 yield from self._state.tenures.take_away(
                     tenure, "a newer lock of its thread", now_ns=self._state.now_ns
@@ -93,9 +93,10 @@ class LockDesk:
             if pinned.seq < lock.seq:
                 del self._state.pins[pinned]
 
-    def _placement_or_items_refused(
+    def refused(
         self, session: Session | None, map_version: int, items: tuple[Item, ...]
     ) -> Answer | None:
+        """Return why nobody can be given these items here, None if that may be."""
         if session is None:
             return EpochChanged(self._state.epoch)
         if map_version != self._state.settings.placement.version:
@@ -114,24 +115,6 @@ class LockDesk:
             if item.aspect not in self._state.catalogue.aspects:
                 return Refused("unknown_aspect", f"aspect {item.aspect!r} is not registered here")
         return None
-
-    def on_take_view(self, message: TakeView, reply_to: int) -> Iterator[Effect]:
-        """Show committed data without a lock."""
-        session = self._state.session_in_epoch(message.lock.session, message.epoch)
-        refusal = self._placement_or_items_refused(session, message.map_version, message.items)
-        if refusal is not None or session is None:
-            yield Reply(reply_to, refusal or EpochChanged(self._state.epoch))
-            return
-        # Whatever is counted renews: the client believes from the newest counter that was seen.
-        session.renewed_ns = max(session.renewed_ns, self._state.now_ns)
-        session.count_seen = max(session.count_seen, message.count)
-        self._state.tenures.took_views(message.lock)
-        states = self._state.slots.states(message.items)
-        pins = self._state.tenures.pins_of(states)
-        if pins:
-            self._state.pins[message.lock] = pins
-        stamp_ns = self._state.stamp(message.seen_stamp_ns)
-        yield Reply(reply_to, Viewed(message.lock, self._state.epoch, stamp_ns, tuple(states)))
 
     def on_fetch(self, message: Fetch, reply_to: int) -> Iterator[Effect]:
         """Hand out a part of a large datum that a lock pins, or that is current."""
@@ -172,7 +155,9 @@ class LockDesk:
     def on_release(self, message: Release, reply_to: int) -> Iterator[Effect]:
         """Give up a lock, its place and its pins; always answered."""
         tenure = self._state.tenures.by_lock.get(message.lock)
-        if tenure is not None and not tenure.committing:
+        if tenure is not None and not tenure.bound:
             yield from self._state.tenures.remove(tenure, now_ns=self._state.now_ns)
+        elif tenure is not None:
+            self._prepares.hint(message.lock)
         self._state.pins.pop(message.lock, None)
         yield Reply(reply_to, Released())

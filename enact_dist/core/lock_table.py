@@ -216,13 +216,13 @@ class LockTable:
                         self._ready[eligible.lock] = eligible
         return claim
 
-    def writers(self, slot: Slot) -> list[Claim]:
-        """Return the granted claims that may write a slot, by its name or by a pattern."""
-        found: list[Claim] = []
+    def writers_of(self, slot: Slot) -> list[LockId]:
+        """Return who holds a slot for writing, alone or with its whole column."""
+        found: list[LockId] = []
         for resource in (slot, Column(slot.context, slot.aspect)):
             queue = self._queues.get(resource)
             if queue is not None and queue.held_modes[Mode.X]:
-                found += [self.claims[lock] for lock, mode in queue.held.items() if mode is Mode.X]
+                found += [lock for lock, mode in queue.held.items() if mode is Mode.X]
         return found
 
     def overtook(self, claim: Claim) -> bool:

@@ -187,7 +187,8 @@ class Acquire:
     Idempotent: the same lock asked again finds its place in the queue or gets its grant again.
     `wait_ns` is how long this one call may be parked (at most `WAIT_SLICE_NS_MAX`), not how long
     the lock may take.  `count` is the session's message counter (see `KeepAlive`).
-    `seen_stamp_ns` is the largest commit stamp the client has seen.
+    `seen_stamp_ns` is the largest commit stamp the client has seen.  `alone` says that the whole
+    lock, its views included, lies on this shard, so that its commit decides in one step.
     """
 
     lock: LockId
@@ -198,6 +199,7 @@ class Acquire:
     wait_ns: int
     hold_ns: int
     seen_stamp_ns: int
+    alone: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,6 +207,8 @@ class TakeView:
     """Read committed data without a lock.  Answer: `Viewed` or `WrongShard`.
 
     Large data stay fetchable for the lock id until it is released or overtaken by its lane.
+    With `at_ns` the data are asked as of that stamp: the shard moves its clock past it, waits (at
+    most a slice) for undecided commits stamped up to it, and goes back to it where it still can.
     """
 
     lock: LockId
@@ -213,6 +217,7 @@ class TakeView:
     count: int
     items: tuple[Item, ...]
     seen_stamp_ns: int
+    at_ns: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -248,7 +253,9 @@ class KeepAlive:
 class Commit:
     """Publish all writes of a lock and release it.  Answer: `Committed`, `Fenced` or `Changed`.
 
-    Every slot of `expects` must still be at that version.
+    Every slot of `expects` must still be at that version, and in nobody's way (see `Commits`).
+    Where other shards have prepared writes, they are the `participants`, and the record of this
+    commit decides for them too; it is kept as `durability` asks ("" leaves it to its own slots).
     """
 
     lock: LockId
@@ -256,6 +263,8 @@ class Commit:
     writes: tuple[WriteItem, ...]
     seen_stamp_ns: int
     expects: tuple[SlotVersion, ...] = ()
+    participants: tuple[str, ...] = ()
+    durability: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -267,10 +276,49 @@ class Outcome:
 
 @dataclass(frozen=True, slots=True)
 class Validate:
-    """Is this lock still continuously held?  If so, release it.  Answer: `Valid` or `Fenced`."""
+    """Is this lock still continuously held?  If so, release it.
+
+    Answer: `Valid`, `Fenced` or `Changed`.  A token with number 0 stands for a shard where the lock
+    holds nothing but expects something.
+    """
 
     lock: LockId
     token: Token
+    expects: tuple[SlotVersion, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Prepare:
+    """Keep these writes, and the lock with them, until shard `primary` has decided.
+
+    Answer: `Prepared`, `Fenced` or `Changed`.  From then on neither the client nor the end of a
+    lease frees the lock: the shard itself asks the primary, for as long as it takes.
+    """
+
+    lock: LockId
+    token: Token
+    writes: tuple[WriteItem, ...]
+    seen_stamp_ns: int
+    expects: tuple[SlotVersion, ...]
+    primary: str
+    primary_token: Token
+
+
+@dataclass(frozen=True, slots=True)
+class Finish:
+    """Shard to shard: the lock has committed, apply what was prepared.  Answer: `Finished`."""
+
+    lock: LockId
+    position: Position
+
+
+@dataclass(frozen=True, slots=True)
+class Resolve:
+    """Shard to shard: what became of a lock that `asker` has prepared?  Answer: `Resolved`."""
+
+    lock: LockId
+    primary_token: Token
+    asker: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -320,6 +368,18 @@ class ListSessions:
 @dataclass(frozen=True, slots=True)
 class Break:
     """Take a lock away by its grant number, by hand.  Answer: `Broken`."""
+
+    number: int
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class ForceAbort:
+    """Give up a prepared lock whose primary is lost for good, by hand.  Answer: `Broken`.
+
+    If the primary had decided to commit after all, the commit is torn: only for an operator who
+    knows that it never comes back.
+    """
 
     number: int
     reason: str
@@ -388,12 +448,18 @@ class Stale:
 
 @dataclass(frozen=True, slots=True)
 class Viewed:
-    """Committed data as of one moment of this shard."""
+    """Committed data that were current from `from_ns` to `until_ns`, at every stamp between.
+
+    Where the first lies after the second, an undecided commit stands in the way: ask again at
+    `from_ns`.
+    """
 
     lock: LockId
     epoch: int
     stamp_ns: int
     states: tuple[SlotState, ...]
+    from_ns: int = 0
+    until_ns: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -448,11 +514,45 @@ class Fenced:
 
 @dataclass(frozen=True, slots=True)
 class Changed:
-    """An expected slot has moved on to this version; nothing was written, the lock is released."""
+    """An expected slot has moved on to this version; nothing was written, the lock is released.
+
+    The expected version itself means: another lock holds the slot for writing now.
+    """
 
     lock: LockId
     slot: Slot
     version: int
+
+
+@dataclass(frozen=True, slots=True)
+class Prepared:
+    """The writes are kept until the primary decides; their stamp is at least this one."""
+
+    lock: LockId
+    stamp_ns: int
+    versions: tuple[SlotVersion, ...]
+    durability: str
+
+
+@dataclass(frozen=True, slots=True)
+class Finished:
+    """Nothing of the lock waits for a decision here any more, and that survives."""
+
+    lock: LockId
+
+
+@dataclass(frozen=True, slots=True)
+class Resolved:
+    """What the primary has decided: `kind` is one of `RESOLVED_*`."""
+
+    lock: LockId
+    kind: str
+    position: Position
+
+
+RESOLVED_COMMITTED = "committed"
+RESOLVED_ABORTED = "aborted"
+RESOLVED_OPEN = "open"
 
 
 @dataclass(frozen=True, slots=True)
@@ -589,6 +689,9 @@ Request = (
     | Commit
     | Outcome
     | Validate
+    | Prepare
+    | Finish
+    | Resolve
     | Release
     | Goodbye
     | AwaitStamp
@@ -596,6 +699,7 @@ Request = (
     | ListLocks
     | ListSessions
     | Break
+    | ForceAbort
 )
 Answer = (
     Welcome
@@ -610,6 +714,9 @@ Answer = (
     | Committed
     | Fenced
     | Changed
+    | Prepared
+    | Finished
+    | Resolved
     | OutcomeIs
     | Valid
     | Released

@@ -1,8 +1,9 @@
-"""The client half of one lock: acquire over shards in order, hold, validate, commit, give up.
+"""The client half of one lock: acquire over shards in order, hold, finish, give up.
 
 ::
 
     ACQUIRING ──> VIEWING ──> HELD ──> VALIDATING ──> COMMITTING ──> COMMITTED
+                                       (preparing)
         │            │          │           │              │
         └────────────┴──────────┴───────────┴──────────────┴──> LOST · TIMED_OUT · UNREACHABLE ·
                                                                 REFUSED · UNKNOWN · RELEASED
@@ -10,13 +11,11 @@
 Rules a change must keep
   * Shards are acquired in one global order (by name), waiting at one at a time: waits-for edges
     over shards only go up, so there is no deadlock.
-  * Reads on other shards are validated after the last grant and before the commit; every lock was
-    then held at the moment of the last grant (strict two-phase locking).
+  * Reads and expectations on other shards are validated, writes prepared, after `finish` and
+    before the commit: everything was then held at the moment of `finish`.
+  * Until the commit is sent, giving up means abort: releasing the primary makes it so.
   * No answer means unknown.  A commit without an answer is asked about (`Outcome`), never guessed.
   * A `Stale` or lost lock never comes back under its seq.
-
-Writes on more than one shard need a prepared commit, which this version refuses (the API says so
-before anything is locked).
 """
 
 from __future__ import annotations
@@ -25,6 +24,8 @@ import enum
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+from enact_dist.core.cuts import ROUNDS_MAX, Cut
+from enact_dist.core.finishing import Finishing, tokens_of
 from enact_dist.core.messages import (
     OUTCOME_COMMITTED,
     OUTCOME_EXPIRED,
@@ -39,6 +40,8 @@ from enact_dist.core.messages import (
     Granted,
     Outcome,
     OutcomeIs,
+    Prepare,
+    Prepared,
     Refused,
     Release,
     Stale,
@@ -49,12 +52,13 @@ from enact_dist.core.messages import (
     Waiting,
     WrongShard,
 )
+from enact_dist.core.placement import shard_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from enact_dist.core.client import Client
-    from enact_dist.core.datum import LockId, Position, Token
+    from enact_dist.core.datum import LockId, Position, Slot, Token
     from enact_dist.core.messages import Holder, Item, Request, SlotState, SlotVersion, WriteItem
 
 WAIT_SLICE_NS: Final = 900_000_000
@@ -126,14 +130,16 @@ class Reading(NamedTuple):
 class Plan:
     """What one lock asks of which shard; both in the order of the shards' names.
 
-    A shard appears once in each.  Locks on several shards take their views afterwards.
-    `map_version` names the placement that it was made by: the client may learn another meanwhile,
-    and a shard refuses what was placed by any other than its own.
+    A shard appears once in each.  Locks on several shards take their views afterwards, as one cut
+    that lies not before `floor_ns`.  `map_version` names the placement that it was made by: the
+    client may learn another meanwhile, and a shard refuses what was placed by any other than its
+    own.
     """
 
     locks: tuple[tuple[str, tuple[Item, ...]], ...]
     views: tuple[tuple[str, tuple[Item, ...]], ...]
     map_version: int
+    floor_ns: int = 0
 
 
 @dataclass(slots=True, eq=False)
@@ -155,15 +161,10 @@ class MultiLock:
     versions: tuple[SlotVersion, ...] = ()
     states: list[Reading] = field(default_factory=list)
     parts: list[Part] = field(default_factory=list)
-    sent_commit: bool = False
     slice_ns: int = WAIT_SLICE_NS
     lane_free: bool = False
-    _views_left: dict[str, tuple[Item, ...]] = field(default_factory=dict)
-    _writer: str = ""
-    _writes: tuple[WriteItem, ...] = ()
-    _expects: tuple[SlotVersion, ...] = ()
-    _validate_left: dict[str, Part] = field(default_factory=dict)
-    _ask_outcome: bool = False
+    cut: Cut | None = None
+    _finishing: Finishing | None = None
     _free_calls: int = FREE_CALLS
     _retry_at_ns: int = 0
     _retry_ns: int = RETRY_NS_MIN
@@ -171,7 +172,8 @@ class MultiLock:
 
     def __post_init__(self) -> None:
         self.parts = [Part(shard, items) for shard, items in self.plan.locks]
-        self._views_left = dict(self.plan.views)
+        if self.plan.views:
+            self.cut = Cut(dict(self.plan.views), floor_ns=self.plan.floor_ns)
         self._advance()
 
     # ---------------------------------------------------------------- what to send
@@ -197,21 +199,16 @@ class MultiLock:
     def _calls(self, now_ns: int) -> list[tuple[str, Request]]:
         if self.phase is Phase.ACQUIRING:
             return [self._acquire(now_ns)]
-        if self.phase is Phase.VIEWING:
-            return [(shard, self._view(shard, now_ns)) for shard in self._views_left]
+        if self.cut is not None and self.phase is Phase.VIEWING:
+            return [(shard, self._view(shard, self.cut, now_ns)) for shard in self.cut.left]
+        finishing = self._finishing
+        assert finishing is not None
         if self.phase is Phase.VALIDATING:
-            return [
-                (shard, Validate(self.lock, part.token))
-                for shard, part in self._validate_left.items()
-                if part.token is not None
-            ]
-        if self._ask_outcome:
-            return [(self._writer, Outcome(self.lock))]
-        token = self._part(self._writer).token
-        assert token is not None
-        self.sent_commit = True
-        seen_ns = self.client.seen_stamp_ns
-        return [(self._writer, Commit(self.lock, token, self._writes, seen_ns, self._expects))]
+            return finishing.votes_to_ask(self.client.seen_stamp_ns)
+        if finishing.ask_outcome:
+            return [(finishing.primary, Outcome(self.lock))]
+        finishing.sent = True
+        return [(finishing.primary, finishing.commit(self.client.seen_stamp_ns))]
 
     def _acquire(self, now_ns: int) -> tuple[str, Request]:
         part = next(part for part in self.parts if part.token is None)
@@ -228,16 +225,18 @@ class MultiLock:
             min(self.slice_ns, left_ns),
             hold_ns,
             self.client.seen_stamp_ns,
+            alone=len(self.parts) == 1 and not self.plan.views,
         )
 
-    def _view(self, shard: str, now_ns: int) -> Request:
+    def _view(self, shard: str, cut: Cut, now_ns: int) -> Request:
         return TakeView(
             self.lock,
             self.client.epoch(shard),
             self.plan.map_version,
             self.client.sendings.next(now_ns),
-            self._views_left[shard],
+            cut.items[shard],
             self.client.seen_stamp_ns,
+            cut.at_ns,
         )
 
     def take_farewells(self) -> list[tuple[str, Request]]:
@@ -264,38 +263,43 @@ class MultiLock:
             self.client.learn_placement(answer.placement)
             self._end(Phase.MISPLACED)
         elif isinstance(answer, EpochChanged):
-            self._epoch_changed(request)
+            self._epoch_changed(shard, request)
+        elif getattr(answer, "lock", None) != self.lock:
+            return
         elif self.phase is Phase.ACQUIRING:
             self._on_acquiring(shard, answer, now_ns)
-        elif self.phase is Phase.VIEWING and isinstance(answer, Viewed):
-            self._on_viewed(shard, answer)
-        elif self.phase is Phase.VALIDATING:
-            self._on_validating(shard, answer)
-        elif self.phase is Phase.COMMITTING:
+        elif isinstance(answer, Viewed) and isinstance(request, TakeView):
+            self._on_viewed(shard, request, answer)
+        elif self.phase is Phase.VALIDATING and isinstance(request, Validate | Prepare):
+            self._on_vote(shard, answer)
+        elif self.phase is Phase.COMMITTING and isinstance(request, Commit | Outcome):
             self._on_committing(answer, now_ns)
 
     def _silent(self, shard: str, request: Request, now_ns: int) -> None:
         self.silent_shard = shard
         self._free_calls = 0
-        if isinstance(request, Commit | Outcome):
-            self._ask_outcome = True
+        if isinstance(request, Commit | Outcome) and self._finishing is not None:
+            self._finishing.ask_outcome = True
         self._pause(now_ns)
 
     def _pause(self, now_ns: int) -> None:
         self._retry_at_ns = now_ns + self._retry_ns
         self._retry_ns = min(2 * self._retry_ns, RETRY_NS_MAX)
 
-    def _epoch_changed(self, request: Request) -> None:
+    def _epoch_changed(self, shard: str, request: Request) -> None:
         """The shard restarted or forgot the session; `client` has dropped our grants there."""
         self._free_calls = max(0, self._free_calls - 1)
-        if isinstance(request, Commit | Outcome):
-            self._ask_outcome = True
+        finishing = self._finishing
+        if isinstance(request, Commit | Outcome) and finishing is not None:
+            finishing.ask_outcome = True
+        elif isinstance(request, Validate | Prepare) and finishing and shard in finishing.left:
+            self.lose(f"shard {shard} restarted or forgot this session")
         # Otherwise: a first acquire or view is simply asked again after the new Hello; a lost
-        # grant has already ended this lock through `lose`.
+        # grant has already ended this lock through `lose_at`.
 
     def _on_acquiring(self, shard: str, answer: Answer, now_ns: int) -> None:
         part = next((part for part in self.parts if part.token is None), None)
-        if part is None or part.shard != shard or getattr(answer, "lock", None) != self.lock:
+        if part is None or part.shard != shard:
             return
         if isinstance(answer, Granted):
             if answer.epoch != self.client.epoch(shard):
@@ -316,18 +320,29 @@ class MultiLock:
         elif isinstance(answer, Stale):
             self.lose("its place in the queue was lost")
 
-    def _on_viewed(self, shard: str, answer: Viewed) -> None:
-        if answer.lock == self.lock and self._views_left.pop(shard, None) is not None:
-            self.client.saw_stamp(answer.stamp_ns)
-            self.states += [Reading(shard, answer.epoch, state) for state in answer.states]
+    def _on_viewed(self, shard: str, request: TakeView, answer: Viewed) -> None:
+        cut = self.cut
+        if self.phase is not Phase.VIEWING or cut is None:
+            return
+        cut.take(shard, request, answer)
+        self.client.saw_stamp(answer.stamp_ns)
+        if cut.left:
+            return
+        answers = cut.settled(self.client.epoch)
+        if answers is not None:
+            for one, viewed in answers.items():
+                self.states += [Reading(one, viewed.epoch, state) for state in viewed.states]
+                self.client.viewed(one, viewed.until_ns)
             self._advance()
+        elif cut.rounds > ROUNDS_MAX:
+            self.lose("its views over several shards were never of one moment")
 
     def _advance(self) -> None:
         """Go on when everything of this phase has arrived."""
         self._free_calls = FREE_CALLS
         if self.phase is Phase.ACQUIRING and all(part.token is not None for part in self.parts):
             self.phase = Phase.VIEWING
-        if self.phase is Phase.VIEWING and not self._views_left:
+        if self.phase is Phase.VIEWING and (self.cut is None or not self.cut.left):
             self.phase = Phase.HELD
 
     # ---------------------------------------------------------------- holding
@@ -337,6 +352,16 @@ class MultiLock:
         return self.phase is Phase.HELD and all(
             now_ns < min(part.until_ns, part.hold_until_ns) for part in self.parts
         )
+
+    @property
+    def no_cut(self) -> bool:
+        """Whether it ended because its views were never of one moment."""
+        return self.phase is Phase.LOST and self.cut is not None and self.cut.rounds > ROUNDS_MAX
+
+    def lose_at(self, shard: str, cause: str) -> None:
+        """A shard has dropped the grant there; what it has prepared it keeps (and says so)."""
+        if self._finishing is None or shard == self._finishing.primary:
+            self.lose(cause)
 
     def lose(self, cause: str, *, asked_of: Part | None = None) -> None:
         """A shard has ended this lock; give the rest back.
@@ -363,13 +388,11 @@ class MultiLock:
         if isinstance(answer, Fenced) and answer.lock == self.lock:
             self.cause = answer.cause
 
-    def _part(self, shard: str) -> Part:
-        return next(part for part in self.parts if part.shard == shard)
-
     def _gives_up(self) -> None:
         """The deadline has passed: rest in what that means in this phase."""
         if self.phase is Phase.COMMITTING:
-            self._end(Phase.UNKNOWN if self.sent_commit else Phase.UNREACHABLE)
+            sent = self._finishing is not None and self._finishing.sent
+            self._end(Phase.UNKNOWN if sent else Phase.UNREACHABLE)
         elif self.phase is Phase.VALIDATING or self.silent_shard:
             self._end(Phase.UNREACHABLE)
         else:
@@ -398,29 +421,44 @@ class MultiLock:
         give_up_ns: int,
         expects: Sequence[SlotVersion] = (),
     ) -> None:
-        """Publish `writes` (by shard, at most one) if every lock is still held.
+        """Publish `writes` (by shard) if every lock is still held.
 
-        `expects` are viewed versions, on the writing shard, that must still be the newest.
+        `expects` are versions that were viewed and must still be the newest.
         Ends in COMMITTED, LOST, CHANGED, REFUSED, UNREACHABLE (nothing written) or UNKNOWN.
         """
-        assert len(writes) <= 1, "writes on several shards are refused before anything is locked"
         if self.phase is not Phase.HELD:
             return
         self.give_up_ns = give_up_ns
         self._free_calls = self._retry_at_ns = 0
-        self._expects = tuple(expects)
-        for shard, items in writes.items():
-            self._writer, self._writes = shard, tuple(items)
-        self._validate_left = {
-            part.shard: part for part in self.parts if part.shard != self._writer
-        }
+        expected: dict[str, list[SlotVersion]] = {}
+        for expect in expects:
+            expected.setdefault(self._shard_of(expect.slot), []).append(expect)
+        self._finishing = Finishing(
+            self.lock,
+            tokens_of(
+                ((part.shard, part.token) for part in self.parts),
+                ((shard, self._epoch_viewed(shard)) for shard in expected),
+            ),
+            {shard: tuple(items) for shard, items in writes.items() if items},
+            {shard: tuple(versions) for shard, versions in expected.items()},
+        )
         self.phase = Phase.VALIDATING
-        self._after_validation()
+        self._after_votes()
 
-    def _after_validation(self) -> None:
-        if self._validate_left:
+    def _shard_of(self, slot: Slot) -> str:
+        for reading in self.states:
+            if reading.state.slot == slot:
+                return reading.shard
+        return shard_of(slot.entity, self.client.placement)
+
+    def _epoch_viewed(self, shard: str) -> int:
+        return next((r.epoch for r in self.states if r.shard == shard), self.client.epoch(shard))
+
+    def _after_votes(self) -> None:
+        finishing = self._finishing
+        if finishing is None or finishing.left:
             return
-        if self._writer:
+        if finishing.primary:
             self.phase = Phase.COMMITTING
         else:
             if not self.parts:
@@ -433,32 +471,39 @@ class MultiLock:
             return []
         return [shard for shard, _ in self.plan.views]
 
-    def _on_validating(self, shard: str, answer: Answer) -> None:
-        if isinstance(answer, Valid) and answer.lock == self.lock:
-            self._validate_left.pop(shard, None)
-            self._after_validation()
-        elif isinstance(answer, Fenced) and answer.lock == self.lock:
+    def _on_vote(self, shard: str, answer: Answer) -> None:
+        assert self._finishing is not None
+        if shard not in self._finishing.left:
+            return
+        if isinstance(answer, Valid | Prepared):
+            del self._finishing.left[shard]
+            if isinstance(answer, Prepared):
+                self._finishing.prepared[shard] = answer
+                self.client.saw_stamp(answer.stamp_ns)
+            self._after_votes()
+        elif isinstance(answer, Fenced):
             self.lose(answer.cause)
+        elif isinstance(answer, Changed):
+            self._changed(answer)
+
+    def _changed(self, answer: Changed) -> None:
+        self.cause = f"{answer.slot} is now at version {answer.version} or being written"
+        self._end(Phase.CHANGED)
 
     def _on_committing(self, answer: Answer, now_ns: int) -> None:
-        if getattr(answer, "lock", None) != self.lock:
-            return
         if isinstance(answer, Committed):
             self._committed(answer.position, answer.versions)
         elif isinstance(answer, Fenced):
             self.cause = answer.cause
             self._end(Phase.LOST)
         elif isinstance(answer, Changed):
-            unchanged = (answer.slot, answer.version) in self._expects
-            how = "has been held for writing, at" if unchanged else "moved on to"
-            self.cause = f"{answer.slot} {how} version {answer.version}"
-            self._end(Phase.CHANGED)
+            self._changed(answer)
         elif isinstance(answer, OutcomeIs):
             self._on_outcome(answer, now_ns)
 
     def _on_outcome(self, answer: OutcomeIs, now_ns: int) -> None:
-        token = self._part(self._writer).token
-        assert token is not None
+        finishing = self._finishing
+        assert finishing is not None
         if answer.kind == OUTCOME_COMMITTED:
             self._committed(answer.position, answer.versions)
         elif answer.kind == OUTCOME_PENDING:
@@ -466,13 +511,17 @@ class MultiLock:
         elif answer.kind == OUTCOME_EXPIRED:
             self.cause = "its shard has no record of this session any more"
             self._end(Phase.UNKNOWN)
-        elif answer.epoch == token.epoch:
-            self._ask_outcome = False  # it never arrived: send it (again)
+        elif answer.epoch == finishing.token.epoch:
+            finishing.ask_outcome = False  # it never arrived: send it (again)
         else:
             self.cause = "its shard restarted before the commit arrived"
             self._end(Phase.LOST)
 
     def _committed(self, position: Position, versions: tuple[SlotVersion, ...]) -> None:
-        self.position, self.versions = position, versions
+        assert self._finishing is not None
+        prepared = self._finishing.prepared
+        self.position = position
+        self.versions = versions + tuple(v for vote in prepared.values() for v in vote.versions)
         self.client.saw_stamp(position.stamp_ns)
+        self.client.committed(prepared, position.stamp_ns)
         self._end(Phase.COMMITTED)

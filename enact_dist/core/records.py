@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from enact_dist.core.datum import Datum, LockId, Position, Slot
-from enact_dist.core.messages import AspectEntry, SlotVersion
+from enact_dist.core.datum import Datum, LockId, Position, Slot, Token
+from enact_dist.core.messages import AspectEntry, Item, SlotVersion, WriteItem
 from enact_dist.terms import Durability
 
 
@@ -68,6 +68,47 @@ class OutcomeRecord:
 
 
 @dataclass(frozen=True, slots=True)
+class PreparedRecord:
+    """Writes of a lock that another shard decides about; a restart restores it with its locks.
+
+    `items` is what the lock holds here, reads included.  `writes` carry their data whatever their
+    aspect's durability: a commit that is reported later must not have lost them to a restart.
+    """
+
+    lock: LockId
+    token: Token
+    items: tuple[Item, ...]
+    writes: tuple[WriteItem, ...]
+    versions: tuple[SlotVersion, ...]
+    stamp_ns: int
+    primary: str
+    primary_token: Token
+
+
+@dataclass(frozen=True, slots=True)
+class PreparedEnded:
+    """A prepared lock was decided about; forget its record."""
+
+    lock: LockId
+
+
+@dataclass(frozen=True, slots=True)
+class DecisionRecord:
+    """This shard has committed a lock for all its participants too, who must be told."""
+
+    lock: LockId
+    position: Position
+    participants: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class DecisionDone:
+    """Every participant has finished; forget the decision."""
+
+    lock: LockId
+
+
+@dataclass(frozen=True, slots=True)
 class AuditRecord:
     """An operator's act (a broken lock), kept for good."""
 
@@ -82,6 +123,10 @@ Record = (
     | AspectRecord
     | SlotRecord
     | OutcomeRecord
+    | PreparedRecord
+    | PreparedEnded
+    | DecisionRecord
+    | DecisionDone
     | AuditRecord
 )
 
@@ -96,6 +141,8 @@ class Recovered:
     aspects: list[AspectEntry] = field(default_factory=list)
     slots: list[SlotRecord] = field(default_factory=list)
     outcomes: list[OutcomeRecord] = field(default_factory=list)
+    prepared: list[PreparedRecord] = field(default_factory=list)
+    decisions: list[DecisionRecord] = field(default_factory=list)
 
 
 # ---------------------------------------------------------------- effects of the shard
@@ -126,6 +173,14 @@ class Publish:
 
 
 @dataclass(frozen=True, slots=True)
+class Call:
+    """Ask another shard, once; an answer comes back as `Called`, none needs no report."""
+
+    shard: str
+    request: object
+
+
+@dataclass(frozen=True, slots=True)
 class Story:
     """One line for the log: what the shard decided and about whom."""
 
@@ -133,7 +188,7 @@ class Story:
     text: str
 
 
-Effect = Reply | Persist | Publish | Story
+Effect = Reply | Persist | Publish | Call | Story
 
 
 # ---------------------------------------------------------------- events that are no requests
@@ -144,6 +199,15 @@ class Persisted:
     """The store has done what `Persist(ticket)` asked for."""
 
     ticket: int
+
+
+@dataclass(frozen=True, slots=True)
+class Called:
+    """Another shard has answered what `Call` asked it."""
+
+    shard: str
+    request: object
+    answer: object
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,4 +228,4 @@ class Drain:
     """The shard is about to stop: grant nothing new, answer parked requests."""
 
 
-Event = Persisted | SessionSeen | Tick | Drain
+Event = Persisted | Called | SessionSeen | Tick | Drain

@@ -150,7 +150,7 @@ class SessionDesk:
         session.report = message.report or session.report
         lowest = {view.lane: view.seq for view in message.view}
         for tenure in self._state.tenures.of_session(message.session):
-            if tenure.lock.seq < lowest.get(tenure.lock.lane, 0) and not tenure.committing:
+            if tenure.lock.seq < lowest.get(tenure.lock.lane, 0) and not tenure.bound:
                 self._state.count("orphans_freed")
                 yield Story("lock.orphan", f"{tenure.lock} is not wanted any more")
                 yield from self._state.tenures.remove(tenure, now_ns=self._state.now_ns)
@@ -185,7 +185,7 @@ class SessionDesk:
             return
         tenures = self._state.tenures.of_session(session)
         for tenure in tenures:
-            if not tenure.committing:
+            if not tenure.bound:
                 yield from self._state.tenures.take_away(tenure, cause, now_ns=self._state.now_ns)
         self._state.drop_pins(session)
         self._state.sessions.forget(session)

@@ -17,7 +17,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from enact_dist.core import inspection
-from enact_dist.core.commits import duplicate_slot
 from enact_dist.core.lock_desk import LockDesk
 from enact_dist.core.messages import (
     Acquire,
@@ -26,6 +25,8 @@ from enact_dist.core.messages import (
     Broken,
     Commit,
     Fetch,
+    Finish,
+    ForceAbort,
     Goodbye,
     Hello,
     KeepAlive,
@@ -33,16 +34,19 @@ from enact_dist.core.messages import (
     ListSessions,
     Locks,
     Outcome,
+    Prepare,
     Reached,
-    Refused,
     Register,
     Release,
+    Resolve,
     Survey,
     TakeView,
     Validate,
 )
+from enact_dist.core.prepares import PrepareDesk
 from enact_dist.core.records import (
     AuditRecord,
+    Called,
     Drain,
     Effect,
     Persist,
@@ -55,6 +59,7 @@ from enact_dist.core.records import (
 from enact_dist.core.session_desk import SessionDesk
 from enact_dist.core.shard_state import ShardSettings, ShardState
 from enact_dist.core.tenures import WAIT_SLICE_NS_MAX
+from enact_dist.core.view_desk import ViewDesk
 from enact_dist.terms import Durability
 
 if TYPE_CHECKING:
@@ -73,7 +78,9 @@ class Shard:
         self.state = ShardState(settings, recovered, now_ns=now_ns, wall_ns=wall_ns)
         self.settings, self.epoch = settings, self.state.epoch
         self._sessions = SessionDesk(self.state)
-        self._locks = LockDesk(self.state)
+        self._prepares = PrepareDesk(self.state, recovered.prepared)
+        self._locks = LockDesk(self.state, self._prepares)
+        self._views = ViewDesk(self.state, self._locks, self._prepares)
         self._parked_stamps: dict[int, AwaitStamp] = {}
         self._parked_stamp_ends: dict[int, int] = {}
         self._handlers: dict[type, Callable[..., Iterator[Effect]]] = {
@@ -83,12 +90,17 @@ class Shard:
             Goodbye: self._sessions.on_goodbye,
             SessionSeen: self._sessions.on_session_seen,
             Acquire: self._locks.on_acquire,
-            TakeView: self._locks.on_take_view,
+            TakeView: self._views.on_take_view,
             Fetch: self._locks.on_fetch,
             Release: self._locks.on_release,
             Commit: self._on_commit,
             Outcome: self._on_outcome,
             Validate: self._on_validate,
+            Prepare: self._prepares.on_prepare,
+            Finish: self._prepares.on_finish,
+            Resolve: self._prepares.on_resolve,
+            Called: self._prepares.on_called,
+            ForceAbort: self._prepares.on_force_abort,
             AwaitStamp: self._on_await_stamp,
             Survey: self._on_survey,
             ListLocks: self._on_list_locks,
@@ -114,6 +126,7 @@ class Shard:
         """
         self._advance(now_ns, wall_ns)
         effects = list(self._handlers[type(message)](message, reply_to))
+        effects += self._views.answer_parked()
         effects += self.state.grant_ready()
         return effects
 
@@ -137,12 +150,16 @@ class Shard:
         soonest = self.state.tenures.next_deadline_ns()
         if soonest is not None:
             deadlines.append(soonest)
+        for desk in (self._prepares, self._views, self.state.decisions):
+            due_ns = desk.next_deadline_ns()
+            if due_ns is not None:
+                deadlines.append(due_ns)
         deadlines += [
             self.state.sessions.by_id[session].lease_end_ns(now_ns)
             for session, tenures in self.state.tenures.by_session.items()
             if session in self.state.sessions.by_id
-            # A lease cannot end a commit in flight: looking again and again would help nobody.
-            and not all(tenure.committing for tenure in tenures.values())
+            # A lease cannot end what is bound: looking again and again would help nobody.
+            and not all(tenure.bound for tenure in tenures.values())
         ]
         return min(deadlines)
 
@@ -153,17 +170,19 @@ class Shard:
 
     @property
     def idle(self) -> bool:
-        """Whether a draining shard may stop: no commit in flight and no lock held."""
-        held = any(tenure.token is not None for tenure in self.state.tenures.by_lock.values())
+        """Whether a draining shard may stop: no commit in flight and no lock held.
+
+        What is prepared, or decided and not told everywhere, comes back with the next start.
+        """
+        held = any(
+            tenure.token is not None and (tenure.committing or tenure.prepared is None)
+            for tenure in self.state.tenures.by_lock.values()
+        )
         return not self.state.commits.in_flight and not held and not self._sessions.waits_for_store
 
     # ---------------------------------------------------------------- commits
 
     def _on_commit(self, message: Commit, reply_to: int) -> Iterator[Effect]:
-        twice = duplicate_slot(message.writes)
-        if twice is not None:
-            yield Reply(reply_to, Refused("protocol", f"{twice} is written twice in one commit"))
-            return
         self.state.pins.pop(message.lock, None)
         yield from self.state.commits.commit(
             message, reply_to=reply_to, now_ns=self.state.now_ns, wall_ns=self.state.wall_ns
@@ -175,7 +194,10 @@ class Shard:
 
     def _on_persisted(self, message: Persisted, _: int) -> Iterator[Effect]:
         if message.ticket > 0:
-            yield from self.state.commits.persisted(message.ticket, now_ns=self.state.now_ns)
+            if self.state.commits.is_commit(message.ticket):
+                yield from self.state.commits.persisted(message.ticket, now_ns=self.state.now_ns)
+            else:
+                yield from self._prepares.persisted(message.ticket)
             yield from self._answer_reached()
         else:
             yield from self._sessions.persisted(message.ticket)
@@ -192,9 +214,10 @@ class Shard:
     def _answer_reached(self) -> Iterator[Effect]:
         for reply_to, message in list(self._parked_stamps.items()):
             stamp_ns = self.state.stamp()
-            earliest = self.state.commits.earliest_in_flight_stamp_ns()
+            undecided = [stamp for stamp, _ in self.state.commits.undecided()]
+            undecided += [record.stamp_ns for record in self._prepares.undecided()]
             reached = stamp_ns >= message.stamp_ns and (
-                earliest is None or earliest > message.stamp_ns
+                not undecided or min(undecided) > message.stamp_ns
             )
             if reached or self._parked_stamp_ends[reply_to] <= self.state.now_ns:
                 del self._parked_stamps[reply_to], self._parked_stamp_ends[reply_to]
@@ -215,13 +238,16 @@ class Shard:
         yield from self.state.grant_ready()
         yield from self.state.tenures.end_slices(now_ns)
         yield from self._answer_reached()
+        yield from self._prepares.ask()
+        yield from self.state.decisions.tell(now_ns)
+        self._views.forget_past()
 
     def _expire(self, session: str) -> Iterator[Effect]:
         found = self.state.sessions.by_id.get(session)
         if found is not None and found.lease_end_ns(self.state.now_ns) > self.state.now_ns:
             return
         for tenure in self.state.tenures.of_session(session):
-            if tenure.committing:
+            if tenure.bound:
                 continue
             if tenure.token is None:
                 self.state.count("waiters_dropped")
@@ -259,7 +285,7 @@ class Shard:
 
     def _on_break(self, message: Break, reply_to: int) -> Iterator[Effect]:
         found = [t for t in self.state.tenures.by_lock.values() if t.claim.ticket == message.number]
-        if not found or found[0].committing:
+        if not found or found[0].bound:
             yield Reply(reply_to, Broken(False, None))
             return
         holder = self.state.describe(found[0], self.state.now_ns)
@@ -271,11 +297,11 @@ class Shard:
         yield Reply(reply_to, Broken(True, holder))
 
     def assert_invariants(self) -> None:
-        """Assert I1, I8, I11 and the bookkeeping of all parts.  For tests and simulation."""
+        """Assert I1, I8, I10, I11 and the bookkeeping of all parts.  For tests and simulation."""
+        self._prepares.assert_invariants()
         self.state.tenures.assert_invariants()
         if self.state.sessions.in_grace(self.state.now_ns):
-            assert all(t.token is None for t in self.state.tenures.by_lock.values()), (
-                "grant in grace"
-            )
+            granted = [t for t in self.state.tenures.by_lock.values() if t.token is not None]
+            assert all(t.prepared is not None for t in granted), "grant in grace"
         for slot_pins in self.state.pins:
             assert slot_pins.session in self.state.sessions.by_id

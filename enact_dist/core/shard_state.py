@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.core import inspection
 from enact_dist.core.commits import Commits
+from enact_dist.core.decisions import Decisions
 from enact_dist.core.messages import AspectEntry, PlacementMap
 from enact_dist.core.sessions import Session, SessionTable
 from enact_dist.core.slots import Catalogue, SlotMap
@@ -91,11 +92,13 @@ class ShardState:
         )
         stamps = [record.stamp_ns for record in recovered.slots]
         stamps += [record.position.stamp_ns for record in recovered.outcomes]
+        stamps += [record.position.stamp_ns for record in recovered.decisions]
         self.stamps = Stamps(max(stamps, default=0))
         self.tenures = Tenures(
             epoch=self.epoch, slots=self.slots, sessions=self.sessions, count=self.count
         )
         self.tenures.describe = self.describe
+        self.decisions = Decisions(recovered.decisions, now_ns=now_ns, count=self.count)
         self.commits = Commits(
             shard=settings.name,
             epoch=self.epoch,
@@ -104,6 +107,7 @@ class ShardState:
             sessions=self.sessions,
             tenures=self.tenures,
             stamps=self.stamps,
+            decisions=self.decisions,
             count=self.count,
         )
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.datum import Column, Datum, Slot
 from enact_dist.core.messages import AspectEntry, SlotState
+from enact_dist.core.past import Past
 from enact_dist.terms import Access, Durability, NullReason, pattern_matches
 
 if TYPE_CHECKING:
@@ -43,7 +44,7 @@ NOTHING: Final = Content(0, 0, None, NullReason.NEVER_SET)
 class SlotMap:
     """All slots of one shard by context and aspect."""
 
-    __slots__ = ("_answer_bytes_max", "_columns", "bytes", "count")
+    __slots__ = ("_answer_bytes_max", "_columns", "bytes", "count", "past")
 
     def __init__(
         self, recovered: Iterable[SlotRecord], *, answer_bytes_max: int = ANSWER_BYTES_MAX
@@ -52,6 +53,7 @@ class SlotMap:
         self._columns: dict[Column, dict[str, Content]] = {}
         self.count = 0
         self.bytes = 0
+        self.past = Past()
         for record in recovered:
             if record.volatile:
                 self.set(record.slot, Content(0, 0, None, NullReason.LOST))
@@ -71,6 +73,17 @@ class SlotMap:
         """Whether the slot was ever written or is known to have been."""
         column = self._columns.get(Column(slot.context, slot.aspect))
         return column is not None and slot.entity in column
+
+    def replace(self, slot: Slot, content: Content) -> None:
+        """Put a newly committed state in place of the old one, which stays known for a while."""
+        self.past.keep(slot, self[slot], until_ns=content.stamp_ns)
+        self.set(slot, content)
+
+    def at(self, slot: Slot, content: Content, at_ns: int) -> Content:
+        """Return the state of a slot as of a stamp (0: now), or `content` where that is gone."""
+        if not at_ns or content.stamp_ns <= at_ns:
+            return content
+        return self.past.at(slot, at_ns) or content
 
     def set(self, slot: Slot, content: Content) -> None:
         """Put a new committed state in place of the old one."""
@@ -93,6 +106,36 @@ class SlotMap:
     def columns(self) -> Iterator[Column]:
         """Yield every (context, aspect) that has slots."""
         yield from self._columns
+
+    def views(
+        self, items: Iterable[Item], at_ns: int
+    ) -> tuple[list[SlotState], list[Content], int]:
+        """Return what `items` show as of a stamp (0: now).
+
+        Returns:
+            The states; the contents of those that carry none of their data; and the largest stamp
+            that they bear, nulls of a pattern included: all of them were current from there on.
+        """
+        shown: list[SlotState] = []
+        contents: list[Content] = []
+        from_ns, left = 0, self._answer_bytes_max
+        for item in items:
+            each = Access(item.access).each
+            if each:
+                column = Column(item.context, item.aspect)
+                found = list(self.matching(column, item.entity))
+            else:
+                slot = Slot(item.context, item.entity, item.aspect)
+                found = [(slot, self[slot])]
+            for slot, newest in found:
+                content = self.at(slot, newest, at_ns)
+                from_ns = max(from_ns, content.stamp_ns)
+                if content.datum is not None or not each:
+                    state = state_of(slot, content, known=item.known, inline_max=left)
+                    left -= state.datum.size if state.datum is not None else 0
+                    shown.append(state)
+                    contents.append(content)
+        return shown, contents, from_ns
 
     def states(self, items: Iterable[Item]) -> list[SlotState]:
         """Return what a grant or view shows of `items`: slots in order, patterns expanded."""

@@ -30,6 +30,10 @@ class Stamps:
         self.last_ns = max(self.last_ns + 1, seen_ns + 1, wall_ns)
         return self.last_ns
 
+    def saw(self, stamp_ns: int) -> None:
+        """Come after a stamp that was decided elsewhere."""
+        self.last_ns = max(self.last_ns, stamp_ns)
+
     def now(self, *, wall_ns: int) -> int:
         """Return the present; every later commit gets a larger stamp."""
         self.last_ns = max(self.last_ns, wall_ns)

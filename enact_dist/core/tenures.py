@@ -3,13 +3,15 @@
 ::
 
     Acquire ──> waiting ──> granted ──> committing ──> (gone)
+                   │           │ └────> preparing ──> prepared ──> finishing ──> (gone)
                    │           │
                    └───────────┴── released · superseded · not wanted any more ·
                                    lease ended · held too long · broken ──> (gone, cause kept)
 
 Rules a change must keep
   * A token is given once and never again; `Commit` and `Validate` compare it (the fence).
-  * A tenure that is committing ends only by its commit: no expiry, no release, no break.
+  * A tenure that is bound (committing, or prepared for another shard's decision) ends only by
+    that: no expiry, no release, no break.  A restart restores what was prepared.
   * A grant names the data as of the moment it is sent; large ones stay fetchable by pins.
   * Every parked request is answered, at the latest when its slice of waiting ends.
 """
@@ -31,6 +33,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
     from enact_dist.core.messages import Holder, SlotState
+    from enact_dist.core.records import PreparedRecord
     from enact_dist.core.sessions import SessionTable
 
 WAIT_SLICE_NS_MAX: Final = 1_000_000_000
@@ -48,8 +51,9 @@ class Tenure:
     """One lock at this shard.
 
     Attributes:
-        views_number: How many grants this shard had given when the lock's views were taken: they
-            come with the grant, or, for a lock over several shards, after its last one.
+        alone: It holds and views nothing at other shards: its commit decides in one step.
+        committing: The store works on its commit, its preparation or its end.
+        prepared: What another shard decides about.
     """
 
     lock: LockId
@@ -60,11 +64,16 @@ class Tenure:
     token: Token | None = None
     granted_ns: int = 0
     hold_end_ns: int = 0
-    views_number: int = 0
-    views_taken: bool = False
+    alone: bool = False
     committing: bool = False
+    prepared: PreparedRecord | None = None
     parked: int | None = None
     pins: dict[tuple[Slot, int], Datum] = field(default_factory=dict)
+
+    @property
+    def bound(self) -> bool:
+        """Whether neither its client nor time can end it."""
+        return self.committing or self.prepared is not None
 
     def covers(self, slot: Slot) -> bool:
         """Whether this lock may write `slot`."""
@@ -136,9 +145,22 @@ class Tenures:
         claim = self.table.enqueue(message.lock, wants_of(message.items))
         hold_ns = min(message.hold_ns, HOLD_NS_MAX)
         tenure = Tenure(message.lock, claim, message.items, hold_ns, asked_ns=now_ns)
-        self.by_lock[message.lock] = tenure
-        self.by_session.setdefault(message.lock.session, {})[message.lock] = tenure
+        tenure.alone = message.alone
+        self._add(tenure)
         return tenure
+
+    def _add(self, tenure: Tenure) -> None:
+        self.by_lock[tenure.lock] = tenure
+        self.by_session.setdefault(tenure.lock.session, {})[tenure.lock] = tenure
+
+    def restore(self, record: PreparedRecord, *, now_ns: int) -> None:
+        """Hold again what was prepared before a restart, before anything else is granted."""
+        claim = self.table.enqueue(record.lock, wants_of(record.items))
+        granted = self.table.take_ready()
+        assert granted == [claim], "two prepared locks were never in conflict"
+        tenure = Tenure(record.lock, claim, record.items, 0, asked_ns=now_ns, granted_ns=now_ns)
+        tenure.token, tenure.prepared = record.token, record
+        self._add(tenure)
 
     def park(self, tenure: Tenure, *, reply_to: int, wait_ns: int, now_ns: int) -> Iterator[Effect]:
         """Keep a waiter's request until the grant or the end of its slice."""
@@ -177,7 +199,6 @@ class Tenures:
             tenure = self.by_lock[claim.lock]
             self._granted += 1
             tenure.token = Token(self._epoch, self._granted)
-            tenure.views_number = self._granted
             tenure.granted_ns = now_ns
             tenure.hold_end_ns = now_ns + tenure.hold_ns
             if len(self._hold_ends) > 2 * len(self.by_lock) + STALE_ENDS_MAX:
@@ -212,21 +233,6 @@ class Tenures:
             tuple(states),
         )
 
-    def took_views(self, lock: LockId) -> None:
-        """Note that a lock takes views after its grant; only the first time counts."""
-        tenure = self.by_lock.get(lock)
-        if tenure is not None and tenure.token is not None and not tenure.views_taken:
-            tenure.views_taken = True
-            tenure.views_number = self._granted
-
-    def earlier_writer(self, tenure: Tenure, slot: Slot) -> Tenure | None:
-        """Return who may write `slot` and was granted before the views of `tenure` were taken."""
-        for claim in self.table.writers(slot):
-            other = self.by_lock[claim.lock]
-            if other is not tenure and other.token and other.token.number <= tenure.views_number:
-                return other
-        return None
-
     def pins_of(self, states: Iterable[SlotState]) -> dict[tuple[Slot, int], Datum]:
         """Return the data that `states` name without carrying, to keep them fetchable."""
         pins = {}
@@ -250,7 +256,7 @@ class Tenures:
 
     def take_away(self, tenure: Tenure, cause: str, *, now_ns: int) -> Iterator[Effect]:
         """End a tenure against its holder's will, remembering why for its next message."""
-        assert not tenure.committing
+        assert not tenure.bound
         session = self._sessions.by_id.get(tenure.lock.session)
         if session is not None and tenure.token is not None:
             session.lane(tenure.lock.lane).ended = (tenure.lock, cause)
@@ -266,12 +272,12 @@ class Tenures:
                 yield self.waiting(tenure, now_ns)
 
     def held_too_long(self, now_ns: int) -> list[Tenure]:
-        """Return the tenures whose hold limit is over, committing ones left out."""
+        """Return the tenures whose hold limit is over, bound ones left out."""
         over = []
         while self._hold_ends and self._hold_ends[0][0] <= now_ns:
             _, lock = heapq.heappop(self._hold_ends)
             tenure = self.by_lock.get(lock)
-            if tenure is None or tenure.token is None or tenure.committing:
+            if tenure is None or tenure.token is None or tenure.bound:
                 continue
             if tenure.hold_end_ns > now_ns:
                 heapq.heappush(self._hold_ends, (tenure.hold_end_ns, lock))
@@ -297,6 +303,6 @@ class Tenures:
         assert len(tokens) == len(set(tokens))
         for tenure in self.by_lock.values():
             assert tenure.claim.granted == (tenure.token is not None), tenure
-            assert not tenure.committing or tenure.token is not None
+            assert not tenure.bound or tenure.token is not None
             assert not (tenure.claim.granted and tenure.parked is not None)
             assert self.by_session[tenure.lock.session][tenure.lock] is tenure

@@ -45,6 +45,10 @@ CODES: Final[dict[type[Any], int]] = {
     m.ListLocks: 14,
     m.ListSessions: 15,
     m.Break: 16,
+    m.Prepare: 17,
+    m.Finish: 18,
+    m.Resolve: 19,
+    m.ForceAbort: 20,
     m.Welcome: 33,
     m.Registered: 34,
     m.Granted: 35,
@@ -68,6 +72,9 @@ CODES: Final[dict[type[Any], int]] = {
     m.WrongShard: 53,
     m.Refused: 54,
     m.Changed: 55,
+    m.Prepared: 56,
+    m.Finished: 57,
+    m.Resolved: 58,
     m.Notice: 97,
 }
 

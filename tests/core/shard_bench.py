@@ -225,7 +225,7 @@ class ShardBench:
         """Return the request for a lock."""
         epoch = self.shard.epoch if epoch is None else epoch
         counter = self.next_count(lock.session)
-        return Acquire(lock, epoch, 1, counter, items, wait_ns, hold_ns, 0)
+        return Acquire(lock, epoch, 1, counter, items, wait_ns, hold_ns, 0, alone=True)
 
     def acquire(self, lock: LockId, *items: Item, **options: int) -> Answer | None:
         """Ask for a lock; None while the request is parked."""

@@ -11,8 +11,12 @@ from typing import TYPE_CHECKING
 
 from enact_dist.core.records import (
     AspectRecord,
+    DecisionDone,
+    DecisionRecord,
     OutcomeRecord,
     Persist,
+    PreparedEnded,
+    PreparedRecord,
     Recovered,
     SessionEnded,
     SessionRecord,
@@ -25,6 +29,7 @@ from simulated.world import MS
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from enact_dist.core.datum import LockId
     from simulated.faults import Faults
     from simulated.world import Host, World
 
@@ -105,12 +110,22 @@ class Disk:
         aspects: dict[str, AspectRecord] = {}
         slots: dict[object, SlotRecord] = {}
         outcomes: dict[tuple[str, int], OutcomeRecord] = {}
+        prepared: dict[LockId, PreparedRecord] = {}
+        decisions: dict[LockId, DecisionRecord] = {}
         for persist in self.log:
             for record in persist.records:
                 if isinstance(record, SlotRecord):
                     slots[record.slot] = record
                 elif isinstance(record, OutcomeRecord):
                     outcomes[record.lock.session, record.lock.lane] = record
+                elif isinstance(record, PreparedRecord):
+                    prepared[record.lock] = record
+                elif isinstance(record, PreparedEnded):
+                    prepared.pop(record.lock, None)
+                elif isinstance(record, DecisionRecord):
+                    decisions[record.lock] = record
+                elif isinstance(record, DecisionDone):
+                    decisions.pop(record.lock, None)
                 elif isinstance(record, SessionRecord):
                     sessions[record.session] = record
                 elif isinstance(record, SessionEnded):
@@ -126,4 +141,6 @@ class Disk:
             [record.entry for record in aspects.values()],
             list(slots.values()),
             list(outcomes.values()),
+            list(prepared.values()),
+            list(decisions.values()),
         )

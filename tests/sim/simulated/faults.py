@@ -23,6 +23,8 @@ class Faults:
     """Share of answers that are delivered although their caller has given up on the call."""
     triggered: float = 0.0
     """Share of decisive messages and disk writes that set off a fault at that very moment."""
+    at_decision: float = 0.0
+    """Share of commits over shards at which one of the shards dies, just before or just after."""
     crashes_per_s: float = 0.0
     """Shards that die and start again."""
     power_cut: float = 0.0
@@ -70,6 +72,7 @@ def drawn(random: Random, *, shards: int) -> Faults:
         delay=delay,
         late_answers=random.choice((0.0, 0.5)),
         triggered=random.choice((0.0, 0.005, 0.02, 0.05)),
+        at_decision=random.choice((0.0, 0.0, 0.03, 0.1)) if shards > 1 else 0.0,
         crashes_per_s=random.choice((0.0, 0.1, 0.4)),
         power_cut=random.choice((0.0, 0.5, 1.0)),
         kills_per_s=random.choice((0.0, 0.1)),

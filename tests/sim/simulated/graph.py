@@ -13,6 +13,7 @@ from __future__ import annotations
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
+from enact_dist.core.datum import LockId
 from enact_dist.core.multilock import Phase
 
 if TYPE_CHECKING:
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from enact_dist.core.datum import Slot
     from simulated.history import Entry, History
     from simulated.model import Model
-    from simulated.picture import Picture
+    from simulated.picture import Picture, State
 
 NEVER = 1 << 63
 
@@ -66,12 +67,53 @@ class Graph:
         chain = picture.chains.get(slot, [])
         index = -1
         for position, state in enumerate(chain):
-            if state.epoch == epoch and state.name == name:
+            if state.epoch <= epoch and state.name == name:
                 index = position
         if index >= 0:
             self._edge(chain[index].writer, entry.id, f"wr {slot}")
         if index + 1 < len(chain):
-            self._edge(entry.id, chain[index + 1].writer, f"rw {slot}")
+            after = chain[index + 1].writer
+            # A prepared lock outlives a restart, which may empty volatile slots that it has read.
+            if isinstance(after, LockId) or entry.id not in self._model.decided:
+                self._edge(entry.id, after, f"rw {slot}")
+
+    def check_views(self) -> None:
+        """Every view shows all that a commit has written, or nothing of it."""
+        chains = {s: c for p in self._model.pictures.values() for s, c in p.chains.items()}
+        written: dict[LockId, dict[Slot, int]] = {}
+        for slot, chain in chains.items():
+            for index, state in enumerate(chain):
+                if isinstance(state.writer, LockId):
+                    written.setdefault(state.writer, {})[slot] = index
+        for entry in self._entries:
+            seen = self._seen_by_views(entry, chains)
+            for lock in {chains[s][i].writer for s, i in seen.items() if i >= 0}:
+                if isinstance(lock, LockId) and lock not in self._model.permitted_losses:
+                    missed = [
+                        slot
+                        for slot, index in written[lock].items()
+                        if slot in seen and seen[slot] < index
+                    ]
+                    if missed:
+                        self._model.fail("a view shows half a commit", entry.id, lock, missed)
+
+    def _seen_by_views(self, entry: Entry, chains: dict[Slot, list[State]]) -> dict[Slot, int]:
+        """Return which state of each viewed slot a lock saw, those of restarts left out."""
+        seen: dict[Slot, int] = {}
+        for reading in entry.views():
+            slot, name = reading.state.slot, (reading.state.version, reading.state.stamp_ns)
+            chain = chains.get(slot, [])
+            found = [
+                i
+                for i, state in enumerate(chain)
+                if state.name == name and state.epoch <= reading.epoch
+            ]
+            if found and isinstance(chain[found[-1]].writer, str):
+                continue
+            seen[slot] = found[-1] if found else -1
+        if len(seen) > 1:
+            self._model.count("views over several slots checked")
+        return seen
 
     # ---------------------------------------------------------------- real time
 

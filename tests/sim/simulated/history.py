@@ -57,6 +57,10 @@ class Entry:
             if self.expects or any(_covers(item, reading) for item in self.items)
         ]
 
+    def views(self) -> list[Reading]:
+        """Return what the lock saw without protection, at whatever shard."""
+        return [r for r in self.lock.states if not any(_covers(item, r) for item in self.items)]
+
 
 @dataclass(slots=True)
 class History:

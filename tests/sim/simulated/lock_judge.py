@@ -36,6 +36,9 @@ class LockJudge:
         for lock in picture.in_flight:
             if lock not in picture.granted:
                 self._fail("I17 a commit in flight keeps its lock", lock)
+        for lock in picture.prepared:
+            if lock not in picture.granted:
+                self._fail("I10 what is prepared keeps its locks", lock)
         fresh = [
             tenure
             for lock, tenure in tenures.items()
@@ -84,7 +87,7 @@ class LockJudge:
         """After a look at the clock no grant is left that should have ended."""
         state = host.shard.state
         for lock, tenure in state.tenures.by_lock.items():
-            if tenure.token is None or tenure.committing:
+            if tenure.token is None or tenure.bound:
                 continue
             lease_end_ns = state.sessions.by_id[lock.session].lease_end_ns(state.now_ns)
             if min(tenure.hold_end_ns, lease_end_ns) <= state.now_ns:

@@ -17,11 +17,23 @@ from enact_dist.core.messages import (
     Hello,
     Item,
     Notice,
+    Prepared,
+    SlotVersion,
     Valid,
     Viewed,
 )
 from enact_dist.core.multilock import Phase
-from enact_dist.core.records import OutcomeRecord, Persist, Publish, Recovered, Reply
+from enact_dist.core.records import (
+    DecisionRecord,
+    OutcomeRecord,
+    Persist,
+    PreparedEnded,
+    PreparedRecord,
+    Publish,
+    Recovered,
+    Reply,
+    SlotRecord,
+)
 from enact_dist.terms import Access, Durability, pattern_matches
 from simulated.history import TOLD_NOT, Entry, History, conflict
 from simulated.lock_judge import LockJudge
@@ -47,7 +59,16 @@ class Model:
         self.absent: dict[LockId, dict[tuple[str, Slot], tuple[int, tuple[int, int]]]] = {}
         self.labels: dict[tuple[str, str], Slot] = {}
         self.permitted_losses: dict[LockId, None] = {}
+        self.decided: dict[LockId, DecisionRecord] = {}
         self.clocks_were_set = False
+
+    def fail(self, rule: str, *facts: object) -> None:
+        """Stop the run: a rule is broken."""
+        self._fail(rule, *facts)
+
+    def count(self, name: str) -> None:
+        """Add one to a tally of the run."""
+        self._world.tally[name] += 1
 
     def _fail(self, rule: str, *facts: object) -> None:
         self._world.violation(rule, *facts)
@@ -58,19 +79,60 @@ class Model:
         """A shard died and its disk lost these records: was it allowed to?"""
         picture = self.pictures[host.name]
         gone = {id(persist) for persist in lost}
+        losses: dict[LockId, None] = {}
         for lock, persist in picture.applied.items():
             if persist is None or id(persist) not in gone:
                 continue
             if not (power_cut and persist.durability is Durability.OS):
                 self._fail("I5 committed survives", lock, persist.durability, power_cut)
             self.permitted_losses[lock] = None
+            losses[lock] = None
             self._world.tally["commits lost as declared"] += 1
+        self._lose_prepared(lost, picture, losses, power_cut=power_cut)
         for lock, persist in picture.in_flight.items():
             if id(persist) not in gone:
                 self._world.tally["commits found after a crash"] += 1
-                self._apply(host, lock, persist, picture, datum_of=_recorded_data(persist))
+                self._found(host, lock, persist, picture)
         picture.in_flight.clear()
-        picture.applied = dict.fromkeys(picture.applied)
+        picture.preparing.clear()
+        picture.prepared.clear()
+        picture.applied = {lock: None for lock in picture.applied if lock not in losses}
+
+    def _lose_prepared(
+        self,
+        lost: list[Persist],
+        picture: Picture,
+        losses: dict[LockId, None],
+        *,
+        power_cut: bool,
+    ) -> None:
+        """A power cut may take what was promised for `os` data, and what was applied of it."""
+        for persist in lost:
+            for record in persist.records:
+                if isinstance(record, PreparedRecord) and record.lock in picture.prepared:
+                    if not (power_cut and persist.durability is Durability.OS):
+                        self._fail("a promise survives", record.lock, persist.durability)
+                    self.permitted_losses[record.lock] = None
+                    self._world.tally["promises lost as declared"] += 1
+        for chain in picture.chains.values():
+            for index, state in enumerate(chain):
+                if state.writer in losses and state.writer in self.decided:
+                    # It may be applied again: the store has forgotten that it was.
+                    chain[index] = state._replace(writer=f"lost {state.writer}")
+
+    def _found(self, host: ShardHost, lock: LockId, persist: Persist, picture: Picture) -> None:
+        """What was under way at a crash turned out to be on disk."""
+        for record in persist.records:
+            if isinstance(record, DecisionRecord):
+                self.decided[lock] = record
+        datum_of = _recorded_data(persist)
+        if any(isinstance(record, OutcomeRecord) for record in persist.records):
+            self._apply(host, lock, persist, picture, datum_of=datum_of)
+        else:
+            kept = [r for r in persist.records if isinstance(r, SlotRecord) and not r.volatile]
+            versions = {r.slot: (r.version, r.stamp_ns) for r in kept}
+            self._put_all(lock, versions, picture, datum_of)
+            picture.applied[lock] = persist
 
     def booted(self, host: ShardHost, recovered: Recovered, *, crashed_at_ns: int) -> None:
         """A shard started: what it recovered becomes one writer of all slots in the history."""
@@ -81,6 +143,7 @@ class Model:
         writer = f"restart {recovered.epoch} of {host.name}"
         picture.restarts.append((writer, crashed_at_ns, self._world.now_ns))
         found = {record.slot: record for record in recovered.slots if not record.volatile}
+        prepared = {w.slot: record.lock for record in recovered.prepared for w in record.writes}
         for slot in list(picture.chains):
             record, before = found.get(slot), picture.now(slot)
             name = (record.version, record.stamp_ns) if record else (0, 0)
@@ -92,10 +155,22 @@ class Model:
             content = host.shard.state.slots[slot]
             if (content.version, content.stamp_ns) != name:
                 self._fail("I15 recovery is exact", slot, content, name)
-            picture.put(slot, State(*name, writer, picture.epoch, content.datum))
+            if name != before.name:
+                # What is prepared here comes later, however early it was decided elsewhere.
+                by = f"{writer} under {prepared[slot]}" if slot in prepared else writer
+                picture.put(slot, State(*name, by, picture.epoch, content.datum))
         picture.arrivals.clear()
         picture.granted.clear()
         picture.granted_ever.clear()
+        for record in recovered.prepared:
+            lock = record.lock
+            self._world.tally["prepared over a restart"] += 1
+            tenure = host.shard.state.tenures.by_lock.get(lock)
+            if tenure is None or tenure.token != record.token or not tenure.claim.granted:
+                self._fail("I10 prepared locks are held again", lock)
+            picture.prepared[lock] = record
+            picture.granted[lock] = picture.granted_ever[lock] = record.token
+            picture.arrivals[lock] = 0
         picture.notices = 0
         longest_ns = max((record.ttl_ns for record in recovered.sessions), default=0)
         picture.grace_end_ns = host.local_ns + longest_ns * 101 // 100
@@ -118,7 +193,8 @@ class Model:
                 self._check_snapshot(host, effect.answer, picture)
             elif isinstance(effect.answer, Valid):
                 lock = effect.answer.lock
-                picture.confirmed[lock] = picture.granted_ever[lock]
+                if lock in picture.granted_ever:  # else it only expected something here
+                    picture.confirmed[lock] = picture.granted_ever[lock]
 
     def _check_commits(self, host: ShardHost, effects: list[object], picture: Picture) -> None:
         told = {
@@ -128,34 +204,107 @@ class Model:
         }
         for effect in effects:
             if isinstance(effect, Persist):
-                for record in effect.records:
-                    if isinstance(record, OutcomeRecord):
-                        picture.in_flight[record.lock] = effect
+                self._check_persist(effect, picture)
+            elif isinstance(effect, Reply) and isinstance(effect.answer, Prepared):
+                self._check_prepared(host, effect.answer, picture)
             elif isinstance(effect, Publish):
                 assert isinstance(effect.notice, Notice)
                 picture.notices += 1
                 if effect.notice.number != picture.notices:
                     self._fail("notices have no gap", effect.notice.number, picture.notices)
-                committed = told[effect.notice.changes[0].stamp_ns]
-                self._applied(host, committed, effect.notice, picture)
+                committed = told.get(effect.notice.changes[0].stamp_ns)
+                if committed is not None:
+                    versions = list(committed.versions)
+                    self._applied(host, committed.lock, versions, effect.notice, picture)
+                else:
+                    self._finished(host, effect.notice, picture)
+
+    def _check_persist(self, persist: Persist, picture: Picture) -> None:
+        for record in persist.records:
+            if isinstance(record, OutcomeRecord):
+                picture.in_flight[record.lock] = persist
+            elif isinstance(record, PreparedRecord):
+                picture.preparing[record.lock] = record
+            elif isinstance(record, PreparedEnded) and persist.ticket:
+                picture.in_flight[record.lock] = persist
+            elif isinstance(record, PreparedEnded):
+                self._world.tally["prepared and aborted"] += 1
+                picture.aborted[record.lock] = None
+                picture.prepared.pop(record.lock, None)
+                if record.lock in self.decided and record.lock not in self.permitted_losses:
+                    self._fail("I9 committed and aborted", record.lock)
+                if record.lock in picture.applied:
+                    self._fail("I9 applied and aborted", record.lock)
+
+    def _check_prepared(self, host: ShardHost, answer: Prepared, picture: Picture) -> None:
+        record = picture.preparing.pop(answer.lock, None)
+        if record is not None:
+            picture.prepared[answer.lock] = record
+            picture.confirmed[answer.lock] = record.token
+        if answer.lock not in picture.prepared and answer.lock not in picture.in_flight:
+            self._fail("prepared what was not asked", answer)
+        kept = host.disk.synced if answer.durability == "durable" else host.disk.written
+        on_disk = host.disk.log[:kept]
+        if not any(
+            isinstance(r, PreparedRecord) and r.lock == answer.lock
+            for persist in reversed(on_disk)
+            for r in persist.records
+        ):
+            self._fail("a promise is on disk before it is given", answer)
+
+    def _finished(self, host: ShardHost, notice: Notice, picture: Picture) -> None:
+        """A participant has applied what it had prepared."""
+        slots = {change.slot for change in notice.changes}
+        for lock, record in picture.prepared.items():
+            if lock in picture.in_flight and {w.slot for w in record.writes} == slots:
+                break
+        else:
+            self._fail("only what is prepared is finished", notice)
+            return
+        if lock not in self.decided:
+            self._fail("I9 applied without a decision", lock)
+        versions = [SlotVersion(change.slot, change.version) for change in notice.changes]
+        self._world.tally["commits finished by participants"] += 1
+        self._applied(host, lock, versions, notice, picture)
+        del picture.prepared[lock]
 
     def _applied(
-        self, host: ShardHost, committed: Committed, notice: Notice, picture: Picture
+        self,
+        host: ShardHost,
+        lock: LockId,
+        expected: list[SlotVersion],
+        notice: Notice,
+        picture: Picture,
     ) -> None:
         """A commit became visible."""
-        lock = committed.lock
         persist = picture.in_flight.pop(lock, None)
         self._check_on_disk(host, lock, persist, notice)
         if picture.granted.get(lock) is None:
             self._fail("the fence: only a holder commits", lock)
-        if [(c.slot, c.version) for c in notice.changes] != list(committed.versions):
-            self._fail("a notice tells what was committed", notice, committed)
+        if [(c.slot, c.version) for c in notice.changes] != expected:
+            self._fail("a notice tells what was committed", notice, expected)
+        for record in persist.records if persist is not None else ():
+            if isinstance(record, DecisionRecord):
+                self.decided[lock] = record
+                self._world.tally["decisions"] += 1
         versions = {change.slot: (change.version, change.stamp_ns) for change in notice.changes}
         datum_of = {slot: host.shard.state.slots[slot].datum for slot in versions}
         self._put_all(lock, versions, picture, datum_of)
         picture.applied[lock] = persist
         picture.confirmed[lock] = picture.granted_ever[lock]
         self._world.tally["commits"] += 1
+
+    def check_all_or_nothing(self) -> None:
+        """I3: in the end a lock has its effects on all of its shards or on none."""
+        for lock, record in self.decided.items():
+            if lock in self.permitted_losses:
+                continue
+            for shard in record.participants:
+                if lock not in self.pictures[shard].applied:
+                    self._fail("I3 decided, but not applied", lock, shard)
+        for name, picture in self.pictures.items():
+            if picture.prepared:
+                self._fail("I12 nothing stays prepared", name, list(picture.prepared))
 
     def _check_on_disk(
         self, host: ShardHost, lock: LockId, persist: Persist | None, notice: Notice
@@ -193,7 +342,7 @@ class Model:
         picture: Picture,
         datum_of: dict[Slot, Datum | None],
     ) -> None:
-        if any(lock in other.applied for other in self.pictures.values()):
+        if lock in picture.applied:
             self._fail("I16 one execution per lock", lock)
         entry = self._history.entries.get(lock)
         if entry is not None and entry.told in TOLD_NOT:
@@ -206,7 +355,10 @@ class Model:
                 self._fail("stamps grow", slot, stamp_ns, before)
             if datum is not None:
                 self._check_content(lock, slot, before, datum)
-            picture.put(slot, State(version, stamp_ns, lock, picture.epoch, datum))
+            # What a power cut took may come back: a writer of its own, as late as that.
+            again = lock in self.decided and lock in self.permitted_losses
+            writer = f"again {lock}" if again else lock
+            picture.put(slot, State(version, stamp_ns, writer, picture.epoch, datum))
 
     def _check_content(self, lock: LockId, slot: Slot, before: State, datum: Datum) -> None:
         if writer_of(datum) != str(lock):
@@ -217,7 +369,8 @@ class Model:
                 self._fail("no phantom: two created one thing", first, slot, label_of(datum))
             return
         old = 0 if before.datum is None else value_of(before.datum)
-        if value_of(datum) != old + 1:
+        emptied = self._durabilities[slot.aspect] is Durability.VOLATILE and before.version == 0
+        if value_of(datum) != old + 1 and not (emptied and lock in self.decided):
             self._fail("no lost update", slot, old, datum)
 
     # ---------------------------------------------------------------- readers
@@ -226,7 +379,11 @@ class Model:
         """I18: an answer shows one committed moment, and all of it."""
         for state in answer.states:
             now = picture.now(state.slot)
-            if (state.version, state.stamp_ns) != now.name:
+            name = (state.version, state.stamp_ns)
+            if name != now.name and isinstance(answer, Viewed):
+                now = picture.at(state.slot, answer.until_ns)
+                self._world.tally["data shown as of the past"] += 1
+            if name != now.name:
                 self._fail("I18 readers see what is committed", state.slot, state, now)
             if (state.null_reason == "") != (now.datum is not None):
                 self._fail("null is null", state, now)
@@ -278,7 +435,7 @@ class Model:
         picture = self.pictures[reading.shard]
         state = reading.state
         for one in reversed(picture.chains.get(state.slot, ())):
-            if one.epoch == reading.epoch and one.name == (state.version, state.stamp_ns):
+            if one.epoch <= reading.epoch and one.name == (state.version, state.stamp_ns):
                 same = (one.datum is None) == (datum is None) and (
                     datum is None or one.datum is None or bytes(datum.body) == bytes(one.datum.body)
                 )
@@ -295,6 +452,7 @@ class Model:
         refusal = entry.lock.refusal
         if refusal is not None and not (self.clocks_were_set and refusal.code == "clock_skew"):
             self._fail("nothing is refused", entry.id, refusal)
+        applied = applied or entry.id in self.permitted_losses
         if entry.told is Phase.COMMITTED and entry.lock.versions and not applied:
             self._fail("I5 told committed, not visible", entry.id)
         if entry.told in TOLD_NOT and applied and not self._may_be_gone(entry):

@@ -32,6 +32,12 @@ DECISIVE = (
     m.OutcomeIs,
     m.Validate,
     m.Valid,
+    m.Prepare,
+    m.Prepared,
+    m.Finish,
+    m.Finished,
+    m.Resolve,
+    m.Resolved,
     m.Release,
     m.EpochChanged,
 )
@@ -46,6 +52,7 @@ class Network:
         self._through_wire = through_wire
         self._cuts: dict[tuple[str, str], int] = {}
         self.set_off: Callable[[Host, Host], int | None] = lambda _source, _target: 0
+        self.before_decision: Callable[[m.Commit, Host], None] = lambda _commit, _target: None
 
     def cut(self, source: Host, target: Host, *, duration_ns: int) -> None:
         """Let nothing pass from one host to another for a while."""
@@ -71,6 +78,8 @@ class Network:
         if self._through_wire:
             message = passed_through_wire(message)
         late_ns: int | None = 0
+        if isinstance(message, m.Commit) and message.participants:
+            self.before_decision(message, target)
         decisive = faults.triggered and isinstance(message, DECISIVE)
         if decisive and random.random() < faults.triggered:
             late_ns = self.set_off(source, target)

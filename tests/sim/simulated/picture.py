@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from enact_dist.core.datum import Datum, LockId, Slot, Token
 
 if TYPE_CHECKING:
-    from enact_dist.core.records import Persist
+    from enact_dist.core.records import Persist, PreparedRecord
 
 
 class State(NamedTuple):
@@ -37,6 +37,9 @@ class Picture:
     chains: dict[Slot, list[State]] = field(default_factory=dict)
     columns: dict[tuple[str, str], dict[Slot, None]] = field(default_factory=dict)
     in_flight: dict[LockId, Persist] = field(default_factory=dict)
+    preparing: dict[LockId, PreparedRecord] = field(default_factory=dict)
+    prepared: dict[LockId, PreparedRecord] = field(default_factory=dict)
+    aborted: dict[LockId, None] = field(default_factory=dict)
     applied: dict[LockId, Persist | None] = field(default_factory=dict)
     arrivals: dict[LockId, int] = field(default_factory=dict)
     granted: dict[LockId, Token] = field(default_factory=dict)
@@ -53,6 +56,13 @@ class Picture:
         """Return the newest committed state of a slot."""
         chain = self.chains.get(slot)
         return chain[-1] if chain else NEVER_SET
+
+    def at(self, slot: Slot, stamp_ns: int) -> State:
+        """Return the committed state of a slot as of a stamp."""
+        for state in reversed(self.chains.get(slot, [])):
+            if state.stamp_ns <= stamp_ns:
+                return state
+        return NEVER_SET
 
     def put(self, slot: Slot, state: State) -> None:
         """Add a state to the chain of a slot."""

@@ -28,6 +28,7 @@ from simulated.world import MS, Host, S, SimulationError, World
 if TYPE_CHECKING:
     from collections import Counter
 
+    from enact_dist.core.messages import Commit
     from simulated.faults import Faults
 
 FAULTS_NS = 20 * S
@@ -64,7 +65,7 @@ class Scenario:
         self.seed = seed
         random = Random(seed)
         self.world = world = World(random)
-        count = random.choice((1, 1, 1, 2, 2, 3))
+        count = random.choice((1, 2, 2, 3))
         self.faults = fault_options.drawn(random, shards=count) if faults is None else faults
         self.ttl_ns = random.choice((500 * MS, S, 2 * S))
         self.history = History()
@@ -72,6 +73,7 @@ class Scenario:
         self.model = Model(world, self.history, durabilities)
         self.network = Network(world, self.faults, through_wire=through_wire)
         self.network.set_off = self._set_off
+        self.network.before_decision = self._before_decision
         self.shards = self._made_shards(count)
         for host in self.shards.values():
             host.asserts = asserts
@@ -99,6 +101,8 @@ class Scenario:
             host.model = self.model
             host.tokens = self._tokens_seen
             host.on_persist = self._on_persist
+            host.on_decision = self._on_decision
+            host.network, host.peers = self.network, shards
         return shards
 
     def _add_client(self) -> None:
@@ -152,7 +156,10 @@ class Scenario:
         self._check_quiet()
         for host in self.shards.values():
             host.close()
-        cycle = Graph(self.history, self.model).cycle()
+        self.model.check_all_or_nothing()
+        graph = Graph(self.history, self.model)
+        graph.check_views()
+        cycle = graph.cycle()
         if cycle is not None:
             self.world.violation("I6 strict serializability", *("\n  " + line for line in cycle))
 
@@ -162,7 +169,10 @@ class Scenario:
     def _quiet(self) -> bool:
         busy = any(host.threads_left for host in self.model.clients if host.up)
         locks = any(
-            host.shard.state.tenures.by_lock or host.unanswered for host in self.shards.values()
+            host.shard.state.tenures.by_lock
+            or host.unanswered
+            or host.shard.state.decisions.by_lock
+            for host in self.shards.values()
         )
         return not busy and not locks
 
@@ -174,9 +184,10 @@ class Scenario:
                 self.world.violation("I12 all threads end", host.name, host.threads_left, phases)
         for host in self.shards.values():
             left = host.shard.state.tenures.by_lock
-            if left or host.unanswered:
+            untold = host.shard.state.decisions.by_lock
+            if left or host.unanswered or untold:
                 self.world.violation(
-                    "I12 nothing is left", host.name, list(left.values()), host.unanswered
+                    "I12 nothing is left", host.name, list(left.values()), host.unanswered, untold
                 )
 
     # ---------------------------------------------------------------- faults in time
@@ -265,6 +276,14 @@ class Scenario:
 
     def _partition(self) -> None:
         random, world = self.world.random, self.world
+        if len(self.shards) > 1 and random.random() < 0.4:
+            one, other = random.sample(list(self.shards.values()), 2)
+            world.tally["partitions: shards"] += 1
+            duration_ns = random.choice((500 * MS, 2 * S, 5 * S))
+            self.network.cut(one, other, duration_ns=duration_ns)
+            if random.random() < 0.5:
+                self.network.cut(other, one, duration_ns=duration_ns)
+            return
         client = random.choice(self._up_clients())
         shards = random.sample(list(self.shards.values()), random.randint(1, len(self.shards)))
         duration_ns = random.choice((500 * MS, 2 * S, 5 * S))
@@ -312,6 +331,25 @@ class Scenario:
         random = self.world.random
         if self.faults.triggered and random.random() < self.faults.triggered / 2:
             self.world.after(random.randrange(6 * MS), lambda: self._crash(host))
+
+    def _before_decision(self, commit: Commit, primary: Host) -> None:
+        """All are prepared, and the commit that decides is about to leave its client."""
+        if self.world.random.random() < self.faults.at_decision:
+            self.world.tally["crashes before a decision"] += 1
+            self._crash_around([primary.name, *commit.participants])
+
+    def _on_decision(self, primary: ShardHost, told: list[str]) -> None:
+        """A decision is durable and its participants are about to hear of it."""
+        if self.world.random.random() < self.faults.at_decision:
+            self.world.tally["crashes after a decision"] += 1
+            self._crash_around([primary.name, *told])
+
+    def _crash_around(self, names: list[str]) -> None:
+        random = self.world.random
+        for name in random.sample(names, random.choice((1, 1, len(names)))):
+            host = self.shards[name]
+            delay_ns = random.choice((0, MS // 4, MS, 2 * MS))
+            self.world.after(delay_ns, lambda host=host: self._crash(host))
 
     # ---------------------------------------------------------------- liveliness tokens
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from enact_dist.core.messages import Answer, Refused, Request
-from enact_dist.core.records import Persist, Persisted, Reply, SessionSeen, Tick
+from enact_dist.core.messages import Answer, Finish, Refused, Request
+from enact_dist.core.records import Call, Called, Persist, Persisted, Reply, SessionSeen, Tick
 from enact_dist.core.shard import Shard
 from simulated.disk import Disk
 from simulated.world import MS, Host, S
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from enact_dist.core.shard_state import ShardSettings
     from simulated.faults import Faults
     from simulated.model import Model
+    from simulated.network import Network
     from simulated.world import World
 
 
@@ -37,6 +38,9 @@ class ShardHost(Host):
         self.shard: Shard
         self.tokens: Callable[[ShardHost], list[str]] = lambda _host: []
         self.on_persist: Callable[[ShardHost], None] = lambda _host: None
+        self.on_decision: Callable[[ShardHost, list[str]], None] = lambda _host, _told: None
+        self.network: Network
+        self.peers: dict[str, ShardHost] = {}
         self._replies: dict[int, Callable[[Answer], None]] = {}
         self._handle = 0
         self._tick_due_ns = 0
@@ -109,7 +113,25 @@ class ShardHost(Host):
             elif isinstance(effect, Persist):
                 self.disk.submit(self, effect, lambda ticket: self.event(Persisted(ticket)))
                 self.on_persist(self)
+            elif isinstance(effect, Call):
+                self._call(effect)
+        told = [e.shard for e in effects if isinstance(e, Call) and isinstance(e.request, Finish)]
+        if told:
+            self.on_decision(self, told)
         self._plan_tick()
+
+    def _call(self, call: Call) -> None:
+        """Ask another shard over the same bad network; no answer needs no report."""
+        peer, network = self.peers[call.shard], self.network
+
+        def answered(answer: Answer) -> None:
+            if self.up:
+                self.event(Called(call.shard, call.request, answer))
+
+        def reply(answer: Answer) -> None:
+            network.send(peer, self, answer, answered)
+
+        network.send(self, peer, call.request, lambda came: peer.request(came, reply))
 
     def _plan_tick(self) -> None:
         now_ns = self.local_ns

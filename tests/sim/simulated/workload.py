@@ -108,10 +108,10 @@ class Workload:
         return self._written(random, random.choice((1, 1, 2, 3)))
 
     def _written(self, random: Random, count: int) -> tuple[Item, ...]:
-        """Writes stay on one shard: one entity."""
-        entity = random.choice(self._entities)
+        """Writes lie on one entity or on several, so on one shard or on several."""
+        some = random.choice(([random.choice(self._entities)], self._entities, self._entities))
         slots = {
-            (random.choice(CONTEXTS), entity, random.choice(self._aspects)): None
+            (random.choice(CONTEXTS), random.choice(some), random.choice(self._aspects)): None
             for _ in range(count)
         }
         return tuple(Item(Access.WRITE, *slot) for slot in slots)
@@ -129,11 +129,10 @@ class Workload:
     def _cross(self, random: Random) -> tuple[Item, ...]:
         """Write one of two slots and view the other: write skew, if the view is not expected."""
         here, there = random.sample(CONTEXTS, 2)
-        entity = self._entities[0]
-        return (
-            Item(Access.WRITE, here, entity, "count"),
-            Item(Access.VIEW, there, entity, "count"),
-        )
+        one, other = random.choice((self._entities[:1] * 2, random.sample(self._entities[:2], 2)))
+        if one != other:
+            here = there = "online"
+        return Item(Access.WRITE, here, one, "count"), Item(Access.VIEW, there, other, "count")
 
     def _across(self, random: Random) -> tuple[Item, ...]:
         """Write one of two entities and read the other, named in either order."""
@@ -148,7 +147,16 @@ class Workload:
         return self._besides(random, (), Access.READ)
 
     def _view(self, random: Random) -> tuple[Item, ...]:
-        views = self._besides(random, (), Access.VIEW)
+        views: tuple[Item, ...] = self._besides(random, (), Access.VIEW)
+        if random.random() < 0.5:
+            each = random.choice((("**", "count"), ("**", "note"), ("tray/*", "frame")))
+            views = (Item(Access.VIEW_EACH, random.choice(CONTEXTS), *each),)
+        elif random.random() < 0.5:
+            views = tuple(
+                Item(Access.VIEW, context, entity, "count")
+                for context in CONTEXTS
+                for entity in self._entities
+            )
         return views + self._besides(random, views, Access.READ) if random.random() < 0.5 else views
 
     def _read_each(self, random: Random) -> tuple[Item, ...]:
@@ -173,12 +181,12 @@ class Workload:
             yield Sleep(random.choice((0, 5 * MS, 50 * MS, 300 * MS)))
             yield from self._do(host, lane, self.job())
 
-    def _do(self, host: ClientHost, lane: int, job: Job) -> Thread:
+    def _do(self, host: ClientHost, lane: int, job: Job, *, lock_views: bool = False) -> Thread:
         client = host.client
         items = tuple(self._with_known(host, item) for item in job.items)
         lock = client.begin(
             lane,
-            client.plan(items),
+            client.plan(items, lock_views=lock_views),
             now_ns=host.local_ns,
             wait_ns=job.wait_ns,
             hold_ns=job.hold_ns,
@@ -198,6 +206,9 @@ class Workload:
             yield from host.drive(lock)
         self._history.end(entry, now_ns=self._world.now_ns)
         self._model.told(host, entry)
+        if lock.no_cut:
+            self._world.tally["views that became reads"] += 1
+            yield from self._do(host, lane, job, lock_views=True)
 
     @staticmethod
     def _with_known(host: ClientHost, item: Item) -> Item:
@@ -254,27 +265,29 @@ class Workload:
         self, host: ClientHost, entry: Entry, job: Job, data: dict[Slot, Datum | None]
     ) -> None:
         lock = entry.lock
-        slots = self._slots_to_write(host, job, data)
-        writes = [WriteItem(slot, self._datum(lock, job, slot, data)) for slot in slots]
-        shard = shard_of(slots[0].entity, host.client.placement) if slots else ""
+        writes: dict[str, list[WriteItem]] = {}
+        for slot in self._slots_to_write(job, data):
+            shard = shard_of(slot.entity, host.client.placement)
+            writes.setdefault(shard, []).append(WriteItem(slot, self._datum(lock, job, slot, data)))
+        if len(writes) > 1:
+            self._world.tally["locks that write on several shards"] += 1
         expects: list[SlotVersion] = []
-        if job.expects and writes:
+        views = {Slot(*item[1:4]) for item in job.items if item.access == Access.VIEW}
+        if job.expects and views:
             expects = [
                 SlotVersion(reading.state.slot, reading.state.version)
                 for reading in lock.states
-                if reading.shard == shard
+                if reading.state.slot in views
             ]
-            entry.expects = len(expects) == len(lock.states)
+            entry.expects = True
         finish_s = self._world.random.choice((10, 10, 3))
         lock.finish(
-            {shard: writes} if writes else {},
+            writes,
             give_up_ns=host.local_ns + finish_s * S,
             expects=expects,
         )
 
-    def _slots_to_write(
-        self, host: ClientHost, job: Job, data: dict[Slot, Datum | None]
-    ) -> list[Slot]:
+    def _slots_to_write(self, job: Job, data: dict[Slot, Datum | None]) -> list[Slot]:
         if job.kind == "create":
             if any(datum is not None and label_of(datum) == job.label for datum in data.values()):
                 self._world.tally["labels found"] += 1
@@ -283,10 +296,7 @@ class Workload:
             return [Slot(job.items[0].context, name, "made")]
         if job.kind == "write each":
             item = job.items[0]
-            slots = [Slot(item.context, found.entity, item.aspect) for found in data]
-            shards = {shard_of(slot.entity, host.client.placement): None for slot in slots}
-            first = next(iter(shards), "")
-            return [s for s in slots if shard_of(s.entity, host.client.placement) == first]
+            return [Slot(item.context, found.entity, item.aspect) for found in data]
         return [
             Slot(item.context, item.entity, item.aspect)
             for item in job.items

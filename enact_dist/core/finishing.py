@@ -1,0 +1,107 @@
+"""How a lock ends with its writes: validate, prepare, then the one commit that decides.
+
+::
+
+    reads elsewhere:  Validate ──┐
+    writes elsewhere: Prepare  ──┴── all positive ──> Commit at the primary = decided
+    one shard alone:  ──────────────────────────────> Commit
+
+The primary is the lowest shard that is written to.  Each part is sent again until it is answered;
+every answer can be had again.  After the commit was sent, only the primary knows the outcome.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from enact_dist.core.datum import Token
+from enact_dist.core.messages import Commit, Prepare, Validate
+from enact_dist.terms import Durability
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+    from enact_dist.core.datum import LockId
+    from enact_dist.core.messages import Prepared, Request, SlotVersion, WriteItem
+
+
+@dataclass(slots=True)
+class Finishing:
+    """What is to be published, shard by shard, and what is still to be said.
+
+    Attributes:
+        tokens: The grants; number 0 where something is expected but nothing held.
+        primary: The shard whose commit decides; empty where nothing is written.
+        left: Shards that have not validated or prepared yet.
+        prepared: What the other writing shards have answered.
+    """
+
+    lock: LockId
+    tokens: Mapping[str, Token]
+    writes: Mapping[str, tuple[WriteItem, ...]]
+    expects: Mapping[str, tuple[SlotVersion, ...]]
+    primary: str = ""
+    left: dict[str, None] = field(default_factory=dict)
+    prepared: dict[str, Prepared] = field(default_factory=dict)
+    ask_outcome: bool = False
+    sent: bool = False
+
+    def __post_init__(self) -> None:
+        self.primary = min(self.writes, default="")
+        self.left = dict.fromkeys(shard for shard in self.tokens if shard != self.primary)
+
+    def votes_to_ask(self, seen_stamp_ns: int) -> list[tuple[str, Request]]:
+        """Return what to ask the shards that have not said yes."""
+        calls: list[tuple[str, Request]] = []
+        for shard in self.left:
+            token, expects = self.tokens[shard], self.expects.get(shard, ())
+            if shard in self.writes:
+                request: Request = Prepare(
+                    self.lock,
+                    token,
+                    self.writes[shard],
+                    seen_stamp_ns,
+                    expects,
+                    self.primary,
+                    self.tokens[self.primary],
+                )
+            else:
+                request = Validate(self.lock, token, expects)
+            calls.append((shard, request))
+        return calls
+
+    def commit(self, seen_stamp_ns: int) -> Commit:
+        """Return the commit that decides, stamped after everything that was prepared."""
+        stamps = [answer.stamp_ns for answer in self.prepared.values()]
+        durabilities = [Durability(answer.durability) for answer in self.prepared.values()]
+        return Commit(
+            self.lock,
+            self.tokens[self.primary],
+            self.writes[self.primary],
+            max(seen_stamp_ns, *stamps) if stamps else seen_stamp_ns,
+            self.expects.get(self.primary, ()),
+            tuple(sorted(self.prepared)),
+            _strictest(durabilities),
+        )
+
+    @property
+    def token(self) -> Token:
+        """The grant that the commit is compared with."""
+        return self.tokens[self.primary]
+
+
+def tokens_of(
+    held: Iterable[tuple[str, Token | None]], expected_at: Iterable[tuple[str, int]]
+) -> dict[str, Token]:
+    """Return the tokens of a lock, and epochs as tokens where it only expects something."""
+    tokens = {shard: Token(epoch, 0) for shard, epoch in expected_at}
+    tokens.update((shard, token) for shard, token in held if token is not None)
+    return tokens
+
+
+def _strictest(durabilities: list[Durability]) -> str:
+    if not durabilities:
+        return ""
+    strictest = Durability.DURABLE if Durability.DURABLE in durabilities else Durability.OS
+    return str(strictest.value)

@@ -1,0 +1,54 @@
+"""Replaced states of slots, kept for a moment so that a shard can answer as of a recent stamp.
+
+Only the tail of each slot's history is here, without holes: whatever is forgotten is older than
+all that is kept of the same slot.  What is not here any more is answered with the present.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from enact_dist.core.datum import Slot
+    from enact_dist.core.slots import Content
+
+PAST_NS: Final = 2_000_000_000
+"""How long a replaced state is kept, on the clock of the stamps."""
+PAST_BYTES_MAX: Final = 64 << 20
+"""Bytes of replaced data that are kept at most."""
+
+
+class Past:
+    """The recently replaced states of one shard's slots."""
+
+    __slots__ = ("_by_slot", "_order", "bytes")
+
+    def __init__(self) -> None:
+        self._by_slot: dict[Slot, deque[Content]] = {}
+        self._order: deque[tuple[int, Slot]] = deque()
+        self.bytes = 0
+
+    def keep(self, slot: Slot, old: Content, *, until_ns: int) -> None:
+        """Keep a state that another one, stamped `until_ns`, has replaced."""
+        self._by_slot.setdefault(slot, deque()).append(old)
+        self._order.append((until_ns, slot))
+        self.bytes += old.datum.size if old.datum is not None else 0
+        self.forget(until_ns - PAST_NS)
+
+    def forget(self, before_ns: int) -> None:
+        """Forget what was replaced before a stamp, and the oldest of what is too much."""
+        while self._order and (self._order[0][0] < before_ns or self.bytes > PAST_BYTES_MAX):
+            _, slot = self._order.popleft()
+            states = self._by_slot[slot]
+            old = states.popleft()
+            self.bytes -= old.datum.size if old.datum is not None else 0
+            if not states:
+                del self._by_slot[slot]
+
+    def at(self, slot: Slot, at_ns: int) -> Content | None:
+        """Return the replaced state that was current at a stamp, None if it is forgotten."""
+        for old in reversed(self._by_slot.get(slot, ())):
+            if old.stamp_ns <= at_ns:
+                return old
+        return None

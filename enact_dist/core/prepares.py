@@ -1,0 +1,308 @@
+"""The participant's half of a commit over shards: keep writes and locks until told.
+
+::
+
+    Prepare ── fence, expectations ── Persist ── prepared ──┬─ Finish, or Resolved(committed):
+                                                            │     Persist ── applied, freed
+                                                            └─ Resolved(aborted): freed
+
+Rules a change must keep
+  * What is prepared ignores its client and every lease; only its primary's word ends it (or an
+    operator's).  This shard asks for that word by itself, again and again: there is no
+    coordinator, and no scan at a restart that could miss a late prepare.
+  * `Finished` is said only when the end of the prepared state survives: after that the primary
+    may forget, and would answer *aborted*.
+  * Nobody sees the writes before their record is durable (a restart must not take them back).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.core.datum import LockId, Position
+from enact_dist.core.messages import (
+    RESOLVED_ABORTED,
+    RESOLVED_COMMITTED,
+    RESOLVED_OPEN,
+    Broken,
+    Changed,
+    Finish,
+    Finished,
+    ForceAbort,
+    Prepare,
+    Prepared,
+    Resolve,
+    Resolved,
+    SlotVersion,
+)
+from enact_dist.core.records import (
+    AuditRecord,
+    Call,
+    Called,
+    Effect,
+    Persist,
+    PreparedEnded,
+    PreparedRecord,
+    Reply,
+    Story,
+)
+from enact_dist.terms import Durability
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+    from enact_dist.core.shard_state import ShardState
+    from enact_dist.core.tenures import Tenure
+
+ASK_NS_MAX: Final = 1_000_000_000
+"""A prepared lock asks its primary at least so often (TTL / 2 of its session where shorter)."""
+HINT_NS: Final = 50_000_000
+"""After a release of a prepared lock the primary is asked so soon: it was probably released too."""
+
+
+@dataclass(slots=True)
+class _AtStore:
+    """A preparation or an end that the store is working on; `position` belongs to an end."""
+
+    tenure: Tenure
+    record: PreparedRecord
+    position: Position | None = None
+    replies: list[int] = field(default_factory=list)
+
+
+class PrepareDesk:
+    """Everything that is prepared at this shard, and what it tells others about its own locks."""
+
+    def __init__(self, state: ShardState, recovered: Iterable[PreparedRecord]) -> None:
+        self._state = state
+        self._at_store: dict[int, _AtStore] = {}
+        self._ask_ns: dict[LockId, int] = {}
+        for record in recovered:
+            # Versions of volatile slots have started again.
+            versions = tuple(
+                SlotVersion(write.slot, state.slots[write.slot].version + 1)
+                for write in record.writes
+            )
+            record = replace(record, versions=versions)  # noqa: PLW2901 - the same, as of now
+            state.tenures.restore(record, now_ns=state.now_ns)
+            state.stamps.saw(record.stamp_ns)
+            self._ask_ns[record.lock] = state.now_ns
+            state.count("prepared_restored")
+
+    # ---------------------------------------------------------------- prepare
+
+    def on_prepare(self, message: Prepare, reply_to: int) -> Iterator[Effect]:
+        """Keep writes for another shard's decision, or say why not."""
+        state = self._state
+        tenure = state.tenures.by_lock.get(message.lock)
+        if tenure is not None and tenure.prepared is not None:
+            state.count("prepares_repeated")
+            yield Reply(reply_to, self._prepared(tenure.prepared))
+            return
+        under_way = self._at_store_of(message.lock)
+        if under_way is not None:
+            under_way.replies.append(reply_to)
+            return
+        refusal = state.commits.refusal(message, tenure, wall_ns=state.wall_ns)
+        if refusal is not None or tenure is None:
+            yield Reply(reply_to, refusal)
+            return
+        moved = state.commits.moved_on(message.expects, message.lock)
+        if moved is not None:
+            state.count("commits_changed")
+            yield from state.tenures.remove(tenure, now_ns=state.now_ns)
+            yield Reply(reply_to, Changed(message.lock, *moved))
+            return
+        stamp_ns = state.stamps.next(seen_ns=message.seen_stamp_ns, wall_ns=state.wall_ns)
+        record = PreparedRecord(
+            message.lock,
+            message.token,
+            tenure.items,
+            message.writes,
+            tuple(
+                SlotVersion(write.slot, state.slots[write.slot].version + 1)
+                for write in message.writes
+            ),
+            stamp_ns,
+            message.primary,
+            message.primary_token,
+        )
+        state.pins.pop(message.lock, None)
+        yield self._persist(
+            _AtStore(tenure, record, replies=[reply_to]), (record,), self._survives(record)
+        )
+
+    def _persist(
+        self, work: _AtStore, records: tuple[object, ...], durability: Durability
+    ) -> Effect:
+        work.tenure.committing = True
+        ticket = self._state.commits.new_ticket()
+        self._at_store[ticket] = work
+        return Persist(ticket, records, durability)  # type: ignore[arg-type]  # records they are
+
+    def _survives(self, record: PreparedRecord) -> Durability:
+        """Return what the record must survive: volatile writes too must reach their decision."""
+        return self._state.commits.strictest(record.writes, at_least=Durability.OS)
+
+    def _prepared(self, record: PreparedRecord) -> Prepared:
+        durability = self._survives(record)
+        return Prepared(record.lock, record.stamp_ns, record.versions, durability.value)
+
+    def _at_store_of(self, lock: LockId) -> _AtStore | None:
+        return next((work for work in self._at_store.values() if work.record.lock == lock), None)
+
+    def persisted(self, ticket: int) -> Iterator[Effect]:
+        """The store is done with a preparation, or with the end of one."""
+        work = self._at_store.pop(ticket)
+        tenure, record = work.tenure, work.record
+        tenure.committing = False
+        if work.position is None:
+            tenure.prepared = record
+            self._ask_ns[record.lock] = self._state.now_ns + self._ask_again_ns(record.lock)
+            self._state.count("prepared")
+            for reply_to in work.replies:
+                yield Reply(reply_to, self._prepared(record))
+            return
+        stamp_ns = work.position.stamp_ns
+        changes = self._state.commits.apply_writes(record.writes, record.versions, stamp_ns)
+        yield from self._end(tenure)
+        self._state.count("commits_finished")
+        for reply_to in work.replies:
+            yield Reply(reply_to, Finished(record.lock))
+        yield from self._state.commits.publish(changes)
+
+    # ---------------------------------------------------------------- the decision
+
+    def on_finish(self, message: Finish, reply_to: int) -> Iterator[Effect]:
+        """The primary says: committed."""
+        tenure = self._state.tenures.by_lock.get(message.lock)
+        if tenure is None or tenure.prepared is None:
+            self._state.count("finishes_repeated")
+            yield Reply(reply_to, Finished(message.lock))
+        else:
+            yield from self._finish(tenure, message.position, [reply_to])
+
+    def _finish(
+        self, tenure: Tenure, position: Position, replies: list[int]
+    ) -> Iterator[Effect]:
+        record = tenure.prepared
+        assert record is not None
+        under_way = self._at_store_of(record.lock)
+        if under_way is not None:
+            under_way.replies += replies
+            return
+        self._state.stamps.saw(position.stamp_ns)
+        written = self._state.commits.records(record.writes, record.versions, position.stamp_ns)
+        yield self._persist(
+            _AtStore(tenure, record, position, replies),
+            (*written, PreparedEnded(record.lock)),
+            self._survives(record),
+        )
+
+    def _end(self, tenure: Tenure) -> Iterator[Effect]:
+        tenure.prepared = None
+        self._ask_ns.pop(tenure.lock, None)
+        yield from self._state.tenures.remove(tenure, now_ns=self._state.now_ns)
+
+    def on_called(self, message: Called, _: int) -> Iterator[Effect]:
+        """Another shard has answered."""
+        request, answer = message.request, message.answer
+        if isinstance(request, Finish) and isinstance(answer, Finished):
+            yield from self._state.decisions.finished(request.lock, message.shard)
+        if not (isinstance(request, Resolve) and isinstance(answer, Resolved)):
+            return
+        tenure = self._state.tenures.by_lock.get(request.lock)
+        if tenure is None or tenure.prepared is None:
+            return
+        if answer.kind == RESOLVED_COMMITTED:
+            self._state.count("resolved_committed")
+            yield from self._finish(tenure, answer.position, [])
+        elif answer.kind == RESOLVED_ABORTED and not tenure.committing:
+            self._state.count("resolved_aborted")
+            yield Story("lock.aborted", f"{tenure.lock}: {message.shard} has not committed it")
+            yield Persist(0, (PreparedEnded(tenure.lock),), Durability.OS)
+            yield from self._end(tenure)
+
+    def on_resolve(self, message: Resolve, reply_to: int) -> Iterator[Effect]:
+        """Another shard asks what became of a lock whose primary this is."""
+        yield Reply(reply_to, self._resolved(message))
+
+    def _resolved(self, message: Resolve) -> Resolved:
+        state, lock = self._state, message.lock
+        position = state.commits.position_of(lock)
+        if position is not None:
+            return Resolved(lock, RESOLVED_COMMITTED, position)
+        tenure = state.tenures.by_lock.get(lock)
+        nowhere = Position(0, state.settings.name)
+        if tenure is not None and tenure.token == message.primary_token:
+            return Resolved(lock, RESOLVED_OPEN, nowhere)
+        return Resolved(lock, RESOLVED_ABORTED, nowhere)
+
+    # ---------------------------------------------------------------- time and views
+
+    def _ask_again_ns(self, lock: LockId) -> int:
+        session = self._state.sessions.by_id.get(lock.session)
+        return min(ASK_NS_MAX, session.ttl_ns // 2) if session is not None else ASK_NS_MAX
+
+    def hint(self, lock: LockId) -> None:
+        """The client has given up: its primary probably knows already."""
+        if lock in self._ask_ns:
+            self._ask_ns[lock] = min(self._ask_ns[lock], self._state.now_ns + HINT_NS)
+
+    def ask(self) -> Iterator[Effect]:
+        """Ask the primaries whose word is overdue."""
+        now_ns, name = self._state.now_ns, self._state.settings.name
+        for lock, due_ns in self._ask_ns.items():
+            if due_ns > now_ns:
+                continue
+            record = self._state.tenures.by_lock[lock].prepared
+            assert record is not None
+            self._state.count("resolves_asked")
+            yield Call(record.primary, Resolve(lock, record.primary_token, name))
+            self._ask_ns[lock] = now_ns + self._ask_again_ns(lock)
+
+    def next_deadline_ns(self) -> int | None:
+        """Return when a primary is to be asked again."""
+        return min(self._ask_ns.values(), default=None)
+
+    def undecided(self) -> Iterator[PreparedRecord]:
+        """Yield what is prepared, or about to be, and not decided as far as is known here."""
+        yield from (work.record for work in self._at_store.values())
+        for lock in self._ask_ns:
+            record = self._state.tenures.by_lock[lock].prepared
+            if record is not None:
+                yield record
+
+    # ---------------------------------------------------------------- people
+
+    def on_force_abort(self, message: ForceAbort, reply_to: int) -> Iterator[Effect]:
+        """Give up a prepared lock by hand; audited, and durable before it is told."""
+        state = self._state
+        found = [t for t in state.tenures.by_lock.values() if t.claim.ticket == message.number]
+        if not found or found[0].prepared is None or found[0].committing:
+            yield Reply(reply_to, Broken(False, None))
+            return
+        tenure = found[0]
+        holder = state.describe(tenure, state.now_ns)
+        why = message.reason or "no reason given"
+        text = (
+            f"prepared lock {message.number} ({tenure.lock}) of {holder.actor}@{holder.host} was"
+            f" aborted by hand without the word of {tenure.prepared.primary}: {why}"  # type: ignore[union-attr]
+        )
+        state.count("prepared_forced")
+        records = (AuditRecord(state.wall_ns, text), PreparedEnded(tenure.lock))
+        yield Persist(0, records, Durability.DURABLE)
+        yield Story("lock.forced", text)
+        yield from self._end(tenure)
+        yield Reply(reply_to, Broken(True, holder))
+
+    def assert_invariants(self) -> None:
+        """Assert I10 and the bookkeeping.  For tests and simulation."""
+        prepared = {
+            lock for lock, t in self._state.tenures.by_lock.items() if t.prepared is not None
+        }
+        assert prepared == set(self._ask_ns), (prepared, self._ask_ns)
+        for lock in prepared:
+            assert self._state.tenures.by_lock[lock].claim.granted, "prepared without its locks"
+

@@ -1,0 +1,120 @@
+"""Views at the shard's door: committed data without a lock, as of now or as of a stamp.
+
+A view over several shards is one cut if all of them answer as of one stamp T: every commit stamped
+up to T is shown, none after it.  The answer says from when to when its data were current; that
+interval ends before the stamp of any commit that is prepared or under way on the viewed slots,
+because such a commit may still become visible with a stamp from there on.  Asked *at* T, a shard
+first moves its clock past T, so that whatever is prepared later gets a larger stamp, and then
+waits for those that are undecided and stamped up to T.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.core.datum import Column, Datum, Slot
+from enact_dist.core.messages import EpochChanged, TakeView, Viewed
+from enact_dist.core.past import PAST_NS
+from enact_dist.core.records import Reply
+from enact_dist.terms import Access, pattern_matches
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from enact_dist.core.lock_desk import LockDesk
+    from enact_dist.core.messages import Item
+    from enact_dist.core.prepares import PrepareDesk
+    from enact_dist.core.records import Effect
+    from enact_dist.core.shard_state import ShardState
+
+VIEW_WAIT_NS: Final = 400_000_000
+"""How long a view waits for undecided commits; then it is answered, and may be asked again."""
+
+
+class ViewDesk:
+    """Everything about views without a lock."""
+
+    def __init__(self, state: ShardState, locks: LockDesk, prepares: PrepareDesk) -> None:
+        self._state = state
+        self._locks = locks
+        self._prepares = prepares
+        self._parked: dict[int, tuple[TakeView, int]] = {}
+
+    def on_take_view(self, message: TakeView, reply_to: int) -> Iterator[Effect]:
+        """Show committed data without a lock."""
+        state = self._state
+        session = state.session_in_epoch(message.lock.session, message.epoch)
+        refusal = self._locks.refused(session, message.map_version, message.items)
+        if refusal is not None or session is None:
+            yield Reply(reply_to, refusal or EpochChanged(state.epoch))
+            return
+        # Whatever is counted renews: the client believes from the newest counter that was seen.
+        session.renewed_ns = max(session.renewed_ns, state.now_ns)
+        session.count_seen = max(session.count_seen, message.count)
+        state.stamp(max(message.seen_stamp_ns, message.at_ns))
+        if message.at_ns and self._undecided_ns(message.items) <= message.at_ns:
+            state.count("views_waited")
+            self._parked[reply_to] = (message, state.now_ns + VIEW_WAIT_NS)
+        else:
+            yield Reply(reply_to, self._viewed(message))
+
+    def _undecided_ns(self, items: tuple[Item, ...]) -> int:
+        """Return the smallest stamp that an undecided commit on these items may get."""
+        undecided = list(self._state.commits.undecided())
+        undecided += [(record.stamp_ns, record.writes) for record in self._prepares.undecided()]
+        if not undecided:
+            return _NEVER_NS
+        slots = {Slot(i.context, i.entity, i.aspect) for i in items if not Access(i.access).each}
+        each = [(Column(i.context, i.aspect), i.entity) for i in items if Access(i.access).each]
+        return min(
+            (
+                stamp_ns
+                for stamp_ns, writes in undecided
+                if any(write.slot in slots or _in_any(write.slot, each) for write in writes)
+            ),
+            default=_NEVER_NS,
+        )
+
+    def _viewed(self, message: TakeView) -> Viewed:
+        state = self._state
+        shown, contents, from_ns = state.slots.views(message.items, message.at_ns)
+        pins: dict[tuple[Slot, int], Datum] = {
+            (slot_state.slot, slot_state.version): content.datum
+            for slot_state, content in zip(shown, contents, strict=True)
+            if content.datum is not None and (slot_state.large or slot_state.same)
+        }
+        if pins:
+            # Added to: the client may have taken an answer to an earlier one of these.
+            state.pins.setdefault(message.lock, {}).update(pins)
+        stamp_ns = state.stamp()
+        until_ns = min(stamp_ns, self._undecided_ns(message.items) - 1)
+        if message.at_ns:
+            # Some of it may be past already, and was current at that stamp for certain.
+            until_ns = min(until_ns, message.at_ns)
+        return Viewed(message.lock, state.epoch, stamp_ns, tuple(shown), from_ns, until_ns)
+
+    def answer_parked(self) -> Iterator[Effect]:
+        """Answer the views that nothing undecided stands before any more, or that waited enough."""
+        for reply_to, (message, end_ns) in list(self._parked.items()):
+            waited = end_ns <= self._state.now_ns or self._state.draining
+            if waited or self._undecided_ns(message.items) > message.at_ns:
+                del self._parked[reply_to]
+                yield Reply(reply_to, self._viewed(message))
+
+    def forget_past(self) -> None:
+        """Forget replaced states that nobody asks for any more."""
+        self._state.slots.past.forget(self._state.stamps.last_ns - PAST_NS)
+
+    def next_deadline_ns(self) -> int | None:
+        """Return when a view has waited enough."""
+        return min((end_ns for _, end_ns in self._parked.values()), default=None)
+
+
+_NEVER_NS: Final = 1 << 62
+
+
+def _in_any(slot: Slot, each: list[tuple[Column, str]]) -> bool:
+    column = Column(slot.context, slot.aspect)
+    return any(column == one and pattern_matches(pattern, slot.entity) for one, pattern in each)
+
+
