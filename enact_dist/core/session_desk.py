@@ -98,7 +98,7 @@ class SessionDesk:
             self._answers_after[self._ticket] = [(reply_to, answer)]
             yield Persist(self._ticket, records, Durability.DURABLE)
         elif self._answers_after:
-            self._answers_after[self._ticket].append((reply_to, answer))
+            next(reversed(self._answers_after.values())).append((reply_to, answer))
         else:
             yield Reply(reply_to, answer)
 

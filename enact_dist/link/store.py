@@ -29,7 +29,11 @@ from typing import TYPE_CHECKING, Final
 from enact_dist.core.records import (
     AspectRecord,
     AuditRecord,
+    DecisionDone,
+    DecisionRecord,
     OutcomeRecord,
+    PreparedEnded,
+    PreparedRecord,
     Recovered,
     SessionEnded,
     SessionRecord,
@@ -41,12 +45,21 @@ from enact_dist.link.blobs import Blob, BlobFolder
 from enact_dist.link.folder_lock import FolderLock, check_format, sync_folder
 from enact_dist.link.store_database import Database, DatabaseRow
 from enact_dist.link.store_mark import MarkFile
+from enact_dist.link.store_prepared import (
+    decision_key,
+    decision_row,
+    prepared_key,
+    prepared_row,
+    prepared_writes,
+)
 from enact_dist.link.store_recovery import (
     BLOB_FOLDER,
+    DATABASE_FILE,
     Contents,
     check_log,
     look_at,
     open_database,
+    put_together,
     read_blobs,
 )
 from enact_dist.link.store_rows import (
@@ -121,6 +134,7 @@ def _open_locked(folder: Path, lock: FolderLock, unix_s: int) -> tuple[Store, Re
         (folder / BLOB_FOLDER).mkdir(exist_ok=True)
         blobs = BlobFolder(folder / BLOB_FOLDER, epoch=epoch)
         read_blobs(contents, blobs, power_cut=found.power_cut)
+        put_together(contents, folder / DATABASE_FILE)
         contents.recovered.epoch = epoch
         store = Store(folder, lock=lock, database=database, blobs=blobs, contents=contents)
         store._begin(contents, wall_ns=unix_s * 1_000_000_000)  # noqa: SLF001 - its constructor
@@ -152,6 +166,10 @@ class Store:
         self._lanes: dict[str, set[int]] = {}
         for outcome in contents.recovered.outcomes:
             self._lanes.setdefault(outcome.lock.session, set()).add(outcome.lock.lane)
+        self._prepared = {
+            record.lock: tuple(key for key, _ in prepared_writes(record))
+            for record in contents.recovered.prepared
+        }
         self._next_id = max(self._ids.values(), default=0) + 1
         self._batch = contents.batch
         self._mark: MarkFile | None = None
@@ -166,8 +184,7 @@ class Store:
         # A new generation of the log: remains of a torn one must not look like damage later.
         self._database.checkpoint(cut=True)
         changes: dict[Key, bytes | None] = {EPOCH_KEY: epoch_body(contents.recovered.epoch)}
-        for record in contents.lost:
-            key = slot_key(record.slot)
+        for key, record in contents.lost.items():
             changes[key] = slot_body(record, None)
             self._blob_of.pop(key, None)
         self._forget_ended(changes, wall_ns=wall_ns)
@@ -227,6 +244,7 @@ class Store:
         changes: dict[Key, bytes | None] = {}
         slots: dict[Key, tuple[SlotRecord, bool]] = {}
         forced = False
+        gone: list[Blob] = []
         for persist in batch:
             durable = persist.durability is Durability.DURABLE
             forced |= durable
@@ -235,9 +253,13 @@ class Store:
                     key = slot_key(record.slot)
                     _, before = slots.get(key, (None, False))
                     slots[key] = (record, durable or before)
+                elif isinstance(record, PreparedRecord):
+                    self._stage_prepared(record, changes, slots, durable=durable)
+                elif isinstance(record, PreparedEnded):
+                    gone += self._stage_prepared_end(record, changes, slots)
                 else:
                     self._stage(record, changes)
-        replaced = self._stage_slots(slots, changes)
+        replaced = gone + self._stage_slots(slots, changes)
         if changes:
             self._commit(changes, forced=forced)
         self._discard(replaced, forced=forced)
@@ -262,11 +284,48 @@ class Store:
         elif isinstance(record, OutcomeRecord):
             self._lanes.setdefault(record.lock.session, set()).add(record.lock.lane)
             key, body = outcome_row(record)
+        elif isinstance(record, DecisionRecord):
+            key, body = decision_row(record)
+        elif isinstance(record, DecisionDone):
+            changes[decision_key(record.lock)] = None
+            return
         elif isinstance(record, AuditRecord):
             key, body = audit_row(record, batch=self._batch + 1, number=len(changes))
         else:
             raise TypeError(f"no record of a store: {record!r}")
         changes[key] = body
+
+    def _stage_prepared(
+        self,
+        record: PreparedRecord,
+        changes: dict[Key, bytes | None],
+        slots: dict[Key, tuple[SlotRecord, bool]],
+        *,
+        durable: bool,
+    ) -> None:
+        """Note a prepared lock and its writes."""
+        key, body = prepared_row(record)
+        changes[key] = body
+        writes = dict(prepared_writes(record))
+        self._prepared[record.lock] = tuple(writes)
+        slots.update((key, (write, durable)) for key, write in writes.items())
+
+    def _stage_prepared_end(
+        self,
+        record: PreparedEnded,
+        changes: dict[Key, bytes | None],
+        slots: dict[Key, tuple[SlotRecord, bool]],
+    ) -> list[Blob]:
+        """Note that a lock is prepared no more; return its files."""
+        changes[prepared_key(record.lock)] = None
+        blobs: list[Blob] = []
+        for key in self._prepared.pop(record.lock, ()):
+            slots.pop(key, None)
+            changes[key] = None
+            blob = self._blob_of.pop(key, None)
+            if blob is not None:
+                blobs.append(blob)
+        return blobs
 
     def _forget_ended(self, changes: dict[Key, bytes | None], *, wall_ns: int) -> None:
         """Remove the outcomes of sessions that ended long before `wall_ns`."""

@@ -23,12 +23,18 @@ from enact_dist.errors import StoreError
 from enact_dist.link.blobs import Blob, BlobFolder, DamagedBlobError, allow_mapped
 from enact_dist.link.store_database import Database, DatabaseRow, is_damage
 from enact_dist.link.store_mark import Mark, boot_id, read_mark
+from enact_dist.link.store_prepared import (
+    lock_of_write,
+    read_decision,
+    read_prepared,
+    read_prepared_lock,
+    slot_of_write,
+)
 from enact_dist.link.store_rows import (
     EPOCH_KEY,
     DamagedRowError,
     Key,
     Kind,
-    StoredSlot,
     read_aspect,
     read_ended,
     read_epoch,
@@ -37,13 +43,14 @@ from enact_dist.link.store_rows import (
     read_slot,
     read_world,
     row_checksum,
-    slot_key,
 )
 from enact_dist.link.wal_check import check_wal
 from enact_dist.terms import NullReason
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from enact_dist.core.datum import LockId, Slot
 
 DATABASE_FILE: Final = "store.db"
 LOG_FILE: Final = "store.db-wal"
@@ -67,6 +74,8 @@ class Contents:
         ids: Row ids by key.
         blobs: Blob files by the key of their slot.
         ended: When sessions ended whose outcomes are kept still, wall clock in ns.
+        kept: States of slots, and prepared ones.
+        prepared: Rows of prepared locks, still packed.
         lost: Slots whose unforced body a power cut took, to be stored as null.
         batch: Number of the newest batch.
     """
@@ -75,7 +84,9 @@ class Contents:
     ids: dict[Key, int] = field(default_factory=dict)
     blobs: dict[Key, Blob] = field(default_factory=dict)
     ended: dict[str, int] = field(default_factory=dict)
-    lost: list[SlotRecord] = field(default_factory=list)
+    lost: dict[Key, SlotRecord] = field(default_factory=dict)
+    kept: dict[Key, SlotRecord] = field(default_factory=dict)
+    prepared: dict[LockId, tuple[Key, bytes]] = field(default_factory=dict)
     batch: int = 0
 
 
@@ -198,17 +209,15 @@ def read_contents(database: Database, path: Path) -> Contents:
         StoreError: A row is damaged.
     """
     contents = Contents()
-    slots: list[StoredSlot] = []
     for row in database.rows():
         try:
-            _read_row(row, contents, slots)
+            _read_row(row, contents)
         except (DamagedRowError, ValueError, TypeError, msgpack.UnpackException) as damage:
             refuse(path, f"is damaged in row {row.id}: {damage}")
-    contents.recovered.slots = [slot.record for slot in slots]
     return contents
 
 
-def _read_row(row: DatabaseRow, contents: Contents, slots: list[StoredSlot]) -> None:
+def _read_row(row: DatabaseRow, contents: Contents) -> None:
     key = Key(Kind(row.kind), row.key)
     if row_checksum(key, row.batch, row.body) != row.crc:
         raise DamagedRowError("its checksum is wrong")
@@ -228,11 +237,16 @@ def _read_row(row: DatabaseRow, contents: Contents, slots: list[StoredSlot]) -> 
             recovered.worlds.append(read_world(key))
         case Kind.ASPECT:
             recovered.aspects.append(read_aspect(key, row.body))
-        case Kind.SLOT:
-            slot = read_slot(key, row.body)
-            slots.append(slot)
+        case Kind.SLOT | Kind.PREPARED_WRITE:
+            of_slot = key if key.kind is Kind.SLOT else slot_of_write(key)
+            slot = read_slot(of_slot, row.body)
+            contents.kept[key] = slot.record
             if slot.blob is not None:
                 contents.blobs[key] = slot.blob
+        case Kind.PREPARED:
+            contents.prepared[read_prepared_lock(key)] = (key, row.body)
+        case Kind.DECISION:
+            recovered.decisions.append(read_decision(key, row.body))
         case Kind.OUTCOME:
             recovered.outcomes.append(read_outcome(key, row.body))
         case Kind.AUDIT:
@@ -247,9 +261,8 @@ def read_blobs(contents: Contents, blobs: BlobFolder, *, power_cut: bool) -> Non
         OSError: As the system reports it.
     """
     allow_mapped(len(contents.blobs))
-    slots = contents.recovered.slots
-    for number, record in enumerate(slots):
-        blob = contents.blobs.get(slot_key(record.slot))
+    for key, record in contents.kept.items():
+        blob = contents.blobs.get(key)
         if blob is None or record.datum is None:
             continue
         try:
@@ -261,7 +274,27 @@ def read_blobs(contents: Contents, blobs: BlobFolder, *, power_cut: bool) -> Non
                     f"holds {record.slot}, version {record.version}, and cannot be used: {damage}",
                 )
             _log.warning("%s is lost with the power: %s", record.slot, damage)
-            slots[number] = replace(record, datum=None, null_reason=NullReason.LOST.name)
-            contents.lost.append(slots[number])
+            lost = replace(record, datum=None, null_reason=NullReason.LOST.name)
+            contents.kept[key] = contents.lost[key] = lost
         else:
-            slots[number] = replace(record, datum=replace(record.datum, body=body))
+            contents.kept[key] = replace(record, datum=replace(record.datum, body=body))
+
+
+def put_together(contents: Contents, path: Path) -> None:
+    """Give back what is kept as the core knows it, bodies included.
+
+    Raises:
+        StoreError: A prepared lock lacks some of its writes.
+    """
+    writes: dict[LockId, dict[Slot, SlotRecord]] = {lock: {} for lock in contents.prepared}
+    for key, record in contents.kept.items():
+        if key.kind is Kind.SLOT:
+            contents.recovered.slots.append(record)
+        else:
+            writes.setdefault(lock_of_write(key), {})[record.slot] = record
+    for lock, found in writes.items():
+        try:
+            row = contents.prepared[lock]
+            contents.recovered.prepared.append(read_prepared(*row, found))
+        except (DamagedRowError, KeyError) as damage:
+            refuse(path, f"is damaged: the prepared lock {lock} cannot be read ({damage})")

@@ -42,6 +42,9 @@ class Kind(enum.IntEnum):
     SLOT = 5
     OUTCOME = 6
     AUDIT = 7
+    PREPARED = 8
+    PREPARED_WRITE = 9
+    DECISION = 10
 
 
 class Key(NamedTuple):
@@ -60,7 +63,7 @@ EPOCH_KEY: Final = Key(Kind.EPOCH, b"")
 
 def key_of(kind: Kind, *parts: object) -> Key:
     """Return the key of a row of `kind` about `parts`."""
-    return Key(kind, _pack(list(parts)))
+    return Key(kind, pack(list(parts)))
 
 
 def row_checksum(key: Key, batch: int, body: bytes) -> int:
@@ -69,7 +72,8 @@ def row_checksum(key: Key, batch: int, body: bytes) -> int:
     return zlib.crc32(body, zlib.crc32(key.name, zlib.crc32(head)))
 
 
-def _pack(value: object) -> bytes:
+def pack(value: object) -> bytes:
+    """Return a value as it is stored."""
     packed: bytes = msgpack.packb(value, use_bin_type=True)
     return packed
 
@@ -79,34 +83,34 @@ def _pack(value: object) -> bytes:
 
 def epoch_body(epoch: int) -> bytes:
     """Return the row of the shard's epoch."""
-    return _pack([epoch])
+    return pack([epoch])
 
 
 def session_row(record: SessionRecord) -> tuple[Key, bytes]:
     """Return the row of a session."""
-    return key_of(Kind.SESSION, record.session), _pack([record.ttl_ns])
+    return key_of(Kind.SESSION, record.session), pack([record.ttl_ns])
 
 
 def ended_row(record: SessionEnded) -> tuple[Key, bytes]:
     """Return the row of a session that ended."""
-    return key_of(Kind.ENDED, record.session), _pack([record.wall_ns])
+    return key_of(Kind.ENDED, record.session), pack([record.wall_ns])
 
 
 def world_row(record: WorldRecord) -> tuple[Key, bytes]:
     """Return the row of a world context."""
-    return key_of(Kind.WORLD, record.name), _pack([])
+    return key_of(Kind.WORLD, record.name), pack([])
 
 
 def aspect_row(entry: AspectEntry) -> tuple[Key, bytes]:
     """Return the row of an aspect."""
-    return key_of(Kind.ASPECT, entry.name), _pack([entry.fingerprint, entry.durability])
+    return key_of(Kind.ASPECT, entry.name), pack([entry.fingerprint, entry.durability])
 
 
 def outcome_row(record: OutcomeRecord) -> tuple[Key, bytes]:
     """Return the row of a lane's newest outcome."""
     lock = record.lock
     versions = [[*entry.slot, entry.version] for entry in record.versions]
-    return outcome_key(lock.session, lock.lane), _pack([lock.seq, *record.position, versions])
+    return outcome_key(lock.session, lock.lane), pack([lock.seq, *record.position, versions])
 
 
 def outcome_key(session: str, lane: int) -> Key:
@@ -116,7 +120,7 @@ def outcome_key(session: str, lane: int) -> Key:
 
 def audit_row(record: AuditRecord, *, batch: int, number: int) -> tuple[Key, bytes]:
     """Return the row of an operator's act; `batch` and `number` in it keep acts apart."""
-    return key_of(Kind.AUDIT, batch, number), _pack([record.wall_ns, record.text])
+    return key_of(Kind.AUDIT, batch, number), pack([record.wall_ns, record.text])
 
 
 def slot_key(slot: Slot) -> Key:
@@ -127,12 +131,12 @@ def slot_key(slot: Slot) -> Key:
 def slot_body(record: SlotRecord, blob: Blob | None) -> bytes:
     """Return the row of a slot; `blob` is where its body went, None if it goes into the row."""
     if record.volatile:
-        return _pack([])
+        return pack([])
     datum = record.datum
     if datum is None:
-        return _pack([record.version, record.stamp_ns, record.null_reason, None])
+        return pack([record.version, record.stamp_ns, record.null_reason, None])
     place = bytes(datum.body) if blob is None else list(blob)
-    return _pack(
+    return pack(
         [
             record.version,
             record.stamp_ns,
@@ -157,37 +161,37 @@ class StoredSlot(NamedTuple):
 
 def read_epoch(body: bytes) -> int:
     """Read the row of the epoch."""
-    fields = _Fields(body)
+    fields = Fields(body)
     return fields.last(int)
 
 
 def read_session(key: Key, body: bytes) -> SessionRecord:
     """Read the row of a session."""
-    return SessionRecord(_Fields(key.name).last(str), _Fields(body).last(int))
+    return SessionRecord(Fields(key.name).last(str), Fields(body).last(int))
 
 
 def read_ended(key: Key, body: bytes) -> SessionEnded:
     """Read the row of a session that ended."""
-    return SessionEnded(_Fields(key.name).last(str), _Fields(body).last(int))
+    return SessionEnded(Fields(key.name).last(str), Fields(body).last(int))
 
 
 def read_world(key: Key) -> str:
     """Read the row of a world context."""
-    return _Fields(key.name).last(str)
+    return Fields(key.name).last(str)
 
 
 def read_aspect(key: Key, body: bytes) -> AspectEntry:
     """Read the row of an aspect."""
-    fields = _Fields(body)
-    return AspectEntry(_Fields(key.name).last(str), fields.next(str), fields.last(str))
+    fields = Fields(body)
+    return AspectEntry(Fields(key.name).last(str), fields.next(str), fields.last(str))
 
 
 def read_outcome(key: Key, body: bytes) -> OutcomeRecord:
     """Read the row of an outcome."""
-    names, fields = _Fields(key.name), _Fields(body)
+    names, fields = Fields(key.name), Fields(body)
     lock = LockId(names.next(str), names.last(int), fields.next(int))
     position = Position(fields.next(int), fields.next(str))
-    versions = [_Fields(entry) for entry in fields.last(list)]
+    versions = [Fields(entry) for entry in fields.last(list)]
     return OutcomeRecord(
         lock, position, tuple(SlotVersion(_slot(entry), entry.last(int)) for entry in versions)
     )
@@ -195,33 +199,33 @@ def read_outcome(key: Key, body: bytes) -> OutcomeRecord:
 
 def read_slot(key: Key, body: bytes) -> StoredSlot:
     """Read the row of a slot."""
-    names = _Fields(key.name)
+    names = Fields(key.name)
     slot = _slot(names)
     names.end()
-    fields = _Fields(body)
+    fields = Fields(body)
     if fields.empty:
         return StoredSlot(SlotRecord(slot, 0, 0, None, "", volatile=True), None)
     version, stamp_ns, reason = fields.next(int), fields.next(int), fields.next(str)
     packed = fields.last(object)
     if packed is None:
         return StoredSlot(SlotRecord(slot, version, stamp_ns, None, reason), None)
-    fields = _Fields(packed)
+    fields = Fields(packed)
     encoding, datum_stamp_ns, place = fields.next(bytes), fields.next(int), fields.last(object)
     blob = None
     if isinstance(place, bytes):
         datum = Datum(encoding, place, len(place), datum_stamp_ns)
     else:
-        fields = _Fields(place)
+        fields = Fields(place)
         blob = Blob(fields.next(str), fields.next(int), fields.next(int), fields.last(bool))
         datum = Datum(encoding, b"", blob.size, datum_stamp_ns)
     return StoredSlot(SlotRecord(slot, version, stamp_ns, datum, reason), blob)
 
 
-def _slot(fields: _Fields) -> Slot:
+def _slot(fields: Fields) -> Slot:
     return Slot(fields.next(str), fields.next(str), fields.next(str))
 
 
-class _Fields:
+class Fields:
     """The fields of a packed list, each asked for with its type, in order and to the end."""
 
     __slots__ = ("_fields", "_next")
@@ -235,9 +239,11 @@ class _Fields:
 
     @property
     def empty(self) -> bool:
+        """Whether there is no field at all."""
         return not self._fields
 
     def next(self, asked: type[T]) -> T:
+        """Take the next field, which must be of this type."""
         if self._next >= len(self._fields):
             raise DamagedRowError(f"field {self._next + 1} of {self._fields!r:.80} is missing")
         found = self._fields[self._next]
@@ -247,10 +253,12 @@ class _Fields:
         return found
 
     def last(self, asked: type[T]) -> T:
+        """Take the next field, which must be the last."""
         found = self.next(asked)
         self.end()
         return found
 
     def end(self) -> None:
+        """Make sure that nothing is left."""
         if self._next != len(self._fields):
             raise DamagedRowError(f"{self._fields!r:.80} has more than {self._next} fields")

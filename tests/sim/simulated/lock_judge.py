@@ -22,6 +22,7 @@ class LockJudge:
     def __init__(self, world: World) -> None:
         self._fail = world.violation
         self._waits: dict[str, dict[LockId, list[LockId]]] = {}
+        self._hosts: dict[str, ShardHost] = {}
 
     def judge(self, host: ShardHost, message: object, picture: Picture) -> None:
         """Note who came, went and was granted, and whether that was right."""
@@ -98,6 +99,7 @@ class LockJudge:
         state = host.shard.state
         everybody = list(state.tenures.by_lock.values())
         waits = self._waits[host.name] = {}
+        self._hosts[host.name] = host
         for waiter in everybody:
             if waiter.token is not None:
                 continue
@@ -114,13 +116,19 @@ class LockJudge:
         for waiter in waits:
             self._check_circle(waiter)
 
+    def _still_waits(self, name: str, lock: LockId) -> bool:
+        """Whether a lock that waited when the shard last looked does so now."""
+        host = self._hosts[name]
+        tenure = host.shard.state.tenures.by_lock.get(lock) if host.up else None
+        return tenure is not None and tenure.token is None
+
     def _check_circle(self, first: LockId) -> None:
         """Follow who waits for whom over all shards, as they last looked at the time."""
         reached, ahead = {first}, [first]
         while ahead:
             lock = ahead.pop()
-            for waits in self._waits.values():
-                for other in waits.get(lock, ()):
+            for name, waits in self._waits.items():
+                for other in waits.get(lock, ()) if self._still_waits(name, lock) else ():
                     if other == first:
                         self._fail("no deadlock", first, self._waits)
                     if other not in reached:

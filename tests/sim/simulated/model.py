@@ -240,9 +240,9 @@ class Model:
         record = picture.preparing.pop(answer.lock, None)
         if record is not None:
             picture.prepared[answer.lock] = record
-            picture.confirmed[answer.lock] = record.token
         if answer.lock not in picture.prepared and answer.lock not in picture.in_flight:
             self._fail("prepared what was not asked", answer)
+        picture.confirmed[answer.lock] = picture.prepared[answer.lock].token
         kept = host.disk.synced if answer.durability == "durable" else host.disk.written
         on_disk = host.disk.log[:kept]
         if not any(
@@ -357,7 +357,7 @@ class Model:
                 self._check_content(lock, slot, before, datum)
             # What a power cut took may come back: a writer of its own, as late as that.
             again = lock in self.decided and lock in self.permitted_losses
-            writer = f"again {lock}" if again else lock
+            writer = f"again {lock} in {picture.epoch}" if again else lock
             picture.put(slot, State(version, stamp_ns, writer, picture.epoch, datum))
 
     def _check_content(self, lock: LockId, slot: Slot, before: State, datum: Datum) -> None:
@@ -381,7 +381,7 @@ class Model:
             now = picture.now(state.slot)
             name = (state.version, state.stamp_ns)
             if name != now.name and isinstance(answer, Viewed):
-                now = picture.at(state.slot, answer.until_ns)
+                now = picture.at(state.slot, max(answer.from_ns, answer.until_ns))
                 self._world.tally["data shown as of the past"] += 1
             if name != now.name:
                 self._fail("I18 readers see what is committed", state.slot, state, now)
