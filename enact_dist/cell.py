@@ -17,6 +17,7 @@ from enact_dist.core.messages import (
     AwaitStamp,
     Break,
     Broken,
+    ForceAbort,
     ListLocks,
     ListSessions,
     Locks,
@@ -218,12 +219,29 @@ class Cell:
             MisuseError: The cell has no such shard.
             ShardUnreachableError: The shard does not answer.
         """
+        return self._ended_by_hand(shard, Break(number, reason))
+
+    def force_abort(self, number: int, *, shard: str, reason: str) -> LockInfo | None:
+        """Give up a lock in doubt whose deciding shard is lost for good; audited by the shard.
+
+        If that shard had committed the lock after all, only a part of its writes stands then.
+
+        Returns:
+            What the lock was, or None if no such lock is in doubt.
+
+        Raises:
+            MisuseError: The cell has no such shard.
+            ShardUnreachableError: The shard does not answer.
+        """
+        return self._ended_by_hand(shard, ForceAbort(number, reason))
+
+    def _ended_by_hand(self, shard: str, request: Break | ForceAbort) -> LockInfo | None:
         if shard not in self._client.shards():
             raise MisuseError(
                 f"cell {self.name!r} has no shard {shard!r}; it has"
                 f" {', '.join(self._client.shards())}"
             )
-        answer = self._client.call(shard, Break(number, reason))
+        answer = self._client.call(shard, request)
         holder = answer.holder if isinstance(answer, Broken) else None
         return lock_info(shard, holder) if holder is not None else None
 

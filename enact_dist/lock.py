@@ -90,7 +90,7 @@ class Lock:
 
     Args:
         requests: What to read, write and view; of one cell, of any of its contexts and shards.
-            Writes must lie on one shard in this version.
+            Writes on several shards become visible all or none, whatever crashes.
         wait_s: How long to wait for the grant.
         hold_s: How long it may be held at most after the grant.
 
@@ -169,7 +169,6 @@ class Lock:
                 [self._session.item_of(request) for request in self._requests],
                 wait_s=self._wait_s,
                 hold_s=self._hold_s,
-                check_plan=self._check_one_writing_shard,
                 interrupt=self._interrupt,
                 begun=begun,
             )
@@ -210,15 +209,8 @@ class Lock:
             if not client.forked:
                 client.release(lock)
 
-    def _check_one_writing_shard(self) -> None:
-        slots = [slot_of(r) for r in self._requests if r.access is Access.WRITE]
-        self._session.refuse_several_shards(slots)
-
     def _writes_by_shard(self) -> dict[str, list[WriteItem]]:
-        """Return the writes by shard; expectations alone are a commit without writes."""
         by_shard: dict[str, list[WriteItem]] = {}
-        for slot in self._expects:
-            by_shard.setdefault(self._session.shard_of(slot), [])
         for slot, datum in self._writes.items():
             by_shard.setdefault(self._session.shard_of(slot), []).append(WriteItem(slot, datum))
         return by_shard
@@ -325,7 +317,6 @@ class Lock:
     def _put(self, slot: Slot, aspect: Aspect[T], datum: T, *, stamp_ns: int = 0) -> None:
         from enact_dist.wire.payload import encode_datum
 
-        self._refuse_second_shard(slot)
         self._note_write(slot, encode_datum(datum, aspect.datum_type, stamp_ns=stamp_ns))
 
     def _note_write(self, slot: Slot, datum: Datum | None) -> None:
@@ -342,38 +333,29 @@ class Lock:
         self._bytes = size
         self._edits += 1
 
-    def _refuse_second_shard(self, slot: Slot) -> None:
-        """Raise if `slot` lies elsewhere than what is written already, which is on one shard."""
-        first = next(iter(self._writes), slot)
-        self._session.refuse_several_shards([first, slot])
-
     def __delitem__(self, request: Write[Any]) -> None:
         """Write null when the block ends cleanly."""
         self._check_writable(request)
         self._delete(slot_of(request))
 
     def _delete(self, slot: Slot) -> None:
-        self._refuse_second_shard(slot)
         self._note_write(slot, None)
 
     def expect(self, view: View[Any]) -> None:
         """Let the commit fail with `ChangedError` if the viewed slot has moved on by then.
 
-        The slot must lie on the shard where this lock writes (or, in a lock that writes nothing,
-        reads).  Expectations over shards need the prepared commit, which this version lacks.
+        It fails too if another lock holds the slot for writing at that moment and might yet
+        commit before this one.  What is expected counts as read: two locks that each expect what
+        the other writes never both commit, on whatever shards the slots lie.
 
         Raises:
-            MisuseError: Not a `View` of this lock, or on another shard.
+            MisuseError: Not a `View` of this lock.
         """
         self._check(view)
         assert self._lock is not None
         if view.access is not Access.VIEW:
             raise MisuseError(f"{view!r} is held or a pattern; only a View can be expected")
         slot = slot_of(view)
-        shard = self._session.shard_of(slot)
-        if shard not in {part.shard for part in self._lock.parts}:
-            raise MisuseError(f"{view!r} lies on shard {shard}, where this lock holds nothing")
-        self._session.refuse_several_shards([*self._writes, *self._expects, slot])
         state = self._readings.state(slot)
         self._expects[slot] = SlotVersion(slot, state.version if state is not None else 0)
 

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
     from enact_dist.core.datum import Datum, LockId
+    from enact_dist.core.lock_parts import Reading
     from enact_dist.core.messages import SlotState
-    from enact_dist.core.multilock import Reading
     from enact_dist.link.client import CellClient
     from enact_dist.link.fetching import DatumCache
     from enact_dist.terms import LockRequest

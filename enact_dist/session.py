@@ -95,23 +95,6 @@ class Session:
         known = self.cache.version(slot, shard, self.client.core.epoch(shard))
         return Item(int(request.access), context, entity, aspect, known)
 
-    def refuse_several_shards(self, slots: Iterable[Slot]) -> None:
-        """Raise if writes to `slots` would lie on more than one shard.
-
-        Raises:
-            MisuseError: They do; the message names the shards and a remedy.
-        """
-        shards: dict[str, Slot] = {}
-        for slot in slots:
-            shards.setdefault(self.shard_of(slot), slot)
-        if len(shards) > 1:
-            named = ", ".join(f"{slot.entity}/{slot.aspect} on {s}" for s, slot in shards.items())
-            raise MisuseError(
-                f"one lock writes on {len(shards)} shards ({named}); this version commits on one"
-                " shard at a time: pin these entities to one shard ([placement] in cell.toml) or"
-                " write them in separate locks"
-            )
-
 
 def session_of(requests: tuple[LockRequest[Any], ...]) -> Session:
     """Return the one cell session that all requests belong to.

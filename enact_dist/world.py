@@ -89,8 +89,7 @@ class WorldContext(Context):
     def view(self, *requests: LockRequest[Any]) -> Snapshot:
         """Read committed data without a lock.
 
-        All data of one shard are of one moment.  Over several shards they need not be of one cut
-        in this version; a lock with `Read`s is.
+        All data are of one moment, over shards too: every commit is shown whole or not at all.
 
         Args:
             requests: `View`s and `ViewEach`es of this cell.
@@ -208,7 +207,7 @@ def _view(session: Session, requests: tuple[LockRequest[Any], ...]) -> Readings:
     """Take one view and fetch what is large."""
     client = session.client
     items: list[Item] = [session.item_of(request) for request in requests]
-    lock = client.acquire(items, wait_s=VIEW_WAIT_S, hold_s=VIEW_WAIT_S, check_plan=lambda: None)
+    lock = client.acquire(items, wait_s=VIEW_WAIT_S, hold_s=VIEW_WAIT_S)
     try:
         readings = Readings(client, session.cache, lock.lock, lock.states, lambda: None)
         for reading in lock.states:

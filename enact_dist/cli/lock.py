@@ -1,4 +1,4 @@
-"""`enact lock ls|hold|break`."""
+"""`enact lock ls|hold|break|resolve`."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ _ACCESSES: Final = {
 
 def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
     """Add the noun and its verbs."""
-    verbs = verbs_of(add_noun(nouns, "lock", "look at locks, hold one, break one"))
+    verbs = verbs_of(add_noun(nouns, "lock", "look at locks, hold one, break one, resolve one"))
     ls = add_verb(
         verbs,
         "ls",
@@ -58,6 +58,7 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
     add_reader(ls)
     _add_hold(verbs)
     _add_break(verbs)
+    _add_resolve(verbs)
 
 
 def _add_hold(verbs: argparse._SubParsersAction[Verb]) -> None:
@@ -98,6 +99,27 @@ def _add_break(verbs: argparse._SubParsersAction[Verb]) -> None:
     cut.add_argument("--shard", metavar="NAME", help="needed where two shards use the number")
     cut.add_argument("--reason", default="broken by hand", metavar="TEXT", help="for the holder")
     add_reader(cut)
+
+
+def _add_resolve(verbs: argparse._SubParsersAction[Verb]) -> None:
+    resolve = add_verb(
+        verbs,
+        "resolve",
+        "give up a lock in doubt whose deciding shard is lost for good (audited)",
+        run=resolve_lock,
+        example="enact lock resolve --force-abort 17 --shard right --reason 'disk of left is gone'",
+    )
+    resolve.add_argument(
+        "--force-abort",
+        required=True,
+        type=whole,
+        metavar="LOCK",
+        help="its number in `enact lock ls`; if the lost shard had committed it, only a part of"
+        " that commit stands: restore that shard's folder first wherever you can",
+    )
+    resolve.add_argument("--shard", metavar="NAME", help="needed where two shards use the number")
+    resolve.add_argument("--reason", required=True, metavar="TEXT", help="for the audit record")
+    add_reader(resolve)
 
 
 # ---------------------------------------------------------------- ls
@@ -182,9 +204,7 @@ def _hold(cell: Cell, arguments: argparse.Namespace, stop: StopSignals) -> int:
     client = cell.world(items[0].context).session.client
     entries = client.aspect_entries()
     client.register(aspects=[entries[item.aspect] for item in items])  # a pattern is on every shard
-    lock = client.acquire(
-        items, wait_s=arguments.wait, hold_s=arguments.hold, check_plan=lambda: None
-    )
+    lock = client.acquire(items, wait_s=arguments.wait, hold_s=arguments.hold)
     try:
         with HeldCommand(arguments.command) as running:
             while not running.wait(POLL_S):
@@ -246,6 +266,24 @@ def break_lock(arguments: argparse.Namespace) -> int:
         print(
             f"broke lock {broken.number} on {shard}, {state} by {who(broken)}: {arguments.reason}"
         )
+    return DONE
+
+
+def resolve_lock(arguments: argparse.Namespace) -> int:
+    """Abort a lock in doubt by its number."""
+    number, reason = arguments.force_abort, arguments.reason
+    with open_cell(arguments) as cell:
+        shard = arguments.shard or _shard_of(number, cell.locks())
+        given_up = cell.force_abort(number, shard=shard, reason=reason)
+    if given_up is None:
+        raise MisuseError(
+            f"lock {number} on shard {shard} is not in doubt, so nothing was done; see"
+            " enact lock ls (enact lock break takes a lock from its holder)"
+        )
+    if arguments.json:
+        print_json(given_up)
+    else:
+        print(f"gave up lock {number} on {shard}, in doubt for {who(given_up)}: {reason}")
     return DONE
 
 

@@ -10,5 +10,6 @@ The three laws
 
 Reading order: `datum` (addresses, identities), `messages` (the protocol), `lock_table` (who waits),
 `sessions` (who is alive), `tenures` (the life of a lock), `commits` (the fence), `shard` (all of it
-behind one method), then the client's half: `beliefs`, `client`, `multilock`.
+behind one method), then the client's half: `beliefs`, `client`,
+`multilock`, `cuts`, `finishing`; and for commits over shards `prepares` and `decisions`.
 """

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 
 from enact_dist.core.beliefs import Sendings
 from enact_dist.core.datum import LockId
+from enact_dist.core.lock_parts import Plan
 from enact_dist.core.messages import (
     Alive,
     Answer,
@@ -26,7 +27,7 @@ from enact_dist.core.messages import (
     PlacementMap,
     Welcome,
 )
-from enact_dist.core.multilock import MultiLock, Phase, Plan
+from enact_dist.core.multilock import MultiLock, Phase
 from enact_dist.core.placement import shard_of
 from enact_dist.terms import Access
 

@@ -22,10 +22,11 @@ from __future__ import annotations
 
 import enum
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.cuts import ROUNDS_MAX, Cut
 from enact_dist.core.finishing import Finishing, tokens_of
+from enact_dist.core.lock_parts import Part, Plan, Reading
 from enact_dist.core.messages import (
     OUTCOME_COMMITTED,
     OUTCOME_EXPIRED,
@@ -58,8 +59,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from enact_dist.core.client import Client
-    from enact_dist.core.datum import LockId, Position, Slot, Token
-    from enact_dist.core.messages import Holder, Item, Request, SlotState, SlotVersion, WriteItem
+    from enact_dist.core.datum import LockId, Position, Slot
+    from enact_dist.core.messages import Holder, Request, SlotVersion, WriteItem
 
 WAIT_SLICE_NS: Final = 900_000_000
 """How long one call of a waiting lock is parked; below the shard's own limit of 1 s."""
@@ -96,50 +97,6 @@ class Phase(enum.Enum):
 
 
 _BUSY: Final = frozenset((Phase.ACQUIRING, Phase.VIEWING, Phase.VALIDATING, Phase.COMMITTING))
-
-
-@dataclass(slots=True, eq=False)
-class Part:
-    """What a lock holds, or asks for, at one shard.
-
-    Attributes:
-        items: Locks and, where this is the only part, views.
-        token: The grant's fencing number once granted.
-        granted_count: The session's message counter when the grant arrived.
-        until_ns: Until when the lease may be believed in (CLOCK_BOOTTIME).
-        hold_until_ns: Until when the hold limit leaves it.
-    """
-
-    shard: str
-    items: tuple[Item, ...]
-    token: Token | None = None
-    granted_count: int = 0
-    until_ns: int = 0
-    hold_until_ns: int = 0
-
-
-class Reading(NamedTuple):
-    """What a grant or view showed of one slot, and in which epoch of which shard."""
-
-    shard: str
-    epoch: int
-    state: SlotState
-
-
-@dataclass(frozen=True, slots=True)
-class Plan:
-    """What one lock asks of which shard; both in the order of the shards' names.
-
-    A shard appears once in each.  Locks on several shards take their views afterwards, as one cut
-    that lies not before `floor_ns`.  `map_version` names the placement that it was made by: the
-    client may learn another meanwhile, and a shard refuses what was placed by any other than its
-    own.
-    """
-
-    locks: tuple[tuple[str, tuple[Item, ...]], ...]
-    views: tuple[tuple[str, tuple[Item, ...]], ...]
-    map_version: int
-    floor_ns: int = 0
 
 
 @dataclass(slots=True, eq=False)
@@ -354,6 +311,11 @@ class MultiLock:
         )
 
     @property
+    def sent_commit(self) -> bool:
+        """Whether the commit that decides has been sent: only its shard knows then."""
+        return self._finishing is not None and self._finishing.sent
+
+    @property
     def no_cut(self) -> bool:
         """Whether it ended because its views were never of one moment."""
         return self.phase is Phase.LOST and self.cut is not None and self.cut.rounds > ROUNDS_MAX
@@ -391,8 +353,7 @@ class MultiLock:
     def _gives_up(self) -> None:
         """The deadline has passed: rest in what that means in this phase."""
         if self.phase is Phase.COMMITTING:
-            sent = self._finishing is not None and self._finishing.sent
-            self._end(Phase.UNKNOWN if sent else Phase.UNREACHABLE)
+            self._end(Phase.UNKNOWN if self.sent_commit else Phase.UNREACHABLE)
         elif self.phase is Phase.VALIDATING or self.silent_shard:
             self._end(Phase.UNREACHABLE)
         else:

@@ -183,9 +183,7 @@ class PrepareDesk:
         else:
             yield from self._finish(tenure, message.position, [reply_to])
 
-    def _finish(
-        self, tenure: Tenure, position: Position, replies: list[int]
-    ) -> Iterator[Effect]:
+    def _finish(self, tenure: Tenure, position: Position, replies: list[int]) -> Iterator[Effect]:
         record = tenure.prepared
         assert record is not None
         under_way = self._at_store_of(record.lock)
@@ -305,4 +303,3 @@ class PrepareDesk:
         assert prepared == set(self._ask_ns), (prepared, self._ask_ns)
         for lock in prepared:
             assert self._state.tenures.by_lock[lock].claim.granted, "prepared without its locks"
-

@@ -116,5 +116,3 @@ _NEVER_NS: Final = 1 << 62
 def _in_any(slot: Slot, each: list[tuple[Column, str]]) -> bool:
     column = Column(slot.context, slot.aspect)
     return any(column == one and pattern_matches(pattern, slot.entity) for one, pattern in each)
-
-

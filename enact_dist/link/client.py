@@ -27,7 +27,7 @@ from enact_dist.link.session_client import (
 
 if TYPE_CHECKING:
     import threading
-    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     from enact_dist.core.messages import Item, SlotVersion, WriteItem
 
@@ -51,7 +51,6 @@ class CellClient(SessionClient):
         *,
         wait_s: float,
         hold_s: float,
-        check_plan: Callable[[], None],
         interrupt: threading.Event | None = None,
         begun: list[MultiLock] | None = None,
     ) -> MultiLock:
@@ -61,7 +60,6 @@ class CellClient(SessionClient):
             items: What to lock and view.
             wait_s: How long to wait for the grant; with 0 each shard is asked once.
             hold_s: Hold limit after the last grant.
-            check_plan: Called with each plan before anything is asked; may raise.
             interrupt: Ends the waiting within 0.2 s once it is set.
             begun: Gets the lock before anything is asked, so that its caller can release it when
                 an exception comes between the return and the assignment.
@@ -77,10 +75,9 @@ class CellClient(SessionClient):
         started_ns = self._now_ns()
         give_up_ns = started_ns + int(min(wait_s, CALLS_S_MAX) * 1e9)
 
-        def begin() -> MultiLock:
+        def begin(*, lock_views: bool = False) -> MultiLock:
             with self._mutex:
-                plan = self.core.plan(items)
-                check_plan()
+                plan = self.core.plan(items, lock_views=lock_views)
                 now_ns = self._now_ns()
                 wait_ns, hold_ns = max(0, give_up_ns - now_ns), int(hold_s * 1e9)
                 lock = self.core.begin(lane, plan, now_ns=now_ns, wait_ns=wait_ns, hold_ns=hold_ns)
@@ -104,7 +101,10 @@ class CellClient(SessionClient):
                 over = attempt > 0 and self._now_ns() >= give_up_ns
                 if over or not self._begins_anew(lock, attempt):
                     break
-                lock = begin()
+                lock_views = lock.no_cut and not self.core.observer
+                if lock_views:
+                    self._count("views_locked")
+                lock = begin(lock_views=lock_views)
             waited_s = (self._now_ns() - started_ns) / 1e9
             raise not_granted(lock, waited_s, self.carrier.endpoint_of)
         except BaseException:

@@ -6,6 +6,7 @@
     store thread ── persisted ───────────┤ mutex │── Shard.handle ── effects ──┐
     timer thread ── Tick ────────────────┘                                     │
               reply(answer)  ◄── Reply │ StoreThread ◄── Persist │ watchers ◄── Publish
+                                       │ other shards ◄── Call
 
 A transport needs `submit` and nothing else; the shard cannot tell which one a message came by.
 Rules that a change must keep:
@@ -27,6 +28,8 @@ from typing import TYPE_CHECKING, Final, cast
 
 from enact_dist.core.messages import Acquire, AwaitStamp, Hello, Refused
 from enact_dist.core.records import (
+    Call,
+    Called,
     Drain,
     Persist,
     Persisted,
@@ -116,6 +119,7 @@ class ShardHost:
         self._handles = 0
         self._kept_at_once: deque[int] = deque()
         self._watchers: tuple[Callable[[Notice], None], ...] = ()
+        self._call: Callable[[str, Request], None] | None = None
         self._inboxes: tuple[Callable[[], None], ...] = ()
         self._failure: Exception | None = None
         self._ended = False
@@ -182,6 +186,14 @@ class ShardHost:
             counters = self._shard.counters
             counters[name] = counters.get(name, 0) + amount
 
+    def call_with(self, call: Callable[[str, Request], None]) -> None:
+        """Let `call(shard, request)` carry requests to other shards; it must not wait."""
+        self._call = call
+
+    def called(self, shard: str, request: Request, answer: Answer) -> None:
+        """Take the answer of another shard."""
+        self.event(Called(shard, request, answer))
+
     def watch(self, watcher: Callable[[Notice], None]) -> Callable[[], None]:
         """Call `watcher` with each notice, in order; return the function that ends it."""
         with self._mutex:
@@ -227,6 +239,8 @@ class ShardHost:
                     reply(cast("Answer", effect.answer))
             elif isinstance(effect, Persist):
                 self._persist(effect)
+            elif isinstance(effect, Call) and self._call is not None:
+                self._call(effect.shard, cast("Request", effect.request))
         for effect in effects:
             if isinstance(effect, Publish):
                 for watcher in self._watchers:

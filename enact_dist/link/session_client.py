@@ -25,6 +25,7 @@ from enact_dist.core.messages import (
     Goodbye,
     Hello,
     KeepAlive,
+    Prepare,
     Refused,
     Register,
     Welcome,
@@ -315,7 +316,7 @@ def _patience_s(request: Request) -> float:
     """Return how long to wait for the answer to one call."""
     if isinstance(request, Acquire):
         return request.wait_ns / 1e9 + CALL_S
-    if isinstance(request, Commit):
+    if isinstance(request, Commit | Prepare):
         size = sum(write.datum.size for write in request.writes if write.datum is not None)
         return CALL_S + size / BYTES_PER_S_MIN
     if isinstance(request, Hello | KeepAlive):

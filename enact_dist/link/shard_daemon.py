@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.errors import ConfigError, EnactError, LinkError
 from enact_dist.link.host import open_host
+from enact_dist.link.shard_calls import ShardCalls
 from enact_dist.link.signals import StopSignals
 from enact_dist.link.zenoh_config import close_session, open_session
 from enact_dist.link.zenoh_discovery import FoundShard, find_shards
@@ -83,6 +84,15 @@ class RunningShard:
         except EnactError:
             self.host.close()
             raise
+        shard = settings.shard
+        self._calls = ShardCalls(
+            settings.cell,
+            shard.name,
+            shard.placement.shards,
+            lease_s=settings.link_lease_s,
+            answered=self.host.called,
+        )
+        self.host.call_with(self._calls.submit)
         self._service = ZenohService(self.host, self._session, settings.cell)
 
     @property
@@ -110,6 +120,7 @@ class RunningShard:
                 time.sleep(0.005)
             self.host.drain()  # who asked meanwhile is parked: answer them, too
             self.host.close()
+            self._calls.close()
             self._service.close()
             close_session(self._session)
             self._ended.set()

@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, Final, cast, get_args
 
 import zenoh
 
-from enact_dist.core.messages import Answer, AwaitStamp, Commit, Fetch, Notice
+from enact_dist.core.messages import Answer, AwaitStamp, Commit, Fetch, Notice, Prepare
 from enact_dist.errors import MisuseError, ProtocolError, ShardUnreachableError
 from enact_dist.link.notices import NoticeQueue
 from enact_dist.link.zenoh_config import QUEUED_MAX, close_session, keep_after_fork, open_session
@@ -181,7 +181,7 @@ class ZenohCarrier:
         priority, congestion = _CONTROL, _BLOCK
         if isinstance(message, Fetch):
             priority, congestion = _BULK, _DROP
-        elif isinstance(message, Commit) and payload and len(payload) > CONTROL_BYTES_MAX:
+        elif isinstance(message, Commit | Prepare) and payload and len(payload) > CONTROL_BYTES_MAX:
             priority = _DATA
         try:
             return link.session.get(

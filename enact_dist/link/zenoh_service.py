@@ -21,10 +21,12 @@ import zenoh
 
 from enact_dist.core.messages import (
     Answer,
+    Finish,
     Granted,
     Reached,
     Refused,
     Request,
+    Resolve,
     Slice,
     Surveyed,
     Viewed,
@@ -235,6 +237,8 @@ def _nameless(_: object) -> str:
 
 
 def _client_getter(kind: type) -> Callable[[object], str]:
+    if kind in (Finish, Resolve):
+        return _nameless  # it comes from a shard, which must not wait for its lock's client
     fields = {field.name for field in dataclasses.fields(kind)}
     path = "lock.session" if "lock" in fields else "session" if "session" in fields else ""
     return attrgetter(path) if path else _nameless

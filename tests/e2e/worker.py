@@ -23,7 +23,13 @@ from enact_dist import (
     WriteEach,
     connect,
 )
-from enact_dist.errors import EnactError, LeaseLostError, LockTimeoutError
+from enact_dist.errors import (
+    CommitUnknownError,
+    EnactError,
+    LeaseLostError,
+    LockTimeoutError,
+    ShardUnreachableError,
+)
 
 COUNT = Aspect("count", int)
 FRAME = Aspect("frame", np.ndarray, Durability.VOLATILE)
@@ -213,6 +219,48 @@ def watch_ticker(cell):
                 say("version", last)
     counts = {"first": first, "seen": seen, "gap": gap, "last": last, "in_order": in_order}
     say("summary", json.dumps(counts))
+
+
+def transfer(cell, seed, count):
+    """Move numbers between two accounts on two shards; every move is certain at the end."""
+    world, draw = cell.world("online"), random.Random(int(seed))
+    one, two = (Write(world, Entity(f"account/{side}"), COUNT) for side in ("left", "right"))
+    done = again = 0
+    say("started")
+    while done < int(count):
+        amount = draw.randint(1, 9)
+        try:
+            with Lock(one, two, wait_s=30.0) as lock:
+                lock[one] = lock[one] - amount
+                lock[two] = lock[two] + amount
+        except (LeaseLostError, ShardUnreachableError):
+            again += 1  # nothing was written: do it again
+        except CommitUnknownError:
+            done += 1  # it was asked about for 10 s; the sum says whether it is half done
+            say("unknown")
+        else:
+            done += 1
+        if done % 20 == 0:
+            say("progress", done)
+    say("done", done, "again", again)
+
+
+def audit(cell):
+    """View both accounts again and again; say how often, and each sum that was seen."""
+    import threading
+
+    world, stop, sums, views = cell.world("online"), threading.Event(), set(), 0
+    threading.Thread(target=lambda: (wait_line(), stop.set()), daemon=True).start()
+    requests = [View(world, Entity(f"account/{side}"), COUNT) for side in ("left", "right")]
+    say("started")
+    while not stop.is_set():
+        try:
+            seen = world.view(*requests)
+        except ShardUnreachableError:
+            continue
+        views += 1
+        sums.add(sum(seen[request] for request in requests))
+    say("summary", json.dumps({"views": views, "sums": sorted(sums)}))
 
 
 def main():

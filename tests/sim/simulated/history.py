@@ -10,8 +10,9 @@ from enact_dist.terms import Access, pattern_matches, patterns_overlap
 
 if TYPE_CHECKING:
     from enact_dist.core.datum import LockId
+    from enact_dist.core.lock_parts import Reading
     from enact_dist.core.messages import Item
-    from enact_dist.core.multilock import MultiLock, Reading
+    from enact_dist.core.multilock import MultiLock
 
 TOLD_NOT = frozenset(
     (

@@ -41,7 +41,8 @@ from simulated.picture import Picture, State
 from simulated.workload import label_of, value_of, writer_of
 
 if TYPE_CHECKING:
-    from enact_dist.core.multilock import MultiLock, Reading
+    from enact_dist.core.lock_parts import Reading
+    from enact_dist.core.multilock import MultiLock
     from simulated.client_host import ClientHost
     from simulated.shard_host import ShardHost
     from simulated.world import World

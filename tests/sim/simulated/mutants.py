@@ -13,9 +13,10 @@ from enact_dist.core.beliefs import Sendings
 from enact_dist.core.client import Client
 from enact_dist.core.commits import Commits
 from enact_dist.core.datum import Token
+from enact_dist.core.lock_parts import Plan
 from enact_dist.core.lock_table import Mode
 from enact_dist.core.messages import Commit, KeepAlive
-from enact_dist.core.multilock import MultiLock, Phase, Plan
+from enact_dist.core.multilock import MultiLock, Phase
 from enact_dist.core.records import Persist, Reply
 from enact_dist.core.session_desk import SessionDesk
 from enact_dist.core.sessions import Lane, Session, SessionTable

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from enact_dist.core.datum import Datum, Slot
+from enact_dist.core.lock_parts import Reading
 from enact_dist.core.messages import (
     AspectEntry,
     Fetch,
@@ -19,7 +20,7 @@ from enact_dist.core.messages import (
     SlotVersion,
     WriteItem,
 )
-from enact_dist.core.multilock import MultiLock, Phase, Reading
+from enact_dist.core.multilock import MultiLock, Phase
 from enact_dist.core.placement import shard_of
 from enact_dist.terms import Access
 from simulated.client_host import Calls, ClientHost, Sleep, Thread

@@ -1,0 +1,54 @@
+"""A lock as its client sees it: what it asks of which shard, and what it was shown."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from enact_dist.core.datum import Token
+    from enact_dist.core.messages import Item, SlotState
+
+
+@dataclass(slots=True, eq=False)
+class Part:
+    """What a lock holds, or asks for, at one shard.
+
+    Attributes:
+        items: Locks and, where this is the only part, views.
+        token: The grant's fencing number once granted.
+        granted_count: The session's message counter when the grant arrived.
+        until_ns: Until when the lease may be believed in (CLOCK_BOOTTIME).
+        hold_until_ns: Until when the hold limit leaves it.
+    """
+
+    shard: str
+    items: tuple[Item, ...]
+    token: Token | None = None
+    granted_count: int = 0
+    until_ns: int = 0
+    hold_until_ns: int = 0
+
+
+class Reading(NamedTuple):
+    """What a grant or view showed of one slot, and in which epoch of which shard."""
+
+    shard: str
+    epoch: int
+    state: SlotState
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """What one lock asks of which shard; both in the order of the shards' names.
+
+    A shard appears once in each.  Locks on several shards take their views afterwards, as one cut
+    that lies not before `floor_ns`.  `map_version` names the placement that it was made by: the
+    client may learn another meanwhile, and a shard refuses what was placed by any other than its
+    own.
+    """
+
+    locks: tuple[tuple[str, tuple[Item, ...]], ...]
+    views: tuple[tuple[str, tuple[Item, ...]], ...]
+    map_version: int
+    floor_ns: int = 0
