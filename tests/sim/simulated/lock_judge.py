@@ -81,14 +81,14 @@ class LockJudge:
         lowest = dict(message.view)
         for lock, tenure in tenures.items():
             unwanted = lock.session == message.session and lock.seq < lowest.get(lock.lane, 0)
-            if unwanted and not tenure.committing:
+            if unwanted and not (tenure.committing or tenure.prepared):
                 self._fail("orphans are freed", lock, message.view)
 
     def _check_ends(self, host: ShardHost) -> None:
         """After a look at the clock no grant is left that should have ended."""
         state = host.shard.state
         for lock, tenure in state.tenures.by_lock.items():
-            if tenure.token is None or tenure.bound:
+            if tenure.token is None or tenure.committing or tenure.prepared:
                 continue
             lease_end_ns = state.sessions.by_id[lock.session].lease_end_ns(state.now_ns)
             if min(tenure.hold_end_ns, lease_end_ns) <= state.now_ns:

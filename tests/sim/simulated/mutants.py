@@ -6,23 +6,27 @@ The shard's own assertions are off while mutants run: what catches them is the j
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from enact_dist.core import lock_table, multilock, tenures
 from enact_dist.core.beliefs import Sendings
 from enact_dist.core.client import Client
 from enact_dist.core.commits import Commits
+from enact_dist.core.cuts import Cut
 from enact_dist.core.datum import Token
-from enact_dist.core.lock_parts import Plan
+from enact_dist.core.decisions import Decisions
 from enact_dist.core.lock_table import Mode
 from enact_dist.core.messages import Commit, KeepAlive
 from enact_dist.core.multilock import MultiLock, Phase
+from enact_dist.core.prepares import PrepareDesk
 from enact_dist.core.records import Persist, Reply
 from enact_dist.core.session_desk import SessionDesk
 from enact_dist.core.sessions import Lane, Session, SessionTable
 from enact_dist.core.slots import Content
 from enact_dist.core.stamps import Stamps
 from enact_dist.core.tenures import Tenure, Tenures
+from enact_dist.core.view_desk import ViewDesk
 from enact_dist.terms import Durability, NullReason
 
 if TYPE_CHECKING:
@@ -162,7 +166,10 @@ def tells_before_it_is_kept(patch: Patch) -> None:
     """A commit is applied and told while the disk still works on it."""
 
     def wrong(self: Commits, commit: Any, *, now_ns: int) -> Any:
-        yield Persist(0, (*self._records(commit), commit.outcome), Durability.DURABLE)
+        stamp_ns = commit.outcome.position.stamp_ns
+        records = self.records(commit.writes, commit.outcome.versions, stamp_ns)
+        decision = (commit.decision,) if commit.decision is not None else ()
+        yield Persist(0, (*records, commit.outcome, *decision), Durability.DURABLE)
         yield from self._apply(commit, now_ns=now_ns)
 
     patch(Commits, "_make_durable", wrong)
@@ -187,13 +194,16 @@ def expects_in_vain(patch: Patch) -> None:
 
 def skips_validation(patch: Patch) -> None:
     """Reads on other shards, and read-only locks, are not validated at the end."""
+    after_votes = MultiLock._after_votes
 
     def wrong(self: MultiLock) -> None:
-        self._validate_left.clear()
-        after_validation(self)
+        finishing = self._finishing
+        assert finishing is not None
+        for shard in [shard for shard in finishing.left if shard not in finishing.writes]:
+            del finishing.left[shard]
+        after_votes(self)
 
-    after_validation = MultiLock._after_validation
-    patch(MultiLock, "_after_validation", wrong)
+    patch(MultiLock, "_after_votes", wrong)
 
 
 def welcomes_early(patch: Patch) -> None:
@@ -252,11 +262,11 @@ def asks_shards_in_the_order_of_the_request(patch: Patch) -> None:
     """A lock over several shards acquires them in the order in which they are named."""
     plan = Client.plan
 
-    def wrong(self: Client, items: Any) -> Plan:
-        sorted_plan = plan(self, items)
+    def wrong(self: Client, items: Any, **options: Any) -> Any:
+        sorted_plan = plan(self, items, **options)
         first = {item.entity: number for number, item in enumerate(items)}
         locks = sorted(sorted_plan.locks, key=lambda part: first[part[1][0].entity])
-        return Plan(tuple(locks), sorted_plan.views, sorted_plan.map_version)
+        return replace(sorted_plan, locks=tuple(locks))
 
     patch(Client, "plan", wrong)
 
@@ -276,6 +286,100 @@ def keeps_one_outcome_per_session(patch: Patch) -> None:
 
     patch(Commits, "_apply", applying)
     patch(Commits, "_recorded", wrong)
+
+
+def prepared_locks_expire(patch: Patch) -> None:
+    """A lease, a release or a keep-alive ends a prepared lock."""
+    patch(Tenure, "bound", property(lambda tenure: tenure.committing))
+
+    ask = PrepareDesk.ask
+
+    def asking(self: PrepareDesk) -> Any:
+        for lock in [lock for lock in self._ask_ns if lock not in self._state.tenures.by_lock]:
+            del self._ask_ns[lock]
+        yield from ask(self)
+
+    patch(PrepareDesk, "ask", asking)
+    undecided = PrepareDesk.undecided
+
+    def known(self: PrepareDesk) -> Any:
+        for lock in [lock for lock in self._ask_ns if lock not in self._state.tenures.by_lock]:
+            del self._ask_ns[lock]
+        yield from undecided(self)
+
+    patch(PrepareDesk, "undecided", known)
+
+
+def promises_before_it_is_kept(patch: Patch) -> None:
+    """Prepared is answered while the disk still works on the record."""
+    on_prepare = PrepareDesk.on_prepare
+
+    def wrong(self: PrepareDesk, message: Any, reply_to: int) -> Any:
+        for effect in on_prepare(self, message, reply_to):
+            if isinstance(effect, Persist):
+                work = self._at_store[effect.ticket]
+                replies, work.replies = work.replies, []
+                for reply in replies:
+                    yield Reply(reply, self._prepared(work.record))
+            yield effect
+
+    patch(PrepareDesk, "on_prepare", wrong)
+
+
+def aborts_what_is_open(patch: Patch) -> None:
+    """A primary that has not decided yet says that it never will."""
+    resolved = PrepareDesk._resolved
+
+    def wrong(self: PrepareDesk, message: Any) -> Any:
+        answer = resolved(self, message)
+        return replace(answer, kind="aborted") if answer.kind == "open" else answer
+
+    patch(PrepareDesk, "_resolved", wrong)
+
+
+def forgets_decisions_at_a_restart(patch: Patch) -> None:
+    """A restarted primary knows neither decisions nor outcomes."""
+    patch(Commits, "position_of", lambda _self, _lock: None)
+
+
+def loses_prepared_at_a_restart(patch: Patch) -> None:
+    """A restarted participant has forgotten what it has prepared."""
+    init = PrepareDesk.__init__
+    patch(PrepareDesk, "__init__", lambda self, state, _recovered: init(self, state, ()))
+
+
+def never_tells_participants(patch: Patch) -> None:
+    """Neither a decision is told nor is it asked for."""
+    patch(Decisions, "tell", lambda _self, _now_ns: iter(()))
+    patch(PrepareDesk, "ask", lambda _self: iter(()))
+
+
+def commits_without_votes(patch: Patch) -> None:
+    """A client commits though a participant has not prepared yet."""
+
+    def wrong(self: MultiLock) -> None:
+        if self._finishing is not None and self._finishing.primary:
+            self.phase = Phase.COMMITTING
+        else:
+            after_votes(self)
+
+    after_votes = MultiLock._after_votes
+    patch(MultiLock, "_after_votes", wrong)
+
+
+def expects_beside_writers(patch: Patch) -> None:
+    """An expected view does not mind that another lock holds the slot for writing."""
+    patch(Commits, "_in_the_way", lambda _self, _slot, _lock: False)
+
+
+def takes_the_first_views(patch: Patch) -> None:
+    """Views over several shards are taken as they come, of one cut or not."""
+    patch(Cut, "settled", lambda cut, _epoch: cut._answers)
+
+
+def views_do_not_wait_for_the_undecided(patch: Patch) -> None:
+    """A view promises to be current though a prepared commit may come before its end."""
+    patch(ViewDesk, "_undecided_ns", lambda _desk, _items: 1 << 62)
 
 
 ALL = (
@@ -305,4 +409,14 @@ ALL = (
     shows_before_it_is_kept,
     asks_shards_in_the_order_of_the_request,
     keeps_one_outcome_per_session,
+    prepared_locks_expire,
+    promises_before_it_is_kept,
+    aborts_what_is_open,
+    forgets_decisions_at_a_restart,
+    loses_prepared_at_a_restart,
+    never_tells_participants,
+    commits_without_votes,
+    expects_beside_writers,
+    takes_the_first_views,
+    views_do_not_wait_for_the_undecided,
 )

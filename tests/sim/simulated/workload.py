@@ -130,7 +130,7 @@ class Workload:
     def _cross(self, random: Random) -> tuple[Item, ...]:
         """Write one of two slots and view the other: write skew, if the view is not expected."""
         here, there = random.sample(CONTEXTS, 2)
-        one, other = random.choice((self._entities[:1] * 2, random.sample(self._entities[:2], 2)))
+        one, other = random.choice((self._entities[:1] * 2, random.sample(ENTITIES[:2], 2)))
         if one != other:
             here = there = "online"
         return Item(Access.WRITE, here, one, "count"), Item(Access.VIEW, there, other, "count")
