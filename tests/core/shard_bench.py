@@ -29,9 +29,14 @@ from enact_dist.core.messages import (
 )
 from enact_dist.core.records import (
     AspectRecord,
+    Call,
+    DecisionDone,
+    DecisionRecord,
     OutcomeRecord,
     Persist,
     Persisted,
+    PreparedEnded,
+    PreparedRecord,
     Publish,
     Record,
     Recovered,
@@ -100,6 +105,7 @@ class ShardBench:
         self.log: list[Record] = []
         self.pending: list[Persist] = []
         self.notices: list[object] = []
+        self.calls: list[tuple[str, object]] = []
         self.answers: dict[int, Answer] = {}
         self._handles = count(1)
         self._counts: dict[str, count[int]] = {}
@@ -137,6 +143,8 @@ class ShardBench:
                 self.answers[effect.reply_to] = effect.answer
             elif isinstance(effect, Persist):
                 self.pending.append(effect)
+            elif isinstance(effect, Call):
+                self.calls.append((effect.shard, effect.request))
             elif isinstance(effect, Publish):
                 self.notices.append(effect.notice)
         if self.disk_is_done:
@@ -189,6 +197,14 @@ class ShardBench:
                 found.aspects.append(record.entry)
             elif isinstance(record, SlotRecord):
                 slots[record.slot] = record
+            elif isinstance(record, PreparedRecord):
+                found.prepared.append(record)
+            elif isinstance(record, PreparedEnded):
+                found.prepared = [p for p in found.prepared if p.lock != record.lock]
+            elif isinstance(record, DecisionRecord):
+                found.decisions.append(record)
+            elif isinstance(record, DecisionDone):
+                found.decisions = [d for d in found.decisions if d.lock != record.lock]
             elif isinstance(record, OutcomeRecord):
                 outcomes[record.lock.session, record.lock.lane] = record
         found.sessions = list(sessions.values())
