@@ -237,11 +237,12 @@ class ShardBench:
         wait_ns: int = 900 * MS,
         hold_ns: int = 60 * S,
         epoch: int | None = None,
+        alone: bool = True,
     ) -> Acquire:
-        """Return the request for a lock."""
+        """Return the request for a lock that lies on this shard alone, or not."""
         epoch = self.shard.epoch if epoch is None else epoch
         counter = self.next_count(lock.session)
-        return Acquire(lock, epoch, 1, counter, items, wait_ns, hold_ns, 0, alone=True)
+        return Acquire(lock, epoch, 1, counter, items, wait_ns, hold_ns, 0, alone=alone)
 
     def acquire(self, lock: LockId, *items: Item, **options: int) -> Answer | None:
         """Ask for a lock; None while the request is parked."""
