@@ -172,6 +172,7 @@ class Store:
         }
         self._next_id = max(self._ids.values(), default=0) + 1
         self._batch = contents.batch
+        self._epoch = contents.recovered.epoch
         self._mark: MarkFile | None = None
         self._log_bytes = 0
         self._rubbish: list[str] = []
@@ -360,6 +361,9 @@ class Store:
 
     def _commit(self, changes: dict[Key, bytes | None], *, forced: bool) -> None:
         self._batch += 1
+        if None in changes.values():
+            # The newest row tells how far the store got; a batch must not only take rows away.
+            changes[EPOCH_KEY] = epoch_body(self._epoch)
         rows: list[DatabaseRow] = []
         gone: list[int] = []
         for key, body in changes.items():
