@@ -51,6 +51,12 @@ HAPPENED = (
     "shard: commits_repeated",
     "shard: commits_changed",
     "shard: lock_waits",
+    # What it did about commits over shards.
+    "decisions",
+    "commits finished by participants",
+    "shard: resolves_asked",
+    "shard: finishes_repeated",
+    "views over several slots checked",
     # What the clients were told, and did.
     "told: committed",
     "told: lost",
