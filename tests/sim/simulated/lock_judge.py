@@ -21,7 +21,7 @@ class LockJudge:
 
     def __init__(self, world: World) -> None:
         self._fail = world.violation
-        self._waits: dict[str, dict[LockId, list[LockId]]] = {}
+        self._hosts: dict[str, tuple[ShardHost, Picture]] = {}
 
     def judge(self, host: ShardHost, message: object, picture: Picture) -> None:
         """Note who came, went and was granted, and whether that was right."""
@@ -93,33 +93,43 @@ class LockJudge:
     def _check_waiters(self, host: ShardHost, picture: Picture) -> None:
         """Whoever waits does so for somebody who holds or came earlier, and nobody in a circle."""
         state = host.shard.state
-        everybody = list(state.tenures.by_lock.values())
-        waits = self._waits[host.name] = {}
-        for waiter in everybody:
-            if waiter.token is not None:
-                continue
-            arrival = picture.arrivals[waiter.lock]
-            waits[waiter.lock] = [
-                other.lock
-                for other in everybody
-                if (other.token is not None or picture.arrivals[other.lock] < arrival)
-                and conflict(waiter.items, other.items, columns=True)
-            ]
-            closed = state.draining or state.sessions.in_grace(state.now_ns)
-            if not waits[waiter.lock] and not closed:
-                self._fail("P6 nobody waits in vain", waiter.lock, waiter.items)
-        for waiter in waits:
-            self._check_circle(waiter)
+        self._hosts[host.name] = (host, picture)
+        waits = _waits_for(host, picture)
+        for waiter, others in waits.items():
+            if not others and not state.draining and not state.sessions.in_grace(state.now_ns):
+                self._fail("P6 nobody waits in vain", waiter)
+        if waits and len(self._hosts) > 1:
+            everywhere = [_waits_for(*known) for known in self._hosts.values() if known[0].up]
+            for waiter in waits:
+                self._check_circle(waiter, everywhere)
 
-    def _check_circle(self, first: LockId) -> None:
-        """Follow who waits for whom over all shards, as they last looked at the time."""
+    def _check_circle(self, first: LockId, everywhere: list[dict[LockId, list[LockId]]]) -> None:
+        """Follow who waits for whom over all shards."""
         reached, ahead = {first}, [first]
         while ahead:
             lock = ahead.pop()
-            for waits in self._waits.values():
+            for waits in everywhere:
                 for other in waits.get(lock, ()):
                     if other == first:
-                        self._fail("no deadlock", first, self._waits)
+                        self._fail("no deadlock", first, everywhere)
                     if other not in reached:
                         reached.add(other)
                         ahead.append(other)
+
+
+def _waits_for(host: ShardHost, picture: Picture) -> dict[LockId, list[LockId]]:
+    """Return for each waiter of a shard those who hold or came earlier and conflict with it."""
+    everybody = list(host.shard.state.tenures.by_lock.values())
+    return {
+        waiter.lock: [
+            other.lock
+            for other in everybody
+            if (
+                other.token is not None
+                or picture.arrivals[other.lock] < picture.arrivals[waiter.lock]
+            )
+            and conflict(waiter.items, other.items, columns=True)
+        ]
+        for waiter in everybody
+        if waiter.token is None
+    }
