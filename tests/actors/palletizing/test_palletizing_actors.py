@@ -203,7 +203,10 @@ def test_conveyor_waits_for_the_verdict(cell):
 
 
 def test_detection_gives_the_same_flags_after_a_restart(cell):
-    """A detection that starts anew judges what is there again and changes no flag."""
+    """A detection that starts anew judges what is there again and changes no flag.
+
+    Lengths may differ by 0.2 mm: Open3D's registration adds up in parallel, in no fixed order.
+    """
     for stop in range(2):
         stand_at(cell, stop)
         testing.run_once(OnlinePerception(OVERHEAD), cell)
@@ -213,7 +216,13 @@ def test_detection_gives_the_same_flags_after_a_restart(cell):
     again = testing.run_once(DeviationDetection(), cell)
 
     assert again == 2
-    assert online(cell, SYSTEM, DEVIATIONS) == before
+    after = online(cell, SYSTEM, DEVIATIONS)
+    assert after.keys() == before.keys()
+    for name, flag in before.items():
+        same = ("package", "product", "verdict", "captured_ns")
+        assert [getattr(after[name], f) for f in same] == [getattr(flag, f) for f in same]
+        assert after[name].deviation_mm == pytest.approx(flag.deviation_mm, abs=0.2)
+        assert after[name].shift_mm == pytest.approx(flag.shift_mm, abs=0.2)
     regions = each(cell, "online", PLACES, REGION)
     assert all(region.dtype == np.bool_ for region in regions.values())
 
