@@ -1,8 +1,23 @@
-"""Rules for all tests: in CI nothing is skipped for want of an environment."""
+"""Rules for all tests: nothing skipped in CI, Ctrl-C as at a terminal, no lock left behind."""
 
 import os
+import signal
 
 import pytest
+
+from enact_dist import lock
+
+
+def pytest_configure():
+    """Take SIGINT as a program at a terminal does: in the background a shell has it ignored."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.fixture(autouse=True)
+def no_lock_left_behind():
+    """Let a test that failed inside a lock fail alone, not with all that follow."""
+    yield
+    lock._thread.lock = None
 
 
 @pytest.hookimpl(hookwrapper=True)

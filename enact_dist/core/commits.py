@@ -174,6 +174,9 @@ class Commits:
             return
         refusal = self.refusal(message, tenure, wall_ns=wall_ns)
         if refusal is not None:
+            if isinstance(refusal, Refused) and tenure is not None:
+                # For good: a late copy must not find the lock again at another time of day.
+                yield from self._tenures.take_away(tenure, refusal.text, now_ns=now_ns)
             yield Reply(reply_to, refusal)
             return
         assert tenure is not None

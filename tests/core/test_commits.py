@@ -11,6 +11,7 @@ from enact_dist.core.messages import (
     Changed,
     Commit,
     Committed,
+    Fenced,
     Granted,
     Item,
     Outcome,
@@ -285,6 +286,17 @@ class TestStampsOfCommits:
 
         assert isinstance(answer, Refused)
         assert (answer.code, "10.0 s ahead" in answer.text) == ("clock_skew", True)
+        assert bench.value() is None
+
+    def test_refused_commit_stays_refused_when_the_clock_is_set(self, bench):
+        """A late copy of a refused commit writes nothing (simulation seed 402476)."""
+        bench.hello("ann")
+        grant = bench.granted(ANN, item(W))
+        commit = Commit(ANN, grant.token, (WriteItem(slot(), datum()),), bench.wall_ns + 10 * S)
+        assert isinstance(bench.ask(commit), Refused)
+        bench.wall_ns += 3600 * S
+
+        assert isinstance(bench.ask(commit), Fenced)
         assert bench.value() is None
 
     def test_wall_clock_set_back_does_not_turn_stamps_back(self, bench):

@@ -14,7 +14,7 @@ from collections import Counter
 import pytest
 from simulated.scenario import Scenario
 
-KNOWN_BAD = (7, 58, 77, 148, 151, 196, 199, 3303)
+KNOWN_BAD = (7, 58, 77, 148, 151, 196, 199, 3303, 100584, 200939, 402476)
 """Seeds that found something in the core or in the simulator; see README.md beside this file."""
 
 SECONDS = float(os.environ.get("ENACT_SIM_SECONDS", "20"))
