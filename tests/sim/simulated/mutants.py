@@ -189,7 +189,7 @@ def grants_a_seq_again(patch: Patch) -> None:
 
 def expects_in_vain(patch: Patch) -> None:
     """A commit does not look whether its expected views still stand."""
-    patch(Commits, "_moved", lambda _commits, _expected, _tenure: False)
+    patch(Commits, "moved_on", lambda _commits, _expects, _lock: None)
 
 
 def skips_validation(patch: Patch) -> None:
