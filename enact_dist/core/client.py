@@ -230,10 +230,6 @@ class Client:
         """Return the shards that know this session, to keep it alive there."""
         return [shard for shard, peer in self._peers.items() if peer.epoch]
 
-    def shards_of_locks(self) -> list[str]:
-        """Return the shards where some lock holds or asks for something now."""
-        return sorted({part.shard for lock in self._locks.values() for part in lock.parts})
-
     def live_locks(self) -> list[MultiLock]:
         """Return the locks that are not at rest."""
         return list(self._locks.values())
