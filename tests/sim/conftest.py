@@ -1,4 +1,4 @@
-"""Make the simulator importable as `simulated`, and take the options of a simulation run."""
+"""Let the tests import the wrong edits of the core that stand beside them."""
 
 from __future__ import annotations
 

@@ -11,8 +11,9 @@ import sys
 import time
 from collections import Counter
 
-from simulated import mutants
-from simulated.scenario import Result, Scenario
+import mutants
+
+from enact_dist.verify.simulation.scenario import Result, Scenario
 
 
 def main() -> int:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import mutants
 import pytest
-from simulated import mutants
-from simulated.scenario import Scenario
+
+from enact_dist.verify.simulation.scenario import Scenario
 
 SEEDS = 600
 """A mutant that survives so many seeds counts as not caught."""

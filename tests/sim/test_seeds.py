@@ -12,7 +12,8 @@ import time
 from collections import Counter
 
 import pytest
-from simulated.scenario import Scenario
+
+from enact_dist.verify.simulation.scenario import Scenario
 
 KNOWN_BAD = (7, 58, 77, 148, 151, 196, 199, 3303, 100584, 200939, 402476)
 """Seeds that found something in the core or in the simulator; see README.md beside this file."""

@@ -6,15 +6,15 @@ from functools import partial
 from random import Random
 
 import pytest
-from simulated.disk import Disk
-from simulated.faults import NONE, drawn
-from simulated.history import conflict
-from simulated.scenario import Scenario
-from simulated.world import Clock, Host, S, World
 
 from enact_dist.core.messages import Item
 from enact_dist.core.records import Persist, SessionRecord
 from enact_dist.terms import Access, Durability
+from enact_dist.verify.simulation.disk import Disk
+from enact_dist.verify.simulation.faults import NONE, drawn
+from enact_dist.verify.simulation.history import conflict
+from enact_dist.verify.simulation.scenario import Scenario
+from enact_dist.verify.simulation.world import Clock, Host, S, World
 
 R, W, RE, WE, V = (
     Access.READ,

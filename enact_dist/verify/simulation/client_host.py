@@ -21,18 +21,18 @@ from enact_dist.core.messages import (
     Registered,
     Request,
 )
-from simulated.world import MS, Host, S
+from enact_dist.verify.simulation.world import MS, Host, S
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from enact_dist.core.datum import Datum, Slot
     from enact_dist.core.multilock import MultiLock
-    from simulated.faults import Faults
-    from simulated.model import Model
-    from simulated.network import Network
-    from simulated.shard_host import ShardHost
-    from simulated.world import World
+    from enact_dist.verify.simulation.faults import Faults
+    from enact_dist.verify.simulation.model import Model
+    from enact_dist.verify.simulation.network import Network
+    from enact_dist.verify.simulation.shard_host import ShardHost
+    from enact_dist.verify.simulation.world import World
 
 CALL_NS = S
 """How long a call may stay unanswered before its thread takes that for an answer."""

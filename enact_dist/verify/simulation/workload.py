@@ -23,15 +23,15 @@ from enact_dist.core.messages import (
 from enact_dist.core.multilock import MultiLock, Phase
 from enact_dist.core.placement import shard_of
 from enact_dist.terms import Access
-from simulated.client_host import Calls, ClientHost, Sleep, Thread
-from simulated.history import Entry, History
-from simulated.world import MS, S
+from enact_dist.verify.simulation.client_host import Calls, ClientHost, Sleep, Thread
+from enact_dist.verify.simulation.history import Entry, History
+from enact_dist.verify.simulation.world import MS, S
 
 if TYPE_CHECKING:
     from random import Random
 
-    from simulated.model import Model
-    from simulated.world import World
+    from enact_dist.verify.simulation.model import Model
+    from enact_dist.verify.simulation.world import World
 
 CONTEXTS = ("training", "online")
 ASPECTS = (

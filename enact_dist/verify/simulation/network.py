@@ -14,10 +14,10 @@ from enact_dist.core import messages as m
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from simulated.faults import Faults
-    from simulated.world import Host, World
+    from enact_dist.verify.simulation.faults import Faults
+    from enact_dist.verify.simulation.world import Host, World
 
-from simulated.world import MS
+from enact_dist.verify.simulation.world import MS
 
 DECISIVE = (
     m.Hello,

@@ -48,6 +48,7 @@ class Entry:
 
     @property
     def id(self) -> LockId:
+        """The lock's identity."""
         return self.lock.lock
 
     def readings(self) -> list[Reading]:

@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from collections.abc import Hashable
 
     from enact_dist.core.datum import Slot
-    from simulated.history import Entry, History
-    from simulated.model import Model
-    from simulated.picture import Picture, State
+    from enact_dist.verify.simulation.history import Entry, History
+    from enact_dist.verify.simulation.model import Model
+    from enact_dist.verify.simulation.picture import Picture, State
 
 NEVER = 1 << 63
 

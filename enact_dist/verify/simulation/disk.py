@@ -24,14 +24,14 @@ from enact_dist.core.records import (
     WorldRecord,
 )
 from enact_dist.terms import Durability
-from simulated.world import MS
+from enact_dist.verify.simulation.world import MS
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from enact_dist.core.datum import LockId
-    from simulated.faults import Faults
-    from simulated.world import Host, World
+    from enact_dist.verify.simulation.faults import Faults
+    from enact_dist.verify.simulation.world import Host, World
 
 
 class Disk:

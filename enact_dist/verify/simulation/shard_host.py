@@ -7,18 +7,18 @@ from typing import TYPE_CHECKING
 from enact_dist.core.messages import Answer, Finish, Refused, Request
 from enact_dist.core.records import Call, Called, Persist, Persisted, Reply, SessionSeen, Tick
 from enact_dist.core.shard import Shard
-from simulated.disk import Disk
-from simulated.world import MS, Host, S
+from enact_dist.verify.simulation.disk import Disk
+from enact_dist.verify.simulation.world import MS, Host, S
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from enact_dist.core.records import Event
     from enact_dist.core.shard_state import ShardSettings
-    from simulated.faults import Faults
-    from simulated.model import Model
-    from simulated.network import Network
-    from simulated.world import World
+    from enact_dist.verify.simulation.faults import Faults
+    from enact_dist.verify.simulation.model import Model
+    from enact_dist.verify.simulation.network import Network
+    from enact_dist.verify.simulation.world import World
 
 
 class ShardHost(Host):

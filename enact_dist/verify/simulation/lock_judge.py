@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 from enact_dist.core.datum import LockId, Token
 from enact_dist.core.messages import Acquire, KeepAlive
 from enact_dist.core.records import Tick
-from simulated.history import conflict
+from enact_dist.verify.simulation.history import conflict
 
 if TYPE_CHECKING:
     from enact_dist.core.tenures import Tenure
-    from simulated.picture import Picture
-    from simulated.shard_host import ShardHost
-    from simulated.world import World
+    from enact_dist.verify.simulation.picture import Picture
+    from enact_dist.verify.simulation.shard_host import ShardHost
+    from enact_dist.verify.simulation.world import World
 
 
 class LockJudge:

@@ -35,17 +35,17 @@ from enact_dist.core.records import (
     SlotRecord,
 )
 from enact_dist.terms import Access, Durability, pattern_matches
-from simulated.history import TOLD_NOT, Entry, History, conflict
-from simulated.lock_judge import LockJudge
-from simulated.picture import Picture, State
-from simulated.workload import label_of, value_of, writer_of
+from enact_dist.verify.simulation.history import TOLD_NOT, Entry, History, conflict
+from enact_dist.verify.simulation.lock_judge import LockJudge
+from enact_dist.verify.simulation.picture import Picture, State
+from enact_dist.verify.simulation.workload import label_of, value_of, writer_of
 
 if TYPE_CHECKING:
     from enact_dist.core.lock_parts import Reading
     from enact_dist.core.multilock import MultiLock
-    from simulated.client_host import ClientHost
-    from simulated.shard_host import ShardHost
-    from simulated.world import World
+    from enact_dist.verify.simulation.client_host import ClientHost
+    from enact_dist.verify.simulation.shard_host import ShardHost
+    from enact_dist.verify.simulation.world import World
 
 
 class Model:

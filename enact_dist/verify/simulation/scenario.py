@@ -15,21 +15,21 @@ from typing import TYPE_CHECKING
 from enact_dist.core.messages import Goodbye, PlacementMap, ShardEntry
 from enact_dist.core.records import Drain, SessionSeen
 from enact_dist.core.shard_state import ShardSettings
-from simulated import faults as fault_options
-from simulated.client_host import ClientHost
-from simulated.graph import Graph
-from simulated.history import History
-from simulated.model import Model
-from simulated.network import Network
-from simulated.shard_host import ShardHost
-from simulated.workload import ASPECTS, CONTEXTS, Workload
-from simulated.world import MS, Host, S, SimulationError, World
+from enact_dist.verify.simulation import faults as fault_options
+from enact_dist.verify.simulation.client_host import ClientHost
+from enact_dist.verify.simulation.graph import Graph
+from enact_dist.verify.simulation.history import History
+from enact_dist.verify.simulation.model import Model
+from enact_dist.verify.simulation.network import Network
+from enact_dist.verify.simulation.shard_host import ShardHost
+from enact_dist.verify.simulation.workload import ASPECTS, CONTEXTS, Workload
+from enact_dist.verify.simulation.world import MS, Host, S, SimulationError, World
 
 if TYPE_CHECKING:
     from collections import Counter
 
     from enact_dist.core.messages import Commit
-    from simulated.faults import Faults
+    from enact_dist.verify.simulation.faults import Faults
 
 FAULTS_NS = 20 * S
 """How long faults go on."""
@@ -136,7 +136,7 @@ class Scenario:
             violation, trace = "", ""
         except SimulationError as broken:
             violation, trace = str(broken), ""
-        except Exception as failure:  # whatever the core raises is a finding too
+        except Exception as failure:  # noqa: BLE001 - whatever the core raises is a finding too
             violation = f"{type(failure).__name__} at {self.world.now_ns / 1e9:.6f} s: {failure}"
             trace = traceback.format_exc()
         return Result(self.seed, violation, self.world.tally, self.world.now_ns / 1e9, trace)
