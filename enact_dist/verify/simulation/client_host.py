@@ -6,8 +6,10 @@ sent, None for each that nobody answered in time.  It drives `MultiLock` as `lin
 
 from __future__ import annotations
 
+from collections.abc import Generator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, TypeAlias, TypeVar
 
 from enact_dist.core.client import Client
 from enact_dist.core.messages import (
@@ -53,7 +55,10 @@ class Calls:
     lock: MultiLock | None = None
 
 
-Thread = "Generator[Sleep | Calls, list[Answer | None], None]"
+T = TypeVar("T")
+Steps: TypeAlias = Generator[Sleep | Calls, list[Answer | None], T]
+"""A part of what a thread does, with what comes of it."""
+Thread: TypeAlias = Steps[None]
 
 
 @dataclass(slots=True)
@@ -117,9 +122,7 @@ class ClientHost(Host):
                 self._resume(thread, answers)
 
         for index, (shard, request) in enumerate(wish.calls):
-            self.call(
-                shard, request, lambda answer, index=index: take(index, answer), lock=wish.lock
-            )
+            self.call(shard, request, partial(take, index), lock=wish.lock)
 
     # ---------------------------------------------------------------- calls
 
@@ -216,11 +219,7 @@ class ClientHost(Host):
         now_ns = self.local_ns
         for shard in self.client.shards_in_use():
             request = self.client.keep_alive(shard, now_ns)
-            self.call(
-                shard,
-                request,
-                lambda answer, shard=shard, request=request: self._renewed(shard, request, answer),
-            )
+            self.call(shard, request, partial(self._renewed, shard, request))
 
     def _renewed(self, shard: str, request: Request, answer: Answer | None) -> None:
         if answer is not None:

@@ -113,8 +113,8 @@ class LockJudge:
             closed = state.draining or state.sessions.in_grace(state.now_ns)
             if not waits[waiter.lock] and not closed:
                 self._fail("P6 nobody waits in vain", waiter.lock, waiter.items)
-        for waiter in waits:
-            self._check_circle(waiter)
+        for lock in waits:
+            self._check_circle(lock)
 
     def _still_waits(self, name: str, lock: LockId) -> bool:
         """Whether a lock that waited when the shard last looked does so now."""

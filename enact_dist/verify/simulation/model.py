@@ -41,8 +41,11 @@ from enact_dist.verify.simulation.picture import Picture, State
 from enact_dist.verify.simulation.workload import label_of, value_of, writer_of
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from enact_dist.core.lock_parts import Reading
     from enact_dist.core.multilock import MultiLock
+    from enact_dist.core.records import Effect
     from enact_dist.verify.simulation.client_host import ClientHost
     from enact_dist.verify.simulation.shard_host import ShardHost
     from enact_dist.verify.simulation.world import World
@@ -163,14 +166,14 @@ class Model:
         picture.arrivals.clear()
         picture.granted.clear()
         picture.granted_ever.clear()
-        for record in recovered.prepared:
-            lock = record.lock
+        for promise in recovered.prepared:
+            lock = promise.lock
             self._world.tally["prepared over a restart"] += 1
             tenure = host.shard.state.tenures.by_lock.get(lock)
-            if tenure is None or tenure.token != record.token or not tenure.claim.granted:
+            if tenure is None or tenure.token != promise.token or not tenure.claim.granted:
                 self._fail("I10 prepared locks are held again", lock)
-            picture.prepared[lock] = record
-            picture.granted[lock] = picture.granted_ever[lock] = record.token
+            picture.prepared[lock] = promise
+            picture.granted[lock] = picture.granted_ever[lock] = promise.token
             picture.arrivals[lock] = 0
         picture.notices = 0
         longest_ns = max((record.ttl_ns for record in recovered.sessions), default=0)
@@ -179,11 +182,11 @@ class Model:
 
     # ---------------------------------------------------------------- one step of a shard
 
-    def handled(self, host: ShardHost, message: object, effects: list[object]) -> None:
+    def handled(self, host: ShardHost, message: object, effects: Sequence[Effect]) -> None:
         """Judge one step: what came in, and what the shard decided."""
         picture = self.pictures[host.name]
         acknowledged = isinstance(message, Hello) and message.known_epoch == picture.epoch
-        if acknowledged or isinstance(message, Goodbye):
+        if isinstance(message, Hello | Goodbye) and (acknowledged or isinstance(message, Goodbye)):
             picture.grace_waits_for.pop(message.session, None)
         self._check_commits(host, effects, picture)
         self._locks.judge(host, message, picture)
@@ -197,7 +200,7 @@ class Model:
                 if lock in picture.granted_ever:  # else it only expected something here
                     picture.confirmed[lock] = picture.granted_ever[lock]
 
-    def _check_commits(self, host: ShardHost, effects: list[object], picture: Picture) -> None:
+    def _check_commits(self, host: ShardHost, effects: Sequence[Effect], picture: Picture) -> None:
         told = {
             effect.answer.position.stamp_ns: effect.answer
             for effect in effects
@@ -486,4 +489,4 @@ def _names(chain: list[State]) -> set[tuple[int, int]]:
 
 
 def _recorded_data(persist: Persist) -> dict[Slot, Datum | None]:
-    return {r.slot: r.datum for r in persist.records if hasattr(r, "datum")}
+    return {r.slot: r.datum for r in persist.records if isinstance(r, SlotRecord)}

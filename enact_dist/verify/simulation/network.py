@@ -7,7 +7,7 @@ those moments.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar, cast
 
 from enact_dist.core import messages as m
 
@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from enact_dist.verify.simulation.world import Host, World
 
 from enact_dist.verify.simulation.world import MS
+
+SomeMessage = TypeVar("SomeMessage", bound=m.Message)
 
 DECISIVE = (
     m.Hello,
@@ -70,7 +72,7 @@ class Network:
         self.faults = faults
 
     def send(
-        self, source: Host, target: Host, message: m.Message, take: Callable[[m.Message], None]
+        self, source: Host, target: Host, message: SomeMessage, take: Callable[[SomeMessage], None]
     ) -> None:
         """Try to bring `message` to `target`, which then does `take` with it."""
         world, faults, random = self._world, self.faults, self._world.random
@@ -101,9 +103,9 @@ class Network:
             world.after(delay_ns, lambda: target.receive(lambda: take(message)))
 
 
-def passed_through_wire(message: m.Message) -> m.Message:
+def passed_through_wire(message: SomeMessage) -> SomeMessage:
     """Return the message as its receiver reads it from the bytes."""
     from enact_dist.wire.frames import decode_frame, encode_frame
 
     header, payload = encode_frame(message)
-    return decode_frame(header, b"" if payload is None else payload)
+    return cast("SomeMessage", decode_frame(header, b"" if payload is None else payload))

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import traceback
 from dataclasses import dataclass, field
+from functools import partial
 from random import Random
 from typing import TYPE_CHECKING
 
@@ -178,10 +179,11 @@ class Scenario:
 
     def _check_quiet(self) -> None:
         """I12: when faults have ended, everything comes to rest."""
-        for host in self.model.clients:
-            if host.up and (host.threads_left or host.client.live_locks()):
-                phases = [(str(lock.lock), lock.phase) for lock in host.client.live_locks()]
-                self.world.violation("I12 all threads end", host.name, host.threads_left, phases)
+        for client in self.model.clients:
+            if client.up and (client.threads_left or client.client.live_locks()):
+                phases = [(str(lock.lock), lock.phase) for lock in client.client.live_locks()]
+                facts = (client.name, client.threads_left, phases)
+                self.world.violation("I12 all threads end", *facts)
         for host in self.shards.values():
             left = host.shard.state.tenures.by_lock
             untold = host.shard.state.decisions.by_lock
@@ -231,7 +233,7 @@ class Scenario:
         for client in self._up_clients():
             # A link that breaks is often noticed at once, and then nobody waits for an answer.
             if random.random() < 0.5:
-                client.receive(lambda client=client: client.notices_end_of(host.name))
+                client.receive(partial(client.notices_end_of, host.name))
 
     def _drain_one(self) -> None:
         """Stop a shard as a signal does: it answers who is parked, grants no more, and ends."""
@@ -349,7 +351,7 @@ class Scenario:
         for name in random.sample(names, random.choice((1, 1, len(names)))):
             host = self.shards[name]
             delay_ns = random.choice((0, MS // 4, MS, 2 * MS))
-            self.world.after(delay_ns, lambda host=host: self._crash(host))
+            self.world.after(delay_ns, partial(self._crash, host))
 
     # ---------------------------------------------------------------- liveliness tokens
 
@@ -368,9 +370,9 @@ class Scenario:
         """Let every shard notice whether the client's liveliness token is there."""
         for shard in self.shards.values():
             seen = SessionSeen(host.client.session, self._visible(host, shard))
-            shard.receive(lambda shard=shard, seen=seen: shard.event(seen))
+            shard.receive(partial(shard.event, seen))
 
     def _show_token(self, host: ClientHost, *, present: bool) -> None:
         seen = SessionSeen(host.client.session, present and self.faults.tokens)
         for shard in self.shards.values():
-            self.world.after(10 * MS, lambda shard=shard: shard.receive(lambda: shard.event(seen)))
+            self.world.after(10 * MS, partial(shard.receive, partial(shard.event, seen)))

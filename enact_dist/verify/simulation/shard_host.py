@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, cast
 
 from enact_dist.core.messages import Answer, Finish, Refused, Request
 from enact_dist.core.records import Call, Called, Persist, Persisted, Reply, SessionSeen, Tick
@@ -59,7 +60,7 @@ class ShardHost(Host):
         self._tick_due_ns = 0
         self._plan_tick()
         for session in self.tokens(self):
-            self.later(10 * MS, lambda session=session: self.event(SessionSeen(session, True)))
+            self.later(10 * MS, partial(self.event, SessionSeen(session, True)))
         if self.shard.epoch != 1:
             self.world.tally["epoch changes"] += 1
 
@@ -109,7 +110,7 @@ class ShardHost(Host):
                     return
                 if isinstance(effect.answer, Refused):
                     self.world.tally[f"refused: {effect.answer.code}"] += 1
-                reply(effect.answer)
+                reply(cast("Answer", effect.answer))
             elif isinstance(effect, Persist):
                 self.disk.submit(self, effect, lambda ticket: self.event(Persisted(ticket)))
                 self.on_persist(self)
@@ -131,7 +132,8 @@ class ShardHost(Host):
         def reply(answer: Answer) -> None:
             network.send(peer, self, answer, answered)
 
-        network.send(self, peer, call.request, lambda came: peer.request(came, reply))
+        request = cast("Request", call.request)
+        network.send(self, peer, request, lambda came: peer.request(came, reply))
 
     def _plan_tick(self) -> None:
         now_ns = self.local_ns

@@ -23,7 +23,7 @@ from enact_dist.core.messages import (
 from enact_dist.core.multilock import MultiLock, Phase
 from enact_dist.core.placement import shard_of
 from enact_dist.terms import Access
-from enact_dist.verify.simulation.client_host import Calls, ClientHost, Sleep, Thread
+from enact_dist.verify.simulation.client_host import Calls, ClientHost, Sleep, Steps, Thread
 from enact_dist.verify.simulation.history import Entry, History
 from enact_dist.verify.simulation.world import MS, S
 
@@ -224,7 +224,7 @@ class Workload:
 
     # ---------------------------------------------------------------- reading
 
-    def _data(self, host: ClientHost, lock: MultiLock) -> Thread:
+    def _data(self, host: ClientHost, lock: MultiLock) -> Steps[dict[Slot, Datum | None] | None]:
         """Return the datum of each slot read, fetching what did not come with the grant."""
         data: dict[Slot, Datum | None] = {}
         for reading in lock.states:
@@ -246,7 +246,7 @@ class Workload:
                 host.cache[state.slot] = (reading.shard, reading.epoch, state.version, datum)
         return data
 
-    def _fetched(self, host: ClientHost, lock: MultiLock, reading: Reading) -> Thread:
+    def _fetched(self, host: ClientHost, lock: MultiLock, reading: Reading) -> Steps[Datum | None]:
         state = reading.state
         request = Fetch(lock.lock, reading.epoch, state.slot, state.version, 0, 1 << 20)
         for _ in range(5):
