@@ -70,9 +70,9 @@ class Model:
         """Stop the run: a rule is broken."""
         self._fail(rule, *facts)
 
-    def count(self, name: str) -> None:
-        """Add one to a tally of the run."""
-        self._world.tally[name] += 1
+    def count(self, name: str, number: int) -> None:
+        """Add to a tally of the run."""
+        self._world.tally[name] += number
 
     def _fail(self, rule: str, *facts: object) -> None:
         self._world.violation(rule, *facts)
