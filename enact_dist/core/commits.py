@@ -28,6 +28,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
+from enact_dist.core.admission import wrong_name, wrong_parties, wrong_writes
 from enact_dist.core.datum import Position, Slot
 from enact_dist.core.messages import (
     OUTCOME_COMMITTED,
@@ -64,7 +65,7 @@ from enact_dist.core.slots import Catalogue, Content, SlotMap
 from enact_dist.terms import Durability, NullReason
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Callable, Collection, Iterable, Iterator
 
     from enact_dist.core.datum import LockId, Token
     from enact_dist.core.decisions import Decisions
@@ -99,6 +100,7 @@ class Commits:
         "_decisions",
         "_epoch",
         "_in_flight",
+        "_peers",
         "_sessions",
         "_shard",
         "_slots",
@@ -112,6 +114,7 @@ class Commits:
         self,
         *,
         shard: str,
+        peers: Collection[str],
         epoch: int,
         slots: SlotMap,
         catalogue: Catalogue,
@@ -123,6 +126,7 @@ class Commits:
     ) -> None:
         self._decisions = decisions
         self._shard = shard
+        self._peers = peers
         self._epoch = epoch
         self._slots = slots
         self._catalogue = catalogue
@@ -174,7 +178,7 @@ class Commits:
             return
         refusal = self.refusal(message, tenure, wall_ns=wall_ns)
         if refusal is not None:
-            if isinstance(refusal, Refused) and tenure is not None:
+            if isinstance(refusal, Refused) and tenure is not None and not tenure.bound:
                 # For good: a late copy must not find the lock again at another time of day.
                 yield from self._tenures.take_away(tenure, refusal.text, now_ns=now_ns)
             yield Reply(reply_to, refusal)
@@ -198,7 +202,9 @@ class Commits:
         commit = _InFlight(tenure, message.writes, outcome, [reply_to])
         if message.participants:
             commit.decision = DecisionRecord(message.lock, outcome.position, message.participants)
-            commit.durability = Durability(message.durability or Durability.OS.value)
+            # Even where all data are volatile: who was told that it has committed may rely on it.
+            asked = Durability(message.durability or Durability.OS.value)
+            commit.durability = max(Durability.OS, asked, key=_STRICTNESS.index)
         yield from self._make_durable(commit, now_ns=now_ns)
 
     def moved_on(self, expects: Iterable[SlotVersion], lock: LockId) -> SlotVersion | None:
@@ -310,9 +316,9 @@ class Commits:
         self, message: Commit | Prepare, tenure: Tenure | None, *, wall_ns: int
     ) -> Fenced | EpochChanged | Refused | None:
         """Return why this holder may not write this now, None if it may."""
-        twice = duplicate_slot(message.writes)
-        if twice is not None:
-            return Refused("protocol", f"{twice} is written twice in one commit")
+        wrong = wrong_writes(message.writes) or wrong_parties(message, peers=self._peers)
+        if wrong is not None:
+            return wrong
         fenced = self._fence(message.lock, message.token, tenure)
         if fenced is not None:
             return fenced
@@ -322,6 +328,12 @@ class Commits:
         uncovered = [write.slot for write in message.writes if not tenure.covers(write.slot)]
         if uncovered:
             return Refused("protocol", f"{message.lock} does not hold {uncovered[0]} for writing")
+        for slot, _ in message.writes:
+            # Everybody whose pattern covers it must be able to read its name.
+            if not self._slots.exists(slot):
+                wrong = wrong_name("entity", slot.entity, slashes=True)
+                if wrong is not None:
+                    return wrong
         if self._stamps.too_far_ahead(message.seen_stamp_ns, wall_ns=wall_ns):
             ahead_s = (message.seen_stamp_ns - wall_ns) / 1e9
             return Refused(
@@ -345,7 +357,8 @@ class Commits:
 
     def _cause(self, lock: LockId) -> str:
         session = self._sessions.known(lock.session)
-        ended = session.lane(lock.lane).ended if session is not None else None
+        lane = session.lanes.get(lock.lane) if session is not None else None
+        ended = lane.ended if lane is not None else None
         return ended[1] if ended is not None and ended[0] == lock else NOT_HELD
 
     # ---------------------------------------------------------------- validate, outcome
@@ -356,11 +369,10 @@ class Commits:
             yield Reply(reply_to, self._expected(message))
             return
         session = self._sessions.known(message.lock.session)
-        if session is not None:
-            lane = session.lane(message.lock.lane)
-            if lane.validated == (message.lock, message.token):
-                yield Reply(reply_to, Valid(message.lock))
-                return
+        lane = session.lanes.get(message.lock.lane) if session is not None else None
+        if lane is not None and lane.validated == (message.lock, message.token):
+            yield Reply(reply_to, Valid(message.lock))
+            return
         tenure = self._tenures.by_lock.get(message.lock)
         fenced = self._fence(message.lock, message.token, tenure)
         if fenced is None and tenure is not None and not tenure.bound:
@@ -421,13 +433,3 @@ class Commits:
 
 def _committed(outcome: OutcomeRecord) -> Committed:
     return Committed(outcome.lock, outcome.position, outcome.versions)
-
-
-def duplicate_slot(writes: tuple[WriteItem, ...]) -> Slot | None:
-    """Return a slot that is written twice in one commit, if any."""
-    seen: set[Slot] = set()
-    for write in writes:
-        if write.slot in seen:
-            return write.slot
-        seen.add(write.slot)
-    return None

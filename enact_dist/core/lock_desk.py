@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
+from enact_dist.core.admission import wrong_access
 from enact_dist.core.datum import Datum, LockId
 from enact_dist.core.messages import (
     Acquire,
@@ -106,6 +107,9 @@ class LockDesk:
             return Refused("value", f"{len(items)} requests in one lock; at most {ITEMS_MAX}")
         if len(self._state.tenures.by_lock) >= WAITERS_MAX:
             return Refused("overload", f"{WAITERS_MAX} locks are held or awaited here")
+        wrong = wrong_access(items)
+        if wrong is not None:
+            return wrong
         for item in items:
             if item.context not in self._state.catalogue.worlds:
                 known = ", ".join(sorted(self._state.catalogue.worlds)) or "none"

@@ -20,6 +20,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
+from enact_dist.core.admission import wrong_finish
 from enact_dist.core.datum import LockId, Position
 from enact_dist.core.messages import (
     RESOLVED_ABORTED,
@@ -180,8 +181,12 @@ class PrepareDesk:
         if tenure is None or tenure.prepared is None:
             self._state.count("finishes_repeated")
             yield Reply(reply_to, Finished(message.lock))
-        else:
-            yield from self._finish(tenure, message.position, [reply_to])
+            return
+        wrong = wrong_finish(message, tenure.prepared)
+        if wrong is not None:
+            yield Reply(reply_to, wrong)
+            return
+        yield from self._finish(tenure, message.position, [reply_to])
 
     def _finish(self, tenure: Tenure, position: Position, replies: list[int]) -> Iterator[Effect]:
         record = tenure.prepared

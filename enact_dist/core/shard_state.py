@@ -59,6 +59,7 @@ class ShardState:
     Attributes:
         now_ns: Monotonic time of the message being handled.
         wall_ns: Wall clock at that moment; for stamps only.
+        peers: The other shards of the cell.
         pins: Data that a view without a lock keeps fetchable.
         shortest_ttl_ns: Of all sessions; bounds how often the shard must look at the time.
         draining: The shard is about to stop and grants nothing.
@@ -73,6 +74,8 @@ class ShardState:
         self.draining = False
         self.counters: dict[str, int] = {}
         self.pins: dict[LockId, dict[tuple[Slot, int], Datum]] = {}
+        names = {shard.name for shard in settings.placement.shards}
+        self.peers = frozenset(names - {settings.name})
         self.slots = SlotMap(
             recovered.slots, answer_bytes_max=ANSWER_FETCHES * settings.fetch_bytes_max
         )
@@ -101,6 +104,7 @@ class ShardState:
         self.decisions = Decisions(recovered.decisions, now_ns=now_ns, count=self.count)
         self.commits = Commits(
             shard=settings.name,
+            peers=self.peers,
             epoch=self.epoch,
             slots=self.slots,
             catalogue=self.catalogue,

@@ -59,7 +59,7 @@ if TYPE_CHECKING:
 MS = 1_000_000
 S = 1_000 * MS
 TTL_NS = 2 * S
-PLACEMENT = PlacementMap(1, (ShardEntry("s0", ()),), ())
+PLACEMENT = PlacementMap(1, (ShardEntry("s0", ()), ShardEntry("far", ())), ())
 ASPECTS = (
     AspectEntry("count", "int", "durable"),
     AspectEntry("note", "int", "os"),
