@@ -243,6 +243,10 @@ class MultiLock:
         self._retry_at_ns = now_ns + self._retry_ns
         self._retry_ns = min(2 * self._retry_ns, RETRY_NS_MAX)
 
+    def ask_again(self) -> None:
+        """Make the next call without a further pause."""
+        self._retry_at_ns, self._retry_ns = 0, RETRY_NS_MIN
+
     def _epoch_changed(self, shard: str, request: Request) -> None:
         """The shard restarted or forgot the session; `client` has dropped our grants there."""
         self._free_calls = max(0, self._free_calls - 1)

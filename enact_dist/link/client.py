@@ -131,7 +131,7 @@ class CellClient(SessionClient):
 
     def _pause(self, pause_s: float) -> None:
         """Wait before asking again; raises if the cell is closed meanwhile."""
-        if self._stopping.wait(pause_s):
+        if self._rest(pause_s, self._returns):
             self.check_usable()
 
     def _drive(self, lock: MultiLock, *, interrupt: threading.Event | None = None) -> None:

@@ -16,7 +16,7 @@ from enact_dist.errors import MisuseError, ShardUnreachableError
 from enact_dist.link.notices import NoticeQueue
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from enact_dist.core.messages import Answer, Request, ShardEntry
     from enact_dist.link.host import ShardHost
@@ -121,6 +121,9 @@ class EmbeddedCarrier:
 
     def add_endpoints(self, entries: Sequence[ShardEntry]) -> None:
         """Do nothing: there is no other shard."""
+
+    def tell_returns(self, returned: Callable[[str], None]) -> None:
+        """Do nothing: the shard is in reach as long as this process lives."""
 
     def endpoint_of(self, shard: str) -> str:
         """Return where the shard is, and why it answers no more."""

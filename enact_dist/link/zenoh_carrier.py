@@ -24,6 +24,7 @@ import threading
 import time
 from collections import deque
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Final, cast, get_args
 
 import zenoh
@@ -32,11 +33,12 @@ from enact_dist.core.messages import Answer, AwaitStamp, Commit, Fetch, Notice, 
 from enact_dist.errors import MisuseError, ProtocolError, ShardUnreachableError
 from enact_dist.link.notices import NoticeQueue
 from enact_dist.link.zenoh_config import QUEUED_MAX, close_session, keep_after_fork, open_session
+from enact_dist.link.zenoh_presence import ShardPresence
 from enact_dist.wire.frames import decode_frame, encode_frame
 from enact_dist.wire.keys import notice_key, request_key, token_key, verb_of
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from enact_dist.core.messages import Request, ShardEntry
 
@@ -131,6 +133,8 @@ class ZenohCarrier:
         self._endpoints_of: dict[str, tuple[str, ...]] = {}
         self._feeds: dict[NoticeQueue, list[_Pump]] = {}
         self._keys: dict[tuple[str, type], str] = {}
+        self._presences: list[ShardPresence] = []
+        self._returned: Callable[[str], None] = lambda _: None
         self._unchecked: deque[zenoh.Handler[zenoh.Reply]] = deque(maxlen=UNCHECKED_MAX)
         keep_after_fork(self)
         first = self._open_link(tuple(endpoints))
@@ -258,6 +262,11 @@ class ZenohCarrier:
                 continue
             link = self._link_reaching(name, endpoints) or self._open_link(endpoints)
             self._link_of[name] = link
+            self._presences.append(
+                ShardPresence(
+                    link.session, self._key(name, QUESTION), partial(self._tell_returned, name)
+                )
+            )
 
     def _link_reaching(self, shard: str, endpoints: Sequence[str]) -> _Link | None:
         """Return the link that leads to `shard` already, perhaps by another of its addresses."""
@@ -277,6 +286,14 @@ class ZenohCarrier:
             for feed, pumps in self._feeds.items():
                 pumps.append(self._pump_into(feed, link))
         return link
+
+    def tell_returns(self, returned: Callable[[str], None]) -> None:
+        """Call `returned` with the name of each shard that comes (back) into reach."""
+        self._returned = returned
+
+    def _tell_returned(self, shard: str) -> None:
+        if not self._closed:
+            self._returned(shard)
 
     def endpoint_of(self, shard: str) -> str:
         """Return where the shard is expected, for messages to people."""
@@ -328,6 +345,8 @@ class ZenohCarrier:
             close_session(link.session)
         for pump in pumps:
             pump.thread.join(JOIN_S)
+        for presence in self._presences:
+            presence.join(JOIN_S)
         # A thread that comes back from Zenoh while the interpreter ends would abort the process.
         self._inside.wait_empty(JOIN_S)
 
