@@ -14,6 +14,7 @@ from enact_dist.verify.simulation.disk import Disk
 from enact_dist.verify.simulation.faults import NONE, drawn
 from enact_dist.verify.simulation.history import conflict
 from enact_dist.verify.simulation.scenario import Scenario
+from enact_dist.verify.simulation.schedule import Schedule
 from enact_dist.verify.simulation.world import Clock, Host, S, World
 
 R, W, RE, WE, V = (
@@ -64,7 +65,7 @@ def test_clock_turns_durations_into_true_time(ppm):
 
 def test_paused_host_handles_afterwards_what_arrived_meanwhile():
     """A pause loses nothing and keeps the order."""
-    world = World(Random(0))
+    world = World(Schedule(0))
     host = Host(world, "h", drift_ppm=0, wall_offset_ns=0)
     seen: list[int] = []
     host.pause(S)
@@ -80,7 +81,7 @@ def test_paused_host_handles_afterwards_what_arrived_meanwhile():
 
 def test_restarted_host_forgets_what_it_had_planned():
     """A new life knows nothing of the old one's timers."""
-    world = World(Random(0))
+    world = World(Schedule(0))
     host = Host(world, "h", drift_ppm=0, wall_offset_ns=0)
     seen: list[int] = []
     host.later(S, lambda: seen.append(1))
@@ -94,16 +95,17 @@ def test_restarted_host_forgets_what_it_had_planned():
 @pytest.mark.parametrize("seed", range(20))
 def test_crash_keeps_a_prefix_and_what_was_reported(seed):
     """A disk loses no durable record that it reported, and nothing in the middle."""
-    world = World(Random(seed))
+    world = World(Schedule(seed))
     host = Host(world, "h", drift_ppm=0, wall_offset_ns=0)
-    disk, done = Disk(world, NONE), []
+    disk, done = Disk(world, NONE, "h"), []
     for number in range(1, 9):
         durability = Durability.DURABLE if number % 3 == 0 else Durability.OS
         persist = Persist(number, (SessionRecord(str(number), 1),), durability)
         submit = partial(disk.submit, host, persist, done.append)
         world.after(number * S // 1000, submit)
-    world.run_until(world.random.randrange(12 * S // 1000))
-    disk.crash(power_cut=True)
+    luck = Random(seed)
+    world.run_until(luck.randrange(12 * S // 1000))
+    disk.crash(power_cut=True, luck=luck)
 
     kept = [persist.ticket for persist in disk.log]
     assert kept == list(range(1, len(kept) + 1))

@@ -84,7 +84,9 @@ class ClientHost(Host):
         ttl_ns: int,
     ) -> None:
         super().__init__(world, name, drift_ppm=faults.drift_ppm, wall_offset_ns=0)
-        self.client = Client(f"{world.random.getrandbits(64):016x}", ttl_ns=ttl_ns, actor=name)
+        session = f"{world.schedule.stream(f'session of {name}').getrandbits(64):016x}"
+        self.client = Client(session, ttl_ns=ttl_ns, actor=name)
+        self.generation = 0
         self.starves_until_ns = 0
         self.cache: dict[Slot, tuple[str, int, int, Datum]] = {}
         self.threads_left = 0
@@ -92,6 +94,7 @@ class ClientHost(Host):
         self._faults = faults
         self._calls: dict[int, _Call] = {}
         self._calls_made = 0
+        self._late_answers = world.schedule.place(f"{name}-late")
 
     # ---------------------------------------------------------------- threads
 
@@ -160,7 +163,7 @@ class ClientHost(Host):
             return
         del self._calls[number]
         call.take(answer)
-        self._model.check_beliefs(self)
+        self._model.of_clients.check_beliefs(self)
 
     def _time_is_up(self, number: int) -> None:
         call = self._calls.get(number)
@@ -179,13 +182,16 @@ class ClientHost(Host):
     def _late(self, number: int, call: _Call, answer: Answer) -> None:
         """Deliver an answer that nobody waits for any more, where the faults say so."""
         del self._calls[number]
-        if self.world.random.random() < self._faults.late_answers:
+        coming = (self._late_answers.next() & 0xFFFF) < self._faults.late_answers * 0x10000
+        if coming and self.world.schedule.allows(self._late_answers.fault):
             self.world.tally["late answers"] += 1
+            text = f"{type(answer).__name__} comes after its caller gave up"
+            self.world.befell(self._late_answers.fault, text)
             if call.lock is not None and call.lock.phase.busy:
                 call.lock.answered(call.shard, call.request, answer, self.local_ns)
             else:
                 self.client.answered(call.shard, call.request, answer, self.local_ns)
-            self._model.check_beliefs(self)
+            self._model.of_clients.check_beliefs(self)
 
     # ---------------------------------------------------------------- the session
 
@@ -210,9 +216,10 @@ class ClientHost(Host):
 
     def keep_alive(self) -> None:
         """Renew the session at every shard, four times per TTL, until the process ends."""
-        starves = self.world.now_ns < self.starves_until_ns
-        if not (starves and self.world.random.random() < self._faults.starved):
+        if self.world.now_ns >= self.starves_until_ns:
             self._renew()
+        else:
+            self.world.tally["keep-alives starved"] += 1
         self.later(self.client.ttl_ns // 4, self.keep_alive)
 
     def _renew(self) -> None:
@@ -238,7 +245,7 @@ class ClientHost(Host):
             answers = yield Calls(calls, lock)
             for (shard, request), answer in zip(calls, answers, strict=True):
                 lock.answered(shard, request, answer, self.local_ns)
-            self._model.check_beliefs(self)
+            self._model.of_clients.check_beliefs(self)
         for shard, farewell in lock.take_farewells():
             self.call(shard, farewell, lambda _answer: None)
 

@@ -1,0 +1,72 @@
+"""`enact verify`: the real core under simulated faults, judged; see `enact_dist.verify`."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from enact_dist.cli.verbs import add_verb, seconds, whole
+
+if TYPE_CHECKING:
+    import argparse
+
+    from enact_dist.cli.verbs import Verb
+
+
+def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
+    """Add the verb, which has no noun."""
+    verify = add_verb(
+        nouns,
+        "verify",
+        "try to break the locks and commits of this version: simulated faults, a judge, no mercy",
+        run=run_verify,
+        example="enact verify                      200 seeds that nobody has run before\n"
+        "enact verify --minutes 10 --json\n"
+        "enact verify --seed 17            one run again, with its story",
+    )
+    add_simulation(verify)
+    verify.add_argument("--json", action="store_true", help="print one JSON object")
+
+
+def add_simulation(verify: Verb) -> None:
+    """Add the options of the simulation."""
+    verify.add_argument("--seeds", type=whole, metavar="N", help="how many (default: 200)")
+    verify.add_argument(
+        "--first", type=int, metavar="SEED", help="first of them (default: never the same twice)"
+    )
+    verify.add_argument(
+        "--jobs", type=whole, metavar="N", help="processes (default: one per processor)"
+    )
+    time = verify.add_mutually_exclusive_group()
+    time.add_argument("--seconds", type=seconds, metavar="S", help="how long to go on")
+    time.add_argument(
+        "--minutes", dest="seconds", type=minutes, metavar="M", help="how long to go on"
+    )
+    verify.add_argument("--keep-going", action="store_true", help="do not stop at a violation")
+    verify.add_argument(
+        "--shrink",
+        dest="shrink_s",
+        type=float,
+        default=60.0,
+        metavar="S",
+        help="seconds to look for a shorter schedule that still fails (default: 60; 0: do not)",
+    )
+    again = verify.add_argument_group("one run again")
+    again.add_argument("--seed", type=int, metavar="SEED", help="run this seed, and tell its story")
+    again.add_argument("--only", metavar="FAULT,…", help="with these faults only")
+    again.add_argument("--locks", metavar="LOCK,…", help="with these locks only")
+    again.add_argument("--clients", metavar="N,…", help="with these clients only")
+    again.add_argument(
+        "--until", dest="until_s", type=seconds, metavar="S", help="begin no lock after that"
+    )
+
+
+def minutes(text: str) -> float:
+    """Read a positive number of minutes as seconds; an `argparse` type."""
+    return seconds(text) * 60.0
+
+
+def run_verify(arguments: argparse.Namespace) -> int:
+    """Run what the options ask for."""
+    from enact_dist.verify.simulation import command
+
+    return command.run(arguments)
