@@ -42,7 +42,12 @@ def wrong_name(kind: str, name: str, *, slashes: bool) -> Refused | None:
 
 def wrong_aspect(entry: AspectEntry) -> Refused | None:
     """Refuse an aspect whose name or durability nobody could use."""
-    return wrong_name("aspect", entry.name, slashes=False) or _wrong_durability(entry.durability)
+    if entry.durability not in _DURABILITIES:
+        return _refused(
+            f"durability {entry.durability!r} of aspect {entry.name!r} was asked; there are"
+            f" {', '.join(filter(None, _DURABILITIES))}"
+        )
+    return wrong_name("aspect", entry.name, slashes=False)
 
 
 def wrong_writes(writes: Iterable[WriteItem]) -> Refused | None:
@@ -70,7 +75,7 @@ def wrong_parties(message: Commit | Prepare, *, peers: Collection[str]) -> Refus
                 f"{shard!r} was named to commit {message.lock} with this shard; the other shards"
                 f" of the cell are: {known}"
             )
-    return _wrong_durability(getattr(message, "durability", ""))
+    return None
 
 
 def wrong_finish(message: Finish, record: PreparedRecord) -> Refused | None:
@@ -81,12 +86,6 @@ def wrong_finish(message: Finish, record: PreparedRecord) -> Refused | None:
         f"shard {message.position.shard!r} is said to have committed {message.lock}, which was"
         f" prepared for shard {record.primary!r}"
     )
-
-
-def _wrong_durability(durability: str) -> Refused | None:
-    if durability in _DURABILITIES:
-        return None
-    return _refused(f"durability {durability!r} was asked; there are {_DURABILITIES[1:]}")
 
 
 def _refused(text: str) -> Refused:

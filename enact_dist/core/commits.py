@@ -88,7 +88,6 @@ class _InFlight:
     outcome: OutcomeRecord
     reply_to: list[int] = field(default_factory=list)
     decision: DecisionRecord | None = None
-    durability: Durability = Durability.VOLATILE
 
 
 class Commits:
@@ -202,9 +201,6 @@ class Commits:
         commit = _InFlight(tenure, message.writes, outcome, [reply_to])
         if message.participants:
             commit.decision = DecisionRecord(message.lock, outcome.position, message.participants)
-            # Even where all data are volatile: who was told that it has committed may rely on it.
-            asked = Durability(message.durability or Durability.OS.value)
-            commit.durability = max(Durability.OS, asked, key=_STRICTNESS.index)
         yield from self._make_durable(commit, now_ns=now_ns)
 
     def moved_on(self, expects: Iterable[SlotVersion], lock: LockId) -> SlotVersion | None:
@@ -233,7 +229,7 @@ class Commits:
 
     def _make_durable(self, commit: _InFlight, *, now_ns: int) -> Iterator[Effect]:
         """Hand the commit to the store, or apply it at once where nothing is to survive."""
-        durability = self.strictest(commit.writes, at_least=commit.durability)
+        durability = self._strictest(commit)
         stamp_ns = commit.outcome.position.stamp_ns
         records = self.records(commit.writes, commit.outcome.versions, stamp_ns)
         if durability is Durability.VOLATILE:
@@ -247,10 +243,15 @@ class Commits:
         decision = (commit.decision,) if commit.decision is not None else ()
         yield Persist(ticket, (*records, commit.outcome, *decision), durability)
 
-    def strictest(self, writes: Iterable[WriteItem], *, at_least: Durability) -> Durability:
-        """Return what a commit of these writes must survive."""
-        durabilities = [self._catalogue.durability(write.slot.aspect) for write in writes]
-        return max((at_least, *durabilities), key=_STRICTNESS.index)
+    def _strictest(self, commit: _InFlight) -> Durability:
+        """Return what a commit must survive: the most that one of its data asks for.
+
+        A decision is relied on by other shards, so it outlasts everything.
+        """
+        if commit.decision is not None:
+            return Durability.DURABLE
+        durabilities = [self._catalogue.durability(write.slot.aspect) for write in commit.writes]
+        return max(durabilities, key=_STRICTNESS.index, default=Durability.VOLATILE)
 
     def persisted(self, ticket: int, *, now_ns: int) -> Iterator[Effect]:
         """The store is done: apply, release and answer."""

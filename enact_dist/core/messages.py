@@ -255,7 +255,7 @@ class Commit:
 
     Every slot of `expects` must still be at that version, and in nobody's way (see `Commits`).
     Where other shards have prepared writes, they are the `participants`, and the record of this
-    commit decides for them too; it is kept as `durability` asks ("" leaves it to its own slots).
+    commit decides for them too; it is then forced to the disk, whatever its own data survive.
     """
 
     lock: LockId
@@ -264,7 +264,6 @@ class Commit:
     seen_stamp_ns: int
     expects: tuple[SlotVersion, ...] = ()
     participants: tuple[str, ...] = ()
-    durability: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -526,12 +525,15 @@ class Changed:
 
 @dataclass(frozen=True, slots=True)
 class Prepared:
-    """The writes are kept until the primary decides; their stamp is at least this one."""
+    """The writes are kept until the primary decides; their stamp is at least this one.
+
+    They outlast a power cut even where their data are `os` or volatile: so do the reads beside
+    them, on which the decision relies.
+    """
 
     lock: LockId
     stamp_ns: int
     versions: tuple[SlotVersion, ...]
-    durability: str
 
 
 @dataclass(frozen=True, slots=True)

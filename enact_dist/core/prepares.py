@@ -13,6 +13,9 @@ Rules a change must keep
   * `Finished` is said only when the end of the prepared state survives: after that the primary
     may forget, and would answer *aborted*.
   * Nobody sees the writes before their record is durable (a restart must not take them back).
+  * Promise and end are forced to the disk whatever the class of the data: a power cut that took
+    the promise would tear the commit and free reads that the decision relies on; one that took the
+    end would let this shard ask a primary that has forgotten.
 """
 
 from __future__ import annotations
@@ -45,6 +48,7 @@ from enact_dist.core.records import (
     Persist,
     PreparedEnded,
     PreparedRecord,
+    Record,
     Reply,
     Story,
 )
@@ -64,11 +68,11 @@ HINT_NS: Final = 50_000_000
 
 @dataclass(slots=True)
 class _AtStore:
-    """A preparation or an end that the store is working on; `position` belongs to an end."""
+    """A preparation (no stamp) or an end, with the commit's stamp, that the store works on."""
 
     tenure: Tenure
     record: PreparedRecord
-    position: Position | None = None
+    stamp_ns: int | None = None
     replies: list[int] = field(default_factory=list)
 
 
@@ -99,7 +103,7 @@ class PrepareDesk:
         tenure = state.tenures.by_lock.get(message.lock)
         if tenure is not None and tenure.prepared is not None:
             state.count("prepares_repeated")
-            yield Reply(reply_to, self._prepared(tenure.prepared))
+            yield Reply(reply_to, _prepared(tenure.prepared))
             return
         under_way = self._at_store_of(message.lock)
         if under_way is not None:
@@ -130,25 +134,13 @@ class PrepareDesk:
             message.primary_token,
         )
         state.pins.pop(message.lock, None)
-        yield self._persist(
-            _AtStore(tenure, record, replies=[reply_to]), (record,), self._survives(record)
-        )
+        yield self._persist(_AtStore(tenure, record, replies=[reply_to]), (record,))
 
-    def _persist(
-        self, work: _AtStore, records: tuple[object, ...], durability: Durability
-    ) -> Effect:
+    def _persist(self, work: _AtStore, records: tuple[Record, ...]) -> Effect:
         work.tenure.committing = True
         ticket = self._state.commits.new_ticket()
         self._at_store[ticket] = work
-        return Persist(ticket, records, durability)  # type: ignore[arg-type]  # records they are
-
-    def _survives(self, record: PreparedRecord) -> Durability:
-        """Return what the record must survive: volatile writes too must reach their decision."""
-        return self._state.commits.strictest(record.writes, at_least=Durability.OS)
-
-    def _prepared(self, record: PreparedRecord) -> Prepared:
-        durability = self._survives(record)
-        return Prepared(record.lock, record.stamp_ns, record.versions, durability.value)
+        return Persist(ticket, records, Durability.DURABLE)
 
     def _at_store_of(self, lock: LockId) -> _AtStore | None:
         return next((work for work in self._at_store.values() if work.record.lock == lock), None)
@@ -158,20 +150,20 @@ class PrepareDesk:
         work = self._at_store.pop(ticket)
         tenure, record = work.tenure, work.record
         tenure.committing = False
-        if work.position is None:
+        if work.stamp_ns is None:
             tenure.prepared = record
             self._ask_ns[record.lock] = self._state.now_ns + self._ask_again_ns(record.lock)
             self._state.count("prepared")
             for reply_to in work.replies:
-                yield Reply(reply_to, self._prepared(record))
+                yield Reply(reply_to, _prepared(record))
             return
-        stamp_ns = work.position.stamp_ns
-        changes = self._state.commits.apply_writes(record.writes, record.versions, stamp_ns)
+        commits = self._state.commits
+        changes = commits.apply_writes(record.writes, record.versions, work.stamp_ns)
         yield from self._end(tenure)
         self._state.count("commits_finished")
         for reply_to in work.replies:
             yield Reply(reply_to, Finished(record.lock))
-        yield from self._state.commits.publish(changes)
+        yield from commits.publish(changes)
 
     # ---------------------------------------------------------------- the decision
 
@@ -195,12 +187,12 @@ class PrepareDesk:
         if under_way is not None:
             under_way.replies += replies
             return
-        self._state.stamps.saw(position.stamp_ns)
-        written = self._state.commits.records(record.writes, record.versions, position.stamp_ns)
+        # Never before what views were told of the lock, whatever its client has said elsewhere.
+        stamp_ns = max(position.stamp_ns, record.stamp_ns)
+        self._state.stamps.saw(stamp_ns)
+        written = self._state.commits.records(record.writes, record.versions, stamp_ns)
         yield self._persist(
-            _AtStore(tenure, record, position, replies),
-            (*written, PreparedEnded(record.lock)),
-            self._survives(record),
+            _AtStore(tenure, record, stamp_ns, replies), (*written, PreparedEnded(record.lock))
         )
 
     def _end(self, tenure: Tenure) -> Iterator[Effect]:
@@ -308,3 +300,7 @@ class PrepareDesk:
         assert prepared == set(self._ask_ns), (prepared, self._ask_ns)
         for lock in prepared:
             assert self._state.tenures.by_lock[lock].claim.granted, "prepared without its locks"
+
+
+def _prepared(record: PreparedRecord) -> Prepared:
+    return Prepared(record.lock, record.stamp_ns, record.versions)

@@ -72,7 +72,7 @@ def test_commit_with_participants_that_cannot_be_told_is_refused(bench, parties)
     """An unknown shard, and this one itself; else the decision would be kept for ever."""
     grant = bench.granted(ANN, item(W))
 
-    refused(bench.ask(Commit(ANN, grant.token, WRITES, 0, (), parties, "os")), "far")
+    refused(bench.ask(Commit(ANN, grant.token, WRITES, 0, (), parties)), "far")
 
     assert not bench.shard.state.decisions.by_lock
     assert free(bench)
@@ -81,7 +81,7 @@ def test_commit_with_participants_that_cannot_be_told_is_refused(bench, parties)
 def test_participant_named_twice_counts_once(bench):
     """It is told once, and once it has finished the decision is over."""
     grant = bench.granted(ANN, item(W))
-    answer = bench.ask(Commit(ANN, grant.token, WRITES, 0, (), ("far", "far"), "os"))
+    answer = bench.ask(Commit(ANN, grant.token, WRITES, 0, (), ("far", "far")))
 
     assert isinstance(answer, Committed)
     assert [shard for shard, _ in bench.calls] == ["far"]
@@ -96,25 +96,6 @@ def test_prepare_for_a_primary_that_cannot_be_asked_is_refused(bench, primary):
 
     bench.ask(Release(ANN))
     assert free(bench)
-
-
-@pytest.mark.parametrize("parties", [(), ("far",)])
-def test_commit_of_unknown_durability_is_refused(bench, parties):
-    """What it would have to survive is not known."""
-    grant = bench.granted(ANN, item(W))
-
-    refused(bench.ask(Commit(ANN, grant.token, WRITES, 0, (), parties, "bogus")), "bogus")
-
-    assert free(bench)
-
-
-def test_decision_is_on_disk_though_its_client_asked_for_less(bench):
-    """The participants rely on it."""
-    grant = bench.granted(ANN, item(W, aspect="frame"))
-    writes = (WriteItem(slot(aspect="frame"), datum()),)
-    bench.disk_is_done = False
-
-    assert bench.ask(Commit(ANN, grant.token, writes, 0, (), ("far",), "volatile")) is None
 
 
 def test_prepared_lock_does_not_commit_by_itself(bench):
@@ -236,7 +217,7 @@ def any_request(random: Random, grants: dict[Any, Token]) -> Any:
         if "writes" in names and random.random() < 0.8:
             changes["writes"] = WRITES
         if random.random() < 0.6:
-            usual = {"participants": (), "primary": "far", "durability": "", "expects": ()}
+            usual = {"participants": (), "primary": "far", "expects": ()}
             changes |= {name: value for name, value in usual.items() if name in names}
             if "seen_stamp_ns" in names:
                 changes["seen_stamp_ns"] = 0

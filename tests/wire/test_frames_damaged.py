@@ -167,7 +167,7 @@ def test_frame_with_a_body_elsewhere_is_refused(offset, size):
     write = [list(SLOT), [b"\x01\x00", offset, size, 0]]
 
     with pytest.raises(ProtocolError):
-        decode_frame(header_of(7, list(LOCK), [1, 1], [write], 0, [], [], ""), b"x" * 100)
+        decode_frame(header_of(7, list(LOCK), [1, 1], [write], 0, [], []), b"x" * 100)
 
 
 def test_frame_bodies_cannot_overlap():
@@ -175,7 +175,7 @@ def test_frame_bodies_cannot_overlap():
     write = [list(SLOT), [b"\x01\x00", 0, 100, 0]]
 
     with pytest.raises(ProtocolError, match="expected at 128"):
-        decode_frame(header_of(7, list(LOCK), [1, 1], [write, write], 0, [], [], ""), b"x" * 100)
+        decode_frame(header_of(7, list(LOCK), [1, 1], [write, write], 0, [], []), b"x" * 100)
 
 
 @pytest.mark.parametrize("mark", [b"\xdd", b"\xdf", b"\xdb", b"\xc6", b"\xc9"])
