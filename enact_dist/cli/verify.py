@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from enact_dist.cli.verbs import add_verb, seconds, whole
@@ -19,11 +20,13 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
         "verify",
         "try to break the locks and commits of this version: simulated faults, a judge, no mercy",
         run=run_verify,
-        example="enact verify                      200 seeds that nobody has run before\n"
+        example="enact verify\n"
         "enact verify --minutes 10 --json\n"
-        "enact verify --seed 17            one run again, with its story",
+        "enact verify --seed 17\n"
+        "enact verify --recovery",
     )
     add_simulation(verify)
+    add_recovery(verify)
     verify.add_argument("--json", action="store_true", help="print one JSON object")
 
 
@@ -60,6 +63,43 @@ def add_simulation(verify: Verb) -> None:
     )
 
 
+def add_recovery(verify: Verb) -> None:
+    """Add the options of the recovery figures."""
+    recovery = verify.add_argument_group("recovery figures")
+    recovery.add_argument(
+        "--recovery",
+        action="store_true",
+        help="kill real daemons and clients of a throw-away cell; say how soon locks are back",
+    )
+    recovery.add_argument(
+        "--rounds", type=whole, default=5, metavar="N", help="deaths per figure (default: 5)"
+    )
+
+
+def add_chaos(verify: Verb) -> None:
+    """Add the options of the run of real processes; it takes `--seed` and `--minutes` too."""
+    chaos = verify.add_argument_group("real daemons and clients")
+    what = chaos.add_mutually_exclusive_group()
+    what.add_argument(
+        "--chaos",
+        action="store_true",
+        help="kill, stop and cut off real processes for a minute, and check what they saw",
+    )
+    what.add_argument(
+        "--history", type=Path, metavar="FOLDER", help="check what a run has kept once more"
+    )
+    chaos.add_argument("--shards", type=whole, default=3, metavar="N", help="default: 3")
+    chaos.add_argument("--actors", type=whole, default=8, metavar="N", help="default: 8")
+    chaos.add_argument(
+        "--keep", type=Path, metavar="FOLDER", help="a new folder that keeps journals and data"
+    )
+    chaos.add_argument(
+        "--require-namespaces",
+        action="store_true",
+        help="fail where there are no network namespaces, instead of leaving partitions out",
+    )
+
+
 def minutes(text: str) -> float:
     """Read a positive number of minutes as seconds; an `argparse` type."""
     return seconds(text) * 60.0
@@ -67,6 +107,14 @@ def minutes(text: str) -> float:
 
 def run_verify(arguments: argparse.Namespace) -> int:
     """Run what the options ask for."""
+    if arguments.chaos or arguments.history is not None:
+        from enact_dist.verify.chaos import command as chaos
+
+        return chaos.run(arguments)
+    if arguments.recovery:
+        from enact_dist.verify import recovery
+
+        return recovery.run(arguments)
     from enact_dist.verify.simulation import command
 
     return command.run(arguments)

@@ -16,14 +16,18 @@ its predecessor ended.
 
 from __future__ import annotations
 
+import sys
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from enact_dist.cli.output import print_json, print_table
+from enact_dist.cli.verbs import DONE, FAILED
 from enact_dist.verify.daemons import CellProcesses
 
 if TYPE_CHECKING:
+    import argparse
     from collections.abc import Callable
 
     from enact_dist.verify.daemons import LineProcess
@@ -52,6 +56,27 @@ class RecoveryFigure:
         """Whether 99 of 100 rounds, all below a hundred, kept the goal."""
         return self.share_s(0.99) <= self.goal_s
 
+    def as_json(self) -> dict[str, object]:
+        """Return the figure with every single time, in seconds."""
+        return {
+            "name": self.name,
+            "rounds": len(self.times_s),
+            "p50_s": self.share_s(0.5),
+            "p99_s": self.share_s(0.99),
+            "max_s": self.times_s[-1],
+            "goal_s": self.goal_s,
+            "met": self.met,
+            "times_s": self.times_s,
+        }
+
+    def as_row(self) -> tuple[object, ...]:
+        """Return the figure as a line of a table."""
+        p50, p99, longest, goal = (
+            f"{value_s:.3f} s"
+            for value_s in (self.share_s(0.5), self.share_s(0.99), self.times_s[-1], self.goal_s)
+        )
+        return self.name, len(self.times_s), p50, p99, longest, goal, "yes" if self.met else "NO"
+
 
 def measure(
     rounds: int = ROUNDS, *, ttl_s: float = TTL_S, say: Callable[[str], None] = lambda _: None
@@ -69,7 +94,7 @@ def measure(
     measured = []
     for name, shards, goal_s, run in (
         ("shard restarted, all clients alive", (SHARD,), 0.5, _all_alive),
-        ("shard restarted, one client dead", (SHARD,), 1.02 * ttl_s + 0.1, _one_dead),
+        ("shard restarted, one client dead", (SHARD,), ttl_s + 0.1, _one_dead),
         ("holder killed", (SHARD,), ttl_s + 0.1, _holder_killed),
         ("client killed in doubt", ("left", "right"), 2 * ttl_s, _in_doubt),
     ):
@@ -86,6 +111,28 @@ def measure(
             times_s = [run(cell, asker) for _ in range(rounds)]
         measured.append(RecoveryFigure(name, tuple(sorted(times_s)), goal_s))
     return measured
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Measure and print all figures; status 1 if one missed its goal.
+
+    Raises:
+        LinkError: A process ended or hung.
+    """
+    figures = measure(arguments.rounds, say=_say)
+    if arguments.json:
+        print_json([figure.as_json() for figure in figures])
+    else:
+        print_table(
+            ("after", "rounds", "p50", "p99", "longest", "goal", "met"),
+            [figure.as_row() for figure in figures],
+            empty="nothing measured",
+        )
+    return DONE if all(figure.met for figure in figures) else FAILED
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
 
 
 def _client(cell: CellProcesses, role: str, word: str) -> LineProcess:
