@@ -23,10 +23,12 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
         example="enact verify\n"
         "enact verify --minutes 10 --json\n"
         "enact verify --seed 17\n"
-        "enact verify --recovery",
+        "enact verify --recovery\n"
+        "enact verify --chaos --minutes 5",
     )
     add_simulation(verify)
     add_recovery(verify)
+    add_chaos(verify)
     verify.add_argument("--json", action="store_true", help="print one JSON object")
 
 

@@ -136,7 +136,7 @@ class Checker:
         stories: Iterable[LockStory],
         chains: Mapping[Any, Sequence[State]],
         *,
-        events: Mapping[Writer, tuple[int, int]] | None = None,
+        events: Mapping[Any, tuple[int, int]] | None = None,
         lost: Collection[Writer] = (),
         applied: Collection[Writer] | None = None,
     ) -> None:

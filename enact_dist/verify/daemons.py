@@ -112,6 +112,13 @@ class LineProcess:
         """Its exit status; None while it runs."""
         return self._popen.poll()
 
+    def wait_status(self, timeout_s: float) -> int | None:
+        """Wait for its end for so long; return its exit status, None while it runs."""
+        try:
+            return self._popen.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            return None
+
     def signal(self, number: int) -> None:
         """Send it a signal."""
         self._popen.send_signal(number)
