@@ -128,6 +128,10 @@ def _open_locked(folder: Path, lock: FolderLock, unix_s: int) -> tuple[Store, Re
     found = look_at(folder)
     check_format(folder, is_new=found.is_new)
     check_log(folder, power_cut=found.power_cut)
+    if found.is_new and found.mark is None:
+        # Before the first byte of the log: only a mark tells a power cut from damage.
+        MarkFile.open(folder, 0).close()
+        sync_folder(folder)
     database, contents = open_database(folder, found)
     try:
         epoch = max(contents.recovered.epoch + 1, unix_s)
@@ -190,9 +194,9 @@ class Store:
             self._blob_of.pop(key, None)
         self._forget_ended(changes, wall_ns=wall_ns)
         self._commit(changes, forced=True)
+        self._mark = MarkFile.open(self._folder, self._batch)
         sync_folder(self._folder)
         sync_folder(self._folder.parent)
-        self._mark = MarkFile.open(self._folder, self._batch)
         self._blobs.sweep(blob.name for blob in self._blob_of.values())
 
     # ---------------------------------------------------------------- writing

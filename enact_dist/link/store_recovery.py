@@ -98,6 +98,11 @@ class Found(NamedTuple):
     power_cut: bool
     """Whether the system has started anew since the store was last opened."""
 
+    @property
+    def is_first(self) -> bool:
+        """Whether no start before this one ever came to its end: nothing was acknowledged."""
+        return self.mark.batch == 0 if self.mark is not None else self.is_new
+
 
 def refuse(path: Path, found: str, remedy: str = _RESTORE) -> NoReturn:
     """Raise the `StoreError` of a damaged file.
@@ -120,11 +125,16 @@ def look_at(folder: Path) -> Found:
     is_new = not database.exists() or database.stat().st_size == 0
     if is_new:
         log = folder / LOG_FILE
-        blobs = folder / BLOB_FOLDER
         has_log = log.exists() and log.stat().st_size > 0
-        if mark is not None or has_log or (blobs.exists() and any(blobs.iterdir())):
+        has_mark = mark is not None and mark.batch > 0
+        if has_mark or has_log or _has_blobs(folder):
             refuse(database, "is missing or empty, but the folder has been in use")
     return Found(mark, is_new, mark is not None and mark.boot != boot_id())
+
+
+def _has_blobs(folder: Path) -> bool:
+    blobs = folder / BLOB_FOLDER
+    return blobs.exists() and any(blobs.iterdir())
 
 
 def check_log(folder: Path, *, power_cut: bool) -> None:
@@ -170,7 +180,7 @@ def open_database(folder: Path, found: Found) -> tuple[Database, Contents]:
         problems = database.problems()
         if problems:
             refuse(path, f"is damaged: {'; '.join(problems)}")
-        if found.is_new:
+        if found.is_first:
             database.make_table()
         contents = read_contents(database, path)
         _check_complete(folder, contents, found)
@@ -185,7 +195,8 @@ def open_database(folder: Path, found: Found) -> tuple[Database, Contents]:
 
 def _check_complete(folder: Path, contents: Contents, found: Found) -> None:
     """Compare what was read with what the mark says was acknowledged."""
-    if EPOCH_KEY not in contents.ids and (contents.ids or found.mark is not None):
+    in_use = contents.ids or not found.is_first or _has_blobs(folder)
+    if EPOCH_KEY not in contents.ids and in_use:
         refuse(folder / DATABASE_FILE, "holds no epoch: rows are missing")
     if found.mark is None or contents.batch >= found.mark.batch:
         return
