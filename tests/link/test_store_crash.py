@@ -19,11 +19,13 @@ from store_writer import contents, group_versions, outcome_record, persist, reop
 from enact_dist.core.datum import Slot
 from enact_dist.core.records import SessionRecord, SlotRecord
 from enact_dist.errors import StoreError
+from enact_dist.link.folder_lock import FORMAT
 from enact_dist.link.store import open_store
 from enact_dist.link.store_database import Database
 from enact_dist.link.store_mark import MarkFile
 from enact_dist.terms import Durability
 
+FORMAT_LINE = f"enact-dist store {FORMAT}\n".encode()
 FRAME_BYTES = 24 + 4096
 LOG_HEADER_BYTES = 32
 
@@ -176,10 +178,10 @@ def test_crash_at_the_first_opening_leaves_a_usable_folder(tmp_path):
     database = (crashed / "store.db").read_bytes()
     Database(tmp_path / "bare.db").close()
     bare = (tmp_path / "bare.db").read_bytes()
-    marked = {"format": b"enact-dist store 1\n", "mark": first_mark(tmp_path)}
+    marked = {"format": FORMAT_LINE, "mark": first_mark(tmp_path)}
     steps = [
         {},
-        {"format": b"enact-dist store 1\n"},
+        {"format": FORMAT_LINE},
         marked,
         {**marked, "store.db": b""},
         {**marked, "store.db": bare},
