@@ -263,7 +263,7 @@ class Client:
         return Plan(
             tuple((shard, tuple(locks[shard])) for shard in sorted(locks)),
             tuple((shard, tuple(views[shard])) for shard in sorted(views)),
-            self.placement.version,
+            self.placement,
             max((self._unsettled.get(shard, 0) for shard in views), default=0),
         )
 

@@ -415,7 +415,8 @@ class Granted:
     """The lock is held.  `states`: every named slot, and every matching one of a pattern.
 
     `count_seen` is the highest message counter that had arrived from the session; `hold_left_ns`
-    counts from when this was sent.  `stamp_ns` is the shard's hybrid logical time.
+    counts from when this was sent.  `stamp_ns` is the shard's hybrid logical time, `from_ns` the
+    largest stamp of what is shown: views elsewhere must not lie before it.
     """
 
     lock: LockId
@@ -425,6 +426,7 @@ class Granted:
     hold_left_ns: int
     stamp_ns: int
     states: tuple[SlotState, ...]
+    from_ns: int = 0
 
 
 @dataclass(frozen=True, slots=True)
