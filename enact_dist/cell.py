@@ -14,10 +14,12 @@ from typing import TYPE_CHECKING, Any
 
 from enact_dist.core.datum import Position
 from enact_dist.core.messages import (
+    Audited,
     AwaitStamp,
     Break,
     Broken,
     ForceAbort,
+    ListAudit,
     ListLocks,
     ListSessions,
     Locks,
@@ -31,6 +33,7 @@ from enact_dist.terms import checked_name
 from enact_dist.world import WorldContext
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
     from types import TracebackType
 
     from enact_dist.core.messages import Holder
@@ -107,6 +110,23 @@ class ActorInfo:
     lease_left_s: float
     locks: int
     report: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class AuditInfo:
+    """An act of an operator at a shard, or what came of one.
+
+    Attributes:
+        stamp_s: When, by the shard's wall clock, seconds since 1970.
+        kind: "broken" or "forced" (what was done), "confirmed" or "alarm" (what a lost shard said
+            when it was back), "settled" (somebody has seen to all alarms before).
+        text: Who or what, and the reason that was given.
+    """
+
+    shard: str
+    stamp_s: float
+    kind: str
+    text: str
 
 
 class Cell:
@@ -194,13 +214,16 @@ class Cell:
 
     # ---------------------------------------------------------------- people
 
-    def locks(self) -> tuple[LockInfo, ...]:
+    def locks(self, shards: Iterable[str] | None = None) -> tuple[LockInfo, ...]:
         """Return all locks held or awaited, oldest first within each shard.
+
+        Args:
+            shards: Where to look; everywhere unless given.
 
         Raises:
             ShardUnreachableError: A shard does not answer.
         """
-        shards = self._client.shards()
+        shards = self._client.shards() if shards is None else tuple(shards)
         answers = self._client.call_all([(shard, ListLocks()) for shard in shards])
         return tuple(
             lock_info(shard, holder)
@@ -235,12 +258,46 @@ class Cell:
         """
         return self._ended_by_hand(shard, ForceAbort(number, reason))
 
-    def _ended_by_hand(self, shard: str, request: Break | ForceAbort) -> LockInfo | None:
+    def audit(self, shards: Iterable[str] | None = None) -> tuple[AuditInfo, ...]:
+        """Return what operators did and what came of it, oldest first; `shards` as in `locks`.
+
+        An "alarm" is a lock that `force_abort` has ended on one shard though another had committed
+        it: only a part of its writes stands.
+
+        Raises:
+            ShardUnreachableError: A shard does not answer.
+        """
+        shards = self._client.shards() if shards is None else tuple(shards)
+        answers = self._client.call_all([(shard, ListAudit("")) for shard in shards])
+        found = [
+            AuditInfo(shard, entry.wall_ns / 1e9, entry.kind, entry.text)
+            for shard, answer in zip(shards, answers, strict=True)
+            if isinstance(answer, Audited)
+            for entry in answer.entries
+        ]
+        return tuple(sorted(found, key=lambda entry: entry.stamp_s))
+
+    def settle_alarms(self, *, shard: str, how: str) -> None:
+        """Say that somebody has seen to all alarms of a shard so far; audited by the shard.
+
+        Raises:
+            MisuseError: The cell has no such shard, or `how` says nothing.
+            ShardUnreachableError: The shard does not answer.
+        """
+        if not how.strip():
+            raise MisuseError("alarms are settled by saying how: how='' says nothing")
+        self._check_shard(shard)
+        self._client.call(shard, ListAudit(how))
+
+    def _check_shard(self, shard: str) -> None:
         if shard not in self._client.shards():
             raise MisuseError(
                 f"cell {self.name!r} has no shard {shard!r}; it has"
                 f" {', '.join(self._client.shards())}"
             )
+
+    def _ended_by_hand(self, shard: str, request: Break | ForceAbort) -> LockInfo | None:
+        self._check_shard(shard)
         answer = self._client.call(shard, request)
         holder = answer.holder if isinstance(answer, Broken) else None
         return lock_info(shard, holder) if holder is not None else None

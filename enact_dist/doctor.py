@@ -301,6 +301,16 @@ def _shard(shard: ShardInfo) -> Iterator[Finding]:
         return
     yield _connection(subject, shard)
     yield clock_skew(f"clock of {shard.name}", shard.clock_ahead_s)
+    alarms = shard.counters.get("alarms", 0)
+    if alarms:
+        yield Finding(
+            Level.FAIL,
+            f"commits on {shard.name}",
+            f"{alarms} locks that were aborted by hand had been committed elsewhere: they stand"
+            " only in part",
+            "read enact lock audit, mend the data, then enact lock audit --settle TEXT"
+            f" --shard {shard.name}",
+        )
 
 
 def _connection(subject: str, shard: ShardInfo) -> Finding:

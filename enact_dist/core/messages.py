@@ -141,6 +141,14 @@ class SessionInfo(NamedTuple):
     report: bytes
 
 
+class AuditEntry(NamedTuple):
+    """An operator's act at a shard, or what came of one; `kind` is one of `core.forced`."""
+
+    wall_ns: int
+    kind: str
+    text: str
+
+
 class Counter(NamedTuple):
     """One named statistic of a shard."""
 
@@ -382,6 +390,16 @@ class ForceAbort:
 
     number: int
     reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class ListAudit:
+    """List what operators did here.  Answer: `Audited`.
+
+    A text in `settle` says that somebody has seen to all alarms so far, and how.
+    """
+
+    settle: str
 
 
 # ---------------------------------------------------------------- answers
@@ -640,6 +658,14 @@ class Broken:
 
 
 @dataclass(frozen=True, slots=True)
+class Audited:
+    """The newest acts of operators, oldest first, and how many alarms nobody has seen to."""
+
+    alarms: int
+    entries: tuple[AuditEntry, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class EpochChanged:
     """The shard is in this epoch and does not know the session there: drop, say Hello, go on."""
 
@@ -704,6 +730,7 @@ Request = (
     | ListSessions
     | Break
     | ForceAbort
+    | ListAudit
 )
 Answer = (
     Welcome
@@ -729,6 +756,7 @@ Answer = (
     | Locks
     | Sessions
     | Broken
+    | Audited
     | EpochChanged
     | WrongShard
     | Refused

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final
 from enact_dist.core import inspection
 from enact_dist.core.commits import Commits
 from enact_dist.core.decisions import Decisions
+from enact_dist.core.forced import Audit
 from enact_dist.core.messages import AspectEntry, PlacementMap
 from enact_dist.core.sessions import Session, SessionTable
 from enact_dist.core.slots import Catalogue, SlotMap
@@ -101,6 +102,7 @@ class ShardState:
             epoch=self.epoch, slots=self.slots, sessions=self.sessions, count=self.count
         )
         self.tenures.describe = self.describe
+        self.audit = Audit(recovered.audit)
         self.decisions = Decisions(recovered.decisions, now_ns=now_ns, count=self.count)
         self.commits = Commits(
             shard=settings.name,

@@ -31,6 +31,8 @@ from enact_dist.core.records import (
     AuditRecord,
     DecisionDone,
     DecisionRecord,
+    ForcedEnded,
+    ForcedRecord,
     OutcomeRecord,
     PreparedEnded,
     PreparedRecord,
@@ -48,6 +50,8 @@ from enact_dist.link.store_mark import MarkFile
 from enact_dist.link.store_prepared import (
     decision_key,
     decision_row,
+    forced_key,
+    forced_row,
     prepared_key,
     prepared_row,
     prepared_writes,
@@ -108,7 +112,7 @@ def open_store(folder: Path, *, unix_s: int) -> tuple[Store, Recovered]:
         The store, and everything it holds; large bodies are read-only maps of their files.
 
     Raises:
-        StoreError: The folder is in use, of a newer format, damaged, or cannot be written.
+        StoreError: The folder is in use, of another format, damaged, or cannot be written.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -293,6 +297,11 @@ class Store:
             key, body = decision_row(record)
         elif isinstance(record, DecisionDone):
             changes[decision_key(record.lock)] = None
+            return
+        elif isinstance(record, ForcedRecord):
+            key, body = forced_row(record)
+        elif isinstance(record, ForcedEnded):
+            changes[forced_key(record.lock)] = None
             return
         elif isinstance(record, AuditRecord):
             key, body = audit_row(record, batch=self._batch + 1, number=len(changes))

@@ -26,6 +26,7 @@ from enact_dist.link.store_mark import Mark, boot_id, read_mark
 from enact_dist.link.store_prepared import (
     lock_of_write,
     read_decision,
+    read_forced,
     read_prepared,
     read_prepared_lock,
     slot_of_write,
@@ -36,6 +37,7 @@ from enact_dist.link.store_rows import (
     Key,
     Kind,
     read_aspect,
+    read_audit,
     read_ended,
     read_epoch,
     read_outcome,
@@ -260,8 +262,10 @@ def _read_row(row: DatabaseRow, contents: Contents) -> None:
             recovered.decisions.append(read_decision(key, row.body))
         case Kind.OUTCOME:
             recovered.outcomes.append(read_outcome(key, row.body))
+        case Kind.FORCED:
+            recovered.forced.append(read_forced(key, row.body))
         case Kind.AUDIT:
-            pass
+            recovered.audit.append(read_audit(row.body))
 
 
 def read_blobs(contents: Contents, blobs: BlobFolder, *, power_cut: bool) -> None:

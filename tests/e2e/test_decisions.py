@@ -9,7 +9,7 @@ from enact_dist.link import client as link_client
 
 pytestmark = pytest.mark.slow
 ROUNDS = int(os.environ.get("ENACT_DECISION_KILLS", "10"))
-TTL_S = float(os.environ.get("ENACT_DECISION_TTL_S", "1.0"))
+TTL_S = float(os.environ.get("DECISION_KILLS_TTL_S", "1.0"))
 
 
 @pytest.mark.parametrize("step", STEP_AT)

@@ -5,8 +5,11 @@ import pytest
 from enact_dist.core.datum import Datum, LockId, Position, Slot, Token
 from enact_dist.core.messages import Item, SlotVersion, WriteItem
 from enact_dist.core.records import (
+    AuditRecord,
     DecisionDone,
     DecisionRecord,
+    ForcedEnded,
+    ForcedRecord,
     Persist,
     PreparedEnded,
     PreparedRecord,
@@ -119,3 +122,17 @@ def test_decision_comes_back_until_it_is_done(tmp_path):
 
     assert kept(tmp_path, decision).decisions == [decision]
     assert kept(tmp_path, DecisionDone(LOCK)).decisions == []
+
+
+def test_abort_by_hand_is_given_back_until_its_primary_has_answered(tmp_path):
+    """What was aborted by hand and what an operator did outlive the process."""
+    forced = ForcedRecord(LOCK, "far", Token(3, 4), (SMALL, NULL))
+    acts = (AuditRecord(5, "given up", "forced"), AuditRecord(6, "torn", "alarm"))
+
+    found = kept(tmp_path, forced, *acts)
+    assert found.forced == [forced]
+    assert sorted(found.audit, key=lambda act: act.wall_ns) == list(acts)
+
+    found = kept(tmp_path, ForcedEnded(LOCK))
+    assert found.forced == []
+    assert len(found.audit) == 2
