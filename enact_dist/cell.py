@@ -212,6 +212,28 @@ class Cell:
             if time.monotonic() >= deadline_s:
                 return False
 
+    def outcome(self, lock_id: str, *, timeout_s: float = 10.0) -> Position | None:
+        """Ask what became of a commit that ended in `CommitUnknownError`.
+
+        A commit that its shard has not taken yet never comes true after this.
+
+        Args:
+            lock_id: As the error has it; any process of the cell may ask.
+            timeout_s: How long the shard may stay without an answer.
+
+        Returns:
+            Where it stands in time, or None if nothing was written.
+
+        Raises:
+            CommitUnknownError: The shard cannot tell (any more): 64 later commits of the process
+                have ended in this error, too, or the process has been gone for a day.
+            ShardUnreachableError: The shard does not answer.
+            LockHeldError: This thread holds a lock.
+            MisuseError: `lock_id` is none of this cell.
+        """
+        refuse_inside_lock("outcome")
+        return self._client.outcome(lock_id, timeout_s=timeout_s)
+
     # ---------------------------------------------------------------- people
 
     def locks(self, shards: Iterable[str] | None = None) -> tuple[LockInfo, ...]:
