@@ -172,8 +172,10 @@ class Commits:
             yield Reply(reply_to, _committed(recorded))
             return
         tenure = self._tenures.by_lock.get(message.lock)
-        if tenure is not None and tenure.committing:
-            self._in_flight_of(tenure).reply_to.append(reply_to)
+        at_store = tenure is not None and tenure.committing
+        in_flight = self._in_flight_of(message.lock) if at_store else None
+        if in_flight is not None:
+            in_flight.reply_to.append(reply_to)
             return
         refusal = self.refusal(message, tenure, wall_ns=wall_ns)
         if refusal is not None:
@@ -317,13 +319,14 @@ class Commits:
         self, message: Commit | Prepare, tenure: Tenure | None, *, wall_ns: int
     ) -> Fenced | EpochChanged | Refused | None:
         """Return why this holder may not write this now, None if it may."""
-        wrong = wrong_writes(message.writes) or wrong_parties(message, peers=self._peers)
-        if wrong is not None:
-            return wrong
+        # The fence comes first: what a stranger asks must not end the holder's lock.
         fenced = self._fence(message.lock, message.token, tenure)
         if fenced is not None:
             return fenced
         assert tenure is not None
+        wrong = wrong_writes(message.writes) or wrong_parties(message, peers=self._peers)
+        if wrong is not None:
+            return wrong
         if tenure.bound:
             return Refused("protocol", f"{message.lock} is being committed in another way")
         uncovered = [write.slot for write in message.writes if not tenure.covers(write.slot)]
@@ -428,8 +431,9 @@ class Commits:
         outcome = lane.outcome if lane is not None else None
         return outcome if outcome is not None and outcome.lock == lock else None
 
-    def _in_flight_of(self, tenure: Tenure) -> _InFlight:
-        return next(commit for commit in self._in_flight.values() if commit.tenure is tenure)
+    def _in_flight_of(self, lock: LockId) -> _InFlight | None:
+        """Return the commit of a lock that the store works on; it may work on a promise instead."""
+        return next((c for c in self._in_flight.values() if c.tenure.lock == lock), None)
 
 
 def _committed(outcome: OutcomeRecord) -> Committed:
