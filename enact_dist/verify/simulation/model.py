@@ -156,6 +156,8 @@ class Model:
                 # What is prepared here comes later, however early it was decided elsewhere.
                 by = f"{writer} under {prepared[slot]}" if slot in prepared else writer
                 picture.put(slot, State(*name, by, picture.epoch, content.datum))
+        if len(recovered.outcomes) > len(picture.lanes):
+            self._fail("I14 one outcome per lane", len(recovered.outcomes), len(picture.lanes))
         picture.arrivals.clear()
         picture.granted.clear()
         picture.granted_ever.clear()

@@ -70,6 +70,7 @@ def run_series(
     *,
     count: int | None = None,
     seconds: float | None = None,
+    at_least: int = 0,
     jobs: int = 1,
     step: int = 1,
     keep_going: bool = False,
@@ -81,6 +82,7 @@ def run_series(
         first: The first seed.
         count: How many seeds at most.
         seconds: How long at most; what runs then is waited for.
+        at_least: So many seeds run even if the time is over.
         jobs: Processes that run them.
         step: From one seed to the next.
         keep_going: Do not stop at a broken rule.
@@ -92,7 +94,8 @@ def run_series(
         """Give the next seed, as long as there is time for one and no reason to stop."""
         numbers = itertools.count() if count is None else iter(range(count))
         for number in numbers:
-            if seconds is not None and time.monotonic() - started_s >= seconds:
+            over = seconds is not None and time.monotonic() - started_s >= seconds
+            if over and number >= at_least:
                 return
             if totals.failures and not keep_going:
                 return

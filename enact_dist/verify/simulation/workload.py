@@ -109,7 +109,7 @@ class Workload:
         return random.choice(CONTEXTS), random.choice(self._entities), random.choice(self._aspects)
 
     def _increment(self, random: Random) -> tuple[Item, ...]:
-        return self._written(random, random.choice((1, 1, 2, 3)))
+        return self._written(random, random.choice((1, 2, 2, 3)))
 
     def _written(self, random: Random, count: int) -> tuple[Item, ...]:
         """Writes lie on one entity or on several, so on one shard or on several."""
@@ -152,10 +152,10 @@ class Workload:
 
     def _view(self, random: Random) -> tuple[Item, ...]:
         views: tuple[Item, ...] = self._besides(random, (), Access.VIEW)
-        if random.random() < 0.5:
+        if random.random() < 0.35:
             each = random.choice((("**", "count"), ("**", "note"), ("tray/*", "frame")))
             views = (Item(Access.VIEW_EACH, random.choice(CONTEXTS), *each),)
-        elif random.random() < 0.5:
+        elif random.random() < 0.7:
             views = tuple(
                 Item(Access.VIEW, context, entity, "count")
                 for context in CONTEXTS
@@ -183,7 +183,7 @@ class Workload:
         schedule, number = self._world.schedule, 0
         random = schedule.stream(f"work of {host.name} in lane {lane}")
         while not self._world.winding_down:
-            yield Sleep(random.choice((0, 5 * MS, 50 * MS, 300 * MS)))
+            yield Sleep(random.choice((0, 5 * MS, 30 * MS, 150 * MS)))
             job = self.job(f"{host.name}/{lane}.{number}", Random(random.getrandbits(64)))
             number += 1
             if schedule.begins(job.name):
