@@ -64,6 +64,15 @@ _RESTORE: Final = (
     " its data"
 )
 
+_UNREADABLE: Final = (
+    DamagedRowError,
+    ValueError,
+    TypeError,
+    OverflowError,
+    msgpack.UnpackException,
+)
+"""What reading a row may raise: none of it is an error of the system."""
+
 _log = logging.getLogger("enact.store")
 
 
@@ -225,7 +234,7 @@ def read_contents(database: Database, path: Path) -> Contents:
     for row in database.rows():
         try:
             _read_row(row, contents)
-        except (DamagedRowError, ValueError, TypeError, msgpack.UnpackException) as damage:
+        except _UNREADABLE as damage:
             refuse(path, f"is damaged in row {row.id}: {damage}")
     return contents
 
@@ -311,5 +320,5 @@ def put_together(contents: Contents, path: Path) -> None:
         try:
             row = contents.prepared[lock]
             contents.recovered.prepared.append(read_prepared(*row, found))
-        except (DamagedRowError, KeyError) as damage:
+        except (*_UNREADABLE, KeyError) as damage:
             refuse(path, f"is damaged: the prepared lock {lock} cannot be read ({damage})")
