@@ -24,7 +24,8 @@ from enact_dist.errors import ConfigError, EnactError, ShardUnreachableError
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from enact_dist.cell import Cell, ShardInfo
+    from enact_dist.cell import Cell
+    from enact_dist.cell_info import ShardInfo
     from enact_dist.config_types import CellConfig
 
 PYTHON_MIN: Final = (3, 11)

@@ -29,7 +29,8 @@ from enact_dist.link.signals import StopSignals
 from enact_dist.terms import Access, Entities, Entity, checked_name
 
 if TYPE_CHECKING:
-    from enact_dist.cell import Cell, LockInfo
+    from enact_dist.cell import Cell
+    from enact_dist.cell_info import LockInfo
     from enact_dist.cli.verbs import Verb
     from enact_dist.core.messages import Item
 

@@ -23,7 +23,7 @@ from enact_dist.errors import ConfigError
 if TYPE_CHECKING:
     import argparse
 
-    from enact_dist.cell import ShardInfo
+    from enact_dist.cell_info import ShardInfo
     from enact_dist.cli.verbs import Verb
 
 

@@ -31,6 +31,7 @@ import zenoh
 
 from enact_dist.core.messages import Answer, AwaitStamp, Commit, Fetch, Notice, Prepare
 from enact_dist.errors import MisuseError, ProtocolError, ShardUnreachableError
+from enact_dist.link.inside import Inside
 from enact_dist.link.notices import NoticeQueue
 from enact_dist.link.zenoh_config import QUEUED_MAX, close_session, keep_after_fork, open_session
 from enact_dist.link.zenoh_presence import ShardPresence
@@ -127,7 +128,7 @@ class ZenohCarrier:
         self._pid = os.getpid()
         self._closed = False
         self._mutex = threading.Lock()
-        self._inside = _Inside()
+        self._inside = Inside()
         self._links: list[_Link] = []
         self._link_of: dict[str, _Link] = {}
         self._endpoints_of: dict[str, tuple[str, ...]] = {}
@@ -349,31 +350,6 @@ class ZenohCarrier:
             presence.join(JOIN_S)
         # A thread that comes back from Zenoh while the interpreter ends would abort the process.
         self._inside.wait_empty(JOIN_S)
-
-
-class _Inside:
-    """Counts the threads that are inside Zenoh, so that an end can wait for them."""
-
-    __slots__ = ("_changed", "_count")
-
-    def __init__(self) -> None:
-        self._changed = threading.Condition(threading.Lock())
-        self._count = 0
-
-    def __enter__(self) -> None:
-        with self._changed:
-            self._count += 1
-
-    def __exit__(self, *_: object) -> None:
-        with self._changed:
-            self._count -= 1
-            if not self._count:
-                self._changed.notify_all()
-
-    def wait_empty(self, timeout_s: float) -> bool:
-        """Wait until no thread is inside; say whether that came true in time."""
-        with self._changed:
-            return self._changed.wait_for(lambda: not self._count, timeout_s)
 
 
 def _pump(notices: zenoh.Handler[zenoh.Sample], feed: NoticeQueue) -> None:
