@@ -161,15 +161,22 @@ class TestedCell:
         index = list(self.clients).index(name) if name in self.clients else len(self.clients)
         words = (
             str(self.file),
-            str(self._folder / f"{full}{SUFFIX}"),
+            str(self._journal(full)),
             full,
             str(hash((self._seed, index, incarnation))),
             str(self._ttl_s),
             str(self._hosts.clock_ahead_ns[host]),
-            str(1 + index % 2),
+            str(2 + index % 2),
         )
         process = self._run(CLIENT, words, name, host)
         self.clients[name] = Client(name, host, process, incarnation)
+
+    def journal_of(self, client: Client) -> Path:
+        """Return the journal of a client process; it exists once the process has started."""
+        return self._journal(f"{client.name}.{client.incarnation}")
+
+    def _journal(self, name: str) -> Path:
+        return self._folder / f"{name}{SUFFIX}"
 
     def _run(self, module: str, words: tuple[str, ...], name: str, host: str) -> LineProcess:
         log = self._folder / f"{name}.output"

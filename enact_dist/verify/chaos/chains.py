@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
     from enact_dist.verify.chaos.evidence import Evidence, LockRecord, Restart
 
+_ANY_TIME: Final = (0, 1 << 62)
 _FIRST: Final = 0
 """Epoch under which slots that keep their versions over restarts are told."""
 
@@ -46,6 +47,8 @@ class History:
         self.oddities: list[Anomaly] = []
         self.guessed: dict[str, None] = {}
         self._seen: dict[str, dict[tuple[int, int], dict[str, None]]] = defaultdict(dict)
+        self._untimed: dict[str, tuple[int, int]] = {}
+        self._viewed: list[tuple[str, int, str]] = []
         self._claims: dict[str, dict[tuple[int, int], list[tuple[LockRecord, str]]]] = {}
         self._names: dict[str, dict[tuple[int, int], str]] = {}
         self._claimed: dict[tuple[str, str], tuple[int, int]] = {}
@@ -53,6 +56,7 @@ class History:
             self._note_claims(record)
         for record in self._locks.values():
             self._note_seen(record)
+        self._note_viewed()
         for slot in self._seen:
             self._build(slot)
         self._made: dict[str, list[str]] = {}
@@ -66,7 +70,7 @@ class History:
             for restarts in self._restarts.values()
             for restart in restarts[1:]
         }
-        return Checker(stories, self.chains, events=events)
+        return Checker(stories, self.chains, events=events | self._untimed)
 
     def anomalies(self) -> list[Anomaly]:
         """Return everything that is wrong with it."""
@@ -93,8 +97,22 @@ class History:
                     facts = (f"{slot}: {writer} wrote {claimed[1]}, {record.id} read {version}",)
                     self.oddities.append(Anomaly("a datum under another version", facts))
             elif not protected:
-                at = claimed  # a view knows no epoch
+                self._viewed.append((slot, version, writer))
+                continue
             seen.setdefault(at, {})[writer] = None
+
+    def _note_viewed(self) -> None:
+        """Take the views of volatile slots, which know no epoch, where nobody else has looked."""
+        known = {(slot, w) for slot, seen in self._seen.items() for ws in seen.values() for w in ws}
+        for slot, version, writer in self._viewed:
+            if (slot, writer) in known:
+                continue
+            epoch, promised = self._claimed.get((writer, slot), (_FIRST, version))
+            if promised != version:
+                # Applied after a restart: the next one, as nobody saw it in a later epoch.
+                later = (r.epoch for r in self._restarts[_shard_of(slot)] if r.epoch > epoch)
+                epoch = min(later, default=epoch)
+            self._seen[slot].setdefault((epoch, version), {})[writer] = None
 
     # ---------------------------------------------------------------- chains
 
@@ -113,7 +131,7 @@ class History:
             if restart is not None:
                 name = f"null {epoch} 0"
                 names[epoch, 0] = name
-                states.append(State(name, _name_of(restart), 0))
+                states.append(State(name, self._emptied_by(restart, slot), 0))
             newest = max((version for since, version in seen if since == epoch), default=0)
             for version in range(1, newest + 1):
                 at = (epoch, version)
@@ -121,6 +139,20 @@ class History:
                 names[at] = next((str(state.name) for state in there), "")
                 states += there
         self.chains[slot] = states
+
+    def _emptied_by(self, restart: Restart, slot: str) -> str:
+        """Return who set a volatile slot to null at a restart.
+
+        A promise holds over it: its commit may have been told before the restart and be applied
+        after it, so of this slot nothing says when it was emptied.
+        """
+        first = self._seen[slot].get((restart.epoch, 1), ())
+        promised = [w for w in first if self._claimed.get((w, slot), (0, 0))[0] < restart.epoch]
+        if not promised:
+            return _name_of(restart)
+        name = f"{_name_of(restart)} under {promised[0]}"
+        self._untimed[name] = _ANY_TIME
+        return name
 
     def _epochs(self, slot: str) -> Iterable[tuple[int, Restart | None]]:
         """Return the epochs in which a slot counts anew, with the restarts that began them."""

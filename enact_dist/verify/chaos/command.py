@@ -119,8 +119,9 @@ def _print(verdict: Verdict) -> None:
         [
             (name, s.n, f"{s.p50_s:.3f}", f"{s.p99_s:.3f}", f"{s.max_s:.3f}")
             for name, s in verdict.recovery.items()
+            if s.n
         ],
-        empty="",
+        empty="no recovery could be measured",
     )
     for anomaly in verdict.anomalies[:FACTS_MAX]:
         print(f"\nANOMALY {anomaly}")

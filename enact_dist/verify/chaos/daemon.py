@@ -7,11 +7,14 @@ machine is set, and the product has no option for it.
 from __future__ import annotations
 
 import sys
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from enact_dist.cli import main
 from enact_dist.link import host
 from enact_dist.link.clock import SystemClock
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
 MODULE: Final = "enact_dist.verify.chaos.daemon"
 
@@ -28,7 +31,11 @@ def shifted_clock(offset_ns: int) -> type[SystemClock]:
     return ShiftedClock
 
 
+def run(words: Sequence[str]) -> int:
+    """Run `enact` with `words[1:]` and a wall clock that is `words[0]` seconds ahead."""
+    host.__dict__["SystemClock"] = shifted_clock(int(float(words[0]) * 1e9))
+    return main.main(words[1:])
+
+
 if __name__ == "__main__":
-    offset_s, *words = sys.argv[1:]
-    host.__dict__["SystemClock"] = shifted_clock(int(float(offset_s) * 1e9))
-    sys.exit(main.main(words))
+    sys.exit(run(sys.argv[1:]))

@@ -1,8 +1,9 @@
 """What is done to a cell under test: drawn from a seed like cards from a deck, one after the other.
 
 ======================  =======================================================================
-kill shard, kill client SIGKILL, and a new process after a while
-stop shard, stop client SIGSTOP for up to three TTLs
+kill shard, kill client SIGKILL, and a new process after a while; clients by preference within
+                        a lock or as they send a commit
+stop shard, stop client SIGSTOP for up to three TTLs; clients as above
 restart shard           SIGTERM, and a new process once it has ended
 set wall clock          the same with a wall clock that is wrong until the next restart: up to
                         0.4 s ahead, or an hour behind
@@ -17,15 +18,19 @@ from __future__ import annotations
 
 import heapq
 import itertools
+import os
 import random
 import signal
 import time
 from typing import TYPE_CHECKING, Final
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
+from enact_dist.errors import LinkError
+from enact_dist.verify.chaos.cell import END_S
 
-    from enact_dist.verify.chaos.cell import TestedCell
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from enact_dist.verify.chaos.cell import Client, TestedCell
     from enact_dist.verify.chaos.hosts import Hosts
     from enact_dist.verify.chaos.journal import Journal
 
@@ -48,6 +53,7 @@ BEHIND_S: Final = -3600.0
 PAUSE_S: Final = (0.7, 1.9)
 """Between the begin of one fault and the next."""
 POLL_S: Final = 0.02
+AIM_S: Final = 0.3
 
 
 class Injector:
@@ -60,6 +66,7 @@ class Injector:
         log: Gets each fault.
         seed: What happens is drawn from it, as far as the moments repeat.
         ttl_s: Session TTL.
+        deck: How many cards of each kind.
     """
 
     def __init__(
@@ -71,6 +78,7 @@ class Injector:
         *,
         seed: int,
         ttl_s: float,
+        deck: Mapping[str, int] = DECK,
     ) -> None:
         self._cell, self._hosts, self._groups, self._log = cell, hosts, groups, log
         self._draw, self._ttl_s = random.Random(seed), ttl_s
@@ -79,7 +87,13 @@ class Injector:
         self._cuts: set[tuple[str, str]] = set()
         self._ends: list[tuple[float, int, Callable[[], None]]] = []
         self._number = itertools.count()
-        self._partitions = not any("partitions" in name for name in hosts.missing)
+        apart = not any("partitions" in name for name in hosts.missing)
+        self._cards = [
+            kind
+            for kind, count in deck.items()
+            if apart or kind not in (PARTITION, ONE_WAY)
+            for _ in range(count)
+        ]
 
     # ---------------------------------------------------------------- time
 
@@ -114,8 +128,7 @@ class Injector:
     def _begin(self) -> None:
         """Carry out the next card, unless what it would hit is hit already."""
         if not self._deck:
-            cards = {k: n for k, n in DECK.items() if self._partitions or "partition" not in k}
-            self._deck = [kind for kind, count in cards.items() for _ in range(count)]
+            self._deck = list(self._cards)
             self._draw.shuffle(self._deck)
         kind = self._deck.pop()
         carried_out: dict[str, Callable[[], bool]] = {
@@ -183,8 +196,9 @@ class Injector:
         shard.process.signal(signal.SIGTERM)
 
         def again() -> None:
-            if shard.process.status is None:
-                shard.process.wait_status(POLL_S)
+            if shard.process.wait_status(POLL_S) is None:
+                if time.monotonic_ns() > from_ns + END_S * 1e9:
+                    raise LinkError(f"shard {name} does not end {END_S:g} s after SIGTERM")
                 self._after(0.0, again)
                 return
             self._cell.forget(shard.process)
@@ -197,12 +211,33 @@ class Injector:
         name = self._free(list(self._cell.clients))
         if name is None:
             return False
-        client, from_ns = self._cell.clients[name], time.monotonic_ns()
+        client = self._cell.clients[name]
+        self._aim(client)
+        from_ns = time.monotonic_ns()
         client.process.kill()
         self._note(KILL_CLIENT, [f"{name}.{client.incarnation}"], from_ns)
         self._cell.forget(client.process)
         self._cell.start_client(name, client.host, incarnation=client.incarnation + 1)
         return True
+
+    def _aim(self, client: Client) -> None:
+        """Wait until the client is where it hurts: within a lock, or about to send a commit.
+
+        Such moments are short and seldom hit by chance; without one within `AIM_S` any will do.
+        """
+        aim = self._draw.choice((None, b'["seen"', b'["write"'))
+        deadline_s = time.monotonic() + AIM_S
+        path = self._cell.journal_of(client)
+        if not path.exists():
+            return  # just started
+        with path.open("rb") as journal:
+            journal.seek(0, os.SEEK_END)
+            while aim is not None and time.monotonic() < deadline_s:
+                line = journal.readline()
+                if line.startswith(aim):
+                    return
+                if not line:
+                    time.sleep(0.0005)
 
     def _stop(self, names: list[str], kind: str) -> bool:
         ready = [
@@ -212,6 +247,8 @@ class Injector:
         if name is None:
             return False
         self._busy.add(name)
+        if name in self._cell.clients:
+            self._aim(self._cell.clients[name])
         owner = self._cell.shards.get(name) or self._cell.clients[name]
         process, from_ns = owner.process, time.monotonic_ns()
         process.signal(signal.SIGSTOP)

@@ -207,7 +207,7 @@ def _next_grant(
             continue
         group = evidence.settings["groups"].get(lock.client.partition(".")[0])
         concerned = {*shards, *lock.epochs, group, lock.client.partition(".")[0]}
-        faults = _overlapping(evidence, killed_ns - ttl_ns, at_ns)
+        faults = _overlapping(evidence, killed_ns, at_ns)
         if any(concerned.intersection(fault.targets) for fault in faults):
             return None
         return at_ns - max(killed_ns, lock.begun_ns)

@@ -6,20 +6,20 @@ import json
 import os
 import signal
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.errors import ConfigError, LinkError
 from enact_dist.verify.chaos import daemon
 from enact_dist.verify.chaos.cell import END_S, TestedCell
 from enact_dist.verify.chaos.evidence import FAULTS, SETTINGS
-from enact_dist.verify.chaos.faults import Injector
+from enact_dist.verify.chaos.faults import DECK, Injector
 from enact_dist.verify.chaos.hosts import open_hosts
 from enact_dist.verify.chaos.journal import Journal
 from enact_dist.verify.checker import Told
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
     from pathlib import Path
 
 
@@ -39,6 +39,7 @@ class ChaosSettings:
         seed: What faults and clients are drawn from.
         namespaces_required: Whether to fail where there are no network namespaces.
         daemon_module: Runs a shard; tests put a broken one in its place.
+        deck: How many faults of each kind come in turn.
     """
 
     seconds: float
@@ -47,6 +48,7 @@ class ChaosSettings:
     actors: int = 8
     namespaces_required: bool = False
     daemon_module: str = daemon.MODULE
+    deck: Mapping[str, int] = field(default_factory=lambda: DECK)
 
 
 def run(settings: ChaosSettings, folder: Path, *, progress: Callable[[str, float], None]) -> None:
@@ -93,7 +95,9 @@ def run(settings: ChaosSettings, folder: Path, *, progress: Callable[[str, float
     try:
         progress("starting", settings.seconds)
         cell.start(shards, told["groups"], watcher_host=WATCHER_HOST)  # type: ignore[arg-type]
-        injector = Injector(cell, hosts, groups, log, seed=settings.seed, ttl_s=TTL_S)
+        injector = Injector(
+            cell, hosts, groups, log, seed=settings.seed, ttl_s=TTL_S, deck=settings.deck
+        )
         injector.run(settings.seconds, progress=lambda left_s: progress("faults", left_s))
         progress("coming to rest", 0.0)
         _rest(cell, log)
