@@ -5,7 +5,7 @@
     folder/
       lock        held by the one process that serves the folder
       format      version of all this
-      mark        boot and newest durable batch (store_mark)
+      mark        boot and newest batches (store_mark)
       store.db    one row per record: epoch, sessions, catalogue, slots, outcomes (store_rows)
       store.db-wal
       blobs/      bodies over 64 KiB, named by their rows (blobs)
@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import errno
 import sqlite3
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from enact_dist.core.records import (
     AspectRecord,
@@ -55,6 +55,7 @@ from enact_dist.link.store_prepared import (
     prepared_key,
     prepared_row,
     prepared_writes,
+    slot_of_write,
 )
 from enact_dist.link.store_recovery import (
     BLOB_FOLDER,
@@ -152,6 +153,14 @@ def _open_locked(folder: Path, lock: FolderLock, unix_s: int) -> tuple[Store, Re
     return store, contents.recovered
 
 
+class _Staged(NamedTuple):
+    """A slot's or prepared write's new state; `blob` is its body's file where there is one."""
+
+    record: SlotRecord
+    durable: bool
+    blob: Blob | None = None
+
+
 class Store:
     """The open store of one shard; made by `open_store`.  Used by one thread at a time."""
 
@@ -175,8 +184,7 @@ class Store:
         for outcome in contents.recovered.outcomes:
             self._lanes.setdefault(outcome.lock.session, set()).add(outcome.lock.lane)
         self._prepared = {
-            record.lock: tuple(key for key, _ in prepared_writes(record))
-            for record in contents.recovered.prepared
+            record.lock: dict(prepared_writes(record)) for record in contents.recovered.prepared
         }
         self._next_id = max(self._ids.values(), default=0) + 1
         self._batch = contents.batch
@@ -251,7 +259,7 @@ class Store:
 
     def _write(self, batch: Sequence[Persist]) -> None:
         changes: dict[Key, bytes | None] = {}
-        slots: dict[Key, tuple[SlotRecord, bool]] = {}
+        slots: dict[Key, _Staged] = {}
         forced = False
         gone: list[Blob] = []
         for persist in batch:
@@ -260,8 +268,10 @@ class Store:
             for record in persist.records:
                 if isinstance(record, SlotRecord):
                     key = slot_key(record.slot)
-                    _, before = slots.get(key, (None, False))
-                    slots[key] = (record, durable or before)
+                    before = slots.get(key)
+                    if before is not None and before.blob is not None:
+                        gone.append(before.blob)
+                    slots[key] = _Staged(record, durable or (before is not None and before.durable))
                 elif isinstance(record, PreparedRecord):
                     self._stage_prepared(record, changes, slots, durable=durable)
                 elif isinstance(record, PreparedEnded):
@@ -313,7 +323,7 @@ class Store:
         self,
         record: PreparedRecord,
         changes: dict[Key, bytes | None],
-        slots: dict[Key, tuple[SlotRecord, bool]],
+        slots: dict[Key, _Staged],
         *,
         durable: bool,
     ) -> None:
@@ -321,23 +331,30 @@ class Store:
         key, body = prepared_row(record)
         changes[key] = body
         writes = dict(prepared_writes(record))
-        self._prepared[record.lock] = tuple(writes)
-        slots.update((key, (write, durable)) for key, write in writes.items())
+        self._prepared[record.lock] = writes
+        slots.update((key, _Staged(write, durable)) for key, write in writes.items())
 
     def _stage_prepared_end(
         self,
         record: PreparedEnded,
         changes: dict[Key, bytes | None],
-        slots: dict[Key, tuple[SlotRecord, bool]],
+        slots: dict[Key, _Staged],
     ) -> list[Blob]:
-        """Note that a lock is prepared no more; return its files."""
+        """Note that a lock is prepared no more; return its files that no slot takes over."""
         changes[prepared_key(record.lock)] = None
         blobs: list[Blob] = []
-        for key in self._prepared.pop(record.lock, ()):
+        for key, write in self._prepared.pop(record.lock, {}).items():
             slots.pop(key, None)
             changes[key] = None
             blob = self._blob_of.pop(key, None)
-            if blob is not None:
+            if blob is None:
+                continue
+            of_slot = slot_of_write(key)
+            staged = slots.get(of_slot)
+            same = staged is not None and staged.record.datum is write.datum
+            if staged is not None and same and (blob.synced or not staged.durable):
+                slots[of_slot] = staged._replace(blob=blob)
+            else:
                 blobs.append(blob)
         return blobs
 
@@ -352,15 +369,15 @@ class Store:
                 changes[outcome_key(session, lane)] = None
 
     def _stage_slots(
-        self, slots: dict[Key, tuple[SlotRecord, bool]], changes: dict[Key, bytes | None]
+        self, slots: dict[Key, _Staged], changes: dict[Key, bytes | None]
     ) -> list[Blob]:
         """Write large bodies to files, note the rows; return the files that are replaced."""
         replaced: list[Blob] = []
         names_to_sync = False
-        for key, (record, durable) in slots.items():
-            blob = None
-            if record.datum is not None and record.datum.size > INLINE_BYTES_MAX:
-                blob = self._blobs.write(record.datum.body, durable=durable)
+        for key, (record, durable, promised) in slots.items():
+            blob, datum = promised, record.datum
+            if blob is None and datum is not None and datum.size > INLINE_BYTES_MAX:
+                blob = self._blobs.write(datum.body, durable=durable)
                 names_to_sync |= durable
             changes[key] = slot_body(record, blob)
             old = self._blob_of.pop(key, None)
@@ -393,8 +410,8 @@ class Store:
             rows.append(DatabaseRow(row_id, key.kind, self._batch, key.name, body, crc))
             self._log_bytes += len(body) + _ROW_LOG_BYTES
         self._database.commit(rows, gone, forced=forced)
-        if forced and self._mark is not None:
-            self._mark.note(self._batch)
+        if self._mark is not None:
+            self._mark.note(self._batch, forced=forced)
 
     # ---------------------------------------------------------------- between batches
 
