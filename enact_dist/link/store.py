@@ -23,6 +23,7 @@ a power cut too (also everything written before).  Rules that a change must keep
 from __future__ import annotations
 
 import errno
+import os
 import sqlite3
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -452,13 +453,22 @@ def open_memory_store(*, unix_s: int) -> tuple[MemoryStore, Recovered]:
     return MemoryStore(), Recovered(epoch=unix_s)
 
 
+def _free_bytes(folder: Path) -> int | str:
+    """Return how many bytes this process may still write below `folder`."""
+    try:
+        found = os.statvfs(folder)
+    except OSError:
+        return "an unknown number of"
+    return found.f_bavail * found.f_frsize
+
+
 def _store_error(folder: Path, failure: OSError | sqlite3.Error) -> StoreError:
     """Return what an operator must read about an error of the system."""
     path = str(getattr(failure, "filename", None) or folder)
     code = getattr(failure, "sqlite_errorcode", 0) & 0xFF
     number = failure.errno if isinstance(failure, OSError) else None
     if number in _FULL_ERRNOS or code == sqlite3.SQLITE_FULL:
-        found = f"no room for the data of {folder}"
+        found = f"no room for the data of {folder}: {_free_bytes(folder)} bytes are free there"
         remedy = "free space on its disk, or raise its quota"
     elif code in {sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED}:
         found = f"the database in {folder} is open in another program"

@@ -112,7 +112,7 @@ class Found(NamedTuple):
     @property
     def is_first(self) -> bool:
         """Whether no start before this one ever came to its end: nothing was acknowledged."""
-        return self.mark.batch == 0 if self.mark is not None else self.is_new
+        return self.mark.is_first if self.mark is not None else self.is_new
 
 
 def refuse(path: Path, found: str, remedy: str = _RESTORE) -> NoReturn:
@@ -137,7 +137,7 @@ def look_at(folder: Path) -> Found:
     if is_new:
         log = folder / LOG_FILE
         has_log = log.exists() and log.stat().st_size > 0
-        has_mark = mark is not None and mark.batch > 0
+        has_mark = mark is not None and not mark.is_first
         if has_mark or has_log or _has_blobs(folder):
             refuse(database, "is missing or empty, but the folder has been in use")
     return Found(mark, is_new, mark is not None and mark.boot != boot_id())
@@ -209,16 +209,17 @@ def _check_complete(folder: Path, contents: Contents, found: Found) -> None:
     in_use = contents.ids or not found.is_first or _has_blobs(folder)
     if EPOCH_KEY not in contents.ids and in_use:
         refuse(folder / DATABASE_FILE, "holds no epoch: rows are missing")
-    if found.mark is None or contents.batch >= found.mark.batch:
+    if found.mark is None or contents.batch >= found.mark.needed():
         return
     log = folder / LOG_FILE
+    readable = check_wal(log)
     if log.exists() and log.stat().st_size:
         # Closing the database cuts the log to what SQLite could read; the whole is evidence.
         shutil.copyfile(log, log.with_name(log.name + _REFUSED_SUFFIX))
     refuse(
         log,
-        f"is cut or damaged at its end: batch {found.mark.batch} was acknowledged, the last one"
-        f" that can be read is {contents.batch}",
+        f"is cut or damaged from byte {readable.end} on: batch {found.mark.needed()} was"
+        f" acknowledged, the last one that can be read is {contents.batch}",
         "restore the whole folder from a backup; or, to go on without the missing commits, keep a"
         f" copy of the folder and delete {folder / 'mark'}",
     )

@@ -295,7 +295,7 @@ def _unlinked_early(discard):
 
 
 def _marked_early(note):
-    return lambda self, batch: note(self, batch + 1)
+    return lambda self, batch, *, forced: note(self, batch + 1, forced=forced)
 
 
 WRONG = {
