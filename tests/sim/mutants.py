@@ -27,9 +27,7 @@ def _of(module: Any) -> tuple[Mutant, ...]:
     return tuple(
         found
         for name, found in vars(module).items()
-        if getattr(found, "__module__", "") == module.__name__
-        and callable(found)
-        and not name.startswith("_")
+        if getattr(found, "__module__", "") == module.__name__ and not name.startswith("_")
     )
 
 
@@ -51,7 +49,7 @@ NAMED = {
     "MAXHOLDNAIVE": one.counts_the_hold_from_its_own_grant,
     "NOVALIDATE": one.skips_validation,
     "VOLPREP": over.loses_prepared_at_a_restart,
-    "CLIENTABORT": over.releases_end_what_is_prepared,
+    "CLIENTABORT": mutants_directed.releases_end_what_is_prepared,
     "NOEPOCH": one.restarts_in_the_same_epoch,
     "BLINDACK": one.blind_acknowledgement,
     "REGRANT": one.grants_a_seq_again,

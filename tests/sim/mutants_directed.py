@@ -8,13 +8,17 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+from mutant_parts import forgets_what_ended
+
 from enact_dist.core.commits import Commits
 from enact_dist.core.lock_desk import LockDesk
 from enact_dist.core.messages import Granted
 from enact_dist.core.multilock import MultiLock
+from enact_dist.core.records import Persist, PreparedEnded
 from enact_dist.core.sessions import Session, SessionTable
 from enact_dist.core.tenures import Tenures
 from enact_dist.core.view_desk import ViewDesk
+from enact_dist.terms import Durability
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -70,6 +74,21 @@ def releases_end_a_commit_in_flight(patch: Patch) -> None:
     patch(LockDesk, "on_release", wrong)
 
 
+def releases_end_what_is_prepared(patch: Patch) -> None:
+    """A client's release aborts what is prepared, though its primary may have committed."""
+    on_release = LockDesk.on_release
+
+    def wrong(self: LockDesk, message: Any, reply_to: int) -> Any:
+        tenure = self._state.tenures.by_lock.get(message.lock)
+        if tenure is not None and tenure.prepared is not None and not tenure.committing:
+            yield Persist(0, (PreparedEnded(message.lock),), Durability.OS)
+            tenure.prepared = None
+        yield from on_release(self, message, reply_to)
+
+    patch(LockDesk, "on_release", wrong)
+    forgets_what_ended(patch)
+
+
 def views_do_not_renew(patch: Patch) -> None:
     """A view is counted as seen, but does not lengthen the lease."""
     on_take_view = ViewDesk.on_take_view
@@ -90,6 +109,9 @@ DIRECTED = {
     compares_no_token: "test_forged_token_is_fenced",
     stalls_count: "test_stalled_shard_takes_no_lease_for_its_own_stall",
     releases_end_a_commit_in_flight: "test_lease_does_not_end_a_commit_in_flight",
+    releases_end_what_is_prepared: (
+        "test_prepared_lock_stays_when_its_client_or_an_operator_ends_it"
+    ),
     views_do_not_renew: "test_everything_that_is_counted_renews",
 }
 """Each with the test of `tests/core` that catches it."""

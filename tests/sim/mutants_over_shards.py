@@ -5,11 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+from mutant_parts import forgets_what_ended
+
 from enact_dist.core import prepares
 from enact_dist.core.commits import Commits
 from enact_dist.core.cuts import Cut
 from enact_dist.core.decisions import Decisions
-from enact_dist.core.lock_desk import LockDesk
 from enact_dist.core.messages import Finished
 from enact_dist.core.multilock import MultiLock, Phase
 from enact_dist.core.prepares import PrepareDesk
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
 def prepared_locks_expire(patch: Patch) -> None:
     """A lease, a release or a keep-alive ends a prepared lock."""
     patch(Tenure, "bound", property(lambda tenure: tenure.committing))
-    _forgets_what_ended(patch)
+    forgets_what_ended(patch)
 
 
 def promises_before_it_is_kept(patch: Patch) -> None:
@@ -100,21 +101,6 @@ def takes_the_first_views(patch: Patch) -> None:
 def views_do_not_wait_for_the_undecided(patch: Patch) -> None:
     """A view promises to be current though a prepared commit may come before its end."""
     patch(ViewDesk, "_undecided_ns", lambda _desk, _items: 1 << 62)
-
-
-def releases_end_what_is_prepared(patch: Patch) -> None:
-    """A client's release aborts what is prepared, though its primary may have committed."""
-    on_release = LockDesk.on_release
-
-    def wrong(self: LockDesk, message: Any, reply_to: int) -> Any:
-        tenure = self._state.tenures.by_lock.get(message.lock)
-        if tenure is not None and tenure.prepared is not None and not tenure.committing:
-            yield Persist(0, (PreparedEnded(message.lock),), Durability.OS)
-            tenure.prepared = None
-        yield from on_release(self, message, reply_to)
-
-    patch(LockDesk, "on_release", wrong)
-    _forgets_what_ended(patch)
 
 
 def promises_may_be_lost(patch: Patch) -> None:
@@ -196,19 +182,3 @@ def stamps_before_what_was_promised(patch: Patch) -> None:
         )
 
     patch(PrepareDesk, "_finish", wrong)
-
-
-def _forgets_what_ended(patch: Patch) -> None:
-    """Keep the desk that asks primaries from stumbling over locks that a mutant ended."""
-    for name in ("ask", "undecided"):
-        patch(PrepareDesk, name, _without_ended(getattr(PrepareDesk, name)))
-
-
-def _without_ended(method: Any) -> Any:
-    def wrong(self: PrepareDesk) -> Any:
-        tenures = self._state.tenures.by_lock
-        for lock in [lock for lock in self._ask_ns if lock not in tenures]:
-            del self._ask_ns[lock]
-        yield from method(self)
-
-    return wrong

@@ -73,6 +73,7 @@ HAPPENED = (
     "shard: lock_waits",
     "commits lost as declared",
     # What it did about commits over shards.
+    "locks that write on three shards",
     "decisions",
     "commits finished by participants",
     "prepared over a restart",

@@ -7,7 +7,8 @@ from random import Random
 
 import pytest
 
-from enact_dist.core.messages import Item
+from enact_dist.core.messages import Item, PlacementMap, ShardEntry
+from enact_dist.core.placement import shard_of
 from enact_dist.core.records import Persist, SessionRecord
 from enact_dist.terms import Access, Durability
 from enact_dist.verify.simulation.disk import Disk
@@ -15,6 +16,7 @@ from enact_dist.verify.simulation.faults import NONE, drawn
 from enact_dist.verify.simulation.history import conflict
 from enact_dist.verify.simulation.scenario import Scenario
 from enact_dist.verify.simulation.schedule import Schedule
+from enact_dist.verify.simulation.workload import ENTITIES
 from enact_dist.verify.simulation.world import Clock, Host, S, World
 
 R, W, RE, WE, V = (
@@ -129,6 +131,16 @@ def test_judge_knows_which_locks_conflict(one, other, clash):
     first, second = ((Item(access, "online", entity, "count"),) for access, entity in (one, other))
 
     assert conflict(first, second) is conflict(second, first) is clash
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_entities_lie_on_every_shard(count):
+    """Locks over all shards of a cell occur: entities by twos lie apart, all of them everywhere."""
+    shards = tuple(ShardEntry(f"s{index}", ()) for index in range(count))
+    homes = [shard_of(entity, PlacementMap(1, shards, ())) for entity in ENTITIES]
+
+    assert set(homes) == {shard.name for shard in shards}
+    assert len(set(homes[:2])) == min(count, 2)
 
 
 def test_drawn_faults_differ_between_seeds():

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from enact_dist.core.datum import Datum, LockId, Slot
 from enact_dist.core.messages import (
     Committed,
+    Finished,
     Goodbye,
     Granted,
     Hello,
@@ -23,6 +24,7 @@ from enact_dist.core.messages import (
     Viewed,
 )
 from enact_dist.core.records import (
+    DecisionDone,
     DecisionRecord,
     OutcomeRecord,
     Persist,
@@ -206,6 +208,8 @@ class Model:
                 self._check_persist(effect, picture)
             elif isinstance(effect, Reply) and isinstance(effect.answer, Prepared):
                 self._check_prepared(host, effect.answer, picture)
+            elif isinstance(effect, Reply) and isinstance(effect.answer, Finished):
+                self._check_end_told(host, effect.answer.lock, picture)
             elif isinstance(effect, Publish):
                 assert isinstance(effect.notice, Notice)
                 picture.notices += 1
@@ -224,6 +228,14 @@ class Model:
                 picture.in_flight[record.lock] = persist
             elif isinstance(record, PreparedRecord):
                 picture.preparing[record.lock] = record
+            elif isinstance(record, DecisionDone):
+                left = [
+                    shard
+                    for shard in self.decided[record.lock].participants
+                    if record.lock not in self.pictures[shard].applied
+                ]
+                if left:
+                    self._fail("a decision is kept until all have applied it", record.lock, left)
             elif isinstance(record, PreparedEnded) and persist.ticket:
                 picture.in_flight[record.lock] = persist
             elif isinstance(record, PreparedEnded):
@@ -249,6 +261,14 @@ class Model:
             for r in persist.records
         ):
             self._fail("a promise is on disk before it is given", answer)
+
+    def _check_end_told(self, host: ShardHost, lock: LockId, picture: Picture) -> None:
+        """Who hears that a participant has finished may forget that the lock was decided."""
+        persist = picture.in_flight.get(lock)
+        if persist is not None and not any(
+            kept is persist for kept in reversed(host.disk.log[: host.disk.synced])
+        ):
+            self._fail("an end is on disk before it is told", lock)
 
     def _finished(self, host: ShardHost, notice: Notice, picture: Picture) -> None:
         """A participant has applied what it had prepared."""

@@ -40,7 +40,8 @@ ASPECTS = (
     AspectEntry("made", "str", "durable"),
 )
 PLAIN = ("count", "note", "frame")
-ENTITIES = ("piece", "bench", "tray/1", "tray/2")
+ENTITIES = ("piece", "bench", "tray/4", "tray/7")
+"""They lie on different shards, by twos and on all of three: a test looks after that."""
 LABELS = 40
 """Things that creators look for, and create when nobody has: about as many as there are looks."""
 KINDS = {
@@ -284,6 +285,7 @@ class Workload:
             writes.setdefault(shard, []).append(WriteItem(slot, self._datum(lock, job, slot, data)))
         if len(writes) > 1:
             self._world.tally["locks that write on several shards"] += 1
+            self._world.tally["locks that write on three shards"] += len(writes) > 2
         expects: list[SlotVersion] = []
         views = {Slot(*item[1:4]) for item in job.items if item.access == Access.VIEW}
         if job.expects and views:
