@@ -48,6 +48,13 @@ FINISH_S_SHORT = 1.0
 TOLD_S = 30.0
 
 
+def must_stand(step, victims):
+    """Return whether a commit must stand after its victims died at a step; None: either way."""
+    if step == "prepared":
+        return False if PRIMARY in victims else None  # the client may prepare once more
+    return step != "all-prepared" or PRIMARY not in victims
+
+
 @dataclass
 class Tally:
     """What happened in the rounds of one kind; times in seconds after the last shard was ready."""
@@ -163,6 +170,7 @@ class DecisionRounds:
             self.cell.kill(name)
         if armed not in victims:
             self.cell.daemons[armed].signal(signal.SIGCONT)
+            self.cell.daemons[armed].tell("go on")
 
     def _probe(self, cell):
         """Lock both accounts; return their one value, and when they could be had."""
@@ -179,6 +187,8 @@ class DecisionRounds:
         tally, before = self.tally, self._value
         committed = value == before + 1
         assert value in {before, before + 1}
+        stands = must_stand(self.step, victims)
+        assert stands in {None, committed}, f"{self.step}, {victims} killed: {value} after {before}"
         if told.outcome == "committed":
             assert committed, f"told committed, not visible; {self._stories()}"
         elif told.outcome == "CommitUnknownError":

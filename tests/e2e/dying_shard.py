@@ -2,8 +2,9 @@
 
 `dying_shard.py ARGUMENT…` takes what the command line `enact` takes and runs the real daemon.  A
 line ``arm STEP`` on standard input arms it; at that step it says ``reached STEP`` and sends itself
-SIGSTOP, so that nothing of it goes on before its parent has killed it or lets it continue.  Each
-arming is for one time.
+SIGSTOP, so that nothing of it goes on before its parent has killed it, or lets it continue by
+SIGCONT and a line ``go on``.  (The signal may take effect some steps later in the thread that sent
+it; that one waits for the line.)  Each arming is for one time.
 
 ==================  ==========================================================================
 all-prepared        the deciding commit has come, with every participant prepared; its record is
@@ -35,25 +36,33 @@ class Trap:
 
     def __init__(self):
         self.step = ""
+        self._go_on = threading.Event()
+        self.decided = set()
 
     def follow(self, lines):
         for line in lines:
-            word, step = line.split()
-            assert word == "arm"
-            self.step = step
-            print("armed", step, flush=True)
+            word, what = line.split()
+            if word == "arm":
+                self._go_on.clear()
+                self.decided.clear()
+                self.step = what
+                print("armed", what, flush=True)
+            else:
+                self._go_on.set()
 
     def look(self, table, batch):
         """Stop if the armed step of `table` is about a record that the batch waits for."""
         asked = table.get(self.step)
-        waited_for = (persist.records for persist in batch if persist.ticket)
-        if asked and any(isinstance(one, asked) for records in waited_for for one in records):
+        waited_for = [one for persist in batch if persist.ticket for one in persist.records]
+        self.decided.update(one.lock for one in waited_for if isinstance(one, DecisionRecord))
+        if asked and any(isinstance(one, asked) for one in waited_for):
             self.spring()
 
     def spring(self):
         step, self.step = self.step, ""
         os.write(1, f"reached {step}\n".encode())
         os.kill(os.getpid(), signal.SIGSTOP)
+        self._go_on.wait()
 
 
 def set_trap():
@@ -66,7 +75,9 @@ def set_trap():
         trap.look(AFTER_WRITE, batch)
 
     def trapped_submit(calls, shard, request):
-        if trap.step == "answered" and isinstance(request, Finish):
+        # Not where an earlier decision is told once more.
+        first = isinstance(request, Finish) and request.lock in trap.decided
+        if first and trap.step == "answered":
             trap.spring()
         submit(calls, shard, request)
 
