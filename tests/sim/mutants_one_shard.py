@@ -17,7 +17,6 @@ from enact_dist.core.datum import Token
 from enact_dist.core.lock_table import Mode
 from enact_dist.core.messages import Alive, Commit, Granted, GrantLeft, KeepAlive
 from enact_dist.core.multilock import MultiLock, Phase
-from enact_dist.core.past import Past
 from enact_dist.core.records import Persist, Reply
 from enact_dist.core.session_desk import SessionDesk
 from enact_dist.core.sessions import Lane, Session, SessionTable
@@ -381,11 +380,7 @@ def keeps_every_outcome(patch: Patch) -> None:
 
 def shows_the_present_for_the_past(patch: Patch) -> None:
     """The history shares what it remembers with the present."""
-    patch(
-        Past,
-        "at",
-        lambda past, slot, _at_ns: past._by_slot[slot][-1] if past._by_slot.get(slot) else None,
-    )
+    patch(SlotMap, "at", lambda _slots, _slot, content, _at_ns: content)
 
 
 def renews_what_is_over(patch: Patch) -> None:

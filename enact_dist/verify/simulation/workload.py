@@ -92,7 +92,7 @@ class Workload:
         """Draw a job."""
         kind = random.choices(list(KINDS), list(KINDS.values()))[0]
         items = getattr(self, "_" + kind.replace(" ", "_"))(random)
-        hold_ns = random.choice((60 * S, 60 * S, 60 * S, 300 * MS))
+        hold_ns = random.choice((60 * S, 60 * S, 60 * S, 300 * MS, 1500 * MS))
         return Job(
             name,
             kind,
