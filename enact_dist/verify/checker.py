@@ -323,10 +323,19 @@ class Checker:
         return None
 
     def _shortened(self, nodes: list[Writer]) -> list[Edge]:
-        """Return the shortest cycle through one of `nodes`; steps in the chain of time are free."""
-        locks = [node for node in nodes if not isinstance(node, _Moment)]
-        ways = [way for way in map(self._way_back, locks) if way]
-        return min((self._edges_of(way) for way in ways), key=len)
+        """Return a short cycle near `nodes`; steps in the chain of time are free.
+
+        The cycle that was found may lead through thousands of locks.  The shortest one through one
+        of them leads through few, and the shortest ones through these are looked at in turn.
+        """
+        best: list[Edge] = []
+        locks = [node for node in nodes if not isinstance(node, _Moment)][:1]
+        while True:
+            found = min((self._edges_of(self._way_back(lock)) for lock in locks), key=len)
+            if best and len(found) >= len(best):
+                return best
+            best = found
+            locks = [edge.one for edge in best]
 
     def _way_back(self, start: Writer) -> list[Writer]:
         """Return the shortest way from `start` to itself, `start` at both ends."""
