@@ -6,6 +6,10 @@ have noticed.
 
 import json
 import os
+import signal
+import subprocess
+import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -74,19 +78,50 @@ def test_nothing_is_lost_doubled_or_half_done(folder):
     assert verdict.recovery["serving to first grant"].n > 3
 
 
-def test_processes_and_namespaces_are_gone_afterwards(folder):
-    """Nobody still works in the folder of the run."""
-    kept, _ = folder
-    named = str(kept).encode()
-    left = []
+def processes_of(folder):
+    """Return the ids of other processes that name the folder."""
+    named, found = str(folder).encode(), []
     for process in Path("/proc").iterdir():
         if process.name.isdigit() and int(process.name) != os.getpid():
             try:
                 if named in (process / "cmdline").read_bytes():
-                    left.append(process.name)
+                    found.append(int(process.name))
             except OSError:
                 continue  # it has just ended
-    assert left == []
+    return found
+
+
+def test_nobody_is_left_afterwards(folder):
+    """No process still works in the folder of the run."""
+    assert processes_of(folder[0]) == []
+
+
+@pytest.mark.parametrize(
+    ("number", "status"), [(signal.SIGINT, 130), (signal.SIGKILL, -signal.SIGKILL)]
+)
+@pytest.mark.usefixtures("_namespaces")
+def test_nobody_is_left_when_the_run_is_broken_off(tmp_path, number, status):
+    """Ctrl-C, and even a kill of the runner, end every process, stopped ones too."""
+    kept = tmp_path / "kept"
+    command = [sys.executable, "-m", "enact_dist.cli.main", "verify", "--chaos", "--keep", kept]
+    with subprocess.Popen(
+        [*command, "--actors", "2"], stderr=subprocess.PIPE, text=True, start_new_session=True
+    ) as run:
+        for line in run.stderr:
+            if line.startswith("chaos: faults"):
+                break
+        working = processes_of(kept)
+        assert len(working) > 5
+        stopped = next(pid for pid in working if pid != run.pid)
+        os.kill(stopped, signal.SIGSTOP)
+
+        run.send_signal(number)
+
+        assert run.wait(30) == status
+    deadline_s = time.monotonic() + 10
+    while processes_of(kept) and time.monotonic() < deadline_s:
+        time.sleep(0.05)  # nothing tells when a process of somebody else has ended
+    assert processes_of(kept) == []
 
 
 def test_history_is_checked_again_from_its_folder(folder, capsys):
