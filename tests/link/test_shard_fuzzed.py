@@ -1,0 +1,169 @@
+"""Bytes that nobody should send, as raw queries to a live shard: refused, counted, and nobody hurt."""
+
+import os
+import random
+import secrets
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from enact_dist import Aspect, Entity, Lock, Write, connect
+from enact_dist.core import messages as m
+from enact_dist.errors import ProtocolError
+from enact_dist.link.zenoh_config import close_session, open_session
+from enact_dist.wire.frames import decode_frame, encode_frame
+from enact_dist.wire.keys import request_key
+from enact_dist.wire.limits import FRAME_VERSION
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "wire"))
+from fuzz.fuzzer import mutated
+from fuzz.targets import join, split
+from wire_samples import CLASSES, sample
+
+QUERIES = int(os.environ.get("ENACT_FUZZ_QUERIES", "1500"))
+AT_ONCE = 25
+COUNT = Aspect("count", int)
+BY_HAND = {m.Break, m.ForceAbort}
+"""What only an operator sends, and what then really takes locks away."""
+
+
+@pytest.fixture
+def raw(endpoint):
+    """A Zenoh session without any of our code: `ask(header, payload)` gives all its answers."""
+    opened = []
+
+    def ask(*frames):
+        if not opened:
+            opened.append(open_session(connect=(endpoint,), lease_s=1.0))
+        sent = [
+            opened[0].get(
+                request_key("cell", "s0", "hello", "fuzz"),
+                attachment=header,
+                payload=payload,
+                timeout=10.0,
+                consolidation=zenoh.ConsolidationMode.NONE,
+            )
+            for header, payload in frames
+        ]
+        return [[(reply.ok.attachment, reply.ok.payload) for reply in replies] for replies in sent]
+
+    yield ask
+    for session in opened:
+        close_session(session)
+
+
+def answer_of(replies):
+    """Return the one answer among the replies to a query."""
+    ((header, payload),) = replies
+    return decode_frame(bytes(header), bytes(payload))
+
+
+class Neighbour(threading.Thread):
+    """A well-behaved client that counts one datum up without pause."""
+
+    def __init__(self, endpoint):
+        super().__init__(daemon=True)
+        self.endpoint, self.ending, self.written, self.failure = (
+            endpoint,
+            threading.Event(),
+            0,
+            None,
+        )
+
+    def run(self):
+        try:
+            with connect(self.endpoint) as cell:
+                request = Write(cell.world("online"), Entity("tray"), COUNT)
+                while not self.ending.is_set():
+                    with Lock(request, wait_s=10.0) as lock:
+                        assert lock.get(request, 0) == self.written
+                        lock[request] = self.written + 1
+                    self.written += 1
+        except BaseException as failure:
+            self.failure = failure
+
+
+def test_shard_refuses_rubbish_and_serves_its_neighbour(daemon, endpoint, raw):
+    """Spoilt requests: each is answered, each refusal is counted, a client beside goes on."""
+    seed = int(os.environ.get("ENACT_FUZZ_SEED", secrets.randbelow(10**6)))
+    rng = random.Random(seed)
+    shard = daemon(endpoint)
+    neighbour = Neighbour(endpoint)
+    neighbour.start()
+    requests = [cls for cls in CLASSES if cls in m.Request.__args__ and cls not in BY_HAND]
+    valid = [
+        join(*(part or b"" for part in encode_frame(sample(cls, rng))))
+        for cls in requests
+        for _ in range(3)
+    ]
+
+    refused = others = 0
+    for _ in range(QUERIES // AT_ONCE):
+        spoilt = [mutated(rng.choice(valid), valid, rng)[:4096] for _ in range(AT_ONCE)]
+        spoilt += [rng.randbytes(rng.randrange(60))]
+        frames = [split(one, 2) for one in spoilt]
+        kinds = [kind_of(*frame) for frame in frames]
+        frames = [frame for frame, kind in zip(frames, kinds, strict=True) if kind not in BY_HAND]
+        for frame, replies in zip(frames, raw(*frames), strict=True):
+            answer = answer_of(replies)
+            is_request = kind_of(*frame) in m.Request.__args__
+            refused += not is_request
+            others += is_request
+            unread = type(answer) is m.Refused and answer.code == "protocol"
+            assert unread or is_request, (seed, frame, answer)
+    neighbour.ending.set()
+    neighbour.join(20)
+
+    counters = shard.host._shard.counters
+    assert neighbour.failure is None, (seed, neighbour.failure)
+    assert neighbour.written > 20
+    assert counters["frames_refused"] == refused
+    assert refused > QUERIES / 3
+    assert others > 20
+    assert shard.failure is None
+
+
+def kind_of(header, payload):
+    """Return the class of the message that these bytes are, None where they are none."""
+    try:
+        return type(decode_frame(header, payload))
+    except ProtocolError:
+        return None
+
+
+@pytest.mark.parametrize("other", [FRAME_VERSION - 1, FRAME_VERSION + 1])
+def test_client_of_another_version_is_refused_with_both_versions(daemon, endpoint, raw, other):
+    """The shard says what came and what it speaks, whatever the rest of the frame is."""
+    daemon(endpoint)
+    header, _ = encode_frame(m.ListLocks())
+
+    (replies,) = raw((header[:1] + bytes([other]) + header[2:], b""))
+
+    answer = answer_of(replies)
+    assert (type(answer), answer.code) == (m.Refused, "protocol")
+    assert f"version {other} came; this side speaks {FRAME_VERSION}" in answer.text
+
+
+CLIENT = """
+import sys
+from enact_dist.wire import frames
+frames.FRAME_VERSION -= 1
+from enact_dist import connect
+connect(sys.argv[1])
+"""
+
+
+def test_program_of_another_release_is_told_both_versions(daemon, endpoint, program):
+    """What its user reads is a named error with both versions and the remedy."""
+    daemon(endpoint)
+
+    client = program(CLIENT, endpoint)
+
+    _, said = client.communicate(timeout=30)
+    assert client.returncode == 1
+    assert "ProtocolError" in said
+    assert f"version {FRAME_VERSION} came; this side speaks {FRAME_VERSION - 1}" in said
+    assert "run the same release of enact-dist on all hosts" in said
