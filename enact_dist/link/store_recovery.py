@@ -68,6 +68,7 @@ _UNREADABLE: Final = (
     ValueError,
     TypeError,
     OverflowError,
+    RecursionError,
     msgpack.UnpackException,
 )
 """What reading a row may raise: none of it is an error of the system."""

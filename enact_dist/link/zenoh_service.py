@@ -124,7 +124,10 @@ class ZenohService:
             client_of = _CLIENT_OF.get(type(message))
             if client_of is None:
                 raise ProtocolError(f"{type(message).__name__} is no request")
-        except ProtocolError as error:
+        except Exception as error:  # noqa: BLE001 - every query is answered
+            if not isinstance(error, ProtocolError):
+                # A fault of the decoder: whoever found it must not make the shard deaf.
+                _log.exception("a frame of %d bytes broke the decoder", len(header or b""))
             self._host.count("frames_refused")
             _Call(self, query, str(query.key_expr))(Refused("protocol", str(error)))
             return

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 import re
+import reprlib
 from functools import lru_cache
 from typing import Any, Final
 
@@ -98,7 +99,7 @@ def _read(node: object, depth: int, fields_left: list[int]) -> np.dtype[Any]:
             raise DtypeError(f"an inner array of shape {shape} is too large")
         return _checked(np.dtype((item, shape)))
     if node.keys() != {"itemsize", "fields"} or not _is_sequence(node["fields"]):
-        raise DtypeError(f"a map with {sorted(map(str, node))[:5]} describes no dtype")
+        raise DtypeError(f"{reprlib.repr(node)} describes no dtype")
     fields_left[0] -= len(node["fields"])
     if fields_left[0] < 0:
         raise DtypeError(f"a structured dtype has over {FIELDS_MAX} fields")
@@ -111,7 +112,7 @@ def _read(node: object, depth: int, fields_left: list[int]) -> np.dtype[Any]:
         formats.append(_read(inner, depth + 1, fields_left))
         offsets.append(offset)
     if type(node["itemsize"]) is not int or not 0 <= node["itemsize"] <= _ITEM_BYTES_MAX:
-        raise DtypeError(f"{node['itemsize']!r:.40} is no size of an item")
+        raise DtypeError(f"{reprlib.repr(node['itemsize'])} is no size of an item")
     return _checked(
         np.dtype(
             {
@@ -151,7 +152,7 @@ def checked_shape(node: object) -> tuple[int, ...]:
         )
     for extent in node:
         if type(extent) is not int or not 0 <= extent < 1 << 62:
-            raise DtypeError(f"{extent!r:.40} is no extent of an array")
+            raise DtypeError(f"{reprlib.repr(extent)} is no extent of an array")
     return tuple(node)
 
 
@@ -179,8 +180,8 @@ def array_over(
     count = math.prod(extents)
     if order not in ("C", "F") or count * dtype.itemsize != len(raw):
         raise DtypeError(
-            f"{len(raw)} bytes in order {order!r:.10} are no array of dtype {dtype} and shape"
-            f" {extents}"
+            f"{len(raw)} bytes in order {reprlib.repr(order)} are no array of dtype {dtype} and"
+            f" shape {extents}"
         )
     if count and not dtype.itemsize:
         raise DtypeError(f"{count} items of dtype {dtype}, which has no size")

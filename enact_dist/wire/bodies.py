@@ -6,6 +6,7 @@ that nothing can hide between them, overlap, or be taken twice.
 
 from __future__ import annotations
 
+import reprlib
 from typing import Any, Final
 
 from enact_dist.core.datum import Datum
@@ -80,7 +81,7 @@ class BodyReader:
             ProtocolError: It is no datum, or its body is not where the next one must be.
         """
         if type(raw) is not tuple or tuple(map(type, raw)) != _DATUM:
-            raise ProtocolError(f"a datum came as {raw!s:.60}")
+            raise ProtocolError(f"a datum came as {reprlib.repr(raw)}")
         encoding, offset, size, stamp_ns = raw
         if len(encoding) > ENCODING_BYTES_MAX + 1 or not 0 <= stamp_ns <= INTEGER_MAX:
             raise ProtocolError(

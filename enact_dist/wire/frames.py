@@ -5,11 +5,13 @@ order of its class; a NamedTuple is the array of its fields.  A datum is ``[enco
 size, stamp_ns]``, and its body stands in the payload at `offset`.
 
 Rules to keep: a code is never used again for another message; what is received is checked whole
-(every type, every length, nothing left over) before a message exists; only `ProtocolError` leaves.
+(every type, every length, nothing left over) before a message exists; only `ProtocolError` leaves,
+so what came is shown by `reprlib` (`repr` itself gives up on 500 nested lists).
 """
 
 from __future__ import annotations
 
+import reprlib
 from functools import partial
 from typing import Any, Final, get_args
 
@@ -135,9 +137,14 @@ def decode_frame(header: bytes, payload: bytes | memoryview = b"") -> m.Message:
     code = values[1] if len(values) > 1 else None
     read = _readers.get(code) if type(code) is int else None
     if read is None:
-        raise ProtocolError(f"a frame has the unknown code {code!r:.40}; is the peer newer?")
+        raise ProtocolError(
+            f"a frame has the unknown code {reprlib.repr(code)}; is the peer newer?"
+        )
     bodies = BodyReader(payload)
-    message: m.Message = read(values[2:], bodies)
+    try:
+        message: m.Message = read(values[2:], bodies)
+    except RecursionError as error:
+        raise ProtocolError("a frame is nested too deeply") from error
     if bodies.end != len(payload):
         raise ProtocolError(
             f"{type(message).__name__} came with {len(payload)} bytes of data, {bodies.end} belong"

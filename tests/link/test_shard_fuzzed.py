@@ -134,6 +134,23 @@ def kind_of(header, payload):
         return None
 
 
+def test_shard_hears_on_after_a_frame_that_breaks_the_decoder(daemon, endpoint, raw, monkeypatch):
+    """Whatever leaves the decoder: the query is refused and the next one served."""
+    shard = daemon(endpoint)
+
+    def broken(header, payload):
+        if header == b"breaks":
+            raise RecursionError("nested without end")
+        return decode_frame(header, payload)
+
+    monkeypatch.setattr("enact_dist.link.zenoh_service.decode_frame", broken)
+    refused, answered = raw((b"breaks", b""), (encode_frame(m.ListLocks())[0], b""))
+
+    assert answer_of(refused) == m.Refused("protocol", "nested without end")
+    assert type(answer_of(answered)) is m.Locks
+    assert shard.host._shard.counters["frames_refused"] == 1
+
+
 @pytest.mark.parametrize("other", [FRAME_VERSION - 1, FRAME_VERSION + 1])
 def test_client_of_another_version_is_refused_with_both_versions(daemon, endpoint, raw, other):
     """The shard says what came and what it speaks, whatever the rest of the frame is."""

@@ -215,6 +215,24 @@ def test_frame_takes_memory_in_proportion_to_its_bytes(filler):
     assert peak < 40 * len(header)
 
 
+@pytest.mark.parametrize("depth", [100, 400, 500, 900, 1000])
+def test_frame_with_a_nested_part_is_refused_whatever_is_shown_of_it(depth):
+    """In the place of the code, of a datum, of any field: the refusal must not choke on it."""
+    nested: object = 1
+    for _ in range(depth):
+        nested = [nested]
+    lock = list(LOCK)
+
+    for header in (
+        header_of(nested, 1),
+        header_of(7, lock, [1, 1], [[list(SLOT), nested]], 0, [], []),
+        header_of(10, nested),
+        header_of(11, nested),
+    ):
+        with pytest.raises(ProtocolError):
+            decode_frame(header)
+
+
 def test_frame_nested_without_end_is_refused():
     """A hundred thousand brackets end in ProtocolError, not in the interpreter's stack."""
     for mark in (b"\x91", b"\xdc\x00\x01"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import random
+import reprlib
 import tracemalloc
 from dataclasses import dataclass
 
@@ -47,6 +48,11 @@ SOURCES = [
     ({"a": [1, "x" * 300, b"y" * 300, np.arange(5)]}, dict),
     (list(range(2000)), list),
 ]
+
+
+NESTED: list = []
+for _ in range(490):
+    NESTED = [NESTED]
 
 
 def datum_of(tree, body=BODY):
@@ -138,6 +144,10 @@ def test_random_extensions_raise_nothing_but_the_two_errors(code, content):
         ("<f8", 1, "C", 0, 8),
         ("<f8", [1] * 33, "C", 0, 8),
         ("<f8", [1], "A", 0, 8),
+        ("<f8", [1], NESTED, 0, 8),
+        ("<f8", [NESTED], "C", 0, 8),
+        (NESTED, [1], "C", 0, 8),
+        ({"itemsize": NESTED, "fields": []}, [1], "C", 0, 8),
         ("<f8", [1], None, 0, 8),
         ("<f8", [1], "C", -8, 8),
         ("<f8", [1], "C", 1020, 8),
@@ -170,7 +180,7 @@ def test_random_extensions_raise_nothing_but_the_two_errors(code, content):
         ({"shape": [1 << 20] * 9, "item": "<f8"}, [0], "C", 0, 0),
         ({"shape": [2], "item": {"shape": "2", "item": "<f8"}}, [1], "C", 0, 8),
     ],
-    ids=repr,
+    ids=reprlib.repr,
 )  # fmt: skip
 def test_array_that_does_not_fit_its_bytes_is_refused(content):
     """dtype, shape and bytes must agree before anything is allocated."""

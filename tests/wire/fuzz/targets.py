@@ -111,7 +111,7 @@ def _even(number: Any) -> Even:
 
 
 register_codec(Side, "side", encode=lambda side: side.value, decode=Side)
-register_codec(Even, "even", encode=lambda even: even.half * 2, decode=_even)
+register_codec(Even, "half", encode=lambda even: even.half * 2, decode=_even)
 TYPES: tuple[Any, ...] = (
     Scan,
     Part,
