@@ -88,6 +88,12 @@ class Coverage:
         """Note that an event has met a state."""
         self.hits[state, event] += 1
 
+    def count_run(self, steps: int) -> None:
+        """Note how long an example was: Hypothesis is free to stop early, and mostly does not."""
+        self.tally["examples"] += 1
+        self.tally["steps"] += steps
+        self.tally["examples of all steps"] += steps >= STEPS - 2  # less the initial ones
+
     def problems(self, wanted: int) -> list[str]:
         """Return the cells that were met too seldom, and those that were met against reason."""
         unknown = self.hits.keys() - {(s, e) for s in self.states for e in self.events}

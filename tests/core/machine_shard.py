@@ -11,7 +11,7 @@ from dataclasses import replace
 from typing import ClassVar
 
 from hypothesis import strategies as st
-from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition, rule
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 from machine_coverage import Coverage
 from machine_messages import HOLDS, MS, TTLS, Pick, Plans
 from machine_pair import Pair
@@ -120,7 +120,7 @@ class ShardMachine(Staging, RuleBasedStateMachine):
         self.sent: list[tuple[str, LockId, object]] = []
         self.late: list[tuple[str, LockId, object]] = []
         self.lapsed: set[str] = set()
-        self.coverage.tally["examples"] += 1
+        self.steps = -1
 
     @property
     def reference(self):
@@ -240,6 +240,15 @@ class ShardMachine(Staging, RuleBasedStateMachine):
         """A shard that drains stops, with everything on disk, and starts again."""
         self._report(len(self.pair.kept))
         self._crash(Pick(pick), "kill")
+
+    @invariant()
+    def count_the_step(self):
+        """Called after each step, and once before the first."""
+        self.steps += 1
+
+    def teardown(self):
+        """The example is over."""
+        self.coverage.count_run(self.steps)
 
     # ---------------------------------------------------------------- choosing
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import ClassVar
 
 from hypothesis import strategies as st
-from hypothesis.stateful import RuleBasedStateMachine, precondition, rule
+from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 from machine_coverage import Coverage
 from reference_table import ReferenceTable, lines_of
 
@@ -78,7 +78,7 @@ class TableMachine(RuleBasedStateMachine):
         super().__init__()
         self.table, self.reference = LockTable(), ReferenceTable()
         self.number = 0
-        self.claims.tally["examples"] += 1
+        self.steps = -1
 
     # ---------------------------------------------------------------- rules
 
@@ -143,7 +143,6 @@ class TableMachine(RuleBasedStateMachine):
             for who in there or {"nobody"}:
                 self.meetings.hit(f"wants {mode.name}", who)
         self.claims.hit("absent", "enqueue")
-        self.claims.tally["steps"] += 1
         claim = self.table.enqueue(lock, wants)
         self.reference.enqueue(lock, lines_of(items))
         assert claim.ticket == self.number, "numbers count arrivals"
@@ -154,7 +153,6 @@ class TableMachine(RuleBasedStateMachine):
 
     def _remove(self, lock):
         self.claims.hit(self._state(lock), "remove")
-        self.claims.tally["steps"] += 1
         before = self.reference.may_go_on()
         claim = self.table.remove(lock)
         self.reference.remove(lock)
@@ -199,8 +197,14 @@ class TableMachine(RuleBasedStateMachine):
             slot = Slot("online", entity, "count")
             assert set(table.writers_of(slot)) == reference.guards_of(slot)
 
+    @invariant()
+    def count_the_step(self):
+        """Called after each step, and once before the first."""
+        self.steps += 1
+
     def teardown(self):
         """Whatever waits is granted in the end, and nothing is kept of who has left."""
+        self.claims.count_run(self.steps)
         for _ in range(len(self.table.claims) + 1):
             self._take()
             for lock in list(self.reference.held):
