@@ -177,7 +177,7 @@ class Cell:
             MisuseError: The cell has no such shard.
             ShardUnreachableError: The shard does not answer.
         """
-        return self._ended_by_hand(shard, Break(number, reason))
+        return self._ended_by_hand(shard, Break(number, reason, self._epoch(shard)))
 
     def force_abort(self, number: int, *, shard: str, reason: str) -> LockInfo | None:
         """Give up a lock in doubt whose deciding shard is lost for good; audited by the shard.
@@ -191,7 +191,7 @@ class Cell:
             MisuseError: The cell has no such shard.
             ShardUnreachableError: The shard does not answer.
         """
-        return self._ended_by_hand(shard, ForceAbort(number, reason))
+        return self._ended_by_hand(shard, ForceAbort(number, reason, self._epoch(shard)))
 
     def audit(self, shards: Iterable[str] | None = None) -> tuple[AuditInfo, ...]:
         """Return what operators did and what came of it, oldest first; `shards` as in `locks`.
@@ -222,7 +222,9 @@ class Cell:
         if not how.strip():
             raise MisuseError("alarms are settled by saying how: how='' says nothing")
         self._check_shard(shard)
-        self._client.call(shard, ListAudit(how))
+        seen = self._client.call(shard, ListAudit(""))
+        stamps_ns = [e.wall_ns for e in seen.entries] if isinstance(seen, Audited) else []
+        self._client.call(shard, ListAudit(how, max(stamps_ns, default=0)))
 
     def _check_shard(self, shard: str) -> None:
         if shard not in self._client.shards():
@@ -231,8 +233,13 @@ class Cell:
                 f" {', '.join(self._client.shards())}"
             )
 
-    def _ended_by_hand(self, shard: str, request: Break | ForceAbort) -> LockInfo | None:
+    def _epoch(self, shard: str) -> int:
+        """Return the epoch in which a shard gives its numbers."""
         self._check_shard(shard)
+        answer = self._client.call(shard, ListLocks())
+        return answer.epoch if isinstance(answer, Locks) else 0
+
+    def _ended_by_hand(self, shard: str, request: Break | ForceAbort) -> LockInfo | None:
         answer = self._client.call(shard, request)
         holder = answer.holder if isinstance(answer, Broken) else None
         return lock_info(shard, holder) if holder is not None else None

@@ -125,7 +125,7 @@ class Client:
             self._welcomed(shard, request, answer)
             return True
         if isinstance(answer, EpochChanged):
-            self._epoch_changed(shard, answer.epoch)
+            self._epoch_changed(shard, answer.epoch, asked_in=_epoch_of(request))
             return False
         if isinstance(answer, Alive) and isinstance(request, KeepAlive):
             self._alive(shard, request, answer, now_ns)
@@ -148,10 +148,11 @@ class Client:
         self.ttl_ns = min(self.ttl_ns, answer.ttl_ns)
         self.learn_placement(answer.placement)
 
-    def _epoch_changed(self, shard: str, epoch: int) -> None:
+    def _epoch_changed(self, shard: str, epoch: int, *, asked_in: int | None) -> None:
         peer = self._peer(shard)
-        if epoch < peer.epoch:
-            return
+        late = asked_in is not None and asked_in < epoch == peer.epoch
+        if epoch < peer.epoch or late:
+            return  # whatever was held before is dropped already
         self._drop_grants(shard)
         peer.epoch = epoch
         peer.acknowledged = -1
@@ -278,3 +279,9 @@ class Client:
 
 
 _GRANTS_COUNT = frozenset((Phase.ACQUIRING, Phase.VIEWING, Phase.HELD))
+
+
+def _epoch_of(request: Request) -> int | None:
+    """Return the epoch that a request was made for (that of its grant, where it bears a token)."""
+    token = getattr(request, "token", None)
+    return getattr(request, "epoch", None) if token is None else token.epoch

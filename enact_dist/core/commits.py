@@ -187,9 +187,7 @@ class Commits:
         assert tenure is not None
         moved = self.moved_on(message.expects, message.lock)
         if moved is not None:
-            self._count("commits_changed")
-            yield from self._tenures.remove(tenure, now_ns=now_ns)
-            yield Reply(reply_to, Changed(message.lock, *moved))
+            yield from self.changed(tenure, moved, reply_to=reply_to, now_ns=now_ns)
             return
         stamp_ns = self._stamps.next(seen_ns=message.seen_stamp_ns, wall_ns=wall_ns)
         outcome = OutcomeRecord(
@@ -212,6 +210,18 @@ class Commits:
             if found != version or self._in_the_way(slot, lock):
                 return SlotVersion(slot, found)
         return None
+
+    def changed(
+        self, tenure: Tenure, moved: SlotVersion, *, reply_to: int, now_ns: int
+    ) -> Iterator[Effect]:
+        """End a lock whose expectation does not stand; whoever asks again is told so again."""
+        answer = Changed(tenure.lock, *moved)
+        session = self._sessions.known(tenure.lock.session)
+        if session is not None:
+            session.lane(tenure.lock.lane).changed = answer
+        self._count("commits_changed")
+        yield from self._tenures.remove(tenure, now_ns=now_ns)
+        yield Reply(reply_to, answer)
 
     def _in_the_way(self, slot: Slot, lock: LockId) -> bool:
         """Whether a lock that is no single step on this shard may write an expected slot."""
@@ -317,7 +327,7 @@ class Commits:
 
     def refusal(
         self, message: Commit | Prepare, tenure: Tenure | None, *, wall_ns: int
-    ) -> Fenced | EpochChanged | Refused | None:
+    ) -> Fenced | Changed | EpochChanged | Refused | None:
         """Return why this holder may not write this now, None if it may."""
         # The fence comes first: what a stranger asks must not end the holder's lock.
         fenced = self._fence(message.lock, message.token, tenure)
@@ -349,12 +359,16 @@ class Commits:
 
     def _fence(
         self, lock: LockId, token: Token, tenure: Tenure | None
-    ) -> Fenced | EpochChanged | None:
+    ) -> Fenced | Changed | EpochChanged | None:
         """Return None only if exactly this grant is live."""
-        if token.epoch != self._epoch or self._sessions.known(lock.session) is None:
+        session = self._sessions.known(lock.session)
+        if token.epoch != self._epoch or session is None:
             self._count("epoch_refusals")
             return EpochChanged(self._epoch)
         if tenure is None or tenure.token != token:
+            lane = session.lanes.get(lock.lane)
+            if lane is not None and lane.changed is not None and lane.changed.lock == lock:
+                return lane.changed
             self._count("fenced")
             return Fenced(lock, self._cause(lock))
         return None
@@ -383,9 +397,7 @@ class Commits:
             assert session is not None
             moved = self.moved_on(message.expects, message.lock)
             if moved is not None:
-                self._count("commits_changed")
-                yield from self._tenures.remove(tenure, now_ns=now_ns)
-                yield Reply(reply_to, Changed(message.lock, *moved))
+                yield from self.changed(tenure, moved, reply_to=reply_to, now_ns=now_ns)
                 return
             session.lane(message.lock.lane).validated = (message.lock, message.token)
             yield from self._tenures.remove(tenure, now_ns=now_ns)

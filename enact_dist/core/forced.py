@@ -68,6 +68,11 @@ class Audit:
         settled = len(kinds) - kinds[::-1].index(SETTLED) if SETTLED in kinds else 0
         return kinds[settled:].count(ALARM)
 
+    def may_settle(self, seen_ns: int) -> bool:
+        """Whether there are alarms, and none that came after `seen_ns` (0: whenever)."""
+        newest_ns = max((r.wall_ns for r in self._records if r.kind == ALARM), default=0)
+        return self.alarms > 0 and (not seen_ns or newest_ns <= seen_ns)
+
     def entries(self) -> tuple[AuditEntry, ...]:
         """Return the newest records, for people."""
         return tuple(

@@ -374,10 +374,15 @@ class ListSessions:
 
 @dataclass(frozen=True, slots=True)
 class Break:
-    """Take a lock away by its grant number, by hand.  Answer: `Broken`."""
+    """Take a lock away by its grant number, by hand.  Answer: `Broken`.
+
+    A restarted shard gives its numbers anew: `epoch` says in which one it was read (0: unsaid), so
+    that a late copy breaks nobody else's lock.
+    """
 
     number: int
     reason: str
+    epoch: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -385,21 +390,25 @@ class ForceAbort:
     """Give up a prepared lock whose primary is lost for good, by hand.  Answer: `Broken`.
 
     If the primary had decided to commit after all, the commit is torn: only for an operator who
-    knows that it never comes back.
+    knows that it never comes back.  `epoch` is that of `Break`.
     """
 
     number: int
     reason: str
+    epoch: int = 0
 
 
 @dataclass(frozen=True, slots=True)
 class ListAudit:
     """List what operators did here.  Answer: `Audited`.
 
-    A text in `settle` says that somebody has seen to all alarms so far, and how.
+    A text in `settle` says that somebody has seen to all alarms so far, and how.  `seen_ns` is the
+    wall-clock stamp of the newest act that this somebody had seen (0: unsaid): a late copy settles
+    no alarm that came since.
     """
 
     settle: str
+    seen_ns: int = 0
 
 
 # ---------------------------------------------------------------- answers

@@ -31,7 +31,6 @@ from enact_dist.core.messages import (
     RESOLVED_COMMITTED,
     RESOLVED_OPEN,
     Broken,
-    Changed,
     Finish,
     Finished,
     ForceAbort,
@@ -132,9 +131,7 @@ class PrepareDesk:
             return
         moved = state.commits.moved_on(message.expects, message.lock)
         if moved is not None:
-            state.count("commits_changed")
-            yield from state.tenures.remove(tenure, now_ns=state.now_ns)
-            yield Reply(reply_to, Changed(message.lock, *moved))
+            yield from state.commits.changed(tenure, moved, reply_to=reply_to, now_ns=state.now_ns)
             return
         stamp_ns = state.stamps.next(seen_ns=message.seen_stamp_ns, wall_ns=state.wall_ns)
         record = PreparedRecord(
@@ -307,11 +304,11 @@ class PrepareDesk:
     def on_force_abort(self, message: ForceAbort, reply_to: int) -> Iterator[Effect]:
         """Give up a prepared lock by hand; audited, and durable before it is told."""
         state = self._state
-        found = [t for t in state.tenures.by_lock.values() if t.claim.ticket == message.number]
-        if not found or found[0].prepared is None or found[0].committing:
+        tenure = state.numbered(message.number, message.epoch)
+        record = tenure.prepared if tenure is not None else None
+        if tenure is None or record is None or tenure.committing:
             yield Reply(reply_to, Broken(False, None))
             return
-        tenure, record = found[0], found[0].prepared
         holder = state.describe(tenure, state.now_ns)
         why = message.reason or "no reason given"
         text = (

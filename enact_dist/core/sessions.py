@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
     from enact_dist.core.datum import LockId, Token
-    from enact_dist.core.messages import Hello
+    from enact_dist.core.messages import Changed, Hello
     from enact_dist.core.records import OutcomeRecord, SessionRecord
 
 LANES_MAX: Final = 1024
@@ -39,12 +39,14 @@ class Lane:
         top: Highest seq that asked for a lock here; each seq is granted at most once.
         outcome: What its newest commit did.
         validated: The newest lock whose reads were found intact, with its token.
+        changed: What the newest lock was told whose expectation did not stand.
         ended: The newest lock that the shard took away, with the cause.
     """
 
     top: int = 0
     outcome: OutcomeRecord | None = None
     validated: tuple[LockId, Token] | None = None
+    changed: Changed | None = None
     ended: tuple[LockId, str] | None = None
 
 

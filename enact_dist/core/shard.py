@@ -288,13 +288,13 @@ class Shard:
         yield Reply(reply_to, answer)
 
     def _on_break(self, message: Break, reply_to: int) -> Iterator[Effect]:
-        found = [t for t in self.state.tenures.by_lock.values() if t.claim.ticket == message.number]
-        if not found or found[0].bound:
+        found = self.state.numbered(message.number, message.epoch)
+        if found is None or found.bound:
             yield Reply(reply_to, Broken(False, None))
             return
-        holder = self.state.describe(found[0], self.state.now_ns)
+        holder = self.state.describe(found, self.state.now_ns)
         cause = f"broken by an operator: {message.reason or 'no reason given'}"
-        yield from self.state.tenures.take_away(found[0], cause, now_ns=self.state.now_ns)
+        yield from self.state.tenures.take_away(found, cause, now_ns=self.state.now_ns)
         self.state.count("locks_broken")
         text = f"lock {message.number} of {holder.actor}@{holder.host} {cause}"
         kept = self.state.audit.keep(AuditRecord(self.state.wall_ns, text, BROKEN))
@@ -303,7 +303,7 @@ class Shard:
 
     def _on_list_audit(self, message: ListAudit, reply_to: int) -> Iterator[Effect]:
         audit = self.state.audit
-        if message.settle:
+        if message.settle and audit.may_settle(message.seen_ns):
             kept = audit.keep(AuditRecord(self.state.wall_ns, message.settle, SETTLED))
             yield Persist(0, (kept,), Durability.OS)
         yield Reply(reply_to, Audited(audit.alarms, audit.entries()))

@@ -152,6 +152,13 @@ class ShardState:
         if session is not None and session.lane(lock.lane).top == lock.seq:
             session.lane(lock.lane).top = lock.seq - 1
 
+    def numbered(self, number: int, epoch: int) -> Tenure | None:
+        """Return the lock of a number that people were told in an epoch (0: this one)."""
+        if epoch not in (0, self.epoch):
+            return None
+        found = (t for t in self.tenures.by_lock.values() if t.claim.ticket == number)
+        return next(found, None)
+
     def describe(self, tenure: Tenure, now_ns: int) -> Holder:
         """Describe one lock for people."""
         return inspection.holder(self, tenure, now_ns=now_ns)

@@ -137,3 +137,33 @@ def test_two_watches_do_not_take_from_each_other(online):
     with online.watch("**") as one, online.watch("**") as other:
         online.init(bench, COUNT, 1)
         assert one.next(SOON_S) == other.next(SOON_S)
+
+
+class Repeating:
+    """A feed whose every notice comes twice, the second time behind the next one."""
+
+    def __init__(self, feed):
+        self._feed, self._copies = feed, []
+
+    def get(self, timeout_s):
+        notice = self._feed.get(timeout_s)
+        if notice is None:
+            return self._copies.pop() if self._copies else None
+        self._copies.append(notice)
+        return notice
+
+    def close(self):
+        self._feed.close()
+
+
+def test_notice_that_comes_again_tells_nothing_twice(online):
+    """Copies, and notices that come after newer ones, are known by their numbers."""
+    count = Write(online, bench, COUNT)
+    with online.watch("**", COUNT) as watch:
+        watch._feed = Repeating(watch._feed)
+        for value in (1, 2, 3):
+            write(count, value)
+        assert [watch.next(SOON_S).version for _ in range(3)] == [1, 2, 3]
+        assert rest(watch) == []
+        assert watch.missed == 0
+        assert not watch._feed._copies

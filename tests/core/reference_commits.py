@@ -104,8 +104,7 @@ class ReferenceShard(ReferenceSessions):
             return
         moved = self.moved(m.expects, m.lock)
         if moved is not None:
-            self.end(life, "given back")
-            self.answer(handle, "changed", m.lock, *moved)
+            self.changed(life, handle, moved)
             return
         life.writes = tuple((write.slot, text_of(write.datum)) for write in m.writes)
         life.versions, life.participants = self.next_versions(life.writes), m.participants
@@ -169,12 +168,24 @@ class ReferenceShard(ReferenceSessions):
         if m.token.epoch != self.epoch or self.known(m.lock.session) is None:
             return "epoch", self.epoch
         if life is None or life.token != m.token:
-            return "fenced", m.lock
+            return self.fenced(m.lock)
         slots = [write.slot for write in m.writes]
         allowed = all(any(line.allows(slot) for line in life.lines) for slot in slots)
         if life.bound or not allowed or len(set(slots)) < len(slots):
             return "refused", "protocol"
         return None
+
+    def changed(self, life, handle, moved):
+        """End a lock whose expectation does not stand."""
+        answer = self.lane_of(life.lock).changed = ("changed", life.lock, *moved)
+        self.end(life, "given back")
+        self.answer(handle, *answer)
+
+    def fenced(self, lock):
+        """What the holder of a lost lock is told: that something moved on, if that ended it."""
+        lane = self.lane_of(lock)
+        told = lane.changed if lane else None
+        return told if told is not None and told[1] == lock else ("fenced", lock)
 
     def moved(self, expects, lock):
         """Return an expected slot that moved on or may be about to, and its version."""
@@ -213,11 +224,12 @@ class ReferenceShard(ReferenceSessions):
             self.answer(handle, "epoch", self.epoch)
         elif not m.token.number:
             self.answer(handle, *(("changed", m.lock, *moved) if moved else ("valid", m.lock)))
-        elif life is None or life.token != m.token or life.bound:
+        elif life is None or life.token != m.token:
+            self.answer(handle, *self.fenced(m.lock))
+        elif life.bound:
             self.answer(handle, "fenced", m.lock)
         elif moved:
-            self.end(life, "given back")
-            self.answer(handle, "changed", m.lock, *moved)
+            self.changed(life, handle, moved)
         else:
             lane.validated = (m.lock, m.token)
             self.end(life, "validated")
@@ -237,8 +249,7 @@ class ReferenceShard(ReferenceSessions):
         if refusal is not None:
             self.answer(handle, *refusal)
         elif moved:
-            self.end(life, "given back")
-            self.answer(handle, "changed", m.lock, *moved)
+            self.changed(life, handle, moved)
         else:
             life.writes = tuple((write.slot, text_of(write.datum)) for write in m.writes)
             life.versions, life.phase = self.next_versions(life.writes), "preparing"

@@ -48,6 +48,7 @@ class Lane:
     top: int = 0
     outcome: tuple[LockId, tuple[tuple[Slot, int], ...]] | None = None
     validated: tuple[LockId, Token] | None = None
+    changed: tuple | None = None
 
 
 @dataclass
