@@ -8,6 +8,7 @@ that large bodies go to files like all others.  The rows of one lock come and go
 
 from __future__ import annotations
 
+import reprlib
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
@@ -98,7 +99,7 @@ def read_decision(key: Key, body: bytes) -> DecisionRecord:
     position = Position(fields.next(int), fields.next(str))
     participants = fields.last(list)
     if not all(isinstance(shard, str) for shard in participants):
-        raise DamagedRowError(f"names of shards were expected, found {participants!r:.80}")
+        raise DamagedRowError(f"names of shards were expected, found {reprlib.repr(participants)}")
     return DecisionRecord(_lock(Fields(key.name)), position, tuple(participants))
 
 

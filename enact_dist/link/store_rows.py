@@ -8,6 +8,7 @@ what is written means a new `FORMAT` in `folder_lock`.
 from __future__ import annotations
 
 import enum
+import reprlib
 import zlib
 from typing import Final, NamedTuple, TypeVar
 
@@ -240,7 +241,7 @@ class Fields:
     def __init__(self, packed: object) -> None:
         fields = msgpack.unpackb(packed) if isinstance(packed, bytes) else packed
         if not isinstance(fields, list):
-            raise DamagedRowError(f"a list was expected, found {fields!r:.80}")
+            raise DamagedRowError(f"a list was expected, found {reprlib.repr(fields)}")
         self._fields: list[object] = fields
         self._next = 0
 
@@ -252,10 +253,12 @@ class Fields:
     def next(self, asked: type[T]) -> T:
         """Take the next field, which must be of this type."""
         if self._next >= len(self._fields):
-            raise DamagedRowError(f"field {self._next + 1} of {self._fields!r:.80} is missing")
+            raise DamagedRowError(
+                f"field {self._next + 1} of {reprlib.repr(self._fields)} is missing"
+            )
         found = self._fields[self._next]
         if not isinstance(found, asked):
-            raise DamagedRowError(f"{asked.__name__} was expected, found {found!r:.80}")
+            raise DamagedRowError(f"{asked.__name__} was expected, found {reprlib.repr(found)}")
         self._next += 1
         return found
 
@@ -268,4 +271,4 @@ class Fields:
     def end(self) -> None:
         """Make sure that nothing is left."""
         if self._next != len(self._fields):
-            raise DamagedRowError(f"{self._fields!r:.80} has more than {self._next} fields")
+            raise DamagedRowError(f"{reprlib.repr(self._fields)} has more than {self._next} fields")

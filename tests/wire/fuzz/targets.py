@@ -34,6 +34,8 @@ from enact_dist.wire.frames import decode_frame, encode_frame
 from enact_dist.wire.payload import decode_datum, decode_untyped, encode_datum
 
 _LENGTH = struct.Struct("<I")
+ROWS_MAX = 100
+"""Rows of one input: a longer one has nothing new to say."""
 
 
 def join(*parts: bytes) -> bytes:
@@ -220,14 +222,15 @@ def row_input(*stored: tuple[int, bytes, bytes]) -> bytes:
 def rows(raw: bytes) -> object:
     """Read rows whose checksums are right, as a program with a bug may have written them."""
     stored = []
-    while raw:
-        name, body_and_rest = split(raw[1:5] + raw[9:], 2)
-        length = int.from_bytes(raw[5:9], "little")
-        body, rest = body_and_rest[:length], body_and_rest[length:]
-        kind = raw[0] % (max(Kind) + 2)
+    begin = 0
+    while begin < len(raw) and len(stored) < ROWS_MAX:
+        kind = raw[begin] % (max(Kind) + 2)
+        middle = begin + 9 + int.from_bytes(raw[begin + 1 : begin + 5], "little")
+        end = middle + int.from_bytes(raw[begin + 5 : begin + 9], "little")
+        name, body = raw[begin + 9 : middle], raw[middle:end]
         crc = row_checksum(Key(kind, name), 1, body)  # type: ignore[arg-type]  # any number at all
         stored.append(DatabaseRow(len(stored) + 1, kind, 1, name, body, crc))
-        raw = rest
+        begin = end
     try:
         contents = read_contents(_Rows(stored), Path("store.db"))  # type: ignore[arg-type]  # rows
         put_together(contents, Path("store.db"))
