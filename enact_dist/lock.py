@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, overload
 
 from enact_dist.core.datum import Datum, Slot
 from enact_dist.core.messages import SlotVersion, WriteItem
-from enact_dist.core.multilock import Phase
+from enact_dist.core.phase import Phase
 from enact_dist.errors import (
     LockHeldError,
     LockReleasedError,

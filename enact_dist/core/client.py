@@ -27,7 +27,8 @@ from enact_dist.core.messages import (
     PlacementMap,
     Welcome,
 )
-from enact_dist.core.multilock import MultiLock, Phase
+from enact_dist.core.multilock import MultiLock
+from enact_dist.core.phase import Phase
 from enact_dist.core.placement import shard_of
 from enact_dist.terms import Access
 

@@ -20,7 +20,6 @@ Rules a change must keep
 
 from __future__ import annotations
 
-import enum
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
@@ -53,6 +52,7 @@ from enact_dist.core.messages import (
     Waiting,
     WrongShard,
 )
+from enact_dist.core.phase import Phase
 from enact_dist.core.placement import shard_of
 
 if TYPE_CHECKING:
@@ -67,36 +67,11 @@ WAIT_SLICE_NS: Final = 900_000_000
 RETRY_NS_MIN: Final = 20_000_000
 RETRY_NS_MAX: Final = 300_000_000
 """Pause after a call without an answer; doubles up to the second figure."""
+OVERLOAD: Final = "overload"
+"""The code of refusals by a shard that has not looked at the request."""
 FREE_CALLS: Final = 3
 """Calls after a step forward that are made though the time to wait is over: a lock that does not
 want to wait asks each shard once, and again where a shard has restarted."""
-
-
-class Phase(enum.Enum):
-    """Where a lock is in its life; see the drawing above."""
-
-    ACQUIRING = "acquiring"
-    VIEWING = "viewing"
-    HELD = "held"
-    VALIDATING = "validating"
-    COMMITTING = "committing"
-    COMMITTED = "committed"
-    RELEASED = "released"
-    LOST = "lost"
-    CHANGED = "changed"
-    TIMED_OUT = "timed out"
-    UNREACHABLE = "unreachable"
-    REFUSED = "refused"
-    MISPLACED = "misplaced"
-    UNKNOWN = "unknown"
-
-    @property
-    def busy(self) -> bool:
-        """Whether the lock has calls to make before it rests."""
-        return self in _BUSY
-
-
-_BUSY: Final = frozenset((Phase.ACQUIRING, Phase.VIEWING, Phase.VALIDATING, Phase.COMMITTING))
 
 
 @dataclass(slots=True, eq=False)
@@ -209,7 +184,7 @@ class MultiLock:
 
     def answered(self, shard: str, request: Request, answer: Answer | None, now_ns: int) -> None:
         """Take the answer to one call (None: unknown)."""
-        if answer is None:
+        if answer is None or self._tells_nothing(request, answer):
             self._silent(shard, request, now_ns)
             return
         if self.client.answered(shard, request, answer, now_ns):
@@ -235,6 +210,18 @@ class MultiLock:
             self._on_vote(shard, answer)
         elif self.phase is Phase.COMMITTING and isinstance(request, Commit | Outcome):
             self._on_committing(answer, now_ns)
+
+    def _tells_nothing(self, request: Request, answer: Answer) -> bool:
+        """Whether it is a refusal that leaves open what became of a commit that was sent.
+
+        Refusing the commit itself ends its lock, but a shard that is too busy has not looked at
+        it: an earlier copy may have been applied, or still be.
+        """
+        if not (
+            isinstance(answer, Refused) and self.phase is Phase.COMMITTING and self.sent_commit
+        ):
+            return False
+        return not isinstance(request, Commit) or answer.code == "overload"
 
     def _silent(self, shard: str, request: Request, now_ns: int) -> None:
         self.silent_shard = shard

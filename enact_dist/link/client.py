@@ -22,7 +22,8 @@ from enact_dist.core.messages import (
     OutcomeIs,
     Release,
 )
-from enact_dist.core.multilock import MultiLock, Phase
+from enact_dist.core.multilock import MultiLock
+from enact_dist.core.phase import Phase
 from enact_dist.errors import CommitUnknownError, EnactError, MisuseError
 from enact_dist.link.lock_names import name_of, read_name
 from enact_dist.link.refusals import not_committed, not_granted

@@ -8,7 +8,8 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING
 
-from enact_dist.core.multilock import MultiLock, Phase
+from enact_dist.core.multilock import MultiLock
+from enact_dist.core.phase import Phase
 from enact_dist.errors import (
     ChangedError,
     ClockSkewError,

@@ -34,7 +34,7 @@ from enact_dist.core.messages import (
     Validate,
     WriteItem,
 )
-from enact_dist.core.multilock import Phase
+from enact_dist.core.phase import Phase
 from enact_dist.terms import Access
 
 R, W, V, WE = Access.READ, Access.WRITE, Access.VIEW, Access.WRITE_EACH

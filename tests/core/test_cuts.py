@@ -8,7 +8,8 @@ from shard_bench import MS, TTL_NS, S, item, lock_id, slot
 
 from enact_dist.core.cuts import ROUNDS_MAX, Cut
 from enact_dist.core.messages import Finish, PlacementMap, ShardEntry, TakeView, Viewed
-from enact_dist.core.multilock import MultiLock, Phase
+from enact_dist.core.multilock import MultiLock
+from enact_dist.core.phase import Phase
 from enact_dist.core.records import Called
 from enact_dist.terms import Access
 

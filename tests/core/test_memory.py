@@ -20,7 +20,7 @@ from enact_dist.core.messages import (
     ShardEntry,
     WriteItem,
 )
-from enact_dist.core.multilock import Phase
+from enact_dist.core.phase import Phase
 from enact_dist.core.placement import shard_of
 from enact_dist.core.records import Call, Called, Persist, Persisted, Recovered, Reply, Tick
 from enact_dist.core.shard import Shard

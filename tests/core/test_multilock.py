@@ -13,11 +13,12 @@ from enact_dist.core.messages import (
     Granted,
     Outcome,
     OutcomeIs,
+    Refused,
     Release,
     Validate,
     Waiting,
 )
-from enact_dist.core.multilock import Phase
+from enact_dist.core.phase import Phase
 from enact_dist.terms import Access
 
 R, W, V, WE = Access.READ, Access.WRITE, Access.VIEW, Access.WRITE_EACH
@@ -132,6 +133,30 @@ class TestLostAnswers:
 
         assert ann.kinds_sent(since=since) == sent
         assert lock.phase is Phase.COMMITTED
+        assert cell.shards["s0"].shard.state.slots[slot()].version == 1
+
+    @pytest.mark.parametrize("refused", [Outcome, Commit])
+    def test_refusal_of_a_busy_shard_says_nothing_of_a_commit(self, cell, refused, monkeypatch):
+        """The answer was lost and the question refused: the client asks on, and learns the truth."""
+        ann = cell.client("ann")
+        lock = ann.locked(item(W))
+        lost = iter([ANSWER] if refused is Outcome else [])
+        ann.lose = lambda _shard, request: (
+            next(lost, NOTHING) if isinstance(request, Commit) else NOTHING
+        )
+        answer, busy = ann._answer, iter([True, True])
+
+        def refusing(shard: str, request: object) -> object:
+            if isinstance(request, refused) and next(busy, False):
+                ann.sent.append((shard, request))
+                return Refused("overload", "too many requests wait")
+            return answer(shard, request)
+
+        monkeypatch.setattr(ann, "_answer", refusing)
+        ann.finish(lock, (slot(), "1"))
+
+        assert lock.phase is Phase.COMMITTED
+        assert [version.version for version in lock.versions] == [1]
         assert cell.shards["s0"].shard.state.slots[slot()].version == 1
 
     def test_commit_that_nobody_answers_is_unknown(self, cell):

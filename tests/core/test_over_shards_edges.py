@@ -10,7 +10,7 @@ from shard_bench import ShardBench, datum, item, lock_id, slot
 
 from enact_dist.core.datum import Position, Token
 from enact_dist.core.messages import Commit, Finish, Finished, PlacementMap, Prepare, WriteItem
-from enact_dist.core.multilock import Phase
+from enact_dist.core.phase import Phase
 from enact_dist.core.records import Called, DecisionDone, Drain
 from enact_dist.terms import Access
 

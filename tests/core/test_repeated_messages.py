@@ -44,7 +44,7 @@ from enact_dist.core.messages import (
     Validate,
     WriteItem,
 )
-from enact_dist.core.multilock import Phase
+from enact_dist.core.phase import Phase
 from enact_dist.core.records import AuditRecord
 from enact_dist.core.sessions import IDLE_TTLS, Lane
 from enact_dist.core.shard_state import ShardState

@@ -16,7 +16,8 @@ from enact_dist.core.commits import Commits
 from enact_dist.core.datum import Token
 from enact_dist.core.lock_table import Mode
 from enact_dist.core.messages import Alive, Commit, Granted, GrantLeft, KeepAlive
-from enact_dist.core.multilock import MultiLock, Phase
+from enact_dist.core.multilock import MultiLock
+from enact_dist.core.phase import Phase
 from enact_dist.core.records import Persist, Reply
 from enact_dist.core.session_desk import SessionDesk
 from enact_dist.core.sessions import Lane, Session, SessionTable

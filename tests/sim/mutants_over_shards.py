@@ -12,7 +12,8 @@ from enact_dist.core.commits import Commits
 from enact_dist.core.cuts import Cut
 from enact_dist.core.decisions import Decisions
 from enact_dist.core.messages import Finished
-from enact_dist.core.multilock import MultiLock, Phase
+from enact_dist.core.multilock import MultiLock
+from enact_dist.core.phase import Phase
 from enact_dist.core.prepares import PrepareDesk
 from enact_dist.core.records import Persist, PreparedEnded, Reply
 from enact_dist.core.tenures import Tenure

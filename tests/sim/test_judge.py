@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from enact_dist.core.datum import LockId, Token
-from enact_dist.core.multilock import Phase
+from enact_dist.core.phase import Phase
 from enact_dist.core.records import Persist, Persisted, PreparedEnded, PreparedRecord, Tick
 from enact_dist.terms import Durability
 from enact_dist.verify.simulation.faults import NONE

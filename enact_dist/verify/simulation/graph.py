@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from enact_dist.core.multilock import Phase
+from enact_dist.core.phase import Phase
 from enact_dist.verify.checker import NOTHING, Checker, LockStory, Reading, State, Told
 from enact_dist.verify.simulation.history import TOLD_NOT
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from enact_dist.core.multilock import Phase
+from enact_dist.core.phase import Phase
 from enact_dist.terms import Access, pattern_matches, patterns_overlap
 
 if TYPE_CHECKING:

@@ -21,7 +21,8 @@ from enact_dist.core.messages import (
     SlotVersion,
     WriteItem,
 )
-from enact_dist.core.multilock import MultiLock, Phase
+from enact_dist.core.multilock import MultiLock
+from enact_dist.core.phase import Phase
 from enact_dist.core.placement import shard_of
 from enact_dist.terms import Access
 from enact_dist.verify.simulation.client_host import Calls, ClientHost, Sleep, Steps, Thread
