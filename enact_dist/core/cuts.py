@@ -91,8 +91,8 @@ class Cut:
             return self._settled
         answers = {shard: answer.viewed for shard, answer in self._answers.items()}
         at_ns = max((viewed.from_ns for viewed in answers.values()), default=0)
-        if len(answers) == 1:
-            at_ns = 0  # one shard shows every commit whole, whatever its stamp
+        if len(answers) == 1 and not self.at_ns:
+            at_ns = 0  # one shard shows every commit whole as of now, whatever its stamp
         at_ns = max(at_ns, self._floor_ns)
         lagging = [
             shard

@@ -80,6 +80,19 @@ class TestCut:
 
         assert settled(cut, now_ns=2 * LATER_NS) == {"a": viewed}
 
+    def test_one_shard_as_of_a_stamp_may_mix_past_and_present(self):
+        """Where it has forgotten a past it shows the present, beside the past of other slots."""
+        cut = cut_over("a", floor_ns=90)
+        answer(cut, "a", 10, 80)
+        assert settled(cut) is None
+        answer(cut, "a", 120, 90)
+
+        assert settled(cut) is None
+        assert cut.at_ns == 120
+
+        again = answer(cut, "a", 120, 120)
+        assert settled(cut) == {"a": again}
+
     def test_own_commits_are_waited_for(self):
         """A session sees what it has committed itself, at one shard too."""
         cut = cut_over("a", floor_ns=70)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from mutant_parts import forgets_what_ended
 
 from enact_dist.core.commits import Commits
+from enact_dist.core.cuts import Cut
 from enact_dist.core.lock_desk import LockDesk
 from enact_dist.core.messages import Granted
 from enact_dist.core.multilock import MultiLock
@@ -109,6 +110,18 @@ def views_do_not_renew(patch: Patch) -> None:
     patch(ViewDesk, "on_take_view", wrong)
 
 
+def mixes_past_and_present(patch: Patch) -> None:
+    """A view of one shard as of a stamp counts as one of now, whatever it mixes."""
+    settled = Cut.settled
+
+    def wrong(self: Cut, *args: Any, **options: Any) -> Any:
+        if len(self.items) == 1:
+            self.at_ns = 0
+        return settled(self, *args, **options)
+
+    patch(Cut, "settled", wrong)
+
+
 DIRECTED = {
     takes_grants_of_an_old_epoch: "test_grant_of_an_epoch_that_is_over_is_not_taken",
     leases_end_late: "test_lease_ends_exactly_with_its_ttl",
@@ -119,6 +132,7 @@ DIRECTED = {
         "test_prepared_lock_stays_when_its_client_or_an_operator_ends_it"
     ),
     shows_the_present_for_the_past: "test_view_as_of_the_past_shows_the_past",
+    mixes_past_and_present: "test_one_shard_as_of_a_stamp_may_mix_past_and_present",
     views_do_not_renew: "test_everything_that_is_counted_renews",
 }
 """Each with the test of `tests/core` that catches it."""

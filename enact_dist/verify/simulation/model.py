@@ -396,6 +396,10 @@ class Model:
             if name != now.name and isinstance(answer, Viewed):
                 now = picture.at(state.slot, max(answer.from_ns, answer.until_ns))
                 self._world.tally["data shown as of the past"] += 1
+                if name != now.name and answer.from_ns > answer.until_ns:
+                    # Of no one moment, and it says so: some of the past was forgotten.
+                    now = picture.at(state.slot, answer.until_ns)
+                    self._world.tally["views of no moment"] += 1
             if name != now.name:
                 self._fail("I18 readers see what is committed", state.slot, state, now)
             if (state.null_reason == "") != (now.datum is not None):
