@@ -10,12 +10,15 @@ knows what was forced to the disk and what was not.  What a crash leaves:
   own sync keeps its name is no promise of POSIX.
 """
 
+import contextlib
 import itertools
+import os
 import re
 import shutil
 import subprocess
+import tempfile
 from dataclasses import dataclass, field
-from pathlib import PurePath
+from pathlib import Path, PurePath
 from typing import NamedTuple
 
 EXHAUSTIVE_MAX = 1 << 10
@@ -335,3 +338,14 @@ def put(image, folder):
             (folder / path).mkdir(exist_ok=True)
         else:
             (folder / path).write_bytes(content)
+
+
+@contextlib.contextmanager
+def memory_folder(tmp_path):
+    """Yield a folder in memory where there is one: thousands of images are written and synced."""
+    shared = Path("/dev/shm")
+    if not os.access(shared, os.W_OK):
+        yield tmp_path
+        return
+    with tempfile.TemporaryDirectory(prefix="enact-store-", dir=shared) as folder:
+        yield Path(folder)

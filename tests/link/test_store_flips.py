@@ -10,6 +10,7 @@ import re
 import shutil
 
 import pytest
+from store_disk import memory_folder
 from store_model import State
 from store_writer import outcome_record, persist, slot_record
 
@@ -51,10 +52,17 @@ def batches():
 
 
 @pytest.fixture
-def folders(tmp_path):
+def memory(tmp_path):
+    """A folder on which a sync costs nothing."""
+    with memory_folder(tmp_path) as folder:
+        yield folder
+
+
+@pytest.fixture
+def folders(memory):
     """A folder as `kill -9` leaves it, the same one as a clean end does, and what they hold."""
     state = State()
-    folder = tmp_path / "closed"
+    folder = memory / "closed"
     store, _ = open_store(folder, unix_s=1)
     for records in batches():
         durability = (
@@ -62,17 +70,17 @@ def folders(tmp_path):
         )
         store.write([persist(*records, durability=durability)])
         state = state.after([(durability, records)])
-    shutil.copytree(folder, tmp_path / "killed")
+    shutil.copytree(folder, memory / "killed")
     store.close()
-    return tmp_path / "killed", folder, state
+    return memory / "killed", folder, state
 
 
 class Flipper:
     """Flips bytes of one file in a folder that is made again whenever it was opened."""
 
-    def __init__(self, whole, file, state, tmp_path):
+    def __init__(self, whole, file, state, folder):
         self.whole, self.file, self.state = whole, file, state
-        self.folder = tmp_path / "flipped"
+        self.folder = folder / "flipped"
         self.content = (whole / file).read_bytes()
         self.outcomes = collections.Counter()
         self.harmless = set()
@@ -104,10 +112,10 @@ class Flipper:
         return None
 
 
-def test_every_byte_of_the_log_is_refused_with_its_frame(folders, tmp_path):
+def test_every_byte_of_the_log_is_refused_with_its_frame(folders, memory):
     """Header, frame headers, salts, checksums, pages: each flip is placed in its frame."""
     killed, _, state = folders
-    flipper = Flipper(killed, "store.db-wal", state, tmp_path)
+    flipper = Flipper(killed, "store.db-wal", state, memory)
     rng = random.Random(5)
     frames = (len(flipper.content) - 32) // FRAME_BYTES
     for offset in range(len(flipper.content)):
@@ -122,10 +130,10 @@ def test_every_byte_of_the_log_is_refused_with_its_frame(folders, tmp_path):
     assert frames >= 3
 
 
-def test_every_byte_of_the_database_is_refused_or_harmless(folders, tmp_path):
+def test_every_byte_of_the_database_is_refused_or_harmless(folders, memory):
     """SQLite's own check and the checksums of rows leave only free space and idle fields."""
     _, closed, state = folders
-    flipper = Flipper(closed, "store.db", state, tmp_path)
+    flipper = Flipper(closed, "store.db", state, memory)
     rng = random.Random(6)
     for offset in range(len(flipper.content)):
         refused = flipper.flip(offset, 1 << rng.randrange(8))
@@ -135,10 +143,10 @@ def test_every_byte_of_the_database_is_refused_or_harmless(folders, tmp_path):
 
 
 @pytest.mark.parametrize("file", ["mark", "format", "lock"])
-def test_every_byte_of_the_small_files_is_refused_or_harmless(folders, tmp_path, file):
+def test_every_byte_of_the_small_files_is_refused_or_harmless(folders, memory, file):
     """A mark that cannot be read counts as none; a format that cannot be read is refused."""
     killed, _, state = folders
-    flipper = Flipper(killed, file, state, tmp_path)
+    flipper = Flipper(killed, file, state, memory)
     for offset in range(len(flipper.content)):
         for bit in range(8):
             flipper.flip(offset, 1 << bit)
@@ -146,11 +154,11 @@ def test_every_byte_of_the_small_files_is_refused_or_harmless(folders, tmp_path,
     assert (flipper.outcomes["refused"] > 0) == (file == "format")
 
 
-def test_every_byte_of_a_large_body_is_refused(folders, tmp_path):
+def test_every_byte_of_a_large_body_is_refused(folders, memory):
     """Each byte by the check of its file, one in 500 by a whole start, which names the slot."""
     _, closed, state = folders
     (name,) = (path.name for path in (closed / "blobs").iterdir())
-    folder = BlobFolder(tmp_path / "closed" / "blobs", epoch=9)
+    folder = BlobFolder(memory / "closed" / "blobs", epoch=9)
     content = (closed / "blobs" / name).read_bytes()
     import zlib
 
@@ -164,7 +172,7 @@ def test_every_byte_of_a_large_body_is_refused(folders, tmp_path):
                 folder.read(blob)
             file.seek(offset)
             file.write(bytes([byte]))
-    flipper = Flipper(closed, f"blobs/{name}", state, tmp_path)
+    flipper = Flipper(closed, f"blobs/{name}", state, memory)
     for offset in range(0, len(content), 500):
         refused = flipper.flip(offset, 0x10)
         assert f"{name} holds online:large/aspect, version 1" in refused
