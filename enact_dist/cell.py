@@ -73,6 +73,7 @@ class ShardInfo:
         open: False while a restarted shard waits for older leases to end.
         clock_ahead_s: Its wall clock less ours, half a round trip taken off.
         round_trip_s: Of the call that asked.
+        carrier: How this process's calls to it travel: "socket", or "zenoh" and why.
         counters: Its statistics by name.
     """
 
@@ -88,6 +89,7 @@ class ShardInfo:
     locks: int = 0
     clock_ahead_s: float = 0.0
     round_trip_s: float = 0.0
+    carrier: str = ""
     counters: dict[str, int] = field(default_factory=dict)
 
 
@@ -270,6 +272,7 @@ class Cell:
             locks=sum(session.locks for session in answer.sessions),
             clock_ahead_s=ahead_ns / 1e9,
             round_trip_s=round_trip_s,
+            carrier=self._client.carrier.way_to(shard),
             counters={counter.name: counter.value for counter in answer.counters},
         )
 

@@ -36,7 +36,9 @@ session_ttl_s          2.0            a holder that dies loses its locks after t
                                       (0.2 to 60)
 data_folder            none           parent of the shards' folders; without one, and without
                                       a `folder`, a shard keeps everything in memory only
-carrier                "zenoh"        how messages travel between processes
+carrier                "auto"         how messages travel between processes: "zenoh"; "socket"
+                                      (of this host, an error elsewhere); "auto" takes sockets
+                                      where it can
 [shards.NAME]          at least one   a shard daemon
   listen               required       endpoint or endpoints it opens, ``tcp/host:port``
   advertise            listen         endpoint or endpoints at which others reach it; required

@@ -27,6 +27,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.config_table import suggestion
+from enact_dist.config_types import CARRIER_DEFAULT
 from enact_dist.config_values import (
     CARRIERS,
     TTL_S_MAX,
@@ -101,6 +102,15 @@ def _carrier(text: str) -> str:
     if text not in CARRIERS:
         raise ConfigError(f"ENACT_CARRIER={text!r} is unknown (known: {', '.join(CARRIERS)})")
     return text
+
+
+def carrier_of(environment: Mapping[str, str]) -> str:
+    """Return the carrier that the environment asks for where no `cell.toml` does.
+
+    Raises:
+        ConfigError: There is none of that name.
+    """
+    return _carrier(environment.get("ENACT_CARRIER", CARRIER_DEFAULT))
 
 
 def _moved(config: CellConfig, data_folder: Path) -> CellConfig:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 TTL_S_DEFAULT: Final = 2.0
 """Session TTL in seconds: a dead holder blocks others that long; shorter needs a quiet network."""
 
-CARRIER_DEFAULT: Final = "zenoh"
+CARRIER_DEFAULT: Final = "auto"
 
 
 @dataclass(frozen=True, slots=True)

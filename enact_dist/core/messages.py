@@ -401,6 +401,8 @@ class Welcome:
     placement: PlacementMap
     worlds: tuple[str, ...]
     aspects: tuple[AspectEntry, ...]
+    shared: str = ""
+    shared_nonce: bytes = b""
 
 
 @dataclass(frozen=True, slots=True)

@@ -53,6 +53,7 @@ from enact_dist.core.records import (
     Persisted,
     Recovered,
     Reply,
+    SessionDied,
     SessionSeen,
     Tick,
 )
@@ -89,6 +90,7 @@ class Shard:
             KeepAlive: self._sessions.on_keep_alive,
             Goodbye: self._sessions.on_goodbye,
             SessionSeen: self._sessions.on_session_seen,
+            SessionDied: self._sessions.on_session_died,
             Acquire: self._locks.on_acquire,
             TakeView: self._views.on_take_view,
             Fetch: self._locks.on_fetch,

@@ -122,6 +122,10 @@ class EmbeddedCarrier:
     def add_endpoints(self, entries: Sequence[ShardEntry]) -> None:
         """Do nothing: there is no other shard."""
 
+    def way_to(self, shard: str) -> str:
+        """Return how calls travel: not at all."""
+        return "call"
+
     def endpoint_of(self, shard: str) -> str:
         """Return where the shard is, and why it answers no more."""
         failure = self._host.failure

@@ -10,7 +10,7 @@ from typing import Final
 
 from enact_dist.terms import NAME_LENGTH_MAX
 
-FRAME_VERSION: Final = 1
+FRAME_VERSION: Final = 2
 """Version of the frames; both ends must speak the same."""
 DATUM_VERSION: Final = 1
 """Version of the encoding of data; these are stored, so old versions stay readable."""

@@ -32,6 +32,7 @@ HAPPENED = (
     "power cuts",
     "torn logs",
     "clients killed",
+    "deaths proven",
     "pauses",
     "pauses with token",
     "late answers",

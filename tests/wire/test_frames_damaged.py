@@ -133,8 +133,8 @@ def test_frame_with_a_field_more_or_less_is_refused(cls):
 def test_frame_of_another_version_names_both_versions():
     """The reader of the error learns which side to upgrade, whatever else has changed."""
     for rest in ([3, 1], [{"a": 1}], []):
-        with pytest.raises(ProtocolError, match=r"version 2 came; this side speaks 1.*release"):
-            decode_frame(msgpack.packb([2, *rest, 0]))
+        with pytest.raises(ProtocolError, match=r"version 3 came; this side speaks 2.*release"):
+            decode_frame(msgpack.packb([3, *rest, 0]))
 
 
 @pytest.mark.parametrize("code", [0, 21, 32, 96, 127, 255, 1 << 40, -1, "3", None, 1.0, True])
@@ -184,7 +184,13 @@ def test_frame_that_claims_gigabytes_takes_no_memory(mark):
     tracemalloc.start()
     try:
         for depth in (1, 40):
-            nested = bytes([0x92, 1]) + b"\x91" * depth + mark + b"\xff\xff\xff\xff" + b"\x01"
+            nested = (
+                bytes([0x92, limits.FRAME_VERSION])
+                + b"\x91" * depth
+                + mark
+                + b"\xff\xff\xff\xff"
+                + b"\x01"
+            )
             with pytest.raises(ProtocolError):
                 decode_frame(nested)
         _, peak = tracemalloc.get_traced_memory()
@@ -198,7 +204,9 @@ def test_frame_that_claims_gigabytes_takes_no_memory(mark):
 def test_frame_takes_memory_in_proportion_to_its_bytes(filler):
     """A header of many small parts costs at most some tens of bytes per byte."""
     count = 1 << 17
-    header = bytes([0x93, 1, 2]) + b"\xdd" + count.to_bytes(4, "big") + filler * count
+    header = (
+        bytes([0x93, limits.FRAME_VERSION, 2]) + b"\xdd" + count.to_bytes(4, "big") + filler * count
+    )
 
     tracemalloc.start()
     try:
@@ -215,4 +223,4 @@ def test_frame_nested_without_end_is_refused():
     """A hundred thousand brackets end in ProtocolError, not in the interpreter's stack."""
     for mark in (b"\x91", b"\xdc\x00\x01"):
         with pytest.raises(ProtocolError):
-            decode_frame(bytes([0x92, 1]) + mark * 100_000)
+            decode_frame(bytes([0x92, limits.FRAME_VERSION]) + mark * 100_000)

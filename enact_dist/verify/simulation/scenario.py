@@ -13,7 +13,7 @@ from random import Random
 from typing import TYPE_CHECKING
 
 from enact_dist.core.messages import Goodbye, PlacementMap, ShardEntry
-from enact_dist.core.records import Drain, SessionSeen
+from enact_dist.core.records import Drain, SessionDied, SessionSeen
 from enact_dist.core.shard_state import ShardSettings
 from enact_dist.verify.simulation import faults as fault_options
 from enact_dist.verify.simulation.client_host import ClientHost
@@ -257,7 +257,21 @@ class Scenario:
             self.world.tally["clients killed"] += 1
         host.dies()
         self._show_token(host, present=False)
+        self._prove_death(host)
         self._add_client()
+
+    def _prove_death(self, host: ClientHost) -> None:
+        """Tell shards of the same host what the kernel knows; messages may still be under way."""
+        chance = int(host.client.session, 16)  # drawn already: older seeds stay as they were
+        for shard in self.shards.values():
+            chance, proven = chance >> 8, chance & 1
+            if proven:
+                self.world.tally["deaths proven"] += 1
+                died = SessionDied(host.client.session)
+                self.world.after(
+                    (chance & 31) * MS,
+                    lambda shard=shard, died=died: shard.receive(lambda: shard.event(died)),
+                )
 
     def _pause_one(self) -> None:
         self._pause(self.world.random.choice([*self.shards.values(), *self._up_clients()]))
