@@ -24,7 +24,6 @@ from enact_dist.link.zenoh_config import close_session, open_session
 from enact_dist.link.zenoh_discovery import FoundShard, discover, find_shards
 from enact_dist.wire.frames import encode_frame
 
-
 both = pytest.mark.parametrize("carry", ["zenoh", "socket"], indirect=True)
 """What every carrier between processes has to do."""
 
