@@ -14,8 +14,9 @@ ENACT_SHARD_<NAME>_FOLDER     shards.NAME.folder
 `<NAME>` is the shard's name in capitals, with ``_`` for ``.`` and ``-``.  Relative folders are
 relative to the working folder.  A variable that starts with ``ENACT_SHARD_`` and names no shard or
 no such key, or that is close to one of the others, is a `ConfigError`: a misspelt override must
-not end as a silent default.  `ENACT_CELL` (which cell the command line talks to) is not a
-key of the file.
+not end as a silent default.  `ENACT_CELL` (which cell the command line talks to) and
+`ENACT_SHARED_FOLDER` (where processes of one host meet, see `link.shared_folder`) are no keys of
+the file.
 """
 
 from __future__ import annotations
@@ -42,7 +43,12 @@ if TYPE_CHECKING:
 
     from enact_dist.config_types import CellConfig, ShardConfig
 
-_CELL_NAMES: Final = ("ENACT_SESSION_TTL_S", "ENACT_DATA_FOLDER", "ENACT_CARRIER")
+_CELL_NAMES: Final = (
+    "ENACT_SESSION_TTL_S",
+    "ENACT_DATA_FOLDER",
+    "ENACT_CARRIER",
+    "ENACT_SHARED_FOLDER",
+)
 _SHARD_PREFIX: Final = "ENACT_SHARD_"
 _SHARD_KEYS: Final = ("LISTEN", "ADVERTISE", "FOLDER")
 _CLOSE: Final = 0.85

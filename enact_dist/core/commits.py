@@ -60,7 +60,7 @@ from enact_dist.core.records import (
     SlotRecord,
 )
 from enact_dist.core.sessions import Lane
-from enact_dist.core.slots import Catalogue, Content, SlotMap
+from enact_dist.core.slots import DURABILITIES, Catalogue, Content, SlotMap
 from enact_dist.terms import Durability, NullReason
 
 if TYPE_CHECKING:
@@ -322,6 +322,8 @@ class Commits:
         uncovered = [write.slot for write in message.writes if not tenure.covers(write.slot)]
         if uncovered:
             return Refused("protocol", f"{message.lock} does not hold {uncovered[0]} for writing")
+        if isinstance(message, Commit) and message.durability not in DURABILITIES:
+            return Refused("protocol", f"{message.durability!r} is no durability")
         if self._stamps.too_far_ahead(message.seen_stamp_ns, wall_ns=wall_ns):
             ahead_s = (message.seen_stamp_ns - wall_ns) / 1e9
             return Refused(

@@ -20,6 +20,7 @@ from enact_dist.core.messages import (
 )
 from enact_dist.core.records import Effect, Reply
 from enact_dist.core.sessions import LANES_MAX, Session
+from enact_dist.terms import Access
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
 ITEMS_MAX: Final = 4096
 """Requests in one lock or view."""
 WAITERS_MAX: Final = 100_000
+_ACCESSES: Final = frozenset(map(int, Access))
 """Locks, granted or waiting, at one shard."""
 
 
@@ -107,6 +109,8 @@ class LockDesk:
         if len(self._state.tenures.by_lock) >= WAITERS_MAX:
             return Refused("overload", f"{WAITERS_MAX} locks are held or awaited here")
         for item in items:
+            if item.access not in _ACCESSES:
+                return Refused("value", f"{item.access} is no kind of access; is the peer newer?")
             if item.context not in self._state.catalogue.worlds:
                 known = ", ".join(sorted(self._state.catalogue.worlds)) or "none"
                 return Refused(

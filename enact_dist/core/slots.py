@@ -182,6 +182,10 @@ def state_of(
     )
 
 
+DURABILITIES: Final = ("", *(durability.value for durability in Durability))
+"""What an aspect may ask for; nothing leaves it to the cell."""
+
+
 class Catalogue:
     """World contexts and aspects that this shard knows."""
 
@@ -209,6 +213,11 @@ class Catalogue:
 
     def register(self, entry: AspectEntry) -> tuple[AspectEntry, bool] | str:
         """Register an aspect; return its entry and whether it is new, or why it is refused."""
+        if entry.durability not in DURABILITIES:
+            return (
+                f"aspect {entry.name!r} asks for the durability {entry.durability!r}; known:"
+                f" {', '.join(filter(None, DURABILITIES))}"
+            )
         wanted = self._with_configured(entry)
         known = self.aspects.get(entry.name)
         if known is None:

@@ -166,7 +166,7 @@ class Stream:
         The memory is the kernel's and comes page by page as it is filled, so a length that is only
         claimed costs nothing.
         """
-        header, payload = memoryview(bytearray(header_bytes)), memoryview(b"")
+        header, payload = memoryview(bytearray(header_bytes)), memoryview(bytearray())
         if payload_bytes:
             payload = memoryview(mmap.mmap(-1, payload_bytes))  # begins at a page
         at = PREFIX_BYTES

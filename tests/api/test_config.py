@@ -162,7 +162,7 @@ WRONG = {
     "ttl type": ('name = "c"\nsession_ttl_s = true\n' + SHARD, 2, "'session_ttl_s' in the file is a number, not a boolean (True)"),
     "ttl range": ('name = "c"\nsession_ttl_s = 0.01\n' + SHARD, 2, "must lie between 0.2 and 60, not 0.01"),
     "ttl nan": ('name = "c"\nsession_ttl_s = nan\n' + SHARD, 2, "must lie between 0.2 and 60, not nan"),
-    "carrier": ('name = "c"\ncarrier = "mqtt"\n' + SHARD, 2, "unknown carrier 'mqtt' (known: zenoh)"),
+    "carrier": ('name = "c"\ncarrier = "mqtt"\n' + SHARD, 2, "unknown carrier 'mqtt' (known: auto, zenoh, socket)"),
     "world name": ('name = "c"\nworlds = [\n  "a",\n  "b c",\n]\n' + SHARD, 4, "'b c' cannot name a world context"),
     "world twice": ('name = "c"\nworlds = ["a",\n"a"]\n' + SHARD, 3, "the world context 'a' is listed twice"),
     "worlds type": ('name = "c"\nworlds = {}\n' + SHARD, 2, "'worlds' in the file is an array of strings, not a table ({})"),
@@ -257,7 +257,7 @@ def test_data_folder_override_leaves_a_folder_of_its_own():
 WRONG_ENVIRONMENT = [
     ("ENACT_SESSION_TTL_S", "fast", "ENACT_SESSION_TTL_S='fast' is no number of seconds"),
     ("ENACT_SESSION_TTL_S", "nan", "ENACT_SESSION_TTL_S='nan' is no number of seconds"),
-    ("ENACT_CARRIER", "mqtt", r"ENACT_CARRIER='mqtt' is unknown \(known: zenoh\)"),
+    ("ENACT_CARRIER", "mqtt", r"ENACT_CARRIER='mqtt' is unknown \(known: auto, zenoh, socket\)"),
     ("ENACT_SESSION_TTL", "2", "did you mean ENACT_SESSION_TTL_S"),
     ("ENACT_SHARD_LEFT_LISTN", "x", "did you mean 'ENACT_SHARD_LEFT_LISTEN'"),
     ("ENACT_SHARD_MIDDLE_LISTEN", "x", "no key of a shard of /cells/demo/cell.toml"),
