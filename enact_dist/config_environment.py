@@ -86,6 +86,8 @@ def _refuse_unknown(config: CellConfig, ours: Mapping[str, str]) -> None:
                 f"the environment sets {name}, which is no key of a shard of {config.path}"
                 f"{suggestion(name, of_shards)} (known: {', '.join(of_shards)})"
             )
+        if name.startswith(_SHARD_PREFIX):
+            continue  # one of them, so it is spelt right
         close = difflib.get_close_matches(name, _CELL_NAMES, n=1, cutoff=_CLOSE)
         if close and name not in _CELL_NAMES:
             raise ConfigError(f"the environment sets {name}; did you mean {close[0]}?")
