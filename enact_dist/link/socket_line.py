@@ -41,6 +41,9 @@ CONNECT_S: Final = 0.5
 """How long a shard has to take a connection: it is on this host."""
 SEND_S: Final = 3.0
 """How long a shard may read nothing of a request before its connection is given up."""
+SLACK_S: Final = 1.0
+"""So much longer than asked, and at most twice as long, a call may be left without an answer: the
+two calls of a lock, which differ by that much, then share one time that the kernel knows."""
 RETRY_S_MIN: Final = 0.1
 RETRY_S_MAX: Final = 5.0
 """Pause before a lost socket is tried again; doubles up to the second figure."""
@@ -68,10 +71,9 @@ class Connection:
             ProtocolError: The request cannot travel.
         """
         header, bodies = encode_parts(request)
-        wait_s = rounded_s(timeout_s)
-        if wait_s != self._wait_s:
-            wait_at_most(self.socket, socket.SO_RCVTIMEO, wait_s)
-            self._wait_s = wait_s
+        if not timeout_s <= self._wait_s <= timeout_s + min(timeout_s, SLACK_S):
+            self._wait_s = rounded_s(timeout_s)
+            wait_at_most(self.socket, socket.SO_RCVTIMEO, self._wait_s)
         send_frame(self.socket, header, bodies)
 
     def receive(self) -> Answer:
