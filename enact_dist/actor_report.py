@@ -11,6 +11,7 @@ Nothing here grows: rates come from the newest `STAMPS_MAX` updates, lock waits 
 from __future__ import annotations
 
 import dataclasses
+import reprlib
 from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
@@ -197,7 +198,7 @@ def decode_reports(report: bytes) -> tuple[ActorStatistics, ...]:
         return ()
     try:
         found = msgpack.unpackb(report)
-    except (ValueError, msgpack.UnpackException) as error:
+    except (ValueError, OverflowError, msgpack.UnpackException) as error:
         raise ProtocolError(
             f"{len(report)} bytes {bytes(report[:16])!r}… are no actor report: {error}"
         ) from error
@@ -225,5 +226,5 @@ def read_reports(report: Mapping[str, object]) -> tuple[ActorStatistics, ...]:
             )
             for row in rows
         )
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise ProtocolError(f"{str(report)[:80]} is no actor report: {error}") from error
+    except (ValueError, TypeError, KeyError, AttributeError, OverflowError) as error:
+        raise ProtocolError(f"{reprlib.repr(report)} is no actor report: {error}") from error

@@ -9,15 +9,17 @@ from __future__ import annotations
 import atexit
 import contextlib
 import time
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from enact_dist.cell_info import ActorInfo, AuditInfo, LockInfo, ShardInfo, lock_info
 from enact_dist.core.datum import Position
 from enact_dist.core.messages import (
+    Audited,
     AwaitStamp,
     Break,
     Broken,
     ForceAbort,
+    ListAudit,
     ListLocks,
     ListSessions,
     Locks,
@@ -31,84 +33,13 @@ from enact_dist.terms import checked_name
 from enact_dist.world import WorldContext
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
     from types import TracebackType
 
-    from enact_dist.core.messages import Holder
     from enact_dist.link.client import CellClient
 
 _open: set[Cell] = set()
 """Held strongly: handles made by a cell work on when nobody keeps the cell itself."""
-
-
-@dataclass(frozen=True, slots=True)
-class LockInfo:
-    """One lock that is held or awaited at a shard; times in seconds.
-
-    Attributes:
-        number: What `Cell.break_lock` takes; unique within the shard's epoch.
-        modes: "read", "write" or both.
-        waits_for: Numbers of the locks in the way.
-    """
-
-    shard: str
-    number: int
-    lock_id: str
-    actor: str
-    host: str
-    pid: int
-    granted: bool
-    modes: str
-    age_s: float
-    lease_left_s: float
-    hold_left_s: float
-    slots: tuple[str, ...]
-    waits_for: tuple[int, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class ShardInfo:
-    """One shard of the cell; `reachable` False leaves everything else at zero.
-
-    Attributes:
-        open: False while a restarted shard waits for older leases to end.
-        clock_ahead_s: Its wall clock less ours, half a round trip taken off.
-        round_trip_s: Of the call that asked.
-        carrier: How this process's calls to it travel: "socket", or "zenoh" and why.
-        counters: Its statistics by name.
-    """
-
-    name: str
-    endpoint: str
-    reachable: bool
-    epoch: int = 0
-    open: bool = False
-    uptime_s: float = 0.0
-    slots: int = 0
-    size_bytes: int = 0
-    sessions: int = 0
-    locks: int = 0
-    clock_ahead_s: float = 0.0
-    round_trip_s: float = 0.0
-    carrier: str = ""
-    counters: dict[str, int] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, slots=True)
-class ActorInfo:
-    """One session of a named actor, as the shards see it.
-
-    Attributes:
-        report: The actor's own statistics; empty where it gives none.
-    """
-
-    actor: str
-    host: str
-    pid: int
-    session: str
-    shards: tuple[str, ...]
-    lease_left_s: float
-    locks: int
-    report: dict[str, Any] = field(default_factory=dict)
 
 
 class Cell:
@@ -194,15 +125,40 @@ class Cell:
             if time.monotonic() >= deadline_s:
                 return False
 
+    def outcome(self, lock_id: str, *, timeout_s: float = 10.0) -> Position | None:
+        """Ask what became of a commit that ended in `CommitUnknownError`.
+
+        A commit that its shard has not taken yet never comes true after this.
+
+        Args:
+            lock_id: As the error has it; any process of the cell may ask.
+            timeout_s: How long the shard may stay without an answer.
+
+        Returns:
+            Where it stands in time, or None if nothing was written.
+
+        Raises:
+            CommitUnknownError: The shard cannot tell (any more): 64 later commits of the process
+                have ended in this error, too, or the process has been gone for a day.
+            ShardUnreachableError: The shard does not answer.
+            LockHeldError: This thread holds a lock.
+            MisuseError: `lock_id` is none of this cell.
+        """
+        refuse_inside_lock("outcome")
+        return self._client.outcome(lock_id, timeout_s=timeout_s)
+
     # ---------------------------------------------------------------- people
 
-    def locks(self) -> tuple[LockInfo, ...]:
+    def locks(self, shards: Iterable[str] | None = None) -> tuple[LockInfo, ...]:
         """Return all locks held or awaited, oldest first within each shard.
+
+        Args:
+            shards: Where to look; everywhere unless given.
 
         Raises:
             ShardUnreachableError: A shard does not answer.
         """
-        shards = self._client.shards()
+        shards = self._client.shards() if shards is None else tuple(shards)
         answers = self._client.call_all([(shard, ListLocks()) for shard in shards])
         return tuple(
             lock_info(shard, holder)
@@ -237,12 +193,46 @@ class Cell:
         """
         return self._ended_by_hand(shard, ForceAbort(number, reason))
 
-    def _ended_by_hand(self, shard: str, request: Break | ForceAbort) -> LockInfo | None:
+    def audit(self, shards: Iterable[str] | None = None) -> tuple[AuditInfo, ...]:
+        """Return what operators did and what came of it, oldest first; `shards` as in `locks`.
+
+        An "alarm" is a lock that `force_abort` has ended on one shard though another had committed
+        it: only a part of its writes stands.
+
+        Raises:
+            ShardUnreachableError: A shard does not answer.
+        """
+        shards = self._client.shards() if shards is None else tuple(shards)
+        answers = self._client.call_all([(shard, ListAudit("")) for shard in shards])
+        found = [
+            AuditInfo(shard, entry.wall_ns / 1e9, entry.kind, entry.text)
+            for shard, answer in zip(shards, answers, strict=True)
+            if isinstance(answer, Audited)
+            for entry in answer.entries
+        ]
+        return tuple(sorted(found, key=lambda entry: entry.stamp_s))
+
+    def settle_alarms(self, *, shard: str, how: str) -> None:
+        """Say that somebody has seen to all alarms of a shard so far; audited by the shard.
+
+        Raises:
+            MisuseError: The cell has no such shard, or `how` says nothing.
+            ShardUnreachableError: The shard does not answer.
+        """
+        if not how.strip():
+            raise MisuseError("alarms are settled by saying how: how='' says nothing")
+        self._check_shard(shard)
+        self._client.call(shard, ListAudit(how))
+
+    def _check_shard(self, shard: str) -> None:
         if shard not in self._client.shards():
             raise MisuseError(
                 f"cell {self.name!r} has no shard {shard!r}; it has"
                 f" {', '.join(self._client.shards())}"
             )
+
+    def _ended_by_hand(self, shard: str, request: Break | ForceAbort) -> LockInfo | None:
+        self._check_shard(shard)
         answer = self._client.call(shard, request)
         holder = answer.holder if isinstance(answer, Broken) else None
         return lock_info(shard, holder) if holder is not None else None
@@ -342,25 +332,6 @@ class Cell:
 
     def __repr__(self) -> str:
         return f"<cell {self.name!r}, {len(self._client.shards())} shards>"
-
-
-def lock_info(shard: str, holder: Holder) -> LockInfo:
-    """Return a shard's description of a lock in seconds."""
-    return LockInfo(
-        shard,
-        holder.number,
-        str(holder.lock),
-        holder.actor,
-        holder.host,
-        holder.pid,
-        holder.granted,
-        holder.modes,
-        holder.age_ns / 1e9,
-        holder.lease_left_ns / 1e9,
-        holder.hold_left_ns / 1e9,
-        holder.slots,
-        holder.waits_for,
-    )
 
 
 def _report(encoded: bytes) -> dict[str, Any]:

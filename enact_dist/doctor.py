@@ -24,7 +24,8 @@ from enact_dist.errors import ConfigError, EnactError, ShardUnreachableError
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from enact_dist.cell import Cell, ShardInfo
+    from enact_dist.cell import Cell
+    from enact_dist.cell_info import ShardInfo
     from enact_dist.config_types import CellConfig
 
 PYTHON_MIN: Final = (3, 11)
@@ -301,6 +302,16 @@ def _shard(shard: ShardInfo) -> Iterator[Finding]:
         return
     yield _connection(subject, shard)
     yield clock_skew(f"clock of {shard.name}", shard.clock_ahead_s)
+    alarms = shard.counters.get("alarms", 0)
+    if alarms:
+        yield Finding(
+            Level.FAIL,
+            f"commits on {shard.name}",
+            f"{alarms} locks that were aborted by hand had been committed elsewhere: they stand"
+            " only in part",
+            "read enact lock audit, mend the data, then enact lock audit --settle TEXT"
+            f" --shard {shard.name}",
+        )
 
 
 def _connection(subject: str, shard: ShardInfo) -> Finding:

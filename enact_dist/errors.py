@@ -130,7 +130,7 @@ class CommitUnknownError(EnactError):
     The only error after which a write may be visible.
 
     Attributes:
-        lock_id: Identity of the lock, to ask for the outcome later.
+        lock_id: Identity of the lock, to ask for the outcome later (`Cell.outcome`).
     """
 
     def __init__(self, message: str, *, lock_id: str = "") -> None:

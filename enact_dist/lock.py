@@ -210,9 +210,10 @@ class Lock:
                 client.release(lock)
 
     def _writes_by_shard(self) -> dict[str, list[WriteItem]]:
+        assert self._lock is not None
         by_shard: dict[str, list[WriteItem]] = {}
         for slot, datum in self._writes.items():
-            by_shard.setdefault(self._session.shard_of(slot), []).append(WriteItem(slot, datum))
+            by_shard.setdefault(self._lock.shard_of(slot), []).append(WriteItem(slot, datum))
         return by_shard
 
     def _use(self) -> None:

@@ -193,7 +193,12 @@ def _pattern_source(pattern: str) -> str:
 
 
 class Durability(enum.Enum):
-    """What a reported commit of an aspect survives."""
+    """What a reported commit of an aspect survives.
+
+    A commit takes the strictest class of its data.  One over several shards is forced to the disk
+    on each of them, whatever the class: it is all there or not at all, after a power cut too, until
+    a later commit replaces its data.  What is volatile still ends with its shard's process.
+    """
 
     DURABLE = "durable"
     """`kill -9` and power loss: on disk before the answer."""

@@ -1,5 +1,10 @@
 """The public surface is short, sorted, and exactly what the package promises."""
 
+import subprocess
+import sys
+
+import pytest
+
 import enact_dist
 from enact_dist import errors
 
@@ -34,3 +39,20 @@ def test_every_error_stands_in_the_drawn_tree():
         assert name in errors.__doc__, name
         assert value.__doc__, name
         assert issubclass(value, errors.EnactError)
+
+
+def test_daemon_starts_without_the_clients_half():
+    """A restarted shard serves the sooner: no locks, no actors, no demo are loaded for it."""
+    code = (
+        "import sys, enact_dist.cli.main, enact_dist.link.shard_daemon, enact_dist.link.store\n"
+        "print(*{'enact_dist.lock', 'enact_dist.actor', 'enact_dist.cell'} & set(sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+
+    assert not done.stdout.strip()
+
+
+def test_unknown_name_is_an_attribute_error():
+    """What the package does not have it does not make up."""
+    with pytest.raises(AttributeError, match="no attribute 'Semaphore'"):
+        _ = enact_dist.Semaphore

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
     from enact_dist.actor import Actor
     from enact_dist.actor_report import ActorStatistics
-    from enact_dist.cell import ActorInfo
+    from enact_dist.cell_info import ActorInfo
     from enact_dist.cli.verbs import Verb
 
 

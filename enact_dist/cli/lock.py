@@ -1,15 +1,18 @@
-"""`enact lock ls|hold|break|resolve`."""
+"""`enact lock ls|hold|break|resolve|audit`."""
 
 from __future__ import annotations
 
 import argparse
 import os
 import re
+import sys
+from datetime import datetime
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.cli.output import print_json, print_table, shown_s
 from enact_dist.cli.verbs import (
     DONE,
+    UNREACHABLE,
     add_cell,
     add_noun,
     add_reader,
@@ -26,9 +29,8 @@ from enact_dist.link.signals import StopSignals
 from enact_dist.terms import Access, Entities, Entity, checked_name
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from enact_dist.cell import Cell, LockInfo
+    from enact_dist.cell import Cell
+    from enact_dist.cell_info import LockInfo
     from enact_dist.cli.verbs import Verb
     from enact_dist.core.messages import Item
 
@@ -59,6 +61,7 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
     _add_hold(verbs)
     _add_break(verbs)
     _add_resolve(verbs)
+    _add_audit(verbs)
 
 
 def _add_hold(verbs: argparse._SubParsersAction[Verb]) -> None:
@@ -122,16 +125,31 @@ def _add_resolve(verbs: argparse._SubParsersAction[Verb]) -> None:
     add_reader(resolve)
 
 
+def _add_audit(verbs: argparse._SubParsersAction[Verb]) -> None:
+    audit = add_verb(
+        verbs,
+        "audit",
+        "list locks that were ended by hand, and alarms: commits that stand only in part since",
+        run=list_audit,
+        example="enact lock audit\n"
+        "enact lock audit --settle 'bench/contacts written again from left' --shard right",
+    )
+    audit.add_argument("--settle", metavar="TEXT", help="say how all alarms so far were seen to")
+    audit.add_argument("--shard", metavar="NAME", help="whose alarms; needed with --settle")
+    add_reader(audit)
+
+
 # ---------------------------------------------------------------- ls
 
 
 def list_locks(arguments: argparse.Namespace) -> int:
-    """Print all locks of the cell, held or awaited."""
+    """Print all locks of the cell, held or awaited; status 3 if a shard does not answer."""
     with open_cell(arguments) as cell:
-        locks = cell.locks()
+        shards, status = in_reach(cell)
+        locks = cell.locks(shards)
     if arguments.json:
         print_json(locks)
-        return DONE
+        return status
     known = {(lock.shard, lock.number): lock for lock in locks}
     print_table(
         ("lock", "shard", "who", "state", "mode", "age", "lease left", "hold left", "data",
@@ -139,7 +157,22 @@ def list_locks(arguments: argparse.Namespace) -> int:
         [_row(lock, known) for lock in locks],
         empty="no lock is held or awaited",
     )  # fmt: skip
-    return DONE
+    return status
+
+
+def in_reach(cell: Cell) -> tuple[tuple[str, ...], int]:
+    """Return the shards that answer, and the exit status; name the others.
+
+    A lock in doubt is looked for exactly when another shard is lost.
+    """
+    status, reachable = DONE, []
+    for shard in cell.shards():
+        if shard.reachable:
+            reachable.append(shard.name)
+        else:
+            status = UNREACHABLE
+            print(f"enact: shard {shard.name} at {shard.endpoint} does not answer", file=sys.stderr)
+    return tuple(reachable), status
 
 
 def _row(lock: LockInfo, known: dict[tuple[str, int], LockInfo]) -> tuple[object, ...]:
@@ -255,7 +288,7 @@ def _item(cell: Cell, request: tuple[str, str, str, str], default: str | None) -
 def break_lock(arguments: argparse.Namespace) -> int:
     """Take a lock away by its number."""
     with open_cell(arguments) as cell:
-        shard = arguments.shard or _shard_of(arguments.number, cell.locks())
+        shard = arguments.shard or _shard_of(arguments.number, cell)
         broken = cell.break_lock(arguments.number, shard=shard, reason=arguments.reason)
     if broken is None:
         raise MisuseError(f"shard {shard} knows no lock {arguments.number}; see enact lock ls")
@@ -273,7 +306,7 @@ def resolve_lock(arguments: argparse.Namespace) -> int:
     """Abort a lock in doubt by its number."""
     number, reason = arguments.force_abort, arguments.reason
     with open_cell(arguments) as cell:
-        shard = arguments.shard or _shard_of(number, cell.locks())
+        shard = arguments.shard or _shard_of(number, cell)
         given_up = cell.force_abort(number, shard=shard, reason=reason)
     if given_up is None:
         raise MisuseError(
@@ -287,7 +320,32 @@ def resolve_lock(arguments: argparse.Namespace) -> int:
     return DONE
 
 
-def _shard_of(number: int, locks: Sequence[LockInfo]) -> str:
+# ---------------------------------------------------------------- audit
+
+
+def list_audit(arguments: argparse.Namespace) -> int:
+    """Print what operators did and what came of it; with `--settle`, first add to it."""
+    if (arguments.settle is None) != (arguments.shard is None):
+        raise ConfigError("--settle TEXT and --shard NAME go together")
+    with open_cell(arguments) as cell:
+        if arguments.settle is not None:
+            cell.settle_alarms(shard=arguments.shard, how=arguments.settle)
+        shards, status = in_reach(cell)
+        entries = cell.audit(shards)
+    if arguments.json:
+        print_json(entries)
+        return status
+    rows = [(_local_time(entry.stamp_s), entry.shard, entry.kind, entry.text) for entry in entries]
+    print_table(("when", "shard", "what", "details"), rows, empty="no lock was ended by hand")
+    return status
+
+
+def _local_time(stamp_s: float) -> str:
+    return datetime.fromtimestamp(stamp_s).astimezone().isoformat(" ", "seconds")
+
+
+def _shard_of(number: int, cell: Cell) -> str:
+    locks = cell.locks(in_reach(cell)[0])
     shards = sorted({lock.shard for lock in locks if lock.number == number})
     if not shards:
         raise MisuseError(f"no shard knows a lock {number}; see enact lock ls")

@@ -23,7 +23,7 @@ from enact_dist.errors import ConfigError
 if TYPE_CHECKING:
     import argparse
 
-    from enact_dist.cell import ShardInfo
+    from enact_dist.cell_info import ShardInfo
     from enact_dist.cli.verbs import Verb
 
 
@@ -115,7 +115,7 @@ def _row(shard: ShardInfo) -> tuple[object, ...]:
     return (
         shard.name,
         shard.endpoint,
-        "open" if shard.open else "waits for older leases",
+        _state(shard),
         shard.epoch,
         shown_s(shard.uptime_s),
         shard.slots,
@@ -124,3 +124,9 @@ def _row(shard: ShardInfo) -> tuple[object, ...]:
         shard.locks,
         shown_s(shard.round_trip_s),
     )
+
+
+def _state(shard: ShardInfo) -> str:
+    state = "open" if shard.open else "waits for older leases"
+    alarms = shard.counters.get("alarms", 0)
+    return f"{state}, ALARMS: {alarms} (enact lock audit)" if alarms else state

@@ -226,6 +226,11 @@ class Client:
         """Forget a lock that rests; called by the lock itself."""
         self._locks.pop(lock.lock, None)
 
+    def ask_again(self) -> None:
+        """A shard has come back: no lock need wait any longer before it asks again."""
+        for lock in self._locks.values():
+            lock.ask_again()
+
     def shards_in_use(self) -> list[str]:
         """Return the shards that know this session, to keep it alive there."""
         return [shard for shard, peer in self._peers.items() if peer.epoch]
@@ -258,7 +263,7 @@ class Client:
         return Plan(
             tuple((shard, tuple(locks[shard])) for shard in sorted(locks)),
             tuple((shard, tuple(views[shard])) for shard in sorted(views)),
-            self.placement.version,
+            self.placement,
             max((self._unsettled.get(shard, 0) for shard in views), default=0),
         )
 

@@ -28,6 +28,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
+from enact_dist.core.admission import wrong_name, wrong_parties, wrong_writes
 from enact_dist.core.datum import Position, Slot
 from enact_dist.core.messages import (
     OUTCOME_COMMITTED,
@@ -60,11 +61,11 @@ from enact_dist.core.records import (
     SlotRecord,
 )
 from enact_dist.core.sessions import Lane
-from enact_dist.core.slots import DURABILITIES, Catalogue, Content, SlotMap
+from enact_dist.core.slots import Catalogue, Content, SlotMap
 from enact_dist.terms import Durability, NullReason
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Callable, Collection, Iterable, Iterator
 
     from enact_dist.core.datum import LockId, Token
     from enact_dist.core.decisions import Decisions
@@ -87,7 +88,6 @@ class _InFlight:
     outcome: OutcomeRecord
     reply_to: list[int] = field(default_factory=list)
     decision: DecisionRecord | None = None
-    durability: Durability = Durability.VOLATILE
 
 
 class Commits:
@@ -99,6 +99,7 @@ class Commits:
         "_decisions",
         "_epoch",
         "_in_flight",
+        "_peers",
         "_sessions",
         "_shard",
         "_slots",
@@ -112,6 +113,7 @@ class Commits:
         self,
         *,
         shard: str,
+        peers: Collection[str],
         epoch: int,
         slots: SlotMap,
         catalogue: Catalogue,
@@ -123,6 +125,7 @@ class Commits:
     ) -> None:
         self._decisions = decisions
         self._shard = shard
+        self._peers = peers
         self._epoch = epoch
         self._slots = slots
         self._catalogue = catalogue
@@ -169,12 +172,14 @@ class Commits:
             yield Reply(reply_to, _committed(recorded))
             return
         tenure = self._tenures.by_lock.get(message.lock)
-        if tenure is not None and tenure.committing:
-            self._in_flight_of(tenure).reply_to.append(reply_to)
+        at_store = tenure is not None and tenure.committing
+        in_flight = self._in_flight_of(message.lock) if at_store else None
+        if in_flight is not None:
+            in_flight.reply_to.append(reply_to)
             return
         refusal = self.refusal(message, tenure, wall_ns=wall_ns)
         if refusal is not None:
-            if isinstance(refusal, Refused) and tenure is not None:
+            if isinstance(refusal, Refused) and tenure is not None and not tenure.bound:
                 # For good: a late copy must not find the lock again at another time of day.
                 yield from self._tenures.take_away(tenure, refusal.text, now_ns=now_ns)
             yield Reply(reply_to, refusal)
@@ -198,7 +203,6 @@ class Commits:
         commit = _InFlight(tenure, message.writes, outcome, [reply_to])
         if message.participants:
             commit.decision = DecisionRecord(message.lock, outcome.position, message.participants)
-            commit.durability = Durability(message.durability or Durability.OS.value)
         yield from self._make_durable(commit, now_ns=now_ns)
 
     def moved_on(self, expects: Iterable[SlotVersion], lock: LockId) -> SlotVersion | None:
@@ -227,7 +231,7 @@ class Commits:
 
     def _make_durable(self, commit: _InFlight, *, now_ns: int) -> Iterator[Effect]:
         """Hand the commit to the store, or apply it at once where nothing is to survive."""
-        durability = self.strictest(commit.writes, at_least=commit.durability)
+        durability = self._strictest(commit)
         stamp_ns = commit.outcome.position.stamp_ns
         records = self.records(commit.writes, commit.outcome.versions, stamp_ns)
         if durability is Durability.VOLATILE:
@@ -241,10 +245,15 @@ class Commits:
         decision = (commit.decision,) if commit.decision is not None else ()
         yield Persist(ticket, (*records, commit.outcome, *decision), durability)
 
-    def strictest(self, writes: Iterable[WriteItem], *, at_least: Durability) -> Durability:
-        """Return what a commit of these writes must survive."""
-        durabilities = [self._catalogue.durability(write.slot.aspect) for write in writes]
-        return max((at_least, *durabilities), key=_STRICTNESS.index)
+    def _strictest(self, commit: _InFlight) -> Durability:
+        """Return what a commit must survive: the most that one of its data asks for.
+
+        A decision is relied on by other shards, so it outlasts everything.
+        """
+        if commit.decision is not None:
+            return Durability.DURABLE
+        durabilities = [self._catalogue.durability(write.slot.aspect) for write in commit.writes]
+        return max(durabilities, key=_STRICTNESS.index, default=Durability.VOLATILE)
 
     def persisted(self, ticket: int, *, now_ns: int) -> Iterator[Effect]:
         """The store is done: apply, release and answer."""
@@ -310,20 +319,25 @@ class Commits:
         self, message: Commit | Prepare, tenure: Tenure | None, *, wall_ns: int
     ) -> Fenced | EpochChanged | Refused | None:
         """Return why this holder may not write this now, None if it may."""
-        twice = duplicate_slot(message.writes)
-        if twice is not None:
-            return Refused("protocol", f"{twice} is written twice in one commit")
+        # The fence comes first: what a stranger asks must not end the holder's lock.
         fenced = self._fence(message.lock, message.token, tenure)
         if fenced is not None:
             return fenced
         assert tenure is not None
+        wrong = wrong_writes(message.writes) or wrong_parties(message, peers=self._peers)
+        if wrong is not None:
+            return wrong
         if tenure.bound:
             return Refused("protocol", f"{message.lock} is being committed in another way")
         uncovered = [write.slot for write in message.writes if not tenure.covers(write.slot)]
         if uncovered:
             return Refused("protocol", f"{message.lock} does not hold {uncovered[0]} for writing")
-        if isinstance(message, Commit) and message.durability not in DURABILITIES:
-            return Refused("protocol", f"{message.durability!r} is no durability")
+        for slot, _ in message.writes:
+            # Everybody whose pattern covers it must be able to read its name.
+            if not self._slots.exists(slot):
+                wrong = wrong_name("entity", slot.entity, slashes=True)
+                if wrong is not None:
+                    return wrong
         if self._stamps.too_far_ahead(message.seen_stamp_ns, wall_ns=wall_ns):
             ahead_s = (message.seen_stamp_ns - wall_ns) / 1e9
             return Refused(
@@ -347,7 +361,8 @@ class Commits:
 
     def _cause(self, lock: LockId) -> str:
         session = self._sessions.known(lock.session)
-        ended = session.lane(lock.lane).ended if session is not None else None
+        lane = session.lanes.get(lock.lane) if session is not None else None
+        ended = lane.ended if lane is not None else None
         return ended[1] if ended is not None and ended[0] == lock else NOT_HELD
 
     # ---------------------------------------------------------------- validate, outcome
@@ -358,11 +373,10 @@ class Commits:
             yield Reply(reply_to, self._expected(message))
             return
         session = self._sessions.known(message.lock.session)
-        if session is not None:
-            lane = session.lane(message.lock.lane)
-            if lane.validated == (message.lock, message.token):
-                yield Reply(reply_to, Valid(message.lock))
-                return
+        lane = session.lanes.get(message.lock.lane) if session is not None else None
+        if lane is not None and lane.validated == (message.lock, message.token):
+            yield Reply(reply_to, Valid(message.lock))
+            return
         tenure = self._tenures.by_lock.get(message.lock)
         fenced = self._fence(message.lock, message.token, tenure)
         if fenced is None and tenure is not None and not tenure.bound:
@@ -417,19 +431,10 @@ class Commits:
         outcome = lane.outcome if lane is not None else None
         return outcome if outcome is not None and outcome.lock == lock else None
 
-    def _in_flight_of(self, tenure: Tenure) -> _InFlight:
-        return next(commit for commit in self._in_flight.values() if commit.tenure is tenure)
+    def _in_flight_of(self, lock: LockId) -> _InFlight | None:
+        """Return the commit of a lock that the store works on; it may work on a promise instead."""
+        return next((c for c in self._in_flight.values() if c.tenure.lock == lock), None)
 
 
 def _committed(outcome: OutcomeRecord) -> Committed:
     return Committed(outcome.lock, outcome.position, outcome.versions)
-
-
-def duplicate_slot(writes: tuple[WriteItem, ...]) -> Slot | None:
-    """Return a slot that is written twice in one commit, if any."""
-    seen: set[Slot] = set()
-    for write in writes:
-        if write.slot in seen:
-            return write.slot
-        seen.add(write.slot)
-    return None

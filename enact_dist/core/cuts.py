@@ -5,11 +5,17 @@ intervals have a stamp T in common, the answers are of one cut.  If not, T is th
 end, and the shards whose interval ended before it are asked again as of T.  That settles it unless
 a shard does not remember so far back, or an undecided commit stays in its way; then T moves on,
 `ROUNDS_MAX` times at most.  Whoever gets no cut takes read locks instead.
+
+Rule a change must keep: a shard that restarts may give stamps below those that it has answered
+with (its clock is not on its disk), so an answer counts only while nobody can have been granted a
+lock in a later epoch.  For a session that locks this is so until it has acknowledged that epoch
+or a TTL has passed: the shard's grace waits for it.  An observer is not waited for; it asks all
+shards a second time, and the first answers count if nobody has restarted until then.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -18,6 +24,11 @@ if TYPE_CHECKING:
 
 ROUNDS_MAX: Final = 8
 """How often shards are asked before the views are given up."""
+
+
+class _Answer(NamedTuple):
+    viewed: Viewed
+    until_ns: int
 
 
 class Cut:
@@ -30,44 +41,77 @@ class Cut:
     Args:
         items: What to view at which shard.
         floor_ns: The cut must not lie before this stamp (the session's own commits).
+        observer: No shard waits for this session when it restarts.
     """
 
-    __slots__ = ("_answers", "_floor_ns", "at_ns", "items", "left", "rounds")
+    __slots__ = (
+        "_answers",
+        "_floor_ns",
+        "_observer",
+        "_settled",
+        "at_ns",
+        "items",
+        "left",
+        "rounds",
+    )
 
-    def __init__(self, items: Mapping[str, tuple[Item, ...]], *, floor_ns: int) -> None:
+    def __init__(
+        self, items: Mapping[str, tuple[Item, ...]], *, floor_ns: int, observer: bool = False
+    ) -> None:
         self.items = dict(items)
         self.left = dict.fromkeys(self.items)
         self.at_ns = 0
         self.rounds = 1
         self._floor_ns = floor_ns
-        self._answers: dict[str, Viewed] = {}
+        self._observer = observer and len(self.items) > 1
+        self._answers: dict[str, _Answer] = {}
+        self._settled: dict[str, Viewed] = {}
 
-    def take(self, shard: str, request: TakeView, answer: Viewed) -> None:
-        """Take an answer of this round; others are too late."""
+    def not_before(self, stamp_ns: int) -> None:
+        """Let the cut show whatever was committed up to a stamp; before it is taken."""
+        self._floor_ns = max(self._floor_ns, stamp_ns)
+
+    def take(self, shard: str, request: TakeView, answer: Viewed, *, until_ns: int) -> None:
+        """Take an answer of this round; others are too late.
+
+        Args:
+            shard: Who has answered.
+            request: What was asked.
+            answer: What came.
+            until_ns: Until when (this host's clock) that shard's grace would wait for us.
+        """
         if shard in self.left and request.at_ns == self.at_ns:
             del self.left[shard]
-            self._answers[shard] = answer
+            self._answers[shard] = _Answer(answer, until_ns)
 
-    def settled(self, epoch: Callable[[str], int]) -> dict[str, Viewed] | None:
-        """Return the answers if they are of one cut, else begin the next round.
-
-        An answer of an epoch that is over does not count: the clock of a restarted shard may have
-        gone back behind what was promised.
-        """
+    def settled(self, epoch: Callable[[str], int], *, now_ns: int) -> dict[str, Viewed] | None:
+        """Return the answers if they are of one cut, else begin the next round."""
         assert not self.left
-        answers = self._answers
-        at_ns = max((answer.from_ns for answer in answers.values()), default=0)
+        if self._settled and self._confirmed():
+            return self._settled
+        answers = {shard: answer.viewed for shard, answer in self._answers.items()}
+        at_ns = max((viewed.from_ns for viewed in answers.values()), default=0)
         if len(answers) == 1:
             at_ns = 0  # one shard shows every commit whole, whatever its stamp
         at_ns = max(at_ns, self._floor_ns)
         lagging = [
             shard
-            for shard, answer in answers.items()
-            if answer.until_ns < at_ns or answer.epoch != epoch(shard)
+            for shard, (viewed, until_ns) in self._answers.items()
+            if viewed.until_ns < at_ns
+            or viewed.epoch != epoch(shard)
+            or (until_ns <= now_ns and len(answers) > 1)
         ]
-        if not lagging:
+        if not lagging and not self._observer:
             return answers
+        self._settled = {} if lagging else answers
         self.at_ns = at_ns
-        self.left = dict.fromkeys(lagging)
+        self.left = dict.fromkeys(lagging or self.items)
         self.rounds += 1
         return None
+
+    def _confirmed(self) -> bool:
+        """Whether no shard had restarted when all first answers were there."""
+        return all(
+            self._answers[shard].viewed.epoch == viewed.epoch
+            for shard, viewed in self._settled.items()
+        )

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING
 
 from enact_dist.core.datum import Token
 from enact_dist.core.messages import Commit, Prepare, Validate
-from enact_dist.terms import Durability
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -74,7 +73,6 @@ class Finishing:
     def commit(self, seen_stamp_ns: int) -> Commit:
         """Return the commit that decides, stamped after everything that was prepared."""
         stamps = [answer.stamp_ns for answer in self.prepared.values()]
-        durabilities = [Durability(answer.durability) for answer in self.prepared.values()]
         return Commit(
             self.lock,
             self.tokens[self.primary],
@@ -82,7 +80,6 @@ class Finishing:
             max(seen_stamp_ns, *stamps) if stamps else seen_stamp_ns,
             self.expects.get(self.primary, ()),
             tuple(sorted(self.prepared)),
-            _strictest(durabilities),
         )
 
     @property
@@ -98,10 +95,3 @@ def tokens_of(
     tokens = {shard: Token(epoch, 0) for shard, epoch in expected_at}
     tokens.update((shard, token) for shard, token in held if token is not None)
     return tokens
-
-
-def _strictest(durabilities: list[Durability]) -> str:
-    if not durabilities:
-        return ""
-    strictest = Durability.DURABLE if Durability.DURABLE in durabilities else Durability.OS
-    return str(strictest.value)

@@ -85,8 +85,14 @@ def sessions(state: ShardState) -> Sessions:
         ),
         tuple(state.catalogue.worlds),
         tuple(state.catalogue.aspects.values()),
-        tuple(Counter(name, count) for name, count in sorted(state.counters.items())),
+        tuple(Counter(name, count) for name, count in sorted(_counted(state).items())),
     )
+
+
+def _counted(state: ShardState) -> dict[str, int]:
+    """Return the statistics, and the alarms that nobody has seen to, of earlier epochs too."""
+    alarms = state.audit.alarms
+    return state.counters | ({"alarms": alarms} if alarms else {})
 
 
 def surveyed(state: ShardState, message: Survey, *, stamp_ns: int) -> Surveyed:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
+from enact_dist.core.admission import wrong_access
 from enact_dist.core.datum import Datum, LockId
 from enact_dist.core.messages import (
     Acquire,
@@ -20,7 +21,6 @@ from enact_dist.core.messages import (
 )
 from enact_dist.core.records import Effect, Reply
 from enact_dist.core.sessions import LANES_MAX, Session
-from enact_dist.terms import Access
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 ITEMS_MAX: Final = 4096
 """Requests in one lock or view."""
 WAITERS_MAX: Final = 100_000
-_ACCESSES: Final = frozenset(map(int, Access))
 """Locks, granted or waiting, at one shard."""
 
 
@@ -108,9 +107,10 @@ class LockDesk:
             return Refused("value", f"{len(items)} requests in one lock; at most {ITEMS_MAX}")
         if len(self._state.tenures.by_lock) >= WAITERS_MAX:
             return Refused("overload", f"{WAITERS_MAX} locks are held or awaited here")
+        wrong = wrong_access(items)
+        if wrong is not None:
+            return wrong
         for item in items:
-            if item.access not in _ACCESSES:
-                return Refused("value", f"{item.access} is no kind of access; is the peer newer?")
             if item.context not in self._state.catalogue.worlds:
                 known = ", ".join(sorted(self._state.catalogue.worlds)) or "none"
                 return Refused(

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
+    from enact_dist.core.beliefs import Sendings
     from enact_dist.core.datum import Token
-    from enact_dist.core.messages import Item, SlotState
+    from enact_dist.core.messages import Granted, Item, PlacementMap, SlotState
 
 
 @dataclass(slots=True, eq=False)
@@ -29,6 +30,12 @@ class Part:
     until_ns: int = 0
     hold_until_ns: int = 0
 
+    def granted(self, answer: Granted, sendings: Sendings, *, ttl_ns: int) -> None:
+        """Take the grant of this part, and what it allows to believe."""
+        self.token, self.granted_count = answer.token, sendings.count
+        self.until_ns = sendings.believe_until_ns(answer.count_seen, ttl_ns)
+        self.hold_until_ns = sendings.believe_until_ns(answer.count_seen, answer.hold_left_ns)
+
 
 class Reading(NamedTuple):
     """What a grant or view showed of one slot, and in which epoch of which shard."""
@@ -43,12 +50,12 @@ class Plan:
     """What one lock asks of which shard; both in the order of the shards' names.
 
     A shard appears once in each.  Locks on several shards take their views afterwards, as one cut
-    that lies not before `floor_ns`.  `map_version` names the placement that it was made by: the
-    client may learn another meanwhile, and a shard refuses what was placed by any other than its
-    own.
+    that lies not before `floor_ns`, nor before anything that the locks show.  `placement` is what
+    the lock was placed by, to its end: the client may learn another meanwhile, and a shard refuses
+    what was placed by any other than its own.
     """
 
     locks: tuple[tuple[str, tuple[Item, ...]], ...]
     views: tuple[tuple[str, tuple[Item, ...]], ...]
-    map_version: int
+    placement: PlacementMap
     floor_ns: int = 0

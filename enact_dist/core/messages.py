@@ -141,6 +141,14 @@ class SessionInfo(NamedTuple):
     report: bytes
 
 
+class AuditEntry(NamedTuple):
+    """An operator's act at a shard, or what came of one; `kind` is one of `core.forced`."""
+
+    wall_ns: int
+    kind: str
+    text: str
+
+
 class Counter(NamedTuple):
     """One named statistic of a shard."""
 
@@ -255,7 +263,7 @@ class Commit:
 
     Every slot of `expects` must still be at that version, and in nobody's way (see `Commits`).
     Where other shards have prepared writes, they are the `participants`, and the record of this
-    commit decides for them too; it is kept as `durability` asks ("" leaves it to its own slots).
+    commit decides for them too; it is then forced to the disk, whatever its own data survive.
     """
 
     lock: LockId
@@ -264,7 +272,6 @@ class Commit:
     seen_stamp_ns: int
     expects: tuple[SlotVersion, ...] = ()
     participants: tuple[str, ...] = ()
-    durability: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -385,6 +392,16 @@ class ForceAbort:
     reason: str
 
 
+@dataclass(frozen=True, slots=True)
+class ListAudit:
+    """List what operators did here.  Answer: `Audited`.
+
+    A text in `settle` says that somebody has seen to all alarms so far, and how.
+    """
+
+    settle: str
+
+
 # ---------------------------------------------------------------- answers
 
 
@@ -418,7 +435,8 @@ class Granted:
     """The lock is held.  `states`: every named slot, and every matching one of a pattern.
 
     `count_seen` is the highest message counter that had arrived from the session; `hold_left_ns`
-    counts from when this was sent.  `stamp_ns` is the shard's hybrid logical time.
+    counts from when this was sent.  `stamp_ns` is the shard's hybrid logical time, `from_ns` the
+    largest stamp of what is shown: views elsewhere must not lie before it.
     """
 
     lock: LockId
@@ -428,6 +446,7 @@ class Granted:
     hold_left_ns: int
     stamp_ns: int
     states: tuple[SlotState, ...]
+    from_ns: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -528,12 +547,15 @@ class Changed:
 
 @dataclass(frozen=True, slots=True)
 class Prepared:
-    """The writes are kept until the primary decides; their stamp is at least this one."""
+    """The writes are kept until the primary decides; their stamp is at least this one.
+
+    They outlast a power cut even where their data are `os` or volatile: so do the reads beside
+    them, on which the decision relies.
+    """
 
     lock: LockId
     stamp_ns: int
     versions: tuple[SlotVersion, ...]
-    durability: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -638,6 +660,14 @@ class Broken:
 
 
 @dataclass(frozen=True, slots=True)
+class Audited:
+    """The newest acts of operators, oldest first, and how many alarms nobody has seen to."""
+
+    alarms: int
+    entries: tuple[AuditEntry, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class EpochChanged:
     """The shard is in this epoch and does not know the session there: drop, say Hello, go on."""
 
@@ -702,6 +732,7 @@ Request = (
     | ListSessions
     | Break
     | ForceAbort
+    | ListAudit
 )
 Answer = (
     Welcome
@@ -727,6 +758,7 @@ Answer = (
     | Locks
     | Sessions
     | Broken
+    | Audited
     | EpochChanged
     | WrongShard
     | Refused

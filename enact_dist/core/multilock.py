@@ -130,7 +130,11 @@ class MultiLock:
     def __post_init__(self) -> None:
         self.parts = [Part(shard, items) for shard, items in self.plan.locks]
         if self.plan.views:
-            self.cut = Cut(dict(self.plan.views), floor_ns=self.plan.floor_ns)
+            self.cut = Cut(
+                dict(self.plan.views),
+                floor_ns=self.plan.floor_ns,
+                observer=self.client.observer,
+            )
         self._advance()
 
     # ---------------------------------------------------------------- what to send
@@ -176,7 +180,7 @@ class MultiLock:
         return part.shard, Acquire(
             self.lock,
             self.client.epoch(part.shard),
-            self.plan.map_version,
+            self.plan.placement.version,
             self.client.sendings.next(now_ns),
             part.items,
             min(self.slice_ns, left_ns),
@@ -189,7 +193,7 @@ class MultiLock:
         return TakeView(
             self.lock,
             self.client.epoch(shard),
-            self.plan.map_version,
+            self.plan.placement.version,
             self.client.sendings.next(now_ns),
             cut.items[shard],
             self.client.seen_stamp_ns,
@@ -226,7 +230,7 @@ class MultiLock:
         elif self.phase is Phase.ACQUIRING:
             self._on_acquiring(shard, answer, now_ns)
         elif isinstance(answer, Viewed) and isinstance(request, TakeView):
-            self._on_viewed(shard, request, answer)
+            self._on_viewed(shard, request, answer, now_ns)
         elif self.phase is Phase.VALIDATING and isinstance(request, Validate | Prepare):
             self._on_vote(shard, answer)
         elif self.phase is Phase.COMMITTING and isinstance(request, Commit | Outcome):
@@ -242,6 +246,10 @@ class MultiLock:
     def _pause(self, now_ns: int) -> None:
         self._retry_at_ns = now_ns + self._retry_ns
         self._retry_ns = min(2 * self._retry_ns, RETRY_NS_MAX)
+
+    def ask_again(self) -> None:
+        """Make the next call without a further pause."""
+        self._retry_at_ns, self._retry_ns = 0, RETRY_NS_MIN
 
     def _epoch_changed(self, shard: str, request: Request) -> None:
         """The shard restarted or forgot the session; `client` has dropped our grants there."""
@@ -261,13 +269,11 @@ class MultiLock:
         if isinstance(answer, Granted):
             if answer.epoch != self.client.epoch(shard):
                 return  # a grant of an epoch that is over
-            part.token = answer.token
-            part.granted_count = self.client.sendings.count
+            part.granted(answer, self.client.sendings, ttl_ns=self.client.ttl_ns)
             self.client.saw_stamp(answer.stamp_ns)
-            believe = self.client.sendings.believe_until_ns
-            part.until_ns = believe(answer.count_seen, self.client.ttl_ns)
-            part.hold_until_ns = believe(answer.count_seen, answer.hold_left_ns)
             self.states += [Reading(shard, answer.epoch, state) for state in answer.states]
+            if self.cut is not None:
+                self.cut.not_before(answer.from_ns)
             self._advance()
         elif isinstance(answer, Waiting):
             self.blockers = answer.blockers
@@ -277,15 +283,16 @@ class MultiLock:
         elif isinstance(answer, Stale):
             self.lose("its place in the queue was lost")
 
-    def _on_viewed(self, shard: str, request: TakeView, answer: Viewed) -> None:
+    def _on_viewed(self, shard: str, request: TakeView, answer: Viewed, now_ns: int) -> None:
         cut = self.cut
         if self.phase is not Phase.VIEWING or cut is None:
             return
-        cut.take(shard, request, answer)
+        believe = self.client.sendings.believe_until_ns
+        cut.take(shard, request, answer, until_ns=believe(request.count, self.client.ttl_ns))
         self.client.saw_stamp(answer.stamp_ns)
         if cut.left:
             return
-        answers = cut.settled(self.client.epoch)
+        answers = cut.settled(self.client.epoch, now_ns=now_ns)
         if answers is not None:
             for one, viewed in answers.items():
                 self.states += [Reading(one, viewed.epoch, state) for state in viewed.states]
@@ -393,7 +400,7 @@ class MultiLock:
         self._free_calls = self._retry_at_ns = 0
         expected: dict[str, list[SlotVersion]] = {}
         for expect in expects:
-            expected.setdefault(self._shard_of(expect.slot), []).append(expect)
+            expected.setdefault(self.shard_of(expect.slot), []).append(expect)
         self._finishing = Finishing(
             self.lock,
             tokens_of(
@@ -406,11 +413,9 @@ class MultiLock:
         self.phase = Phase.VALIDATING
         self._after_votes()
 
-    def _shard_of(self, slot: Slot) -> str:
-        for reading in self.states:
-            if reading.state.slot == slot:
-                return reading.shard
-        return shard_of(slot.entity, self.client.placement)
+    def shard_of(self, slot: Slot) -> str:
+        """Return the shard at which this lock has a slot, whatever the client learns meanwhile."""
+        return shard_of(slot.entity, self.plan.placement)
 
     def _epoch_viewed(self, shard: str) -> int:
         return next((r.epoch for r in self.states if r.shard == shard), self.client.epoch(shard))

@@ -17,6 +17,9 @@ PAST_NS: Final = 2_000_000_000
 """How long a replaced state is kept, on the clock of the stamps."""
 PAST_BYTES_MAX: Final = 64 << 20
 """Bytes of replaced data that are kept at most."""
+PAST_STATES_MAX: Final = 50_000
+"""Replaced states that are kept at most: where the wall clock was set back, the stamps stand still
+for as long, and nothing would be old."""
 
 
 class Past:
@@ -38,7 +41,11 @@ class Past:
 
     def forget(self, before_ns: int) -> None:
         """Forget what was replaced before a stamp, and the oldest of what is too much."""
-        while self._order and (self._order[0][0] < before_ns or self.bytes > PAST_BYTES_MAX):
+        while self._order and (
+            self._order[0][0] < before_ns
+            or self.bytes > PAST_BYTES_MAX
+            or len(self._order) > PAST_STATES_MAX
+        ):
             _, slot = self._order.popleft()
             states = self._by_slot[slot]
             old = states.popleft()

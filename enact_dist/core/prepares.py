@@ -13,6 +13,9 @@ Rules a change must keep
   * `Finished` is said only when the end of the prepared state survives: after that the primary
     may forget, and would answer *aborted*.
   * Nobody sees the writes before their record is durable (a restart must not take them back).
+  * Promise and end are forced to the disk whatever the class of the data: a power cut that took
+    the promise would tear the commit and free reads that the decision relies on; one that took the
+    end would let this shard ask a primary that has forgotten.
 """
 
 from __future__ import annotations
@@ -20,7 +23,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
+from enact_dist.core.admission import wrong_finish
 from enact_dist.core.datum import LockId, Position
+from enact_dist.core.forced import FORCED, ForcedAborts
 from enact_dist.core.messages import (
     RESOLVED_ABORTED,
     RESOLVED_COMMITTED,
@@ -30,6 +35,7 @@ from enact_dist.core.messages import (
     Finish,
     Finished,
     ForceAbort,
+    Holder,
     Prepare,
     Prepared,
     Resolve,
@@ -41,9 +47,11 @@ from enact_dist.core.records import (
     Call,
     Called,
     Effect,
+    ForcedRecord,
     Persist,
     PreparedEnded,
     PreparedRecord,
+    Record,
     Reply,
     Story,
 )
@@ -63,21 +71,35 @@ HINT_NS: Final = 50_000_000
 
 @dataclass(slots=True)
 class _AtStore:
-    """A preparation or an end that the store is working on; `position` belongs to an end."""
+    """A preparation (no stamp) or an end, with the commit's stamp, that the store works on.
+
+    Where an operator ends it, `forced` is what is kept of it; `told` is the position that its
+    primary names too late.
+    """
 
     tenure: Tenure
     record: PreparedRecord
-    position: Position | None = None
+    stamp_ns: int | None = None
     replies: list[int] = field(default_factory=list)
+    forced: ForcedRecord | None = None
+    holder: Holder | None = None
+    operator: int = 0
+    told: Position | None = None
 
 
 class PrepareDesk:
     """Everything that is prepared at this shard, and what it tells others about its own locks."""
 
-    def __init__(self, state: ShardState, recovered: Iterable[PreparedRecord]) -> None:
+    def __init__(
+        self,
+        state: ShardState,
+        recovered: Iterable[PreparedRecord],
+        forced: Iterable[ForcedRecord] = (),
+    ) -> None:
         self._state = state
         self._at_store: dict[int, _AtStore] = {}
         self._ask_ns: dict[LockId, int] = {}
+        self._forced = ForcedAborts(state, forced)
         for record in recovered:
             # Versions of volatile slots have started again.
             versions = tuple(
@@ -98,7 +120,7 @@ class PrepareDesk:
         tenure = state.tenures.by_lock.get(message.lock)
         if tenure is not None and tenure.prepared is not None:
             state.count("prepares_repeated")
-            yield Reply(reply_to, self._prepared(tenure.prepared))
+            yield Reply(reply_to, _prepared(tenure.prepared))
             return
         under_way = self._at_store_of(message.lock)
         if under_way is not None:
@@ -129,59 +151,60 @@ class PrepareDesk:
             message.primary_token,
         )
         state.pins.pop(message.lock, None)
-        yield self._persist(
-            _AtStore(tenure, record, replies=[reply_to]), (record,), self._survives(record)
-        )
+        yield self._persist(_AtStore(tenure, record, replies=[reply_to]), (record,))
 
-    def _persist(
-        self, work: _AtStore, records: tuple[object, ...], durability: Durability
-    ) -> Effect:
+    def _persist(self, work: _AtStore, records: tuple[Record, ...]) -> Effect:
         work.tenure.committing = True
         ticket = self._state.commits.new_ticket()
         self._at_store[ticket] = work
-        return Persist(ticket, records, durability)  # type: ignore[arg-type]  # records they are
-
-    def _survives(self, record: PreparedRecord) -> Durability:
-        """Return what the record must survive: volatile writes too must reach their decision."""
-        return self._state.commits.strictest(record.writes, at_least=Durability.OS)
-
-    def _prepared(self, record: PreparedRecord) -> Prepared:
-        durability = self._survives(record)
-        return Prepared(record.lock, record.stamp_ns, record.versions, durability.value)
+        return Persist(ticket, records, Durability.DURABLE)
 
     def _at_store_of(self, lock: LockId) -> _AtStore | None:
         return next((work for work in self._at_store.values() if work.record.lock == lock), None)
 
     def persisted(self, ticket: int) -> Iterator[Effect]:
         """The store is done with a preparation, or with the end of one."""
+        if self._forced.is_mine(ticket):
+            yield from self._forced.persisted(ticket)
+            return
         work = self._at_store.pop(ticket)
         tenure, record = work.tenure, work.record
         tenure.committing = False
-        if work.position is None:
+        if work.forced is not None:
+            yield from self._given_up(work, work.forced)
+            return
+        if work.stamp_ns is None:
             tenure.prepared = record
             self._ask_ns[record.lock] = self._state.now_ns + self._ask_again_ns(record.lock)
             self._state.count("prepared")
             for reply_to in work.replies:
-                yield Reply(reply_to, self._prepared(record))
+                yield Reply(reply_to, _prepared(record))
             return
-        stamp_ns = work.position.stamp_ns
-        changes = self._state.commits.apply_writes(record.writes, record.versions, stamp_ns)
+        commits = self._state.commits
+        changes = commits.apply_writes(record.writes, record.versions, work.stamp_ns)
         yield from self._end(tenure)
         self._state.count("commits_finished")
         for reply_to in work.replies:
             yield Reply(reply_to, Finished(record.lock))
-        yield from self._state.commits.publish(changes)
+        yield from commits.publish(changes)
 
     # ---------------------------------------------------------------- the decision
 
     def on_finish(self, message: Finish, reply_to: int) -> Iterator[Effect]:
         """The primary says: committed."""
         tenure = self._state.tenures.by_lock.get(message.lock)
+        if message.lock in self._forced:
+            yield from self._forced.committed(message.lock, message.position, [reply_to])
+            return
         if tenure is None or tenure.prepared is None:
             self._state.count("finishes_repeated")
             yield Reply(reply_to, Finished(message.lock))
-        else:
-            yield from self._finish(tenure, message.position, [reply_to])
+            return
+        wrong = wrong_finish(message, tenure.prepared)
+        if wrong is not None:
+            yield Reply(reply_to, wrong)
+            return
+        yield from self._finish(tenure, message.position, [reply_to])
 
     def _finish(self, tenure: Tenure, position: Position, replies: list[int]) -> Iterator[Effect]:
         record = tenure.prepared
@@ -189,13 +212,14 @@ class PrepareDesk:
         under_way = self._at_store_of(record.lock)
         if under_way is not None:
             under_way.replies += replies
+            under_way.told = position
             return
-        self._state.stamps.saw(position.stamp_ns)
-        written = self._state.commits.records(record.writes, record.versions, position.stamp_ns)
+        # Never before what views were told of the lock, whatever its client has said elsewhere.
+        stamp_ns = max(position.stamp_ns, record.stamp_ns)
+        self._state.stamps.saw(stamp_ns)
+        written = self._state.commits.records(record.writes, record.versions, stamp_ns)
         yield self._persist(
-            _AtStore(tenure, record, position, replies),
-            (*written, PreparedEnded(record.lock)),
-            self._survives(record),
+            _AtStore(tenure, record, stamp_ns, replies), (*written, PreparedEnded(record.lock))
         )
 
     def _end(self, tenure: Tenure) -> Iterator[Effect]:
@@ -209,6 +233,9 @@ class PrepareDesk:
         if isinstance(request, Finish) and isinstance(answer, Finished):
             yield from self._state.decisions.finished(request.lock, message.shard)
         if not (isinstance(request, Resolve) and isinstance(answer, Resolved)):
+            return
+        if request.lock in self._forced:
+            yield from self._forced.resolved(answer)
             return
         tenure = self._state.tenures.by_lock.get(request.lock)
         if tenure is None or tenure.prepared is None:
@@ -259,10 +286,13 @@ class PrepareDesk:
             self._state.count("resolves_asked")
             yield Call(record.primary, Resolve(lock, record.primary_token, name))
             self._ask_ns[lock] = now_ns + self._ask_again_ns(lock)
+        yield from self._forced.ask()
 
     def next_deadline_ns(self) -> int | None:
         """Return when a primary is to be asked again."""
-        return min(self._ask_ns.values(), default=None)
+        forced_ns = self._forced.next_deadline_ns()
+        others = () if forced_ns is None else (forced_ns,)
+        return min((*self._ask_ns.values(), *others), default=None)
 
     def undecided(self) -> Iterator[PreparedRecord]:
         """Yield what is prepared, or about to be, and not decided as far as is known here."""
@@ -281,19 +311,28 @@ class PrepareDesk:
         if not found or found[0].prepared is None or found[0].committing:
             yield Reply(reply_to, Broken(False, None))
             return
-        tenure = found[0]
+        tenure, record = found[0], found[0].prepared
         holder = state.describe(tenure, state.now_ns)
         why = message.reason or "no reason given"
         text = (
             f"prepared lock {message.number} ({tenure.lock}) of {holder.actor}@{holder.host} was"
-            f" aborted by hand without the word of {tenure.prepared.primary}: {why}"  # type: ignore[union-attr]
+            f" aborted by hand without the word of {record.primary}: {why}"
         )
         state.count("prepared_forced")
-        records = (AuditRecord(state.wall_ns, text), PreparedEnded(tenure.lock))
-        yield Persist(0, records, Durability.DURABLE)
-        yield Story("lock.forced", text)
-        yield from self._end(tenure)
-        yield Reply(reply_to, Broken(True, holder))
+        slots = tuple(write.slot for write in record.writes)
+        forced = ForcedRecord(tenure.lock, record.primary, record.primary_token, slots)
+        work = _AtStore(tenure, record, forced=forced, holder=holder, operator=reply_to)
+        audit = state.audit.keep(AuditRecord(state.wall_ns, text, FORCED))
+        yield Story("lock.forced", text, grave=True)
+        yield self._persist(work, (audit, forced, PreparedEnded(tenure.lock)))
+
+    def _given_up(self, work: _AtStore, forced: ForcedRecord) -> Iterator[Effect]:
+        """An abort by hand is durable: free the slots, and go on asking the lost shard."""
+        yield from self._end(work.tenure)
+        self._forced.add(forced)
+        yield Reply(work.operator, Broken(True, work.holder))
+        if work.told is not None:
+            yield from self._forced.committed(forced.lock, work.told, work.replies)
 
     def assert_invariants(self) -> None:
         """Assert I10 and the bookkeeping.  For tests and simulation."""
@@ -303,3 +342,7 @@ class PrepareDesk:
         assert prepared == set(self._ask_ns), (prepared, self._ask_ns)
         for lock in prepared:
             assert self._state.tenures.by_lock[lock].claim.granted, "prepared without its locks"
+
+
+def _prepared(record: PreparedRecord) -> Prepared:
+    return Prepared(record.lock, record.stamp_ns, record.versions)

@@ -110,10 +110,31 @@ class DecisionDone:
 
 @dataclass(frozen=True, slots=True)
 class AuditRecord:
-    """An operator's act (a broken lock), kept for good."""
+    """An operator's act or what came of it, kept for good; `kind` is one of `core.forced`."""
 
     wall_ns: int
     text: str
+    kind: str = "broken"
+
+
+@dataclass(frozen=True, slots=True)
+class ForcedRecord:
+    """A prepared lock that was aborted by hand: its primary's word is still to be asked for.
+
+    `slots` are those that it would have written here.
+    """
+
+    lock: LockId
+    primary: str
+    primary_token: Token
+    slots: tuple[Slot, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class ForcedEnded:
+    """The primary has given its word about such a lock; forget the record."""
+
+    lock: LockId
 
 
 Record = (
@@ -128,6 +149,8 @@ Record = (
     | DecisionRecord
     | DecisionDone
     | AuditRecord
+    | ForcedRecord
+    | ForcedEnded
 )
 
 
@@ -143,6 +166,8 @@ class Recovered:
     outcomes: list[OutcomeRecord] = field(default_factory=list)
     prepared: list[PreparedRecord] = field(default_factory=list)
     decisions: list[DecisionRecord] = field(default_factory=list)
+    forced: list[ForcedRecord] = field(default_factory=list)
+    audit: list[AuditRecord] = field(default_factory=list)
 
 
 # ---------------------------------------------------------------- effects of the shard
@@ -182,10 +207,11 @@ class Call:
 
 @dataclass(frozen=True, slots=True)
 class Story:
-    """One line for the log: what the shard decided and about whom."""
+    """One line for the log: what the shard decided and about whom; `grave` needs people."""
 
     event: str
     text: str
+    grave: bool = False
 
 
 Effect = Reply | Persist | Publish | Call | Story

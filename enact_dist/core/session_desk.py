@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
+from enact_dist.core.admission import wrong_aspect, wrong_name
 from enact_dist.core.messages import (
     Alive,
     Answer,
@@ -32,7 +33,7 @@ from enact_dist.core.records import (
     WorldRecord,
 )
 from enact_dist.core.sessions import SESSIONS_MAX
-from enact_dist.terms import Durability, checked_name
+from enact_dist.terms import Durability
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -121,18 +122,20 @@ class SessionDesk:
         records: list[Record] = []
         before = dict(self._state.catalogue.aspects)
         for name in message.worlds:
-            try:
-                checked_name("world context", name, slashes=False)
-            except ValueError as error:
-                yield Reply(reply_to, Refused("value", str(error)))
+            wrong = wrong_name("world context", name, slashes=False)
+            if wrong is not None:
+                yield Reply(reply_to, wrong)
                 return
             if name not in self._state.catalogue.worlds:
                 records.append(WorldRecord(name))
         for entry in message.aspects:
-            registered = self._state.catalogue.register(entry)
+            wrong = wrong_aspect(entry)
+            registered = self._state.catalogue.register(entry) if wrong is None else wrong
             if isinstance(registered, str):
+                registered = Refused("datum_type", registered)
+            if isinstance(registered, Refused):
                 self._state.catalogue.aspects = before
-                yield Reply(reply_to, Refused("datum_type", registered))
+                yield Reply(reply_to, registered)
                 return
             if registered[1]:
                 records.append(AspectRecord(registered[0]))

@@ -17,9 +17,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from enact_dist.core import inspection
+from enact_dist.core.forced import BROKEN, SETTLED
 from enact_dist.core.lock_desk import LockDesk
 from enact_dist.core.messages import (
     Acquire,
+    Audited,
     AwaitStamp,
     Break,
     Broken,
@@ -30,6 +32,7 @@ from enact_dist.core.messages import (
     Goodbye,
     Hello,
     KeepAlive,
+    ListAudit,
     ListLocks,
     ListSessions,
     Locks,
@@ -79,7 +82,7 @@ class Shard:
         self.state = ShardState(settings, recovered, now_ns=now_ns, wall_ns=wall_ns)
         self.settings, self.epoch = settings, self.state.epoch
         self._sessions = SessionDesk(self.state)
-        self._prepares = PrepareDesk(self.state, recovered.prepared)
+        self._prepares = PrepareDesk(self.state, recovered.prepared, recovered.forced)
         self._locks = LockDesk(self.state, self._prepares)
         self._views = ViewDesk(self.state, self._locks, self._prepares)
         self._parked_stamps: dict[int, AwaitStamp] = {}
@@ -108,6 +111,7 @@ class Shard:
             ListLocks: self._on_list_locks,
             ListSessions: self._on_list_sessions,
             Break: self._on_break,
+            ListAudit: self._on_list_audit,
             Persisted: self._on_persisted,
             Tick: self._on_tick,
             Drain: self._on_drain,
@@ -295,8 +299,16 @@ class Shard:
         yield from self.state.tenures.take_away(found[0], cause, now_ns=self.state.now_ns)
         self.state.count("locks_broken")
         text = f"lock {message.number} of {holder.actor}@{holder.host} {cause}"
-        yield Persist(0, (AuditRecord(self.state.wall_ns, text),), Durability.OS)
+        kept = self.state.audit.keep(AuditRecord(self.state.wall_ns, text, BROKEN))
+        yield Persist(0, (kept,), Durability.OS)
         yield Reply(reply_to, Broken(True, holder))
+
+    def _on_list_audit(self, message: ListAudit, reply_to: int) -> Iterator[Effect]:
+        audit = self.state.audit
+        if message.settle:
+            kept = audit.keep(AuditRecord(self.state.wall_ns, message.settle, SETTLED))
+            yield Persist(0, (kept,), Durability.OS)
+        yield Reply(reply_to, Audited(audit.alarms, audit.entries()))
 
     def assert_invariants(self) -> None:
         """Assert I1, I8, I10, I11 and the bookkeeping of all parts.  For tests and simulation."""

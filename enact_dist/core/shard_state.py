@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final
 from enact_dist.core import inspection
 from enact_dist.core.commits import Commits
 from enact_dist.core.decisions import Decisions
+from enact_dist.core.forced import Audit
 from enact_dist.core.messages import AspectEntry, PlacementMap
 from enact_dist.core.sessions import Session, SessionTable
 from enact_dist.core.slots import Catalogue, SlotMap
@@ -63,6 +64,7 @@ class ShardState:
     Attributes:
         now_ns: Monotonic time of the message being handled.
         wall_ns: Wall clock at that moment; for stamps only.
+        peers: The other shards of the cell.
         pins: Data that a view without a lock keeps fetchable.
         shortest_ttl_ns: Of all sessions; bounds how often the shard must look at the time.
         draining: The shard is about to stop and grants nothing.
@@ -77,6 +79,8 @@ class ShardState:
         self.draining = False
         self.counters: dict[str, int] = {}
         self.pins: dict[LockId, dict[tuple[Slot, int], Datum]] = {}
+        names = {shard.name for shard in settings.placement.shards}
+        self.peers = frozenset(names - {settings.name})
         self.slots = SlotMap(
             recovered.slots, answer_bytes_max=ANSWER_FETCHES * settings.fetch_bytes_max
         )
@@ -102,9 +106,11 @@ class ShardState:
             epoch=self.epoch, slots=self.slots, sessions=self.sessions, count=self.count
         )
         self.tenures.describe = self.describe
+        self.audit = Audit(recovered.audit)
         self.decisions = Decisions(recovered.decisions, now_ns=now_ns, count=self.count)
         self.commits = Commits(
             shard=settings.name,
+            peers=self.peers,
             epoch=self.epoch,
             slots=self.slots,
             catalogue=self.catalogue,

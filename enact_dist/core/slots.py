@@ -9,7 +9,7 @@ comparable within one epoch of the shard.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from enact_dist.core.datum import Column, Datum, Slot
 from enact_dist.core.messages import AspectEntry, SlotState
@@ -39,6 +39,20 @@ class Content:
 
 
 NOTHING: Final = Content(0, 0, None, NullReason.NEVER_SET)
+
+
+class Shown(NamedTuple):
+    """What a grant or view shows.
+
+    Attributes:
+        states: The slots.
+        pins: The data that `states` name without carrying, to keep them fetchable.
+        from_ns: The largest stamp of it, nulls of a pattern included: current from there on.
+    """
+
+    states: list[SlotState]
+    pins: dict[tuple[Slot, int], Datum]
+    from_ns: int
 
 
 class SlotMap:
@@ -107,17 +121,12 @@ class SlotMap:
         """Yield every (context, aspect) that has slots."""
         yield from self._columns
 
-    def views(
-        self, items: Iterable[Item], at_ns: int
-    ) -> tuple[list[SlotState], list[Content], int]:
-        """Return what `items` show as of a stamp (0: now).
+    def shown(self, items: Iterable[Item], at_ns: int = 0) -> Shown:
+        """Return what a grant or view shows of `items` as of a stamp (0: now).
 
-        Returns:
-            The states; the contents of those that carry none of their data; and the largest stamp
-            that they bear, nulls of a pattern included: all of them were current from there on.
+        Slots stand in order, patterns expanded to those that are not null.
         """
-        shown: list[SlotState] = []
-        contents: list[Content] = []
+        shown = Shown([], {}, 0)
         from_ns, left = 0, self._answer_bytes_max
         for item in items:
             each = Access(item.access).each
@@ -130,31 +139,14 @@ class SlotMap:
             for slot, newest in found:
                 content = self.at(slot, newest, at_ns)
                 from_ns = max(from_ns, content.stamp_ns)
-                if content.datum is not None or not each:
-                    state = state_of(slot, content, known=item.known, inline_max=left)
-                    left -= state.datum.size if state.datum is not None else 0
-                    shown.append(state)
-                    contents.append(content)
-        return shown, contents, from_ns
-
-    def states(self, items: Iterable[Item]) -> list[SlotState]:
-        """Return what a grant or view shows of `items`: slots in order, patterns expanded."""
-        found: list[SlotState] = []
-        left = self._answer_bytes_max
-        for item in items:
-            for slot, content in self._shown_by(item):
+                if content.datum is None and each:
+                    continue
                 state = state_of(slot, content, known=item.known, inline_max=left)
-                if state.datum is not None:
-                    left -= state.datum.size
-                found.append(state)
-        return found
-
-    def _shown_by(self, item: Item) -> Iterable[tuple[Slot, Content]]:
-        if not Access(item.access).each:
-            slot = Slot(item.context, item.entity, item.aspect)
-            return ((slot, self[slot]),)
-        matching = self.matching(Column(item.context, item.aspect), item.entity)
-        return [(slot, content) for slot, content in matching if content.datum is not None]
+                left -= state.datum.size if state.datum is not None else 0
+                shown.states.append(state)
+                if content.datum is not None and (state.large or state.same):
+                    shown.pins[slot, state.version] = content.datum
+        return shown._replace(from_ns=from_ns)
 
 
 def state_of(
@@ -180,10 +172,6 @@ def state_of(
     return SlotState(
         slot, content.version, content.stamp_ns, datum.size, shown, same, large and not same, ""
     )
-
-
-DURABILITIES: Final = ("", *(durability.value for durability in Durability))
-"""What an aspect may ask for; nothing leaves it to the cell."""
 
 
 class Catalogue:
@@ -213,11 +201,6 @@ class Catalogue:
 
     def register(self, entry: AspectEntry) -> tuple[AspectEntry, bool] | str:
         """Register an aspect; return its entry and whether it is new, or why it is refused."""
-        if entry.durability not in DURABILITIES:
-            return (
-                f"aspect {entry.name!r} asks for the durability {entry.durability!r}; known:"
-                f" {', '.join(filter(None, DURABILITIES))}"
-            )
         wanted = self._with_configured(entry)
         known = self.aspects.get(entry.name)
         if known is None:

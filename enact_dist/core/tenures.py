@@ -32,7 +32,7 @@ from enact_dist.terms import Access, pattern_matches
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
-    from enact_dist.core.messages import Holder, SlotState
+    from enact_dist.core.messages import Holder
     from enact_dist.core.records import PreparedRecord
     from enact_dist.core.sessions import SessionTable
 
@@ -219,9 +219,9 @@ class Tenures:
     def granted(self, tenure: Tenure, *, now_ns: int, stamp_ns: int) -> Granted:
         """Return the grant with its data as of now."""
         assert tenure.token is not None
-        states = self._slots.states(tenure.items)
+        states, pins, from_ns = self._slots.shown(tenure.items)
         # Added to: the client may have taken an earlier answer, whose views have moved on since.
-        tenure.pins.update(self.pins_of(states))
+        tenure.pins.update(pins)
         session = self._sessions.by_id[tenure.lock.session]
         return Granted(
             tenure.lock,
@@ -231,17 +231,8 @@ class Tenures:
             max(0, tenure.hold_end_ns - now_ns),
             stamp_ns,
             tuple(states),
+            from_ns,
         )
-
-    def pins_of(self, states: Iterable[SlotState]) -> dict[tuple[Slot, int], Datum]:
-        """Return the data that `states` name without carrying, to keep them fetchable."""
-        pins = {}
-        for state in states:
-            if state.large or state.same:
-                datum = self._slots[state.slot].datum
-                assert datum is not None
-                pins[state.slot, state.version] = datum
-        return pins
 
     def remove(self, tenure: Tenure, *, now_ns: int) -> Iterator[Effect]:
         """End a tenure; who waited for it becomes ready (see `grant_ready`)."""

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.core.datum import Column, Datum, Slot
+from enact_dist.core.datum import Column, Slot
 from enact_dist.core.messages import EpochChanged, TakeView, Viewed
 from enact_dist.core.past import PAST_NS
 from enact_dist.core.records import Reply
@@ -77,12 +77,7 @@ class ViewDesk:
 
     def _viewed(self, message: TakeView) -> Viewed:
         state = self._state
-        shown, contents, from_ns = state.slots.views(message.items, message.at_ns)
-        pins: dict[tuple[Slot, int], Datum] = {
-            (slot_state.slot, slot_state.version): content.datum
-            for slot_state, content in zip(shown, contents, strict=True)
-            if content.datum is not None and (slot_state.large or slot_state.same)
-        }
+        states, pins, from_ns = state.slots.shown(message.items, message.at_ns)
         if pins:
             # Added to: the client may have taken an answer to an earlier one of these.
             state.pins.setdefault(message.lock, {}).update(pins)
@@ -91,7 +86,7 @@ class ViewDesk:
         if message.at_ns:
             # Some of it may be past already, and was current at that stamp for certain.
             until_ns = min(until_ns, message.at_ns)
-        return Viewed(message.lock, state.epoch, stamp_ns, tuple(shown), from_ns, until_ns)
+        return Viewed(message.lock, state.epoch, stamp_ns, tuple(states), from_ns, until_ns)
 
     def answer_parked(self) -> Iterator[Effect]:
         """Answer the views that nothing undecided stands before any more, or that waited enough."""

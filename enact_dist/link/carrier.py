@@ -13,7 +13,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from enact_dist.core.messages import Answer, Notice, Request, ShardEntry
 
@@ -70,6 +70,12 @@ class Carrier(Protocol):
 
     def way_to(self, shard: str) -> str:
         """Return how calls to a shard travel now, for people: "zenoh", "socket", …."""
+
+    def tell_returns(self, returned: Callable[[str], None]) -> None:
+        """Call `returned` with the name of each shard that comes (back) into reach.
+
+        From any thread; it must not wait.  A hint only: a carrier that cannot tell never calls it.
+        """
 
     def endpoint_of(self, shard: str) -> str:
         """Return where the shard is expected, for messages to people."""

@@ -14,8 +14,17 @@ import itertools
 import logging
 from typing import TYPE_CHECKING, Final
 
+from enact_dist.core.messages import (
+    OUTCOME_COMMITTED,
+    OUTCOME_PENDING,
+    OUTCOME_UNSEEN,
+    Outcome,
+    OutcomeIs,
+    Release,
+)
 from enact_dist.core.multilock import MultiLock, Phase
-from enact_dist.errors import EnactError, MisuseError
+from enact_dist.errors import CommitUnknownError, EnactError, MisuseError
+from enact_dist.link.lock_names import name_of, read_name
 from enact_dist.link.refusals import not_committed, not_granted
 from enact_dist.link.session_client import (
     BYTES_PER_S_MIN,
@@ -29,6 +38,7 @@ if TYPE_CHECKING:
     import threading
     from collections.abc import Iterable, Mapping, Sequence
 
+    from enact_dist.core.datum import Position
     from enact_dist.core.messages import Item, SlotVersion, WriteItem
 
 INTERRUPTIBLE_SLICE_NS: Final = 120_000_000
@@ -131,7 +141,7 @@ class CellClient(SessionClient):
 
     def _pause(self, pause_s: float) -> None:
         """Wait before asking again; raises if the cell is closed meanwhile."""
-        if self._stopping.wait(pause_s):
+        if self._rest(pause_s, self._returns):
             self.check_usable()
 
     def _drive(self, lock: MultiLock, *, interrupt: threading.Event | None = None) -> None:
@@ -202,9 +212,9 @@ class CellClient(SessionClient):
                     raise
                 # The cell was closed, or the answer could not be read: the commit may stand.
                 lock.phase, lock.cause = Phase.UNKNOWN, f"then: {error}"
-                raise self._not_committed(lock, started_ns) from error
+                raise self._not_committed(lock, writes, started_ns) from error
             if lock.phase is not Phase.COMMITTED:
-                raise self._not_committed(lock, started_ns)
+                raise self._not_committed(lock, writes, started_ns)
         finally:
             self.release(lock)  # only the lane, unless something broke in between
 
@@ -215,10 +225,37 @@ class CellClient(SessionClient):
             lock.release()
             raise
 
-    def _not_committed(self, lock: MultiLock, started_ns: int) -> EnactError:
+    def _not_committed(
+        self, lock: MultiLock, writes: Mapping[str, Sequence[WriteItem]], started_ns: int
+    ) -> EnactError:
         waited_s = (self._now_ns() - started_ns) / 1e9
         self._ask_cause(lock)
-        return not_committed(lock, waited_s, self.carrier.endpoint_of)
+        name = name_of(lock.lock, writes)
+        return not_committed(lock, waited_s, self.carrier.endpoint_of, name=name)
+
+    def outcome(self, name: str, *, timeout_s: float) -> Position | None:
+        """Ask what became of a commit; see `Cell.outcome`."""
+        lock, shard = read_name(name)
+        if shard not in self.shards():
+            raise MisuseError(f"{name!r} names shard {shard}; there are {', '.join(self.shards())}")
+        deadline_ns = self._now_ns() + int(timeout_s * 1e9)
+        # A copy of the commit that is still under way finds nothing to commit after this.
+        self.call(shard, Release(lock), timeout_s=timeout_s)
+        while True:
+            left_s = max(0.0, (deadline_ns - self._now_ns()) / 1e9)
+            answer = self.call(shard, Outcome(lock), timeout_s=left_s)
+            kind = answer.kind if isinstance(answer, OutcomeIs) else ""
+            if isinstance(answer, OutcomeIs) and kind == OUTCOME_COMMITTED:
+                return answer.position
+            if kind == OUTCOME_UNSEEN:
+                return None
+            if kind != OUTCOME_PENDING or self._now_ns() >= deadline_ns:
+                why = "still works on it" if kind == OUTCOME_PENDING else "knows it no more"
+                raise CommitUnknownError(
+                    f"shard {shard} {why}: commit {name} may stand or not; read its data",
+                    lock_id=name,
+                )
+            self._pause(0.02)
 
     def release(self, lock: MultiLock) -> None:
         """Give the lock back without writing, and its lane; nothing where that is done already.
@@ -233,7 +270,10 @@ class CellClient(SessionClient):
             self._say_farewell(lock)
         finally:
             lock.lane_free = True
-            self._lanes.give_back(lock.lock.lane)
+            if lock.phase is Phase.UNKNOWN:
+                self._lanes.keep(lock.lock.lane)
+            else:
+                self._lanes.give_back(lock.lock.lane)
 
     def valid(self, lock: MultiLock) -> bool:
         """Whether the client may still believe in the lock, without asking over a network."""

@@ -16,7 +16,7 @@ from enact_dist.errors import MisuseError, ShardUnreachableError
 from enact_dist.link.notices import NoticeQueue
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from enact_dist.core.messages import Answer, Request, ShardEntry
     from enact_dist.link.host import ShardHost
@@ -125,6 +125,9 @@ class EmbeddedCarrier:
     def way_to(self, shard: str) -> str:
         """Return how calls travel: not at all."""
         return "call"
+
+    def tell_returns(self, returned: Callable[[str], None]) -> None:
+        """Do nothing: the shard is in reach as long as this process lives."""
 
     def endpoint_of(self, shard: str) -> str:
         """Return where the shard is, and why it answers no more."""

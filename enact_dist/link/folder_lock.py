@@ -21,8 +21,11 @@ if TYPE_CHECKING:
 
 LOCK_FILE: Final = "lock"
 FORMAT_FILE: Final = "format"
-FORMAT: Final = 1
-"""Version of everything below a data folder; goes up when an older program could misread it."""
+FORMAT: Final = 2
+"""Version of everything below a data folder; goes up when an older program could misread it.
+
+2: commits over shards are stored (prepared locks, decisions), and the mark is there first.
+"""
 
 _FORMAT_WORDS: Final = "enact-dist store"
 _LOCK_BYTES_MAX: Final = 512
@@ -125,7 +128,7 @@ def check_format(folder: Path, *, is_new: bool) -> None:
         is_new: Whether nothing was ever stored in it.
 
     Raises:
-        StoreError: The format is newer, unreadable, or missing in a folder with data.
+        StoreError: The format is newer or older, unreadable, or missing in a folder with data.
         OSError: The mark cannot be written.
     """
     path = folder / FORMAT_FILE
@@ -145,7 +148,14 @@ def check_format(folder: Path, *, is_new: bool) -> None:
         )
     if int(version) > FORMAT:
         raise StoreError(
-            f"{folder} has store format {version}, this program reads up to {FORMAT}: it was"
-            " written by a newer enact-dist; install that one again, nothing was changed",
+            f"{folder} has store format {version}, this program reads {FORMAT}: it was written by a"
+            " newer enact-dist; install that one again, nothing was changed",
+            path=str(path),
+        )
+    if int(version) < FORMAT:
+        raise StoreError(
+            f"{folder} has store format {version}, this program reads {FORMAT}: it was written by"
+            " an older enact-dist; read its data out with that one, or give the shard an empty"
+            " folder; nothing was changed",
             path=str(path),
         )

@@ -246,7 +246,8 @@ class ShardHost:
                 for watcher in self._watchers:
                     watcher(cast("Notice", effect.notice))
             elif isinstance(effect, Story):
-                _log.info("%s: %s", effect.event, effect.text, extra={"event": effect.event})
+                level = logging.CRITICAL if effect.grave else logging.INFO
+                _log.log(level, "%s: %s", effect.event, effect.text, extra={"event": effect.event})
 
     def _persist(self, effect: Persist) -> None:
         if self._store_thread is not None:

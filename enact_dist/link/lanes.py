@@ -7,9 +7,14 @@ used again after its lock has ended, by any thread.
 from __future__ import annotations
 
 import threading
+from collections import deque
+from typing import Final
 
 from enact_dist.core.sessions import LANES_MAX
 from enact_dist.errors import MisuseError
+
+KEPT_MAX: Final = 64
+"""Lanes that rest after a commit without an answer: a new lock would overwrite its outcome."""
 
 
 class Lanes:
@@ -18,6 +23,7 @@ class Lanes:
     def __init__(self) -> None:
         self._mutex = threading.Lock()
         self._free: list[int] = []
+        self._kept: deque[int] = deque()
         self._made = 0
 
     def take(self) -> int:
@@ -44,3 +50,10 @@ class Lanes:
     def give_back(self, lane: int) -> None:
         """Let the lane be used again; to be called once per `take`, or two locks would share it."""
         self._free.append(lane)
+
+    def keep(self, lane: int) -> None:
+        """Give back a lane whose outcome may still be asked for; the oldest such one is freed."""
+        with self._mutex:
+            self._kept.append(lane)
+            if len(self._kept) > KEPT_MAX:
+                self._free.append(self._kept.popleft())

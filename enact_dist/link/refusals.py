@@ -76,17 +76,21 @@ def not_granted(lock: MultiLock, waited_s: float, endpoint_of: Callable[[str], s
 
 
 def not_committed(
-    lock: MultiLock, finish_s: float, endpoint_of: Callable[[str], str]
+    lock: MultiLock, finish_s: float, endpoint_of: Callable[[str], str], *, name: str = ""
 ) -> EnactError:
-    """Return the error for a lock that ended otherwise than by its commit."""
+    """Return the error for a lock that ended otherwise than by its commit.
+
+    `name` is under what its outcome can be asked for.
+    """
     if lock.phase is Phase.REFUSED and lock.refusal is not None:
         return error_of(lock.refusal)
     if lock.phase is Phase.UNKNOWN:
         why = lock.cause or f"no answer came for {finish_s:.1f} s"
         return CommitUnknownError(
             f"the commit of lock {lock.lock} ({_wanted(lock)}) was sent, and {why}; it may stand or"
-            " not; read the data before writing them again",
-            lock_id=str(lock.lock),
+            " not; read the data before writing them again, or ask for it when the shard is back:"
+            f" cell.outcome({name!r})",
+            lock_id=name,
         )
     if lock.phase is Phase.UNREACHABLE:
         return unreachable(lock.silent_shard, finish_s, endpoint_of)

@@ -87,6 +87,8 @@ class SessionClient:
         self._now_ns = now_ns
         self._mutex = threading.RLock()
         self._stopping = threading.Event()
+        self._news = threading.Condition(threading.Lock())
+        self._returns = 0
         self._lanes = Lanes()
         self._catalogue = KnownCatalogue()
         self._registered: dict[str, AspectEntry] = {}
@@ -105,13 +107,16 @@ class SessionClient:
         self._take(welcome.shard, self.core.hello(welcome.shard), welcome)
         if self._renewer is not None:
             self._renewer.start()
+            self.carrier.tell_returns(self._shard_returned)
 
     def close(self) -> None:
         """Say goodbye to every shard and end; twice is harmless."""
         if self.closed or self.forked:
             return
         self.closed = True
-        self._stopping.set()
+        with self._news:
+            self._stopping.set()
+            self._news.notify_all()
         if self._renewer is not None and self._renewer.is_alive():
             self._renewer.join()
         goodbyes = [(shard, Goodbye(self.core.session)) for shard in self.core.shards_in_use()]
@@ -167,7 +172,7 @@ class SessionClient:
             if self._now_ns() >= deadline_ns:
                 missing = next(index for index in left if index not in answers)
                 raise unreachable(calls[missing][0], timeout_s, self.carrier.endpoint_of)
-            self._stopping.wait(pause_s)
+            self._rest(pause_s, self._returns)
             pause_s = min(2 * pause_s, 0.3)
 
     def call_once(
@@ -277,12 +282,35 @@ class SessionClient:
     # ---------------------------------------------------------------- keep-alive
 
     def _renew(self) -> None:
-        while not self._stopping.wait(self.core.ttl_ns / 4e9):
+        returns = 0
+        while True:
+            if self._rest(self.core.ttl_ns / 4e9, returns):
+                return
+            returns = self._returns
             try:
                 self.renew_once()
+                if any(self.core.needs_hello(shard) for shard in self.core.shards_in_use()):
+                    # A shard restarted: the sooner it knows that we know, the sooner it grants.
+                    self.renew_once()
             except Exception as error:  # noqa: BLE001 - a bad answer must not end the renewal
                 self._count("keep_alives_failed")
                 _log.warning("keep-alive of session %s: %s", self.core.session[:8], error)
+
+    def _rest(self, pause_s: float, returns: int) -> bool:
+        """Wait, but not once more shards than `returns` have come back; say whether it is over."""
+        with self._news:
+            self._news.wait_for(
+                lambda: self._stopping.is_set() or self._returns != returns, max(0.0, pause_s)
+            )
+        return self._stopping.is_set()
+
+    def _shard_returned(self, _: str) -> None:
+        """Let everybody who waits ask again at once."""
+        with self._mutex:
+            self.core.ask_again()
+        with self._news:
+            self._returns += 1
+            self._news.notify_all()
 
     def renew_once(self) -> None:
         """Send one keep-alive to every shard in use and take the answers."""

@@ -30,7 +30,9 @@ CALL_S: Final = 1.0
 QUEUED_MAX: Final = 10_000
 """Calls that wait for one shard; what is beyond is dropped, and made again later."""
 JOIN_S: Final = 0.5
-"""How long closing waits for each thread."""
+"""How long closing waits for all threads."""
+SILENT_S: Final = 5.0
+"""A shard that answers nothing for so long is told to the log, once."""
 
 _ANSWERS: Final = frozenset(get_args(Answer))
 _log = logging.getLogger("enact.link")
@@ -61,16 +63,21 @@ class ShardCalls:
         self._answered = answered
         self._mutex = threading.Lock()
         self._lines: dict[str, _Line] = {}
+        self._unknown: dict[str, None] = {}
         self._closed = False
 
     def submit(self, shard: str, request: Request) -> None:
         """Queue a call; the same call that is queued already is not queued twice."""
         with self._mutex:
-            if self._closed or shard not in self._endpoints:
+            if self._closed:
+                return
+            if shard not in self._endpoints:
+                self._tell_unknown(shard)
                 return
             line = self._lines.get(shard)
             if line is None:
                 line = self._lines[shard] = _Line(
+                    shard,
                     lambda request: request_key(self._cell, shard, verb_of(request), self._name),
                     self._endpoints[shard],
                     self._lease_s,
@@ -78,31 +85,49 @@ class ShardCalls:
                 )
         line.submit(request)
 
+    def _tell_unknown(self, shard: str) -> None:
+        """Tell the log once of a shard that a lock was prepared with and the cell has no more."""
+        if shard not in self._unknown:
+            self._unknown[shard] = None
+            _log.error(
+                "a lock waits for shard %s, which is not among the shards of this cell (%s): start"
+                " it again, or give the lock up (enact lock resolve --force-abort)",
+                shard,
+                ", ".join(self._endpoints) or "none",
+            )
+
     def close(self) -> None:
         """Drop what is queued and end; twice is harmless."""
         with self._mutex:
             self._closed = True
             lines = list(self._lines.values())
         for line in lines:
-            line.close()
+            line.end()
+        deadline_s = time.monotonic() + JOIN_S
+        for line in lines:
+            line.join(deadline_s - time.monotonic())
 
 
 class _Line:
-    """The way to one other shard."""
+    """The way to one other shard.  Whatever goes wrong on it, the next calls are tried again."""
 
     def __init__(
         self,
+        shard: str,
         key_of: Callable[[Request], str],
         endpoints: tuple[str, ...],
         lease_s: float,
         answered: Callable[[Request, Answer], None],
     ) -> None:
+        self._shard = shard
         self._key_of, self._endpoints, self._lease_s = key_of, endpoints, lease_s
         self._answered = answered
         self._queued: dict[Request, None] = {}
         self._wake = threading.Condition(threading.Lock())
         self._ending = False
         self._session: zenoh.Session | None = None
+        self._silent_since_s: float | None = None
+        self._silence_told = False
         keep_after_fork(self)
         self._thread = threading.Thread(target=self._run, name="enact-calls", daemon=True)
         self._thread.start()
@@ -115,17 +140,51 @@ class _Line:
 
     def _run(self) -> None:
         try:
+            while (calls := self._next_calls()) is not None:
+                try:
+                    answers = self._answers(calls)
+                except EnactError as error:
+                    answers = []
+                    _log.error("calls to shard %s: %s", self._shard, error)
+                self._note_silence(answered=bool(answers))
+                for request, answer in answers:
+                    if not self._ending:
+                        self._answered(request, answer)
+        finally:
+            self._close_session()
+
+    def _answers(self, calls: list[Request]) -> list[tuple[Request, Answer]]:
+        """Make calls at once; return those that were answered.
+
+        Raises:
+            EnactError: None can be made.
+        """
+        if self._session is None:
             self._session = open_session(connect=self._endpoints, lease_s=self._lease_s)
-        except EnactError as error:
-            _log.error("no way to another shard at %s: %s", self._endpoints, error)
+        session = self._session
+        sent = [(request, self._send(session, request)) for request in calls]
+        end_s = time.monotonic() + CALL_S
+        received = [(request, _receive(replies, end_s)) for request, replies in sent]
+        return [(request, answer) for request, answer in received if answer is not None]
+
+    def _note_silence(self, *, answered: bool) -> None:
+        """Tell the log once that the shard is away, and once that it is back."""
+        now_s = time.monotonic()
+        if answered:
+            if self._silence_told:
+                _log.info("shard %s answers again", self._shard)
+            self._silent_since_s, self._silence_told = None, False
             return
-        while (calls := self._next_calls()) is not None:
-            sent = [(request, self._send(self._session, request)) for request in calls]
-            end_s = time.monotonic() + CALL_S
-            for request, replies in sent:
-                answer = _receive(replies, end_s)
-                if answer is not None and not self._ending:
-                    self._answered(request, answer)
+        if self._silent_since_s is None:
+            self._silent_since_s = now_s
+        if not self._silence_told and now_s - self._silent_since_s >= SILENT_S and not self._ending:
+            self._silence_told = True
+            _log.warning(
+                "shard %s at %s does not answer; commits over it and this shard wait for it, and"
+                " keep their locks here (enact lock ls)",
+                self._shard,
+                " or ".join(self._endpoints),
+            )
 
     def _next_calls(self) -> list[Request] | None:
         """Wait for calls; return all that are queued, None at the end."""
@@ -150,13 +209,20 @@ class _Line:
         except zenoh.ZError:
             return None
 
-    def close(self) -> None:
+    def end(self) -> None:
+        """Take no more calls and let those under way end without an answer."""
         with self._wake:
             self._ending = True
             self._wake.notify()
-        if self._session is not None:
-            close_session(self._session)
-        self._thread.join(JOIN_S)
+        self._close_session()
+
+    def join(self, timeout_s: float) -> None:
+        self._thread.join(max(0.0, timeout_s))
+
+    def _close_session(self) -> None:
+        session = self._session
+        if session is not None:
+            close_session(session)
 
 
 def _receive(replies: zenoh.Handler[zenoh.Reply] | None, end_s: float) -> Answer | None:

@@ -1,16 +1,22 @@
 """SIGTERM and SIGINT as an ordinary event: no lock is ever taken inside a signal handler.
 
-A handler runs in the main thread between any two of its instructions.  If that thread is just
-inside `Event.wait`, an `Event.set` (or a log line) in the handler waits for a lock that its own
-thread holds, for ever: a daemon that was told to stop the moment it was ready hung so, once in some
-hundred starts.  So the handler only puts the number into a `SimpleQueue`, whose `put` may interrupt
-itself, and a thread does the rest.
+A Python handler runs in the main thread between any two of its instructions, and nowhere else.
+
+  * If that thread is just inside `Event.wait`, an `Event.set` (or a log line) in the handler waits
+    for a lock that its own thread holds, for ever: a daemon that was told to stop the moment it was
+    ready hung so, once in some hundred starts.
+  * The kernel may give the signal to any other thread, and does after a SIGCONT; then nothing wakes
+    the main thread, and a daemon that waits there never hears of it.
+
+So nothing is done in the handler.  The interpreter's own C code writes the number of each signal to
+a socket, in whichever thread it arrives, and a thread of ours reads it there and does the rest.
 """
 
 from __future__ import annotations
 
-import queue
+import os
 import signal
+import socket
 import threading
 from typing import TYPE_CHECKING, Final, Self
 
@@ -21,6 +27,20 @@ if TYPE_CHECKING:
 STOPPING: Final = (signal.SIGTERM, signal.SIGINT)
 _END: Final = 0
 
+_running: list[StopSignals] = []
+
+
+def _leave_to_parent() -> None:
+    """Let a forked child die of its signals; its parent's socket is none of its business."""
+    if _running:
+        signal.set_wakeup_fd(-1)
+        for number, handler in _running[0].before.items():
+            signal.signal(number, handler)
+        _running.clear()
+
+
+os.register_at_fork(after_in_child=_leave_to_parent)
+
 
 class StopSignals:
     """Turns SIGTERM and SIGINT into an event while its block runs.  Main thread only.
@@ -28,27 +48,37 @@ class StopSignals:
     Attributes:
         event: Set by the first signal.
         count: How many signals came.
+        before: The handlers outside of the block.
     """
 
     def __init__(self) -> None:
         self.event = threading.Event()
         self.count = 0
-        self._numbers: queue.SimpleQueue[int] = queue.SimpleQueue()
+        self.before: dict[signal.Signals, Callable[[int, FrameType | None], object] | int | None]
         self._acts: list[Callable[[str], None]] = []
         self._mutex = threading.Lock()
         self._name = ""
         self._thread = threading.Thread(target=self._serve, name="enact-signals", daemon=True)
 
     def __enter__(self) -> Self:
+        self._numbers, self._arrivals = socket.socketpair()
+        self._arrivals.setblocking(False)  # as the interpreter demands
         self._thread.start()
-        self._before = {number: signal.signal(number, self._take) for number in STOPPING}
+        self._fd_before = signal.set_wakeup_fd(self._arrivals.fileno(), warn_on_full_buffer=False)
+        self.before = {number: signal.signal(number, _do_nothing) for number in STOPPING}
+        _running.append(self)
         return self
 
     def __exit__(self, *_: object) -> None:
-        for number, handler in self._before.items():
+        _running.remove(self)
+        for number, handler in self.before.items():
             signal.signal(number, handler)
-        self._numbers.put(_END)
+        signal.set_wakeup_fd(self._fd_before)
+        self._arrivals.setblocking(True)
+        self._arrivals.sendall(bytes((_END,)))
         self._thread.join()
+        self._arrivals.close()
+        self._numbers.close()
 
     def call(self, act: Callable[[str], None]) -> None:
         """Call `act` with the signal's name at the first signal, at once if there was one."""
@@ -58,15 +88,18 @@ class StopSignals:
         if name:
             act(name)
 
-    def _take(self, number: int, _: FrameType | None) -> None:
-        self.count += 1
-        self._numbers.put(number)
-
     def _serve(self) -> None:
-        while (number := self._numbers.get()) != _END:
+        while (number := self._numbers.recv(1)[0]) != _END:
+            if number not in STOPPING:
+                continue  # of a handler that somebody else has set
+            self.count += 1
             with self._mutex:
                 first, self._name = not self._name, signal.Signals(number).name
                 acts = list(self._acts) if first else []
             for act in acts:
                 act(self._name)
             self.event.set()
+
+
+def _do_nothing(_: int, __: FrameType | None) -> None:
+    """Be a handler, so that the signal neither ends the process nor is ignored."""

@@ -26,7 +26,7 @@ from enact_dist.link.socket_frames import Kind
 from enact_dist.link.socket_line import Connection, SocketLine
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from enact_dist.core.messages import Answer, Request, ShardEntry
     from enact_dist.link.zenoh_carrier import ZenohCarrier
@@ -214,6 +214,10 @@ class SocketCarrier:
         self._shards.update(entry.name for entry in entries)
         for feed in list(self._feeds.values()):
             feed.settle()
+
+    def tell_returns(self, returned: Callable[[str], None]) -> None:
+        """Call `returned` with the name of each shard that comes (back) into reach."""
+        self._behind.tell_returns(returned)
 
     def endpoint_of(self, shard: str) -> str:
         """Return where the shard is expected, for messages to people."""

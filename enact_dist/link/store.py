@@ -5,7 +5,7 @@
     folder/
       lock        held by the one process that serves the folder
       format      version of all this
-      mark        boot and newest durable batch (store_mark)
+      mark        boot and newest batches (store_mark)
       store.db    one row per record: epoch, sessions, catalogue, slots, outcomes (store_rows)
       store.db-wal
       blobs/      bodies over 64 KiB, named by their rows (blobs)
@@ -23,14 +23,17 @@ a power cut too (also everything written before).  Rules that a change must keep
 from __future__ import annotations
 
 import errno
+import os
 import sqlite3
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from enact_dist.core.records import (
     AspectRecord,
     AuditRecord,
     DecisionDone,
     DecisionRecord,
+    ForcedEnded,
+    ForcedRecord,
     OutcomeRecord,
     PreparedEnded,
     PreparedRecord,
@@ -48,9 +51,12 @@ from enact_dist.link.store_mark import MarkFile
 from enact_dist.link.store_prepared import (
     decision_key,
     decision_row,
+    forced_key,
+    forced_row,
     prepared_key,
     prepared_row,
     prepared_writes,
+    slot_of_write,
 )
 from enact_dist.link.store_recovery import (
     BLOB_FOLDER,
@@ -108,7 +114,7 @@ def open_store(folder: Path, *, unix_s: int) -> tuple[Store, Recovered]:
         The store, and everything it holds; large bodies are read-only maps of their files.
 
     Raises:
-        StoreError: The folder is in use, of a newer format, damaged, or cannot be written.
+        StoreError: The folder is in use, of another format, damaged, or cannot be written.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -128,6 +134,10 @@ def _open_locked(folder: Path, lock: FolderLock, unix_s: int) -> tuple[Store, Re
     found = look_at(folder)
     check_format(folder, is_new=found.is_new)
     check_log(folder, power_cut=found.power_cut)
+    if found.is_new and found.mark is None:
+        # Before the first byte of the log: only a mark tells a power cut from damage.
+        MarkFile.open(folder, 0).close()
+        sync_folder(folder)
     database, contents = open_database(folder, found)
     try:
         epoch = max(contents.recovered.epoch + 1, unix_s)
@@ -142,6 +152,14 @@ def _open_locked(folder: Path, lock: FolderLock, unix_s: int) -> tuple[Store, Re
         database.close()
         raise
     return store, contents.recovered
+
+
+class _Staged(NamedTuple):
+    """A slot's or prepared write's new state; `blob` is its body's file where there is one."""
+
+    record: SlotRecord
+    durable: bool
+    blob: Blob | None = None
 
 
 class Store:
@@ -167,8 +185,7 @@ class Store:
         for outcome in contents.recovered.outcomes:
             self._lanes.setdefault(outcome.lock.session, set()).add(outcome.lock.lane)
         self._prepared = {
-            record.lock: tuple(key for key, _ in prepared_writes(record))
-            for record in contents.recovered.prepared
+            record.lock: dict(prepared_writes(record)) for record in contents.recovered.prepared
         }
         self._next_id = max(self._ids.values(), default=0) + 1
         self._batch = contents.batch
@@ -190,9 +207,9 @@ class Store:
             self._blob_of.pop(key, None)
         self._forget_ended(changes, wall_ns=wall_ns)
         self._commit(changes, forced=True)
+        self._mark = MarkFile.open(self._folder, self._batch)
         sync_folder(self._folder)
         sync_folder(self._folder.parent)
-        self._mark = MarkFile.open(self._folder, self._batch)
         self._blobs.sweep(blob.name for blob in self._blob_of.values())
 
     # ---------------------------------------------------------------- writing
@@ -243,7 +260,7 @@ class Store:
 
     def _write(self, batch: Sequence[Persist]) -> None:
         changes: dict[Key, bytes | None] = {}
-        slots: dict[Key, tuple[SlotRecord, bool]] = {}
+        slots: dict[Key, _Staged] = {}
         forced = False
         gone: list[Blob] = []
         for persist in batch:
@@ -252,8 +269,10 @@ class Store:
             for record in persist.records:
                 if isinstance(record, SlotRecord):
                     key = slot_key(record.slot)
-                    _, before = slots.get(key, (None, False))
-                    slots[key] = (record, durable or before)
+                    before = slots.get(key)
+                    if before is not None and before.blob is not None:
+                        gone.append(before.blob)
+                    slots[key] = _Staged(record, durable or (before is not None and before.durable))
                 elif isinstance(record, PreparedRecord):
                     self._stage_prepared(record, changes, slots, durable=durable)
                 elif isinstance(record, PreparedEnded):
@@ -290,6 +309,11 @@ class Store:
         elif isinstance(record, DecisionDone):
             changes[decision_key(record.lock)] = None
             return
+        elif isinstance(record, ForcedRecord):
+            key, body = forced_row(record)
+        elif isinstance(record, ForcedEnded):
+            changes[forced_key(record.lock)] = None
+            return
         elif isinstance(record, AuditRecord):
             key, body = audit_row(record, batch=self._batch + 1, number=len(changes))
         else:
@@ -300,7 +324,7 @@ class Store:
         self,
         record: PreparedRecord,
         changes: dict[Key, bytes | None],
-        slots: dict[Key, tuple[SlotRecord, bool]],
+        slots: dict[Key, _Staged],
         *,
         durable: bool,
     ) -> None:
@@ -308,23 +332,30 @@ class Store:
         key, body = prepared_row(record)
         changes[key] = body
         writes = dict(prepared_writes(record))
-        self._prepared[record.lock] = tuple(writes)
-        slots.update((key, (write, durable)) for key, write in writes.items())
+        self._prepared[record.lock] = writes
+        slots.update((key, _Staged(write, durable)) for key, write in writes.items())
 
     def _stage_prepared_end(
         self,
         record: PreparedEnded,
         changes: dict[Key, bytes | None],
-        slots: dict[Key, tuple[SlotRecord, bool]],
+        slots: dict[Key, _Staged],
     ) -> list[Blob]:
-        """Note that a lock is prepared no more; return its files."""
+        """Note that a lock is prepared no more; return its files that no slot takes over."""
         changes[prepared_key(record.lock)] = None
         blobs: list[Blob] = []
-        for key in self._prepared.pop(record.lock, ()):
+        for key, write in self._prepared.pop(record.lock, {}).items():
             slots.pop(key, None)
             changes[key] = None
             blob = self._blob_of.pop(key, None)
-            if blob is not None:
+            if blob is None:
+                continue
+            of_slot = slot_of_write(key)
+            staged = slots.get(of_slot)
+            same = staged is not None and staged.record.datum is write.datum
+            if staged is not None and same and (blob.synced or not staged.durable):
+                slots[of_slot] = staged._replace(blob=blob)
+            else:
                 blobs.append(blob)
         return blobs
 
@@ -339,15 +370,15 @@ class Store:
                 changes[outcome_key(session, lane)] = None
 
     def _stage_slots(
-        self, slots: dict[Key, tuple[SlotRecord, bool]], changes: dict[Key, bytes | None]
+        self, slots: dict[Key, _Staged], changes: dict[Key, bytes | None]
     ) -> list[Blob]:
         """Write large bodies to files, note the rows; return the files that are replaced."""
         replaced: list[Blob] = []
         names_to_sync = False
-        for key, (record, durable) in slots.items():
-            blob = None
-            if record.datum is not None and record.datum.size > INLINE_BYTES_MAX:
-                blob = self._blobs.write(record.datum.body, durable=durable)
+        for key, (record, durable, promised) in slots.items():
+            blob, datum = promised, record.datum
+            if blob is None and datum is not None and datum.size > INLINE_BYTES_MAX:
+                blob = self._blobs.write(datum.body, durable=durable)
                 names_to_sync |= durable
             changes[key] = slot_body(record, blob)
             old = self._blob_of.pop(key, None)
@@ -380,8 +411,8 @@ class Store:
             rows.append(DatabaseRow(row_id, key.kind, self._batch, key.name, body, crc))
             self._log_bytes += len(body) + _ROW_LOG_BYTES
         self._database.commit(rows, gone, forced=forced)
-        if forced and self._mark is not None:
-            self._mark.note(self._batch)
+        if self._mark is not None:
+            self._mark.note(self._batch, forced=forced)
 
     # ---------------------------------------------------------------- between batches
 
@@ -422,13 +453,22 @@ def open_memory_store(*, unix_s: int) -> tuple[MemoryStore, Recovered]:
     return MemoryStore(), Recovered(epoch=unix_s)
 
 
+def _free_bytes(folder: Path) -> int | str:
+    """Return how many bytes this process may still write below `folder`."""
+    try:
+        found = os.statvfs(folder)
+    except OSError:
+        return "an unknown number of"
+    return found.f_bavail * found.f_frsize
+
+
 def _store_error(folder: Path, failure: OSError | sqlite3.Error) -> StoreError:
     """Return what an operator must read about an error of the system."""
     path = str(getattr(failure, "filename", None) or folder)
     code = getattr(failure, "sqlite_errorcode", 0) & 0xFF
     number = failure.errno if isinstance(failure, OSError) else None
     if number in _FULL_ERRNOS or code == sqlite3.SQLITE_FULL:
-        found = f"no room for the data of {folder}"
+        found = f"no room for the data of {folder}: {_free_bytes(folder)} bytes are free there"
         remedy = "free space on its disk, or raise its quota"
     elif code in {sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED}:
         found = f"the database in {folder} is open in another program"

@@ -1,10 +1,11 @@
-"""The mark beside a store: in which boot it was written, and which batch is surely on the disk.
+"""The mark beside a store: in which boot it was written, and which batches it then holds surely.
 
-The mark is written after each durable batch, in place and without forcing it out.  So it never
-runs ahead of the disk; after a power cut it may lag by the system's write-back time, after
-`kill -9` it does not.  It answers two questions that the database cannot answer about itself:
+The mark is written after each batch, in place and without forcing it out.  So it never runs ahead
+of what it tells of; after a power cut it may lag by the system's write-back time, after `kill -9`
+it does not.  It answers two questions that the database cannot answer about itself:
 
-- Is something acknowledged missing at the end (a cut log, a deleted log, an older copy)?
+- Is something acknowledged missing at the end (a cut log, a deleted log, an older copy)?  In the
+  same boot nothing may be, else nothing that was forced to the disk.
 - Can the system have gone down since?  Only then may unforced writes have gone in any order.
 """
 
@@ -18,7 +19,8 @@ from pathlib import Path
 from typing import Final, NamedTuple, Self
 
 MARK_FILE: Final = "mark"
-_LAYOUT: Final = struct.Struct("<8s16sQ")
+_LAYOUT: Final = struct.Struct("<8s16sQQ")
+_UNKNOWN_BOOT: Final = bytes(16)
 _MAGIC: Final = b"enactmrk"
 _BOOT_ID: Final = Path("/proc/sys/kernel/random/boot_id")
 
@@ -30,6 +32,18 @@ class Mark(NamedTuple):
     """Id of the system's boot in which the store was last opened, 16 bytes; zeros: unknown."""
     batch: int
     """Number of the newest batch known to be on the disk."""
+    written: int
+    """Number of the newest batch that the system had taken; there unless it went down since."""
+
+    @property
+    def is_first(self) -> bool:
+        """Whether nothing at all was acknowledged yet."""
+        return self.written == 0
+
+    def needed(self) -> int:
+        """Return the number of the batch that must be there now."""
+        same_boot = self.boot == boot_id() != _UNKNOWN_BOOT
+        return self.written if same_boot else self.batch
 
 
 def boot_id() -> bytes:
@@ -37,7 +51,7 @@ def boot_id() -> bytes:
     try:
         return uuid.UUID(_BOOT_ID.read_text(encoding="ascii").strip()).bytes
     except (OSError, ValueError):
-        return bytes(16)
+        return _UNKNOWN_BOOT
 
 
 def read_mark(folder: Path) -> Mark | None:
@@ -52,10 +66,10 @@ def read_mark(folder: Path) -> Mark | None:
         return None
     if len(raw) != _LAYOUT.size + 4:
         return None
-    magic, boot, batch = _LAYOUT.unpack_from(raw)
+    magic, boot, batch, written = _LAYOUT.unpack_from(raw)
     if magic != _MAGIC or raw[_LAYOUT.size :] != _checksum(raw[: _LAYOUT.size]):
         return None
-    return Mark(boot, batch)
+    return Mark(boot, batch, written)
 
 
 def _checksum(packed: bytes) -> bytes:
@@ -69,11 +83,12 @@ class MarkFile:
         OSError: As the system reports it, in every method.
     """
 
-    __slots__ = ("_boot", "_descriptor")
+    __slots__ = ("_batch", "_boot", "_descriptor")
 
     def __init__(self, descriptor: int, boot: bytes) -> None:
         self._descriptor = descriptor
         self._boot = boot
+        self._batch = 0
 
     @classmethod
     def open(cls, folder: Path, batch: int) -> Self:
@@ -81,16 +96,18 @@ class MarkFile:
         descriptor = os.open(folder / MARK_FILE, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
         mark = cls(descriptor, boot_id())
         try:
-            mark.note(batch)
+            mark.note(batch, forced=True)
             os.fsync(descriptor)
         except BaseException:
             mark.close()
             raise
         return mark
 
-    def note(self, batch: int) -> None:
-        """Say that `batch` is on the disk."""
-        packed = _LAYOUT.pack(_MAGIC, self._boot, batch)
+    def note(self, batch: int, *, forced: bool) -> None:
+        """Say that the system has taken `batch`; with `forced` also that it is on the disk."""
+        if forced:
+            self._batch = batch
+        packed = _LAYOUT.pack(_MAGIC, self._boot, self._batch, batch)
         os.pwrite(self._descriptor, packed + _checksum(packed), 0)
 
     def close(self) -> None:

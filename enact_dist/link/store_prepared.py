@@ -1,5 +1,7 @@
 """Rows of commits over shards: what is prepared here, and what was decided here and not told yet.
 
+Also what an operator has aborted here while the deciding shard was away.
+
 A prepared lock is one row about the lock and one row per write, in the form of a slot's row, so
 that large bodies go to files like all others.  The rows of one lock come and go together.
 """
@@ -11,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from enact_dist.core.datum import LockId, Position, Slot, Token
 from enact_dist.core.messages import Item, SlotVersion, WriteItem
-from enact_dist.core.records import DecisionRecord, PreparedRecord, SlotRecord
+from enact_dist.core.records import DecisionRecord, ForcedRecord, PreparedRecord, SlotRecord
 from enact_dist.link.store_rows import DamagedRowError, Fields, Key, Kind, key_of, pack
 
 if TYPE_CHECKING:
@@ -98,6 +100,30 @@ def read_decision(key: Key, body: bytes) -> DecisionRecord:
     if not all(isinstance(shard, str) for shard in participants):
         raise DamagedRowError(f"names of shards were expected, found {participants!r:.80}")
     return DecisionRecord(_lock(Fields(key.name)), position, tuple(participants))
+
+
+def forced_key(lock: LockId) -> Key:
+    """Return where a lock stands that was aborted by hand."""
+    return key_of(Kind.FORCED, *lock)
+
+
+def forced_row(record: ForcedRecord) -> tuple[Key, bytes]:
+    """Return the row of a lock that was aborted by hand."""
+    slots = [list(slot) for slot in record.slots]
+    return forced_key(record.lock), pack([record.primary, list(record.primary_token), slots])
+
+
+def read_forced(key: Key, body: bytes) -> ForcedRecord:
+    """Read the row of a lock that was aborted by hand."""
+    fields = Fields(body)
+    primary, token = fields.next(str), _token(fields.next(list))
+    slots = tuple(_slot(entry) for entry in fields.last(list))
+    return ForcedRecord(_lock(Fields(key.name)), primary, token, slots)
+
+
+def _slot(packed: object) -> Slot:
+    fields = Fields(packed)
+    return Slot(fields.next(str), fields.next(str), fields.last(str))
 
 
 def _lock(fields: Fields) -> LockId:

@@ -26,6 +26,7 @@ from enact_dist.link.store_mark import Mark, boot_id, read_mark
 from enact_dist.link.store_prepared import (
     lock_of_write,
     read_decision,
+    read_forced,
     read_prepared,
     read_prepared_lock,
     slot_of_write,
@@ -36,6 +37,7 @@ from enact_dist.link.store_rows import (
     Key,
     Kind,
     read_aspect,
+    read_audit,
     read_ended,
     read_epoch,
     read_outcome,
@@ -61,6 +63,15 @@ _RESTORE: Final = (
     "restore the whole folder from a backup, or give the shard an empty folder and start without"
     " its data"
 )
+
+_UNREADABLE: Final = (
+    DamagedRowError,
+    ValueError,
+    TypeError,
+    OverflowError,
+    msgpack.UnpackException,
+)
+"""What reading a row may raise: none of it is an error of the system."""
 
 _log = logging.getLogger("enact.store")
 
@@ -98,6 +109,11 @@ class Found(NamedTuple):
     power_cut: bool
     """Whether the system has started anew since the store was last opened."""
 
+    @property
+    def is_first(self) -> bool:
+        """Whether no start before this one ever came to its end: nothing was acknowledged."""
+        return self.mark.is_first if self.mark is not None else self.is_new
+
 
 def refuse(path: Path, found: str, remedy: str = _RESTORE) -> NoReturn:
     """Raise the `StoreError` of a damaged file.
@@ -120,11 +136,16 @@ def look_at(folder: Path) -> Found:
     is_new = not database.exists() or database.stat().st_size == 0
     if is_new:
         log = folder / LOG_FILE
-        blobs = folder / BLOB_FOLDER
         has_log = log.exists() and log.stat().st_size > 0
-        if mark is not None or has_log or (blobs.exists() and any(blobs.iterdir())):
+        has_mark = mark is not None and not mark.is_first
+        if has_mark or has_log or _has_blobs(folder):
             refuse(database, "is missing or empty, but the folder has been in use")
     return Found(mark, is_new, mark is not None and mark.boot != boot_id())
+
+
+def _has_blobs(folder: Path) -> bool:
+    blobs = folder / BLOB_FOLDER
+    return blobs.exists() and any(blobs.iterdir())
 
 
 def check_log(folder: Path, *, power_cut: bool) -> None:
@@ -170,7 +191,7 @@ def open_database(folder: Path, found: Found) -> tuple[Database, Contents]:
         problems = database.problems()
         if problems:
             refuse(path, f"is damaged: {'; '.join(problems)}")
-        if found.is_new:
+        if found.is_first:
             database.make_table()
         contents = read_contents(database, path)
         _check_complete(folder, contents, found)
@@ -185,18 +206,20 @@ def open_database(folder: Path, found: Found) -> tuple[Database, Contents]:
 
 def _check_complete(folder: Path, contents: Contents, found: Found) -> None:
     """Compare what was read with what the mark says was acknowledged."""
-    if EPOCH_KEY not in contents.ids and (contents.ids or found.mark is not None):
+    in_use = contents.ids or not found.is_first or _has_blobs(folder)
+    if EPOCH_KEY not in contents.ids and in_use:
         refuse(folder / DATABASE_FILE, "holds no epoch: rows are missing")
-    if found.mark is None or contents.batch >= found.mark.batch:
+    if found.mark is None or contents.batch >= found.mark.needed():
         return
     log = folder / LOG_FILE
+    readable = check_wal(log)
     if log.exists() and log.stat().st_size:
         # Closing the database cuts the log to what SQLite could read; the whole is evidence.
         shutil.copyfile(log, log.with_name(log.name + _REFUSED_SUFFIX))
     refuse(
         log,
-        f"is cut or damaged at its end: batch {found.mark.batch} was acknowledged, the last one"
-        f" that can be read is {contents.batch}",
+        f"is cut or damaged from byte {readable.end} on: batch {found.mark.needed()} was"
+        f" acknowledged, the last one that can be read is {contents.batch}",
         "restore the whole folder from a backup; or, to go on without the missing commits, keep a"
         f" copy of the folder and delete {folder / 'mark'}",
     )
@@ -212,7 +235,7 @@ def read_contents(database: Database, path: Path) -> Contents:
     for row in database.rows():
         try:
             _read_row(row, contents)
-        except (DamagedRowError, ValueError, TypeError, msgpack.UnpackException) as damage:
+        except _UNREADABLE as damage:
             refuse(path, f"is damaged in row {row.id}: {damage}")
     return contents
 
@@ -249,8 +272,10 @@ def _read_row(row: DatabaseRow, contents: Contents) -> None:
             recovered.decisions.append(read_decision(key, row.body))
         case Kind.OUTCOME:
             recovered.outcomes.append(read_outcome(key, row.body))
+        case Kind.FORCED:
+            recovered.forced.append(read_forced(key, row.body))
         case Kind.AUDIT:
-            pass
+            recovered.audit.append(read_audit(row.body))
 
 
 def read_blobs(contents: Contents, blobs: BlobFolder, *, power_cut: bool) -> None:
@@ -296,5 +321,5 @@ def put_together(contents: Contents, path: Path) -> None:
         try:
             row = contents.prepared[lock]
             contents.recovered.prepared.append(read_prepared(*row, found))
-        except (DamagedRowError, KeyError) as damage:
+        except (*_UNREADABLE, KeyError) as damage:
             refuse(path, f"is damaged: the prepared lock {lock} cannot be read ({damage})")

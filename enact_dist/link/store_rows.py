@@ -45,6 +45,7 @@ class Kind(enum.IntEnum):
     PREPARED = 8
     PREPARED_WRITE = 9
     DECISION = 10
+    FORCED = 11
 
 
 class Key(NamedTuple):
@@ -120,7 +121,7 @@ def outcome_key(session: str, lane: int) -> Key:
 
 def audit_row(record: AuditRecord, *, batch: int, number: int) -> tuple[Key, bytes]:
     """Return the row of an operator's act; `batch` and `number` in it keep acts apart."""
-    return key_of(Kind.AUDIT, batch, number), pack([record.wall_ns, record.text])
+    return key_of(Kind.AUDIT, batch, number), pack([record.wall_ns, record.text, record.kind])
 
 
 def slot_key(slot: Slot) -> Key:
@@ -195,6 +196,12 @@ def read_outcome(key: Key, body: bytes) -> OutcomeRecord:
     return OutcomeRecord(
         lock, position, tuple(SlotVersion(_slot(entry), entry.last(int)) for entry in versions)
     )
+
+
+def read_audit(body: bytes) -> AuditRecord:
+    """Read the row of an operator's act."""
+    fields = Fields(body)
+    return AuditRecord(fields.next(int), fields.next(str), fields.last(str))
 
 
 def read_slot(key: Key, body: bytes) -> StoredSlot:

@@ -47,6 +47,12 @@ class WalVerdict:
     page_bytes: int
     damaged_at: int | None
 
+    @property
+    def end(self) -> int:
+        """Offset in bytes behind the last frame that checks, 0 where there is none."""
+        length = FRAME_HEADER_BYTES + self.page_bytes
+        return HEADER_BYTES + self.frames * length if self.frames else 0
+
 
 def check_wal(path: Path) -> WalVerdict:
     """Read the log at `path` and say whether anything in its middle is damaged.

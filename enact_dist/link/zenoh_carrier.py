@@ -24,19 +24,22 @@ import threading
 import time
 from collections import deque
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Final, cast, get_args
 
 import zenoh
 
 from enact_dist.core.messages import Answer, AwaitStamp, Commit, Fetch, Notice, Prepare
 from enact_dist.errors import MisuseError, ProtocolError, ShardUnreachableError
+from enact_dist.link.inside import Inside
 from enact_dist.link.notices import NoticeQueue
 from enact_dist.link.zenoh_config import QUEUED_MAX, close_session, keep_after_fork, open_session
+from enact_dist.link.zenoh_presence import ShardPresence
 from enact_dist.wire.frames import decode_frame, encode_frame
 from enact_dist.wire.keys import notice_key, request_key, token_key, verb_of
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from enact_dist.core.messages import Request, ShardEntry
 
@@ -125,12 +128,14 @@ class ZenohCarrier:
         self._pid = os.getpid()
         self._closed = False
         self._mutex = threading.Lock()
-        self._inside = _Inside()
+        self._inside = Inside()
         self._links: list[_Link] = []
         self._link_of: dict[str, _Link] = {}
         self._endpoints_of: dict[str, tuple[str, ...]] = {}
         self._feeds: dict[NoticeQueue, list[_Pump]] = {}
         self._keys: dict[tuple[str, type], str] = {}
+        self._presences: list[ShardPresence] = []
+        self._returned: Callable[[str], None] = lambda _: None
         self._unchecked: deque[zenoh.Handler[zenoh.Reply]] = deque(maxlen=UNCHECKED_MAX)
         keep_after_fork(self)
         first = self._open_link(tuple(endpoints))
@@ -258,6 +263,11 @@ class ZenohCarrier:
                 continue
             link = self._link_reaching(name, endpoints) or self._open_link(endpoints)
             self._link_of[name] = link
+            self._presences.append(
+                ShardPresence(
+                    link.session, self._key(name, QUESTION), partial(self._tell_returned, name)
+                )
+            )
 
     def _link_reaching(self, shard: str, endpoints: Sequence[str]) -> _Link | None:
         """Return the link that leads to `shard` already, perhaps by another of its addresses."""
@@ -281,6 +291,14 @@ class ZenohCarrier:
     def way_to(self, shard: str) -> str:
         """Return how calls travel, for people."""
         return "zenoh"
+
+    def tell_returns(self, returned: Callable[[str], None]) -> None:
+        """Call `returned` with the name of each shard that comes (back) into reach."""
+        self._returned = returned
+
+    def _tell_returned(self, shard: str) -> None:
+        if not self._closed:
+            self._returned(shard)
 
     def endpoint_of(self, shard: str) -> str:
         """Return where the shard is expected, for messages to people."""
@@ -337,33 +355,10 @@ class ZenohCarrier:
             close_session(link.session)
         for pump in pumps:
             pump.thread.join(JOIN_S)
+        for presence in self._presences:
+            presence.join(JOIN_S)
         # A thread that comes back from Zenoh while the interpreter ends would abort the process.
         self._inside.wait_empty(JOIN_S)
-
-
-class _Inside:
-    """Counts the threads that are inside Zenoh, so that an end can wait for them."""
-
-    __slots__ = ("_changed", "_count")
-
-    def __init__(self) -> None:
-        self._changed = threading.Condition(threading.Lock())
-        self._count = 0
-
-    def __enter__(self) -> None:
-        with self._changed:
-            self._count += 1
-
-    def __exit__(self, *_: object) -> None:
-        with self._changed:
-            self._count -= 1
-            if not self._count:
-                self._changed.notify_all()
-
-    def wait_empty(self, timeout_s: float) -> bool:
-        """Wait until no thread is inside; say whether that came true in time."""
-        with self._changed:
-            return self._changed.wait_for(lambda: not self._count, timeout_s)
 
 
 def _pump(notices: zenoh.Handler[zenoh.Sample], feed: NoticeQueue) -> None:

@@ -6,7 +6,7 @@ msgpack's):
 **Frame**: one message.  A header and, where the message holds data, a payload (in Zenoh: the
 attachment and the payload of a query, reply or put).  The header is one msgpack array::
 
-    [version = 1, code, field, field, …]
+    [version = 2, code, field, field, …]
 
 `frames.CODES` lists the codes; the fields are those of the class in `core.messages`, in order.  A
 NamedTuple is the array of its fields, a tuple an array, None is nil.  A datum is the array

@@ -49,6 +49,7 @@ CODES: Final[dict[type[Any], int]] = {
     m.Finish: 18,
     m.Resolve: 19,
     m.ForceAbort: 20,
+    m.ListAudit: 21,
     m.Welcome: 33,
     m.Registered: 34,
     m.Granted: 35,
@@ -75,6 +76,7 @@ CODES: Final[dict[type[Any], int]] = {
     m.Prepared: 56,
     m.Finished: 57,
     m.Resolved: 58,
+    m.Audited: 59,
     m.Notice: 97,
 }
 

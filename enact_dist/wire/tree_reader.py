@@ -38,6 +38,7 @@ from enact_dist.wire.shapes import (
 from enact_dist.wire.tree_writer import ARRAY, BYTES, CODEC, RECORD, TEXT, TREE, TUPLE
 
 _SCALARS: Final = frozenset({int, float, bool, str, bytes})
+_KEYS: Final[tuple[set[type[Any]], ...]] = (set(), {str}, {int})
 _EXTENSIONS_DEPTH_MAX: Final = DEPTH_MAX + 4
 """A tree in the body, a codec and an array in it add to the depth of the value itself."""
 
@@ -189,42 +190,47 @@ class TreeReader:
 # ---------------------------------------------------------------- nodes to values
 
 
-def build(node: Any, shape: Shape, where: str) -> Any:
+def build(node: Any, shape: Shape, where: str, depth: int = 0) -> Any:
     """Return the value of a shape that a node stands for; `where` names it in messages.
+
+    `depth` counts what is around the node, as the writer counts it.
 
     Raises:
         DatumTypeError: The node is of another type.
-        ProtocolError: It is of the type, and its dataclass or codec refuses it all the same.
+        ProtocolError: It is of the type, and its dataclass or codec refuses it all the same, or it
+            is nested too deeply.
     """
-    return _BUILDERS[type(shape)](node, shape, where)
+    return _BUILDERS[type(shape)](node, shape, where, depth)
 
 
-def _build_plain(node: Any, shape: Plain, where: str) -> Any:
+def _build_plain(node: Any, shape: Plain, where: str, depth: int) -> Any:
     kind = shape.kind
     if kind is object:
-        return untyped(node)
+        return untyped(node, depth)
     if type(node) is not (tuple if kind is list else kind):
         _refuse(where, kind.__name__, node)
-    return node if kind in _SCALARS else _plain(node, where)
+    return node if kind in _SCALARS else _plain(node, where, depth)
 
 
-def _plain(node: Any, where: str) -> Any:
+def _plain(node: Any, where: str, depth: int) -> Any:
     """Return a list, dict or scalar that holds only plain values."""
     kind = type(node)
     if kind is tuple:
+        _check_depth(depth)
         if set(map(type, node)) <= _SCALARS:
             return list(node)
-        return [_plain(part, f"{where}[]") for part in node]
+        return [_plain(part, f"{where}[]", depth + 1) for part in node]
     if kind is dict:
-        if not set(map(type, node)) <= {str, int}:
-            _refuse(where, "dict with keys str or int", node)
-        return {key: _plain(part, f"{where}[{key!r:.40}]") for key, part in node.items()}
+        _check_depth(depth)
+        if set(map(type, node)) not in _KEYS:
+            _refuse(where, "dict with keys all str or all int", node)
+        return {key: _plain(part, f"{where}[{key!r:.40}]", depth + 1) for key, part in node.items()}
     if kind in _SCALARS or kind is np.ndarray:
         return node
     return _refuse(where, "a plain value", node)
 
 
-def _build_array(node: Any, shape: ArrayOf, where: str) -> Any:
+def _build_array(node: Any, shape: ArrayOf, where: str, _depth: int) -> Any:
     if type(node) is not np.ndarray:
         _refuse(where, "numpy.ndarray", node)
     if shape.dtype is not None and node.dtype.newbyteorder("=") != shape.dtype:
@@ -232,71 +238,80 @@ def _build_array(node: Any, shape: ArrayOf, where: str) -> Any:
     return node
 
 
-def _build_list(node: Any, shape: ListOf, where: str) -> Any:
+def _build_list(node: Any, shape: ListOf, where: str, depth: int) -> Any:
     if type(node) is not tuple:
         _refuse(where, "list", node)
-    return _build_each(node, shape.each, where)
+    _check_depth(depth)
+    return _build_each(node, shape.each, where, depth)
 
 
-def _build_each(nodes: tuple[Any, ...], shape: Shape, where: str) -> list[Any]:
+def _build_each(nodes: tuple[Any, ...], shape: Shape, where: str, depth: int) -> list[Any]:
     alone = type(shape) is Plain and shape.kind in _SCALARS
     if alone and set(map(type, nodes)) <= {shape.kind}:  # type: ignore[union-attr]  # is Plain
         return list(nodes)
-    return [build(part, shape, f"{where}[{index}]") for index, part in enumerate(nodes)]
+    return [build(part, shape, f"{where}[{index}]", depth + 1) for index, part in enumerate(nodes)]
 
 
-def _build_dict(node: Any, shape: DictOf, where: str) -> Any:
+def _build_dict(node: Any, shape: DictOf, where: str, depth: int) -> Any:
     if type(node) is not dict:
         _refuse(where, "dict", node)
+    _check_depth(depth)
     if not set(map(type, node)) <= {shape.key}:
         _refuse(where, f"a dict with keys of {shape.key.__name__}", node)
-    return {key: build(part, shape.each, f"{where}[{key!r:.40}]") for key, part in node.items()}
+    return {
+        key: build(part, shape.each, f"{where}[{key!r:.40}]", depth + 1)
+        for key, part in node.items()
+    }
 
 
-def _build_tuple(node: Any, shape: TupleOf, where: str) -> Any:
+def _build_tuple(node: Any, shape: TupleOf, where: str, depth: int) -> Any:
     if type(node) is not TupleNode:
         _refuse(where, "tuple", node)
+    _check_depth(depth)
     if shape.repeated:
-        return tuple(_build_each(node.nodes, shape.parts[0], where))
+        return tuple(_build_each(node.nodes, shape.parts[0], where, depth))
     if len(shape.parts) != len(node.nodes):
         raise DatumTypeError(
             f"{where}: asked a tuple of {len(shape.parts)}, the datum holds one of"
             f" {len(node.nodes)}"
         )
     parts = zip(node.nodes, shape.parts, strict=True)
-    return tuple([build(part, each, f"{where}[{i}]") for i, (part, each) in enumerate(parts)])
+    return tuple(
+        [build(part, each, f"{where}[{i}]", depth + 1) for i, (part, each) in enumerate(parts)]
+    )
 
 
-def _build_optional(node: Any, shape: OptionalOf, where: str) -> Any:
-    return None if node is None else build(node, shape.inner, where)
+def _build_optional(node: Any, shape: OptionalOf, where: str, depth: int) -> Any:
+    return None if node is None else build(node, shape.inner, where, depth)
 
 
-def _build_record(node: Any, shape: RecordOf, where: str) -> Any:
+def _build_record(node: Any, shape: RecordOf, where: str, depth: int) -> Any:
     names = tuple(name for name, _ in shape.fields)
     if type(node) is not RecordNode or node.name != shape.kind.__name__ or node.fields != names:
         found = (
             f"{node.name:.80}({', '.join(node.fields):.200})" if type(node) is RecordNode else ""
         )
         _refuse(where, f"{shape.kind.__name__}({', '.join(names)})", node, found)
+    _check_depth(depth)
     made: Any = object.__new__(shape.kind)
     for (name, each), part in zip(shape.fields, node.nodes, strict=True):
         # As the value was: the checks of its own class ran when it was made.
-        object.__setattr__(made, name, build(part, each, f"{where}.{name}"))
+        object.__setattr__(made, name, build(part, each, f"{where}.{name}", depth + 1))
     return made
 
 
-def _build_coded(node: Any, shape: CodecOf, where: str) -> Any:
+def _build_coded(node: Any, shape: CodecOf, where: str, depth: int) -> Any:
     codec = shape.codec
     if type(node) is not CodedNode or node.name != codec.name:
         _refuse(where, f"codec {codec.name}", node)
-    plain = _plain(node.node, where)
+    plain = _plain(node.node, where, depth + 1)
     try:
         return codec.decode(plain)
     except (ValueError, TypeError, LookupError, ArithmeticError, AttributeError) as error:
         raise ProtocolError(f"{where}: codec {codec.name} cannot decode: {error!r}") from error
 
 
-_BUILDERS: Final[dict[type[Any], Callable[[Any, Any, str], Any]]] = {
+_BUILDERS: Final[dict[type[Any], Callable[[Any, Any, str, int], Any]]] = {
     Plain: _build_plain,
     ArrayOf: _build_array,
     ListOf: _build_list,
@@ -308,23 +323,34 @@ _BUILDERS: Final[dict[type[Any], Callable[[Any, Any, str], Any]]] = {
 }
 
 
-def untyped(node: Any) -> Any:
+def untyped(node: Any, depth: int = 0) -> Any:
     """Return a node as plain Python: dataclasses and coded values as dicts with `__type__`."""
     kind = type(node)
+    if kind is np.ndarray or node is None or kind in _SCALARS:
+        return node
+    if kind is not CodedNode:
+        _check_depth(depth)
+    depth += 1
     if kind is tuple:
-        return [untyped(part) for part in node]
+        return [untyped(part, depth) for part in node]
     if kind is dict:
-        return {key: untyped(part) for key, part in node.items()}
+        if set(map(type, node)) not in _KEYS:
+            raise ProtocolError("a datum holds a dict with keys neither all str nor all int")
+        return {key: untyped(part, depth) for key, part in node.items()}
     if kind is RecordNode:
-        values = map(untyped, node.nodes)
+        values = [untyped(part, depth) for part in node.nodes]
         return {"__type__": node.name, **dict(zip(node.fields, values, strict=True))}
     if kind is CodedNode:
-        return {"__type__": node.name, "value": untyped(node.node)}
+        return {"__type__": node.name, "value": untyped(node.node, depth)}
     if kind is TupleNode:
-        return tuple([untyped(part) for part in node.nodes])
-    if kind in _SCALARS or kind is np.ndarray or node is None:
-        return node
+        return tuple([untyped(part, depth) for part in node.nodes])
     raise ProtocolError(f"a datum holds a {kind.__name__}")
+
+
+def _check_depth(depth: int) -> None:
+    """Refuse what no writer nests so deeply."""
+    if depth >= DEPTH_MAX:
+        raise ProtocolError(f"a datum is nested deeper than {DEPTH_MAX}")
 
 
 def _refuse(where: str, asked: str, node: Any, found: str = "") -> NoReturn:

@@ -83,7 +83,13 @@ def test_reports_come_back_equal_when_encoded_and_decoded():
     assert decode_reports(b"") == ()
 
 
-@pytest.mark.parametrize("report", [b"\xc1", b"\x93\x01\x02\x03", b"{}", b"\x81\xa6actors\x01"])
+ENDLESS = b"\x81\xa6actors\x91\x81\xa7updates\xcb\x7f\xf0" + bytes(6)
+
+
+@pytest.mark.parametrize(
+    "report",
+    [b"\xc1", b"\x93\x01\x02\x03", b"{}", b"\x81\xa6actors\x01", ENDLESS, b"\x91" * 500 + b"\x01"],
+)
 def test_reports_are_refused_by_name_when_the_bytes_are_none(report: bytes):
     """Bytes that are no report raise `ProtocolError`."""
     with pytest.raises(ProtocolError, match="actor report"):

@@ -6,9 +6,10 @@ import threading
 import pytest
 
 from enact_dist import Aspect, Entity, Lock, View, Write
-from enact_dist.core.messages import Acquire, Commit, Fetch, Outcome, Release, Validate
+from enact_dist.core.messages import Acquire, Commit, Fenced, Fetch, Outcome, Release, Validate
 from enact_dist.errors import CommitUnknownError
 from enact_dist.link import client as link_client
+from enact_dist.link.lanes import KEPT_MAX, Lanes
 
 COUNT = Aspect("count", int)
 counter = Entity("counter")
@@ -76,5 +77,45 @@ def test_commit_raises_unknown_when_no_answer_ever_comes(cell, online, monkeypat
     count = Write(online, counter, COUNT)
     with pytest.raises(CommitUnknownError, match="may stand or not") as caught, Lock(count) as lock:
         lock[count] = 1
-        lose(cell, Commit, Outcome, chance=1.1)
-    assert caught.value.lock_id
+        deaf = lose(cell, Commit, Outcome, chance=1.1)
+    cell._client.carrier = deaf._inner
+    for _ in range(KEPT_MAX + 1):
+        with Lock(count) as lock:
+            lock[count] += 1
+
+    assert cell.outcome(caught.value.lock_id) is not None
+    assert cell.outcome(caught.value.lock_id) == cell.outcome(caught.value.lock_id)
+
+
+def test_commit_that_never_came_through_is_known_not_to_stand(cell, online, monkeypatch):
+    """Asked for, the outcome is *nothing written*, and a late copy of the commit finds no lock."""
+    monkeypatch.setattr(link_client, "FINISH_S", 0.3)
+    count = Write(online, counter, COUNT)
+    kept = []
+
+    class Swallowing(LosingCarrier):
+        def request(self, shard, message, *, timeout_s):
+            if isinstance(message, Commit | Outcome):
+                kept.append(message)
+                return None
+            return super().request(shard, message, timeout_s=timeout_s)
+
+    inner = cell._client.carrier
+    with pytest.raises(CommitUnknownError) as caught, Lock(count) as lock:
+        lock[count] = 1
+        cell._client.carrier = Swallowing(inner, kinds=(), seed=1, chance=0.0)
+    cell._client.carrier = inner
+
+    assert cell.outcome(caught.value.lock_id) is None
+    assert isinstance(inner.request("local", kept[0], timeout_s=5), Fenced)
+    view = View(online, counter, COUNT)
+    assert online.view(view).get(view) is None
+
+
+def test_lanes_of_unanswered_commits_are_used_again_when_there_are_too_many():
+    """Outcomes are kept for 64 of them; a session has no more than 1,024 lanes."""
+    lanes = Lanes()
+    for _ in range(KEPT_MAX + 10):
+        lanes.keep(lanes.take())
+
+    assert lanes.take() in range(10)

@@ -123,12 +123,16 @@ class ClientBench:
         """Take a lock."""
         return self.drive(self.begin(*items, **options))
 
-    def finish(self, lock: MultiLock, *writes: tuple[Slot, str], give_up_s: float = 10.0) -> None:
-        """Commit values under a lock."""
+    def finish(
+        self, lock: MultiLock, *writes: tuple[Slot, str | None], give_up_s: float = 10.0
+    ) -> None:
+        """Commit values, or nulls, under a lock."""
         by_shard: dict[str, list[WriteItem]] = {}
         for slot, text in writes:
             shard = shard_of(slot.entity, self.cell.placement)
-            by_shard.setdefault(shard, []).append(WriteItem(slot, datum(text)))
+            by_shard.setdefault(shard, []).append(
+                WriteItem(slot, None if text is None else datum(text))
+            )
         lock.finish(by_shard, give_up_ns=self.cell.now_ns + int(give_up_s * S))
         self.drive(lock)
 

@@ -29,9 +29,12 @@ from enact_dist.core.messages import (
 )
 from enact_dist.core.records import (
     AspectRecord,
+    AuditRecord,
     Call,
     DecisionDone,
     DecisionRecord,
+    ForcedEnded,
+    ForcedRecord,
     OutcomeRecord,
     Persist,
     Persisted,
@@ -59,7 +62,7 @@ if TYPE_CHECKING:
 MS = 1_000_000
 S = 1_000 * MS
 TTL_NS = 2 * S
-PLACEMENT = PlacementMap(1, (ShardEntry("s0", ()),), ())
+PLACEMENT = PlacementMap(1, (ShardEntry("s0", ()), ShardEntry("far", ())), ())
 ASPECTS = (
     AspectEntry("count", "int", "durable"),
     AspectEntry("note", "int", "os"),
@@ -203,6 +206,12 @@ class ShardBench:
                 found.prepared = [p for p in found.prepared if p.lock != record.lock]
             elif isinstance(record, DecisionRecord):
                 found.decisions.append(record)
+            elif isinstance(record, ForcedRecord):
+                found.forced.append(record)
+            elif isinstance(record, ForcedEnded):
+                found.forced = [f for f in found.forced if f.lock != record.lock]
+            elif isinstance(record, AuditRecord):
+                found.audit.append(record)
             elif isinstance(record, DecisionDone):
                 found.decisions = [d for d in found.decisions if d.lock != record.lock]
             elif isinstance(record, OutcomeRecord):

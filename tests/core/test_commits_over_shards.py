@@ -84,7 +84,7 @@ def decided(bench: ShardBench) -> Committed:
     """Commit at this shard, as the primary, with one participant."""
     grant = bench.granted(ANN, item(W))
     write = WriteItem(slot(), datum("new"))
-    answer = bench.ask(Commit(ANN, grant.token, (write,), STAMP_NS, (), ("far",), "durable"))
+    answer = bench.ask(Commit(ANN, grant.token, (write,), STAMP_NS, (), ("far",)))
     assert isinstance(answer, Committed)
     return answer
 
@@ -383,7 +383,7 @@ class TestPrimary:
         grant = bench.granted(ANN, item(W))
         bench.disk_is_done = False
         write = WriteItem(slot(), datum("new"))
-        bench.send(Commit(ANN, grant.token, (write,), 0, (), ("far",), "os"))
+        bench.send(Commit(ANN, grant.token, (write,), 0, (), ("far",)))
         answer = bench.ask(Resolve(ANN, grant.token, "far"))
 
         assert isinstance(answer, Resolved)
@@ -402,7 +402,7 @@ class TestPrimary:
 
         answer = bench.ask(Resolve(ANN, grant.token, "far"))
         late = bench.ask(
-            Commit(ANN, grant.token, (WriteItem(slot(), datum("x")),), 0, (), ("far",), "os")
+            Commit(ANN, grant.token, (WriteItem(slot(), datum("x")),), 0, (), ("far",))
         )
 
         assert isinstance(answer, Resolved)
@@ -422,7 +422,7 @@ class TestPrimary:
         """A participant must be able to learn it whatever the primary's own data are."""
         grant = bench.granted(ANN, item(W, aspect="frame"))
         write = WriteItem(slot(aspect="frame"), datum("new"))
-        bench.ask(Commit(ANN, grant.token, (write,), 0, (), ("far",), "os"))
+        bench.ask(Commit(ANN, grant.token, (write,), 0, (), ("far",)))
 
         assert any(isinstance(record, DecisionRecord) for record in bench.log)
 

@@ -124,20 +124,6 @@ class TestEnd:
 
         assert isinstance(bench.acquire(BOB, item(W)), Granted)
 
-    def test_access_or_durability_that_does_not_exist_is_refused(self, bench):
-        """A malformed number or word ends one request, never the shard."""
-        bench.hello("ann")
-        unknown = item(W)._replace(access=0)
-        views = view_request(bench, lock_id("ann", 1, 1), unknown)
-        entry = AspectEntry("odd", "int", "for ever")
-
-        assert isinstance(bench.acquire(ANN, unknown), Refused)
-        assert isinstance(bench.ask(views), Refused)
-        assert isinstance(bench.ask(Register("ann", (), (entry,))), Refused)
-        grant = bench.granted(ANN, item(W))
-        commit = Commit(ANN, grant.token, (), 0, (), ("far",), "for ever")
-        assert isinstance(bench.ask(commit), Refused)
-
     def test_proven_death_of_a_stranger_changes_nothing(self, bench):
         """A session that said goodbye before its process ended is not ended twice."""
         bench.hello("ann")

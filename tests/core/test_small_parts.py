@@ -150,7 +150,7 @@ class TestSlots:
     def test_slot_that_nobody_wrote_is_never_set(self):
         """Null has a reason."""
         slots = SlotMap(())
-        (state,) = slots.states([Item(Access.READ, *slot())])
+        (state,) = slots.shown([Item(Access.READ, *slot())]).states
 
         assert slots[slot()] is NOTHING
         assert (state.version, state.datum, state.null_reason) == (0, None, "NEVER_SET")
@@ -161,7 +161,7 @@ class TestSlots:
         slots.set(slot("tray/1"), Content(1, 1, datum(), NullReason.DELETED))
         slots.set(slot("tray/2"), Content(2, 2, None, NullReason.DELETED))
         slots.set(slot("bench"), Content(1, 3, datum(), NullReason.DELETED))
-        states = slots.states([Item(Access.READ_EACH, "online", "tray/*", "count")])
+        states = slots.shown([Item(Access.READ_EACH, "online", "tray/*", "count")]).states
 
         assert [state.slot.entity for state in states] == ["tray/1"]
         assert len(list(slots.matching(Column("online", "count"), "tray/*"))) == 2
@@ -173,7 +173,7 @@ class TestSlots:
         """Up to 64 KiB travel, more waits to be fetched."""
         slots = SlotMap(())
         slots.set(slot(), Content(1, 1, Datum(b"e", bytes(size), size), NullReason.DELETED))
-        (state,) = slots.states([Item(Access.READ, *slot())])
+        (state,) = slots.shown([Item(Access.READ, *slot())]).states
 
         assert (state.large, state.size) == (large, size)
         assert state.datum is not None

@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+sys.path.insert(0, str(Path(__file__).parent))
+
 WORKER = Path(__file__).with_name("worker.py")
 READY_S = 20.0
 
@@ -101,8 +103,8 @@ class Cell:
         self.daemons = {}
         self.processes = []
 
-    def start(self, name="s0"):
-        arguments = ["-m", "enact_dist.cli.main", "shard", "run", name, "--cell", str(self.file)]
+    def start(self, name="s0", *, launcher=("-m", "enact_dist.cli.main")):
+        arguments = [*launcher, "shard", "run", name, "--cell", str(self.file)]
         daemon = Process(arguments, self.folder / f"{name}.log", **self.variables)
         self.processes.append(daemon)
         self.daemons[name] = daemon

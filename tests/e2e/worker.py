@@ -75,6 +75,21 @@ def hold(cell, hold_s="60"):
         say("lost", error)
 
 
+def skew(cell):
+    """Read one account and write the other, wait for a line, then commit."""
+    world = cell.world("online")
+    read = Read(world, Entity("account/right"), COUNT)
+    write = Write(world, Entity("account/left"), COUNT)
+    try:
+        with Lock(read, write) as lock:
+            lock[write] = lock[read] + 1
+            say("holding")
+            wait_line()
+        say("committed")
+    except LeaseLostError as error:
+        say("lost", error)
+
+
 def hold_gil(cell, seconds):
     """Hold the lock while the interpreter lock is held by C code for `seconds`."""
     request = Write(cell.world("online"), counter, COUNT)

@@ -19,6 +19,7 @@ from enact_dist.core.records import (
     WorldRecord,
 )
 from enact_dist.errors import StoreError
+from enact_dist.link.folder_lock import FORMAT
 from enact_dist.link.store import OUTCOMES_KEPT_NS, open_memory_store, open_store
 from enact_dist.terms import Durability, NullReason
 
@@ -247,14 +248,16 @@ def test_second_opener_is_refused_by_pid_and_host(tmp_path):
     reopened(tmp_path)
 
 
-def test_folder_of_a_newer_format_is_refused_untouched(tmp_path):
-    """An older program leaves the folder of a newer one exactly as it is."""
+@pytest.mark.parametrize(("other", "age"), [(FORMAT + 1, "a newer"), (FORMAT - 1, "an older")])
+def test_folder_of_another_format_is_refused_untouched(tmp_path, other, age):
+    """A program leaves the folder of a newer or older one exactly as it is, and names both."""
     store, _ = open_store(tmp_path, unix_s=1)
     store.write([persist(slot_record("a", 1))])
     store.close()
-    (tmp_path / "format").write_text("enact-dist store 2\n")
+    (tmp_path / "format").write_text(f"enact-dist store {other}\n")
     before = files_of(tmp_path)
-    with pytest.raises(StoreError, match="store format 2, this program reads up to 1"):
+    said = f"store format {other}, this program reads {FORMAT}: it was written by {age} enact-dist"
+    with pytest.raises(StoreError, match=said):
         open_store(tmp_path, unix_s=1)
     assert files_of(tmp_path) == before
 

@@ -19,9 +19,13 @@ from store_writer import contents, group_versions, outcome_record, persist, reop
 from enact_dist.core.datum import Slot
 from enact_dist.core.records import SessionRecord, SlotRecord
 from enact_dist.errors import StoreError
+from enact_dist.link.folder_lock import FORMAT
 from enact_dist.link.store import open_store
+from enact_dist.link.store_database import Database
+from enact_dist.link.store_mark import MarkFile
 from enact_dist.terms import Durability
 
+FORMAT_LINE = f"enact-dist store {FORMAT}\n".encode()
 FRAME_BYTES = 24 + 4096
 LOG_HEADER_BYTES = 32
 
@@ -172,12 +176,18 @@ def test_crash_at_the_first_opening_leaves_a_usable_folder(tmp_path):
     shutil.copytree(whole, crashed)
     store.close()
     database = (crashed / "store.db").read_bytes()
+    Database(tmp_path / "bare.db").close()
+    bare = (tmp_path / "bare.db").read_bytes()
+    marked = {"format": FORMAT_LINE, "mark": first_mark(tmp_path)}
     steps = [
         {},
-        {"format": b"enact-dist store 1\n"},
-        {"format": b"enact-dist store 1\n", "store.db": b""},
-        {"format": b"enact-dist store 1\n", "store.db": database},
-        {"format": b"enact-dist store 1\n", "store.db": database, "store.db-wal": b""},
+        {"format": FORMAT_LINE},
+        marked,
+        {**marked, "store.db": b""},
+        {**marked, "store.db": bare},
+        {**marked, "store.db": bare, "store.db-wal": b""},
+        {**marked, "store.db": database},
+        {**marked, "store.db": database, "store.db-wal": b""},
     ]
     for number, step in enumerate(steps):
         folder = tmp_path / str(number)
@@ -186,6 +196,27 @@ def test_crash_at_the_first_opening_leaves_a_usable_folder(tmp_path):
         for name, content in step.items():
             (folder / name).write_bytes(content)
         assert reopened(folder, unix_s=9).epoch == 9
+
+
+def first_mark(folder):
+    """Return the mark that a first start leaves before everything else."""
+    MarkFile.open(folder, 0).close()
+    return (folder / "mark").read_bytes()
+
+
+def test_first_start_marks_the_boot_before_the_log(tmp_path):
+    """Else a power cut during the first start could not be told from a damaged log."""
+    script = f"""
+import os
+from pathlib import Path
+from store_writer import open_store
+open_store(Path({str(tmp_path / "folder")!r}), unix_s=1)
+os.write(1, b"opened")
+"""
+    ((_, calls),) = traced(tmp_path, script)
+    logged = next(i for i, call in enumerate(calls) if "store.db-wal>" in call)
+    assert any(call.startswith("fsync(") and "/mark>" in call for call in calls[:logged])
+    assert any(call.startswith("fsync(") and "/folder>" in call for call in calls[:logged])
 
 
 @contextlib.contextmanager

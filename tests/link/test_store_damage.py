@@ -68,7 +68,7 @@ def after_power_cut(folder):
     mark = store_mark.read_mark(folder)
     file = store_mark.MarkFile.open(folder, mark.batch)
     file._boot = bytes(range(16))
-    file.note(mark.batch)
+    file.note(mark.batch, forced=True)
     file.close()
 
 
@@ -94,6 +94,22 @@ def test_flipped_bit_in_mid_log_is_refused_with_its_frame(crashed, within):
     assert log.read_bytes() == before
 
 
+def test_flipped_bit_in_the_last_frame_of_an_os_batch_is_refused_in_the_same_boot(tmp_path):
+    """No power cut, so what the system had taken must be there; after one it may be gone."""
+    folder = tmp_path / "folder"
+    store, _ = open_store(folder, unix_s=1)
+    store.write([persist(slot_record("a", 1))])
+    store.write([persist(slot_record("a", 2), durability=Durability.OS)])
+    copy = tmp_path / "copy"
+    shutil.copytree(folder, copy)
+    store.close()
+    last = frame_offset(frames_of(copy) - 1)
+    flip(copy / "store.db-wal", last + 100)
+    assert f"from byte {last} on: batch 3 was acknowledged" in str(refusal(copy))
+    after_power_cut(copy)
+    assert [record.version for record in reopened(copy).slots] == [1]
+
+
 def test_named_way_out_of_a_damaged_log_works(crashed):
     """Cutting the log and deleting the mark, as the message says, opens with what came before."""
     log = crashed / "store.db-wal"
@@ -108,10 +124,11 @@ def test_named_way_out_of_a_damaged_log_works(crashed):
 def test_flipped_bit_in_the_last_frame_is_refused(crashed):
     """Nothing follows in the log, but the mark says that more was acknowledged; a copy is kept."""
     log = crashed / "store.db-wal"
-    flip(log, frame_offset(frames_of(crashed) - 1) + 100)
+    last = frame_offset(frames_of(crashed) - 1)
+    flip(log, last + 100)
     spoilt = log.read_bytes()
     found = refusal(crashed)
-    assert "cut or damaged at its end: batch 9 was acknowledged, the last one" in str(found)
+    assert f"{log} is cut or damaged from byte {last} on: batch 9 was acknowledged" in str(found)
     assert (crashed / "store.db-wal.refused").read_bytes() == spoilt
 
 
@@ -322,7 +339,7 @@ def test_power_cut_does_not_excuse_a_hole_before_a_forced_batch(crashed):
     """The mark says that a batch behind the hole was forced: refused, power cut or not."""
     flip(crashed / "store.db-wal", frame_offset(frames_of(crashed) // 2) + 50)
     after_power_cut(crashed)
-    assert "cut or damaged at its end" in str(refusal(crashed))
+    assert "cut or damaged from byte" in str(refusal(crashed))
 
 
 def test_database_in_use_by_another_program_is_refused_as_such(closed):

@@ -5,8 +5,11 @@ import pytest
 from enact_dist.core.datum import Datum, LockId, Position, Slot, Token
 from enact_dist.core.messages import Item, SlotVersion, WriteItem
 from enact_dist.core.records import (
+    AuditRecord,
     DecisionDone,
     DecisionRecord,
+    ForcedEnded,
+    ForcedRecord,
     Persist,
     PreparedEnded,
     PreparedRecord,
@@ -14,6 +17,7 @@ from enact_dist.core.records import (
 )
 from enact_dist.errors import StoreError
 from enact_dist.link.store import open_store
+from enact_dist.link.store_prepared import prepared_key
 from enact_dist.terms import Durability
 
 LOCK = LockId("ann", 3, 4)
@@ -104,6 +108,61 @@ def test_lock_that_begins_and_ends_in_one_batch_leaves_its_slots(tmp_path):
     assert len(blobs(tmp_path)) == 1
 
 
+@pytest.mark.parametrize("restarts", [False, True])
+def test_large_body_of_a_prepared_lock_becomes_its_slot_s(tmp_path, restarts):
+    """It is written once: the file that was promised is the one that stays."""
+    store, _ = open_store(tmp_path, unix_s=1)
+    record = prepared()
+    store.write([Persist(1, (record,), Durability.DURABLE)])
+    promised = blobs(tmp_path)
+    if restarts:
+        store.close()
+        store, recovered = open_store(tmp_path, unix_s=2)
+        (record,) = recovered.prepared
+    slot = SlotRecord(LARGE, 10, 80, record.writes[1].datum, "")
+    store.write([Persist(2, (slot, PreparedEnded(LOCK)), Durability.DURABLE)])
+    store.rest()
+    store.close()
+    store, recovered = open_store(tmp_path, unix_s=3)
+    store.close()
+
+    assert [(found.slot, bytes(found.datum.body)) for found in recovered.slots] == [(LARGE, BODY)]
+    assert blobs(tmp_path) == promised
+
+
+def test_file_taken_over_goes_when_the_same_batch_replaces_its_slot(tmp_path):
+    """The end of one lock and the commit of the next may come together."""
+    store, _ = open_store(tmp_path, unix_s=1)
+    record = prepared()
+    store.write([Persist(1, (record,), Durability.DURABLE)])
+    slot = SlotRecord(LARGE, 10, 80, record.writes[1].datum, "")
+    store.write(
+        [
+            Persist(2, (slot, PreparedEnded(LOCK)), Durability.DURABLE),
+            Persist(3, (SlotRecord(LARGE, 11, 81, None, "DELETED"),), Durability.DURABLE),
+        ]
+    )
+    store.rest()
+
+    assert blobs(tmp_path) == []
+    store.close()
+
+
+def test_body_that_was_not_forced_is_written_anew_for_a_durable_end(tmp_path):
+    """Else a power cut could take what was promised to outlast it."""
+    store, _ = open_store(tmp_path, unix_s=1)
+    record = prepared()
+    store.write([Persist(1, (record,), Durability.OS)])
+    promised = blobs(tmp_path)
+    slot = SlotRecord(LARGE, 10, 80, record.writes[1].datum, "")
+    store.write([Persist(2, (slot, PreparedEnded(LOCK)), Durability.DURABLE)])
+    store.rest()
+
+    assert len(blobs(tmp_path)) == 1
+    assert blobs(tmp_path) != promised
+    store.close()
+
+
 def test_missing_data_of_a_prepared_lock_are_refused(tmp_path):
     """A promise that cannot be kept stops the shard, with the file's name."""
     kept(tmp_path, prepared())
@@ -113,9 +172,33 @@ def test_missing_data_of_a_prepared_lock_are_refused(tmp_path):
         open_store(tmp_path, unix_s=3)
 
 
+@pytest.mark.parametrize("body", [b"", b"\xc1", b"\x91\x01\x01", b"\x96\x92\xff\xff"])
+def test_row_of_a_prepared_lock_that_cannot_be_read_is_refused_by_name(tmp_path, monkeypatch, body):
+    """As any other damaged row, though it is read last: a `StoreError`, not msgpack's own."""
+    monkeypatch.setattr(
+        "enact_dist.link.store.prepared_row", lambda record: (prepared_key(record.lock), body)
+    )
+    with pytest.raises(StoreError, match=r"the prepared lock ann\.3\.4 cannot be read"):
+        kept(tmp_path, prepared())
+
+
 def test_decision_comes_back_until_it_is_done(tmp_path):
     """Who has to be told is remembered as long as anybody has to."""
     decision = DecisionRecord(LOCK, Position(5, "near"), ("far", "farther"))
 
     assert kept(tmp_path, decision).decisions == [decision]
     assert kept(tmp_path, DecisionDone(LOCK)).decisions == []
+
+
+def test_abort_by_hand_is_given_back_until_its_primary_has_answered(tmp_path):
+    """What was aborted by hand and what an operator did outlive the process."""
+    forced = ForcedRecord(LOCK, "far", Token(3, 4), (SMALL, NULL))
+    acts = (AuditRecord(5, "given up", "forced"), AuditRecord(6, "torn", "alarm"))
+
+    found = kept(tmp_path, forced, *acts)
+    assert found.forced == [forced]
+    assert sorted(found.audit, key=lambda act: act.wall_ns) == list(acts)
+
+    found = kept(tmp_path, ForcedEnded(LOCK))
+    assert found.forced == []
+    assert len(found.audit) == 2

@@ -1,6 +1,7 @@
 """Requests, answers, notices and tokens between processes, over Zenoh and over sockets."""
 
 import os
+import queue
 import threading
 import time
 
@@ -185,6 +186,24 @@ def test_carrier_feeds_notices_of_shards_that_it_learns_of_later(
 
     assert notice.shard == "s1"
     assert "enact-notices" not in {thread.name for thread in threading.enumerate()}
+
+
+def test_carrier_tells_when_a_shard_comes_into_reach_again(daemon, carry, endpoint):
+    """Whoever waits for a restarted shard hears of it at once; the watching ends with the carrier."""
+    running = daemon(endpoint)
+    carrier = carry(endpoint)
+    came = queue.Queue()
+    carrier.tell_returns(came.put)
+    carrier.add_endpoints([ShardEntry("s0", (endpoint,))])
+    assert came.get(timeout=5) == "s0"
+
+    running.stop()
+    daemon(endpoint)
+
+    assert came.get(timeout=5) == "s0"
+    assert isinstance(carrier.request("s0", ListLocks(), timeout_s=5), Locks)
+    carrier.close()
+    assert "enact-presence" not in {thread.name for thread in threading.enumerate()}
 
 
 @both

@@ -7,13 +7,16 @@ from random import Random
 
 import pytest
 
-from enact_dist.core.messages import Item
+from enact_dist.core.messages import Item, PlacementMap, ShardEntry
+from enact_dist.core.placement import shard_of
 from enact_dist.core.records import Persist, SessionRecord
 from enact_dist.terms import Access, Durability
 from enact_dist.verify.simulation.disk import Disk
 from enact_dist.verify.simulation.faults import NONE, drawn
 from enact_dist.verify.simulation.history import conflict
 from enact_dist.verify.simulation.scenario import Scenario
+from enact_dist.verify.simulation.schedule import Schedule
+from enact_dist.verify.simulation.workload import ENTITIES
 from enact_dist.verify.simulation.world import Clock, Host, S, World
 
 R, W, RE, WE, V = (
@@ -64,7 +67,7 @@ def test_clock_turns_durations_into_true_time(ppm):
 
 def test_paused_host_handles_afterwards_what_arrived_meanwhile():
     """A pause loses nothing and keeps the order."""
-    world = World(Random(0))
+    world = World(Schedule(0))
     host = Host(world, "h", drift_ppm=0, wall_offset_ns=0)
     seen: list[int] = []
     host.pause(S)
@@ -80,7 +83,7 @@ def test_paused_host_handles_afterwards_what_arrived_meanwhile():
 
 def test_restarted_host_forgets_what_it_had_planned():
     """A new life knows nothing of the old one's timers."""
-    world = World(Random(0))
+    world = World(Schedule(0))
     host = Host(world, "h", drift_ppm=0, wall_offset_ns=0)
     seen: list[int] = []
     host.later(S, lambda: seen.append(1))
@@ -94,16 +97,17 @@ def test_restarted_host_forgets_what_it_had_planned():
 @pytest.mark.parametrize("seed", range(20))
 def test_crash_keeps_a_prefix_and_what_was_reported(seed):
     """A disk loses no durable record that it reported, and nothing in the middle."""
-    world = World(Random(seed))
+    world = World(Schedule(seed))
     host = Host(world, "h", drift_ppm=0, wall_offset_ns=0)
-    disk, done = Disk(world, NONE), []
+    disk, done = Disk(world, NONE, "h"), []
     for number in range(1, 9):
         durability = Durability.DURABLE if number % 3 == 0 else Durability.OS
         persist = Persist(number, (SessionRecord(str(number), 1),), durability)
         submit = partial(disk.submit, host, persist, done.append)
         world.after(number * S // 1000, submit)
-    world.run_until(world.random.randrange(12 * S // 1000))
-    disk.crash(power_cut=True)
+    luck = Random(seed)
+    world.run_until(luck.randrange(12 * S // 1000))
+    disk.crash(power_cut=True, luck=luck)
 
     kept = [persist.ticket for persist in disk.log]
     assert kept == list(range(1, len(kept) + 1))
@@ -127,6 +131,16 @@ def test_judge_knows_which_locks_conflict(one, other, clash):
     first, second = ((Item(access, "online", entity, "count"),) for access, entity in (one, other))
 
     assert conflict(first, second) is conflict(second, first) is clash
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_entities_lie_on_every_shard(count):
+    """Locks over all shards of a cell occur: entities by twos lie apart, all of them everywhere."""
+    shards = tuple(ShardEntry(f"s{index}", ()) for index in range(count))
+    homes = [shard_of(entity, PlacementMap(1, shards, ())) for entity in ENTITIES]
+
+    assert set(homes) == {shard.name for shard in shards}
+    assert len(set(homes[:2])) == min(count, 2)
 
 
 def test_drawn_faults_differ_between_seeds():

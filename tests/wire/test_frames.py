@@ -53,7 +53,7 @@ def test_frame_header_is_an_array_of_version_code_and_fields():
     """The documented layout, byte by byte: another language depends on it."""
     header, payload = encode_frame(m.Validate(LOCK, Token(9, 1)))
 
-    assert header == bytes([0x95, 2, 9, 0x93, 0xA6]) + b"a1b2c3" + bytes([3, 17, 0x92, 9, 1, 0x90])
+    assert header == bytes([0x95, 3, 9, 0x93, 0xA6]) + b"a1b2c3" + bytes([3, 17, 0x92, 9, 1, 0x90])
     assert payload is None
 
 
@@ -69,7 +69,8 @@ def test_frame_codes_stand_still():
         ("Waiting", 36), ("Stale", 37), ("Viewed", 38), ("Slice", 39), ("Gone", 40), ("Alive", 41),
         ("Committed", 42), ("Fenced", 43), ("OutcomeIs", 44), ("Valid", 45), ("Released", 46),
         ("Reached", 47), ("Surveyed", 48), ("Locks", 49), ("Sessions", 50), ("Broken", 51),
-        ("EpochChanged", 52), ("WrongShard", 53), ("Refused", 54), ("Changed", 55), ("Notice", 97),
+        ("EpochChanged", 52), ("WrongShard", 53), ("Refused", 54), ("Changed", 55),
+        ("ForceAbort", 20), ("ListAudit", 21), ("Audited", 59), ("Notice", 97),
     }  # fmt: skip
 
 

@@ -258,6 +258,48 @@ def test_nesting_without_end_is_refused(wrap):
                 decode_datum(datum, datum_type)
 
 
+@pytest.mark.parametrize("wrap", ["list", "dict", TUPLE, RECORD])
+def test_nesting_that_no_writer_makes_is_refused(wrap):
+    """The reader counts the depth as the writer does: what is read can be written again."""
+    wrapped = {
+        "list": lambda node: [node],
+        "dict": lambda node: {"a": node},
+        TUPLE: lambda node: reference(TUPLE, node),
+        RECORD: lambda node: reference(RECORD, "a", ["f"], [node]),
+    }[wrap]
+    trees: list[object] = [1]
+    for _ in range(33):
+        trees.append(wrapped(trees[-1]))
+
+    decode_untyped(datum_of(trees[32], b""))
+    with pytest.raises(ProtocolError, match="nested deeper than 32"):
+        decode_untyped(datum_of(trees[33], b""))
+
+
+def test_value_at_the_greatest_depth_is_read_and_one_deeper_is_not():
+    """Lists in a plain list: 32 come back, 33 are refused by both sides."""
+    deep: list = []
+    for _ in range(31):
+        deep = [deep]
+
+    assert decode_datum(encode_datum(deep, list), list) == deep
+    with pytest.raises(DatumTypeError, match="nested deeper"):
+        encode_datum([deep], list)
+    with pytest.raises(ProtocolError, match="nested deeper"):
+        decode_datum(datum_of([deep], b""), list)
+
+
+def test_dict_with_keys_of_both_kinds_is_refused():
+    """A writer takes keys all str or all int, so a reader takes nothing else."""
+    mixed = datum_of({1: 2, "a": 3}, b"")
+
+    for datum_type in (dict, object):
+        with pytest.raises((ProtocolError, DatumTypeError), match="keys"):
+            decode_datum(mixed, datum_type)
+    with pytest.raises(ProtocolError, match="keys"):
+        decode_untyped(mixed)
+
+
 @pytest.mark.parametrize(
     "datum",
     [

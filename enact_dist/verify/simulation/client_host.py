@@ -6,8 +6,10 @@ sent, None for each that nobody answered in time.  It drives `MultiLock` as `lin
 
 from __future__ import annotations
 
+from collections.abc import Generator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, TypeAlias, TypeVar
 
 from enact_dist.core.client import Client
 from enact_dist.core.messages import (
@@ -53,7 +55,10 @@ class Calls:
     lock: MultiLock | None = None
 
 
-Thread = "Generator[Sleep | Calls, list[Answer | None], None]"
+T = TypeVar("T")
+Steps: TypeAlias = Generator[Sleep | Calls, list[Answer | None], T]
+"""A part of what a thread does, with what comes of it."""
+Thread: TypeAlias = Steps[None]
 
 
 @dataclass(slots=True)
@@ -79,7 +84,9 @@ class ClientHost(Host):
         ttl_ns: int,
     ) -> None:
         super().__init__(world, name, drift_ppm=faults.drift_ppm, wall_offset_ns=0)
-        self.client = Client(f"{world.random.getrandbits(64):016x}", ttl_ns=ttl_ns, actor=name)
+        session = f"{world.schedule.stream(f'session of {name}').getrandbits(64):016x}"
+        self.client = Client(session, ttl_ns=ttl_ns, actor=name)
+        self.generation = 0
         self.starves_until_ns = 0
         self.cache: dict[Slot, tuple[str, int, int, Datum]] = {}
         self.threads_left = 0
@@ -87,6 +94,7 @@ class ClientHost(Host):
         self._faults = faults
         self._calls: dict[int, _Call] = {}
         self._calls_made = 0
+        self._late_answers = world.schedule.place(f"{name}-late")
 
     # ---------------------------------------------------------------- threads
 
@@ -117,9 +125,7 @@ class ClientHost(Host):
                 self._resume(thread, answers)
 
         for index, (shard, request) in enumerate(wish.calls):
-            self.call(
-                shard, request, lambda answer, index=index: take(index, answer), lock=wish.lock
-            )
+            self.call(shard, request, partial(take, index), lock=wish.lock)
 
     # ---------------------------------------------------------------- calls
 
@@ -157,7 +163,7 @@ class ClientHost(Host):
             return
         del self._calls[number]
         call.take(answer)
-        self._model.check_beliefs(self)
+        self._model.of_clients.check_beliefs(self)
 
     def _time_is_up(self, number: int) -> None:
         call = self._calls.get(number)
@@ -176,13 +182,16 @@ class ClientHost(Host):
     def _late(self, number: int, call: _Call, answer: Answer) -> None:
         """Deliver an answer that nobody waits for any more, where the faults say so."""
         del self._calls[number]
-        if self.world.random.random() < self._faults.late_answers:
+        coming = (self._late_answers.next() & 0xFFFF) < self._faults.late_answers * 0x10000
+        if coming and self.world.schedule.allows(self._late_answers.fault):
             self.world.tally["late answers"] += 1
+            text = f"{type(answer).__name__} comes after its caller gave up"
+            self.world.befell(self._late_answers.fault, text)
             if call.lock is not None and call.lock.phase.busy:
                 call.lock.answered(call.shard, call.request, answer, self.local_ns)
             else:
                 self.client.answered(call.shard, call.request, answer, self.local_ns)
-            self._model.check_beliefs(self)
+            self._model.of_clients.check_beliefs(self)
 
     # ---------------------------------------------------------------- the session
 
@@ -207,20 +216,17 @@ class ClientHost(Host):
 
     def keep_alive(self) -> None:
         """Renew the session at every shard, four times per TTL, until the process ends."""
-        starves = self.world.now_ns < self.starves_until_ns
-        if not (starves and self.world.random.random() < self._faults.starved):
+        if self.world.now_ns >= self.starves_until_ns:
             self._renew()
+        else:
+            self.world.tally["keep-alives starved"] += 1
         self.later(self.client.ttl_ns // 4, self.keep_alive)
 
     def _renew(self) -> None:
         now_ns = self.local_ns
         for shard in self.client.shards_in_use():
             request = self.client.keep_alive(shard, now_ns)
-            self.call(
-                shard,
-                request,
-                lambda answer, shard=shard, request=request: self._renewed(shard, request, answer),
-            )
+            self.call(shard, request, partial(self._renewed, shard, request))
 
     def _renewed(self, shard: str, request: Request, answer: Answer | None) -> None:
         if answer is not None:
@@ -239,7 +245,7 @@ class ClientHost(Host):
             answers = yield Calls(calls, lock)
             for (shard, request), answer in zip(calls, answers, strict=True):
                 lock.answered(shard, request, answer, self.local_ns)
-            self._model.check_beliefs(self)
+            self._model.of_clients.check_beliefs(self)
         for shard, farewell in lock.take_farewells():
             self.call(shard, farewell, lambda _answer: None)
 

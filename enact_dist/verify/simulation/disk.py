@@ -28,6 +28,7 @@ from enact_dist.verify.simulation.world import MS
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from random import Random
 
     from enact_dist.core.datum import LockId
     from enact_dist.verify.simulation.faults import Faults
@@ -37,14 +38,16 @@ if TYPE_CHECKING:
 class Disk:
     """Everything that one shard ever asked to keep, as far as it has survived."""
 
-    def __init__(self, world: World, faults: Faults) -> None:
+    def __init__(self, world: World, faults: Faults, name: str) -> None:
         self._world = world
         self.faults = faults
+        self._batches = world.schedule.place(f"{name}-disk")
         self.log: list[Persist] = []
         self.written = 0
         self.synced = 0
         self.epoch = 0
         self._batch_end = 0
+        self._sync_ns = 0
         self._busy = False
 
     # ---------------------------------------------------------------- a running shard
@@ -56,21 +59,24 @@ class Disk:
             self._begin_batch(host, done)
 
     def _begin_batch(self, host: Host, done: Callable[[int], None]) -> None:
-        random = self._world.random
+        luck = self._batches.next()
         self._busy = True
         self._batch_end = len(self.log)
-        delay_ns = random.randrange(MS // 20, MS)
-        if self.faults.slow_disk and random.random() < self.faults.slow_disk:
-            delay_ns += random.randrange(500 * MS)
+        self._sync_ns = MS // 4 + (luck & 0xFFFF) * (4 * MS) // 0x10000
+        delay_ns = MS // 20 + (luck >> 16 & 0xFFFF) * MS // 0x10000
+        slow = (luck >> 32 & 0xFFFF) < self.faults.slow_disk * 0x10000
+        if slow and self._world.schedule.allows(self._batches.fault):
+            more_ns = (luck >> 48 & 0xFFFF) * (500 * MS) // 0x10000
+            delay_ns += more_ns
             self._world.tally["slow disk batches"] += 1
+            self._world.befell(self._batches.fault, f"the disk takes {more_ns // MS} ms more")
         host.later(delay_ns, lambda: self._batch_written(host, done))
 
     def _batch_written(self, host: Host, done: Callable[[int], None]) -> None:
         first, self.written = self.written, self._batch_end
         batch = self.log[first : self.written]
         if any(persist.durability is Durability.DURABLE for persist in batch):
-            delay_ns = self._world.random.randrange(MS // 4, 4 * MS)
-            host.later(delay_ns, lambda: self._batch_synced(host, batch, done))
+            host.later(self._sync_ns, lambda: self._batch_synced(host, batch, done))
         else:
             self._batch_done(host, batch, done)
 
@@ -88,13 +94,17 @@ class Disk:
 
     # ---------------------------------------------------------------- a crash and what is left
 
-    def crash(self, *, power_cut: bool) -> list[Persist]:
-        """Lose what this kind of crash may lose; return what was lost."""
-        random = self._world.random
+    def keepable(self, *, power_cut: bool) -> range:
+        """Return how many records of the log this kind of crash may leave: any prefix."""
         if power_cut:
-            keep = random.randint(self.synced, self.written)
-        else:
-            keep = random.randint(self.written, max(self.written, self._batch_end))
+            return range(self.synced, self.written + 1)
+        return range(self.written, max(self.written, self._batch_end) + 1)
+
+    def crash(self, *, power_cut: bool, luck: Random) -> list[Persist]:
+        """Lose what this kind of crash may lose; return what was lost."""
+        may_keep = self.keepable(power_cut=power_cut)
+        keep = luck.choice(may_keep)
+        self._world.tally["batches torn"] += may_keep[0] < keep < may_keep[-1]
         self._busy = False
         lost = self.log[keep:]
         del self.log[keep:]
@@ -105,6 +115,10 @@ class Disk:
     def recovered(self, *, unix_s: int) -> Recovered:
         """Open the store: a new epoch, durable, and everything that has survived."""
         self.epoch = max(self.epoch + 1, unix_s)
+        return self.left(len(self.log))
+
+    def left(self, count: int) -> Recovered:
+        """Return what a store holds that has kept so many records of the log, in this epoch."""
         sessions: dict[str, SessionRecord] = {}
         worlds: dict[str, None] = {}
         aspects: dict[str, AspectRecord] = {}
@@ -112,7 +126,7 @@ class Disk:
         outcomes: dict[tuple[str, int], OutcomeRecord] = {}
         prepared: dict[LockId, PreparedRecord] = {}
         decisions: dict[LockId, DecisionRecord] = {}
-        for persist in self.log:
+        for persist in self.log[:count]:
             for record in persist.records:
                 if isinstance(record, SlotRecord):
                     slots[record.slot] = record

@@ -28,17 +28,21 @@ class Faults:
     crashes_per_s: float = 0.0
     """Shards that die and start again."""
     power_cut: float = 0.0
-    """Share of crashes that also lose what was written but not synced."""
+    """Share of crashes that also lose what was written but not synced, from any record on."""
     kills_per_s: float = 0.0
     """Client processes that are killed; another one starts in their place."""
     pauses_per_s: float = 0.0
-    """Processes that stand still for up to three TTLs while their messages queue up."""
+    """Processes that stand still for up to seven TTLs while their messages queue up."""
+    stalls_per_s: float = 0.0
+    """Shards whose dispatcher is stuck for up to three TTLs while their disk goes on."""
+    suspended: float = 0.0
+    """Share of pauses of a shard in which its steady clock stands still too (a suspended host)."""
     busy: float = 0.0
     """Share of pauses of a client in which its liveliness token stays (a held interpreter lock)."""
     tokens: bool = True
     """Whether shards see liveliness tokens at all; without them keep-alives alone renew."""
-    starved: float = 0.0
-    """Share of keep-alive rounds that do not take place (the thread that sends them starves)."""
+    starves_per_s: float = 0.0
+    """Clients that send no keep-alive for up to 10 s, because the thread that does it starves."""
     partitions_per_s: float = 0.0
     """Links that are cut for a while, in one direction or in both."""
     slow_disk: float = 0.0
@@ -79,7 +83,9 @@ def drawn(random: Random, *, shards: int) -> Faults:
         pauses_per_s=random.choice((0.0, 0.2, 0.5)),
         busy=random.choice((0.0, 0.5)),
         tokens=random.random() < 0.6,
-        starved=random.choice((0.0, 0.0, 0.5, 0.9)),
+        stalls_per_s=random.choice((0.0, 0.0, 0.2)),
+        suspended=random.choice((0.0, 0.3)),
+        starves_per_s=random.choice((0.0, 0.0, 0.2, 0.6)),
         partitions_per_s=random.choice((0.0, 0.2)),
         slow_disk=random.choice((0.0, 0.05)),
         drift_ppm=random.choice((0, 9_900)),

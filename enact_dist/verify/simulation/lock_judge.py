@@ -1,4 +1,4 @@
-"""The rules of locks at one shard: I1, I8, I11, I13, I17, ends in time, nobody waits in vain."""
+"""The rules of locks at one shard: I1, I8, I10, I11, I13, I14, I17, ends, nobody waits in vain."""
 
 from __future__ import annotations
 
@@ -31,6 +31,8 @@ class LockJudge:
             del picture.arrivals[lock]
             picture.granted.pop(lock, None)
         came = message.lock if isinstance(message, Acquire) else None
+        if came is not None:
+            picture.lanes[came[:2]] = None
         if came in tenures and came not in picture.arrivals:
             picture.came += 1
             picture.arrivals[came] = picture.came
@@ -51,6 +53,7 @@ class LockJudge:
             self._check_wanted(message, tenures)
         if isinstance(message, Tick):
             self._check_ends(host)
+            self._check_outcomes(host, picture)
             self._check_waiters(host, picture)
 
     def _check_grant(
@@ -94,6 +97,14 @@ class LockJudge:
             if min(tenure.hold_end_ns, lease_end_ns) <= state.now_ns:
                 self._fail("leases and hold limits end", lock, tenure.hold_end_ns, lease_end_ns)
 
+    def _check_outcomes(self, host: ShardHost, picture: Picture) -> None:
+        """I14: what is remembered of commits is one entry per lane that ever asked here."""
+        sessions = host.shard.state.sessions
+        for session in sessions:
+            for lane in session.lanes:
+                if (session.session, lane) not in picture.lanes:
+                    self._fail("I14 one outcome per lane", session.session, lane)
+
     def _check_waiters(self, host: ShardHost, picture: Picture) -> None:
         """Whoever waits does so for somebody who holds or came earlier, and nobody in a circle."""
         state = host.shard.state
@@ -113,8 +124,8 @@ class LockJudge:
             closed = state.draining or state.sessions.in_grace(state.now_ns)
             if not waits[waiter.lock] and not closed:
                 self._fail("P6 nobody waits in vain", waiter.lock, waiter.items)
-        for waiter in waits:
-            self._check_circle(waiter)
+        for lock in waits:
+            self._check_circle(lock)
 
     def _still_waits(self, name: str, lock: LockId) -> bool:
         """Whether a lock that waited when the shard last looked does so now."""

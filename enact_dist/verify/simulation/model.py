@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from enact_dist.core.datum import Datum, LockId, Slot
 from enact_dist.core.messages import (
     Committed,
+    Finished,
     Goodbye,
     Granted,
     Hello,
@@ -22,8 +23,8 @@ from enact_dist.core.messages import (
     Valid,
     Viewed,
 )
-from enact_dist.core.multilock import Phase
 from enact_dist.core.records import (
+    DecisionDone,
     DecisionRecord,
     OutcomeRecord,
     Persist,
@@ -36,15 +37,17 @@ from enact_dist.core.records import (
     SlotRecord,
 )
 from enact_dist.terms import Access, Durability, pattern_matches
-from enact_dist.verify.simulation.history import TOLD_NOT, Entry, History, conflict
+from enact_dist.verify.simulation.client_judge import ClientJudge
+from enact_dist.verify.simulation.history import TOLD_NOT, History
 from enact_dist.verify.simulation.lock_judge import LockJudge
 from enact_dist.verify.simulation.picture import Picture, State
+from enact_dist.verify.simulation.prefixes import judge_prefixes
 from enact_dist.verify.simulation.workload import label_of, value_of, writer_of
 
 if TYPE_CHECKING:
-    from enact_dist.core.lock_parts import Reading
-    from enact_dist.core.multilock import MultiLock
-    from enact_dist.verify.simulation.client_host import ClientHost
+    from collections.abc import Sequence
+
+    from enact_dist.core.records import Effect
     from enact_dist.verify.simulation.shard_host import ShardHost
     from enact_dist.verify.simulation.world import World
 
@@ -55,9 +58,9 @@ class Model:
     def __init__(self, world: World, history: History, durabilities: dict[str, str]) -> None:
         self._world, self._history = world, history
         self._locks = LockJudge(world)
-        self._durabilities = {name: Durability(text) for name, text in durabilities.items()}
+        self.durabilities = {name: Durability(text) for name, text in durabilities.items()}
         self.pictures: dict[str, Picture] = {}
-        self.clients: list[ClientHost] = []
+        self.of_clients = ClientJudge(world, history, self)
         self.absent: dict[LockId, dict[tuple[str, Slot], tuple[int, tuple[int, int]]]] = {}
         self.labels: dict[tuple[str, str], Slot] = {}
         self.permitted_losses: dict[LockId, None] = {}
@@ -68,14 +71,22 @@ class Model:
         """Stop the run: a rule is broken."""
         self._fail(rule, *facts)
 
-    def count(self, name: str) -> None:
-        """Add one to a tally of the run."""
-        self._world.tally[name] += 1
+    def clock_was_set(self) -> None:
+        """A wall clock was set: commits may be refused for it from now on."""
+        self.clocks_were_set = True
+
+    def count(self, name: str, number: int) -> None:
+        """Add to a tally of the run."""
+        self._world.tally[name] += number
 
     def _fail(self, rule: str, *facts: object) -> None:
         self._world.violation(rule, *facts)
 
     # ---------------------------------------------------------------- restart
+
+    def judge_prefixes(self, host: ShardHost, *, power_cut: bool) -> None:
+        """A shard is about to lose what a crash may take: could it start from any rest?"""
+        judge_prefixes(host, self.pictures[host.name], self.durabilities, power_cut=power_cut)
 
     def crashed(self, host: ShardHost, lost: list[Persist], *, power_cut: bool) -> None:
         """A shard died and its disk lost these records: was it allowed to?"""
@@ -90,7 +101,7 @@ class Model:
             self.permitted_losses[lock] = None
             losses[lock] = None
             self._world.tally["commits lost as declared"] += 1
-        self._lose_prepared(lost, picture, losses, power_cut=power_cut)
+        self._check_promises(lost, picture)
         for lock, persist in picture.in_flight.items():
             if id(persist) not in gone:
                 self._world.tally["commits found after a crash"] += 1
@@ -100,27 +111,14 @@ class Model:
         picture.prepared.clear()
         picture.applied = {lock: None for lock in picture.applied if lock not in losses}
 
-    def _lose_prepared(
-        self,
-        lost: list[Persist],
-        picture: Picture,
-        losses: dict[LockId, None],
-        *,
-        power_cut: bool,
-    ) -> None:
-        """A power cut may take what was promised for `os` data, and what was applied of it."""
+    def _check_promises(self, lost: list[Persist], picture: Picture) -> None:
+        """Nothing takes a promise that was given, nor the end of one that is decided."""
         for persist in lost:
             for record in persist.records:
                 if isinstance(record, PreparedRecord) and record.lock in picture.prepared:
-                    if not (power_cut and persist.durability is Durability.OS):
-                        self._fail("a promise survives", record.lock, persist.durability)
-                    self.permitted_losses[record.lock] = None
-                    self._world.tally["promises lost as declared"] += 1
-        for chain in picture.chains.values():
-            for index, state in enumerate(chain):
-                if state.writer in losses and state.writer in self.decided:
-                    # It may be applied again: the store has forgotten that it was.
-                    chain[index] = state._replace(writer=f"lost {state.writer}")
+                    self._fail("a promise survives", record.lock, persist.durability)
+                if isinstance(record, PreparedEnded) and record.lock in picture.applied:
+                    self._fail("an end of a promise survives", record.lock, persist.durability)
 
     def _found(self, host: ShardHost, lock: LockId, persist: Persist, picture: Picture) -> None:
         """What was under way at a crash turned out to be on disk."""
@@ -149,7 +147,7 @@ class Model:
         for slot in list(picture.chains):
             record, before = found.get(slot), picture.now(slot)
             name = (record.version, record.stamp_ns) if record else (0, 0)
-            durability = self._durabilities[slot.aspect]
+            durability = self.durabilities[slot.aspect]
             if durability is Durability.DURABLE and name != before.name:
                 self._fail("I4 committed versions never regress", slot, name, before)
             if durability is Durability.OS and name not in _names(picture.chains[slot]):
@@ -161,17 +159,19 @@ class Model:
                 # What is prepared here comes later, however early it was decided elsewhere.
                 by = f"{writer} under {prepared[slot]}" if slot in prepared else writer
                 picture.put(slot, State(*name, by, picture.epoch, content.datum))
+        if len(recovered.outcomes) > len(picture.lanes):
+            self._fail("I14 one outcome per lane", len(recovered.outcomes), len(picture.lanes))
         picture.arrivals.clear()
         picture.granted.clear()
         picture.granted_ever.clear()
-        for record in recovered.prepared:
-            lock = record.lock
+        for promise in recovered.prepared:
+            lock = promise.lock
             self._world.tally["prepared over a restart"] += 1
             tenure = host.shard.state.tenures.by_lock.get(lock)
-            if tenure is None or tenure.token != record.token or not tenure.claim.granted:
+            if tenure is None or tenure.token != promise.token or not tenure.claim.granted:
                 self._fail("I10 prepared locks are held again", lock)
-            picture.prepared[lock] = record
-            picture.granted[lock] = picture.granted_ever[lock] = record.token
+            picture.prepared[lock] = promise
+            picture.granted[lock] = picture.granted_ever[lock] = promise.token
             picture.arrivals[lock] = 0
         picture.notices = 0
         longest_ns = max((record.ttl_ns for record in recovered.sessions), default=0)
@@ -180,11 +180,12 @@ class Model:
 
     # ---------------------------------------------------------------- one step of a shard
 
-    def handled(self, host: ShardHost, message: object, effects: list[object]) -> None:
+    def handled(self, host: ShardHost, message: object, effects: Sequence[Effect]) -> None:
         """Judge one step: what came in, and what the shard decided."""
         picture = self.pictures[host.name]
         acknowledged = isinstance(message, Hello) and message.known_epoch == picture.epoch
-        if acknowledged or isinstance(message, Goodbye | SessionDied):
+        ended = isinstance(message, Goodbye | SessionDied)
+        if isinstance(message, Hello | Goodbye | SessionDied) and (acknowledged or ended):
             picture.grace_waits_for.pop(message.session, None)
         self._check_commits(host, effects, picture)
         self._locks.judge(host, message, picture)
@@ -198,7 +199,7 @@ class Model:
                 if lock in picture.granted_ever:  # else it only expected something here
                     picture.confirmed[lock] = picture.granted_ever[lock]
 
-    def _check_commits(self, host: ShardHost, effects: list[object], picture: Picture) -> None:
+    def _check_commits(self, host: ShardHost, effects: Sequence[Effect], picture: Picture) -> None:
         told = {
             effect.answer.position.stamp_ns: effect.answer
             for effect in effects
@@ -209,6 +210,8 @@ class Model:
                 self._check_persist(effect, picture)
             elif isinstance(effect, Reply) and isinstance(effect.answer, Prepared):
                 self._check_prepared(host, effect.answer, picture)
+            elif isinstance(effect, Reply) and isinstance(effect.answer, Finished):
+                self._check_end_told(host, effect.answer.lock, picture)
             elif isinstance(effect, Publish):
                 assert isinstance(effect.notice, Notice)
                 picture.notices += 1
@@ -227,13 +230,21 @@ class Model:
                 picture.in_flight[record.lock] = persist
             elif isinstance(record, PreparedRecord):
                 picture.preparing[record.lock] = record
+            elif isinstance(record, DecisionDone):
+                left = [
+                    shard
+                    for shard in self.decided[record.lock].participants
+                    if record.lock not in self.pictures[shard].applied
+                ]
+                if left:
+                    self._fail("a decision is kept until all have applied it", record.lock, left)
             elif isinstance(record, PreparedEnded) and persist.ticket:
                 picture.in_flight[record.lock] = persist
             elif isinstance(record, PreparedEnded):
                 self._world.tally["prepared and aborted"] += 1
                 picture.aborted[record.lock] = None
                 picture.prepared.pop(record.lock, None)
-                if record.lock in self.decided and record.lock not in self.permitted_losses:
+                if record.lock in self.decided:
                     self._fail("I9 committed and aborted", record.lock)
                 if record.lock in picture.applied:
                     self._fail("I9 applied and aborted", record.lock)
@@ -245,14 +256,21 @@ class Model:
         if answer.lock not in picture.prepared and answer.lock not in picture.in_flight:
             self._fail("prepared what was not asked", answer)
         picture.confirmed[answer.lock] = picture.prepared[answer.lock].token
-        kept = host.disk.synced if answer.durability == "durable" else host.disk.written
-        on_disk = host.disk.log[:kept]
+        on_disk = host.disk.log[: host.disk.synced]
         if not any(
             isinstance(r, PreparedRecord) and r.lock == answer.lock
             for persist in reversed(on_disk)
             for r in persist.records
         ):
             self._fail("a promise is on disk before it is given", answer)
+
+    def _check_end_told(self, host: ShardHost, lock: LockId, picture: Picture) -> None:
+        """Who hears that a participant has finished may forget that the lock was decided."""
+        persist = picture.in_flight.get(lock)
+        if persist is not None and not any(
+            kept is persist for kept in reversed(host.disk.log[: host.disk.synced])
+        ):
+            self._fail("an end is on disk before it is told", lock)
 
     def _finished(self, host: ShardHost, notice: Notice, picture: Picture) -> None:
         """A participant has applied what it had prepared."""
@@ -299,8 +317,6 @@ class Model:
     def check_all_or_nothing(self) -> None:
         """I3: in the end a lock has its effects on all of its shards or on none."""
         for lock, record in self.decided.items():
-            if lock in self.permitted_losses:
-                continue
             for shard in record.participants:
                 if lock not in self.pictures[shard].applied:
                     self._fail("I3 decided, but not applied", lock, shard)
@@ -311,7 +327,7 @@ class Model:
     def _check_on_disk(
         self, host: ShardHost, lock: LockId, persist: Persist | None, notice: Notice
     ) -> None:
-        strictest = {self._durabilities[change.slot.aspect] for change in notice.changes}
+        strictest = {self.durabilities[change.slot.aspect] for change in notice.changes}
         if strictest == {Durability.VOLATILE}:
             return
         kept = host.disk.synced if Durability.DURABLE in strictest else host.disk.written
@@ -357,10 +373,7 @@ class Model:
                 self._fail("stamps grow", slot, stamp_ns, before)
             if datum is not None:
                 self._check_content(lock, slot, before, datum)
-            # What a power cut took may come back: a writer of its own, as late as that.
-            again = lock in self.decided and lock in self.permitted_losses
-            writer = f"again {lock} in {picture.epoch}" if again else lock
-            picture.put(slot, State(version, stamp_ns, writer, picture.epoch, datum))
+            picture.put(slot, State(version, stamp_ns, lock, picture.epoch, datum))
 
     def _check_content(self, lock: LockId, slot: Slot, before: State, datum: Datum) -> None:
         if writer_of(datum) != str(lock):
@@ -371,7 +384,7 @@ class Model:
                 self._fail("no phantom: two created one thing", first, slot, label_of(datum))
             return
         old = 0 if before.datum is None else value_of(before.datum)
-        emptied = self._durabilities[slot.aspect] is Durability.VOLATILE and before.version == 0
+        emptied = self.durabilities[slot.aspect] is Durability.VOLATILE and before.version == 0
         if value_of(datum) != old + 1 and not (emptied and lock in self.decided):
             self._fail("no lost update", slot, old, datum)
 
@@ -409,82 +422,10 @@ class Model:
         column = picture.columns.get((item.context, item.aspect), {})
         return [s for s in column if s not in shown and pattern_matches(item.entity, s.entity)]
 
-    # ---------------------------------------------------------------- clients
-
-    def holds(self, host: ClientHost, entry: Entry) -> None:
-        """A thread has its lock."""
-        self._world.tally["locks held"] += 1
-        self.check_beliefs(host)
-
-    def check_beliefs(self, host: ClientHost) -> None:
-        """I7: whoever believes in a lock now is alone with it."""
-        entries = self._history.entries
-        mine = _believed(host)
-        if not mine:
-            return
-        for other in self.clients:
-            if not other.up:
-                continue
-            for theirs in _believed(other):
-                for lock in mine:
-                    if lock is not theirs and conflict(
-                        entries[lock.lock].items, entries[theirs.lock].items
-                    ):
-                        self._fail("I7 two believers", lock.lock, theirs.lock)
-
-    def datum_seen(self, reading: Reading, datum: Datum | None) -> None:
-        """A thread looks at a datum, from the grant, its cache or a fetch: is it the right one?"""
-        picture = self.pictures[reading.shard]
-        state = reading.state
-        for one in reversed(picture.chains.get(state.slot, ())):
-            if one.epoch <= reading.epoch and one.name == (state.version, state.stamp_ns):
-                same = (one.datum is None) == (datum is None) and (
-                    datum is None or one.datum is None or bytes(datum.body) == bytes(one.datum.body)
-                )
-                if not same:
-                    self._fail("no stale datum is served", reading, one)
-                return
-        if (state.version, state.stamp_ns) != (0, 0) or datum is not None:
-            self._fail("what is read was committed", reading)
-
-    def told(self, host: ClientHost, entry: Entry) -> None:
-        """A thread was told how its lock ended: is it true?"""
-        self._world.tally[f"told: {entry.told.value if entry.told else '-'}"] += 1
-        applied = any(entry.id in picture.applied for picture in self.pictures.values())
-        refusal = entry.lock.refusal
-        if refusal is not None and not (self.clocks_were_set and refusal.code == "clock_skew"):
-            self._fail("nothing is refused", entry.id, refusal)
-        applied = applied or entry.id in self.permitted_losses
-        if entry.told is Phase.COMMITTED and entry.lock.versions and not applied:
-            self._fail("I5 told committed, not visible", entry.id)
-        if entry.told in TOLD_NOT and applied and not self._may_be_gone(entry):
-            self._fail("I5 told not committed, but visible", entry.id, entry.told, entry.lock.cause)
-
-        if entry.told is Phase.COMMITTED:
-            self._check_confirmed(entry)
-
-    def _check_confirmed(self, entry: Entry) -> None:
-        """P3: each part was asked, at its end, whether it had been held all the time."""
-        for part in entry.lock.parts:
-            picture = self.pictures[part.shard]
-            if part.token != picture.confirmed.get(entry.id):
-                self._fail("P3 every lock is confirmed", entry.id, part.shard, part.token)
-
-    def _may_be_gone(self, entry: Entry) -> bool:
-        """Whether a restart may have undone the lock's writes: volatile, or `os` and power cut."""
-        written = (item for item in entry.items if Access(item.access).writes)
-        volatile = all(self._durabilities[item.aspect] is Durability.VOLATILE for item in written)
-        return volatile or entry.id in self.permitted_losses
-
-
-def _believed(host: ClientHost) -> list[MultiLock]:
-    now_ns = host.local_ns
-    return [lock for lock in host.client.live_locks() if lock.valid(now_ns)]
-
 
 def _names(chain: list[State]) -> set[tuple[int, int]]:
     return {state.name for state in chain} | {(0, 0)}
 
 
 def _recorded_data(persist: Persist) -> dict[Slot, Datum | None]:
-    return {r.slot: r.datum for r in persist.records if hasattr(r, "datum")}
+    return {r.slot: r.datum for r in persist.records if isinstance(r, SlotRecord)}

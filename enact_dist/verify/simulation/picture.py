@@ -45,6 +45,7 @@ class Picture:
     granted: dict[LockId, Token] = field(default_factory=dict)
     granted_ever: dict[LockId, Token] = field(default_factory=dict)
     confirmed: dict[LockId, Token] = field(default_factory=dict)
+    lanes: dict[tuple[str, int], None] = field(default_factory=dict)
     came: int = 0
     newest_token: Token | None = None
     notices: int = 0

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, cast
 
 from enact_dist.core.messages import Answer, Finish, Refused, Request
 from enact_dist.core.records import Call, Called, Persist, Persisted, Reply, SessionSeen, Tick
@@ -12,6 +13,7 @@ from enact_dist.verify.simulation.world import MS, Host, S
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from random import Random
 
     from enact_dist.core.records import Event
     from enact_dist.core.shard_state import ShardSettings
@@ -19,6 +21,10 @@ if TYPE_CHECKING:
     from enact_dist.verify.simulation.model import Model
     from enact_dist.verify.simulation.network import Network
     from enact_dist.verify.simulation.world import World
+
+
+ASSERT_EVERY = 4
+"""Steps between two looks at the shard's own assertions; the judge looks at each step."""
 
 
 class ShardHost(Host):
@@ -32,7 +38,7 @@ class ShardHost(Host):
         )
         self.settings = settings
         self.faults = faults
-        self.disk = Disk(world, faults)
+        self.disk = Disk(world, faults, settings.name)
         self.asserts = True
         self.model: Model
         self.shard: Shard
@@ -42,7 +48,9 @@ class ShardHost(Host):
         self.network: Network
         self.peers: dict[str, ShardHost] = {}
         self._replies: dict[int, Callable[[Answer], None]] = {}
-        self._handle = 0
+        self._handle = self._steps = 0
+        self._stalled = False
+        self._inbox: list[tuple[Request | Event, int]] = []
         self._tick_due_ns = 0
         self._crashed_at_ns = 0
 
@@ -59,25 +67,51 @@ class ShardHost(Host):
         self._tick_due_ns = 0
         self._plan_tick()
         for session in self.tokens(self):
-            self.later(10 * MS, lambda session=session: self.event(SessionSeen(session, True)))
+            self.later(10 * MS, partial(self.event, SessionSeen(session, True)))
         if self.shard.epoch != 1:
             self.world.tally["epoch changes"] += 1
+        self.world.tell(f"{self.name} starts with epoch {self.shard.epoch}")
 
-    def crash(self, *, power_cut: bool, down_ns: int) -> None:
+    def crash(self, *, power_cut: bool, down_ns: int, luck: Random) -> None:
         """Die now and come back after a while."""
         if not self.up:
             return
         self.world.tally["power cuts" if power_cut else "crashes"] += 1
         self.end_life()
+        self._stalled = False
+        self._inbox.clear()
         self._crashed_at_ns = self.world.now_ns
         self._tally_counters()
-        lost = self.disk.crash(power_cut=power_cut)
+        self.model.judge_prefixes(self, power_cut=power_cut)
+        lost = self.disk.crash(power_cut=power_cut, luck=luck)
         self.model.crashed(self, lost, power_cut=power_cut)
         self.world.after(down_ns, self.boot)
 
     def _tally_counters(self) -> None:
         for name, count in self.shard.counters.items():
             self.world.tally[f"shard: {name}"] += count
+
+    def stall(self, true_ns: int) -> bool:
+        """Let the dispatcher stand still for a while, and nothing else of this host.
+
+        The disk goes on, and what it reports waits with the requests.  False if it stalls already.
+        """
+        if self._stalled or self.paused or not self.up:
+            return False
+        self._stalled = True
+        life = self.life
+        self.world.after(true_ns, lambda: self._do(life, self.go_on))
+        return True
+
+    def go_on(self) -> None:
+        """End a stall: what has come in is handled first, then the time is looked at."""
+        self._stalled = False
+        inbox, self._inbox = self._inbox, []
+        for message, handle in inbox:
+            if not isinstance(message, Tick):
+                self._give(message, handle)
+        if self.up and inbox:
+            self._give(Tick(), 0)
 
     def close(self) -> None:
         """Add this shard's own statistics to those of the run."""
@@ -96,9 +130,13 @@ class ShardHost(Host):
         self._give(event, 0)
 
     def _give(self, message: Request | Event, handle: int) -> None:
+        if self._stalled:
+            self._inbox.append((message, handle))
+            return
         now_ns, wall_ns = self.local_ns, self.wall_ns
         effects = self.shard.handle(message, reply_to=handle, now_ns=now_ns, wall_ns=wall_ns)
-        if self.asserts:
+        self._steps += 1
+        if self.asserts and self._steps % ASSERT_EVERY == 0:
             self.shard.assert_invariants()
         self.model.handled(self, message, effects)
         for effect in effects:
@@ -109,7 +147,7 @@ class ShardHost(Host):
                     return
                 if isinstance(effect.answer, Refused):
                     self.world.tally[f"refused: {effect.answer.code}"] += 1
-                reply(effect.answer)
+                reply(cast("Answer", effect.answer))
             elif isinstance(effect, Persist):
                 self.disk.submit(self, effect, lambda ticket: self.event(Persisted(ticket)))
                 self.on_persist(self)
@@ -131,7 +169,8 @@ class ShardHost(Host):
         def reply(answer: Answer) -> None:
             network.send(peer, self, answer, answered)
 
-        network.send(self, peer, call.request, lambda came: peer.request(came, reply))
+        request = cast("Request", call.request)
+        network.send(self, peer, request, lambda came: peer.request(came, reply))
 
     def _plan_tick(self) -> None:
         now_ns = self.local_ns

@@ -7,6 +7,7 @@ body; every creation looks for its label first.  So a lost update or a phantom s
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from random import Random
 from typing import TYPE_CHECKING
 
 from enact_dist.core.datum import Datum, Slot
@@ -23,13 +24,11 @@ from enact_dist.core.messages import (
 from enact_dist.core.multilock import MultiLock, Phase
 from enact_dist.core.placement import shard_of
 from enact_dist.terms import Access
-from enact_dist.verify.simulation.client_host import Calls, ClientHost, Sleep, Thread
+from enact_dist.verify.simulation.client_host import Calls, ClientHost, Sleep, Steps, Thread
 from enact_dist.verify.simulation.history import Entry, History
 from enact_dist.verify.simulation.world import MS, S
 
 if TYPE_CHECKING:
-    from random import Random
-
     from enact_dist.verify.simulation.model import Model
     from enact_dist.verify.simulation.world import World
 
@@ -41,7 +40,8 @@ ASPECTS = (
     AspectEntry("made", "str", "durable"),
 )
 PLAIN = ("count", "note", "frame")
-ENTITIES = ("piece", "bench", "tray/1", "tray/2")
+ENTITIES = ("piece", "bench", "tray/4", "tray/7")
+"""They lie on different shards, by twos and on all of three: a test looks after that."""
 LABELS = 40
 """Things that creators look for, and create when nobody has: about as many as there are looks."""
 KINDS = {
@@ -62,10 +62,12 @@ LARGE = 64 * 1024 + 1
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """One thing that a thread does under one lock."""
+    """One thing that a thread does under one lock, with luck of its own."""
 
+    name: str
     kind: str
     items: tuple[Item, ...]
+    luck: Random
     wait_ns: int
     hold_ns: int
     work_ns: int
@@ -81,19 +83,21 @@ class Workload:
         self._world, self._history, self._model = world, history, model
         self._entities = ENTITIES[:entities]
         # With one entity nearly all locks want the same few slots.
-        self._aspects = PLAIN if entities > 1 else world.random.sample(PLAIN, 1)
+        one = world.schedule.stream("the one aspect").choice(PLAIN)
+        self._aspects = PLAIN if entities > 1 else (one,)
 
     # ---------------------------------------------------------------- drawing
 
-    def job(self) -> Job:
+    def job(self, name: str, random: Random) -> Job:
         """Draw a job."""
-        random = self._world.random
         kind = random.choices(list(KINDS), list(KINDS.values()))[0]
         items = getattr(self, "_" + kind.replace(" ", "_"))(random)
-        hold_ns = random.choice((60 * S, 60 * S, 60 * S, 300 * MS))
+        hold_ns = random.choice((60 * S, 60 * S, 60 * S, 300 * MS, 1500 * MS))
         return Job(
+            name,
             kind,
             items,
+            random,
             wait_ns=random.choice((0, 200 * MS, 2 * S, 8 * S)),
             hold_ns=hold_ns,
             work_ns=random.choice((0, 0, 0, 2 * MS, 20 * MS, 20 * MS, 100 * MS, 500 * MS, 2 * S)),
@@ -106,7 +110,7 @@ class Workload:
         return random.choice(CONTEXTS), random.choice(self._entities), random.choice(self._aspects)
 
     def _increment(self, random: Random) -> tuple[Item, ...]:
-        return self._written(random, random.choice((1, 1, 2, 3)))
+        return self._written(random, random.choice((1, 2, 2, 3)))
 
     def _written(self, random: Random, count: int) -> tuple[Item, ...]:
         """Writes lie on one entity or on several, so on one shard or on several."""
@@ -149,10 +153,10 @@ class Workload:
 
     def _view(self, random: Random) -> tuple[Item, ...]:
         views: tuple[Item, ...] = self._besides(random, (), Access.VIEW)
-        if random.random() < 0.5:
+        if random.random() < 0.35:
             each = random.choice((("**", "count"), ("**", "note"), ("tray/*", "frame")))
             views = (Item(Access.VIEW_EACH, random.choice(CONTEXTS), *each),)
-        elif random.random() < 0.5:
+        elif random.random() < 0.7:
             views = tuple(
                 Item(Access.VIEW, context, entity, "count")
                 for context in CONTEXTS
@@ -177,10 +181,16 @@ class Workload:
 
     def thread(self, host: ClientHost, lane: int) -> Thread:
         """Do one job after the other until the run winds down."""
-        random = self._world.random
+        schedule, number = self._world.schedule, 0
+        random = schedule.stream(f"work of {host.name} in lane {lane}")
         while not self._world.winding_down:
-            yield Sleep(random.choice((0, 5 * MS, 50 * MS, 300 * MS)))
-            yield from self._do(host, lane, self.job())
+            yield Sleep(random.choice((0, 5 * MS, 30 * MS, 150 * MS)))
+            job = self.job(f"{host.name}/{lane}.{number}", Random(random.getrandbits(64)))
+            number += 1
+            if schedule.begins(job.name):
+                yield from self._do(host, lane, job)
+            else:
+                yield Sleep(job.work_ns + MS)
 
     def _do(self, host: ClientHost, lane: int, job: Job, *, lock_views: bool = False) -> Thread:
         client = host.client
@@ -194,9 +204,11 @@ class Workload:
         )
         entry = Entry(lock, items, job.kind, self._world.now_ns)
         self._history.begin(entry)
+        self._world.tell(job.name, "asks for", *map(told_of, items))
         yield from host.drive(lock)
         if lock.phase is Phase.HELD:
-            self._model.holds(host, entry)
+            self._world.tell(job.name, "has its lock")
+            self._model.of_clients.holds(host, entry)
             data = yield from self._data(host, lock)
             if lock.phase is Phase.HELD and job.work_ns:
                 yield Sleep(job.work_ns)
@@ -206,7 +218,8 @@ class Workload:
                 self._finish(host, entry, job, data)
             yield from host.drive(lock)
         self._history.end(entry, now_ns=self._world.now_ns)
-        self._model.told(host, entry)
+        self._world.tell(job.name, "is told", entry.told.value if entry.told else "-", lock.cause)
+        self._model.of_clients.told(host, entry)
         if lock.no_cut:
             self._world.tally["views that became reads"] += 1
             yield from self._do(host, lane, job, lock_views=True)
@@ -224,7 +237,7 @@ class Workload:
 
     # ---------------------------------------------------------------- reading
 
-    def _data(self, host: ClientHost, lock: MultiLock) -> Thread:
+    def _data(self, host: ClientHost, lock: MultiLock) -> Steps[dict[Slot, Datum | None] | None]:
         """Return the datum of each slot read, fetching what did not come with the grant."""
         data: dict[Slot, Datum | None] = {}
         for reading in lock.states:
@@ -240,13 +253,13 @@ class Workload:
                     datum = yield from self._fetched(host, lock, reading)
                     if datum is None:
                         return None
-            self._model.datum_seen(reading, datum)
+            self._model.of_clients.datum_seen(reading, datum)
             data[state.slot] = datum
             if datum is not None:
                 host.cache[state.slot] = (reading.shard, reading.epoch, state.version, datum)
         return data
 
-    def _fetched(self, host: ClientHost, lock: MultiLock, reading: Reading) -> Thread:
+    def _fetched(self, host: ClientHost, lock: MultiLock, reading: Reading) -> Steps[Datum | None]:
         state = reading.state
         request = Fetch(lock.lock, reading.epoch, state.slot, state.version, 0, 1 << 20)
         for _ in range(5):
@@ -272,6 +285,7 @@ class Workload:
             writes.setdefault(shard, []).append(WriteItem(slot, self._datum(lock, job, slot, data)))
         if len(writes) > 1:
             self._world.tally["locks that write on several shards"] += 1
+            self._world.tally["locks that write on three shards"] += len(writes) > 2
         expects: list[SlotVersion] = []
         views = {Slot(*item[1:4]) for item in job.items if item.access == Access.VIEW}
         if job.expects and views:
@@ -281,7 +295,7 @@ class Workload:
                 if reading.state.slot in views
             ]
             entry.expects = True
-        finish_s = self._world.random.choice((10, 10, 3))
+        finish_s = job.luck.choice((10, 10, 3))
         lock.finish(
             writes,
             give_up_ns=host.local_ns + finish_s * S,
@@ -293,7 +307,7 @@ class Workload:
             if any(datum is not None and label_of(datum) == job.label for datum in data.values()):
                 self._world.tally["labels found"] += 1
                 return []
-            name = f"made/{self._world.random.getrandbits(64):016x}"
+            name = f"made/{job.luck.getrandbits(64):016x}"
             return [Slot(job.items[0].context, name, "made")]
         if job.kind == "write each":
             item = job.items[0]
@@ -307,7 +321,7 @@ class Workload:
     def _datum(
         self, lock: MultiLock, job: Job, slot: Slot, data: dict[Slot, Datum | None]
     ) -> Datum | None:
-        random = self._world.random
+        random = job.luck
         if job.kind == "create":
             return datum_of(f"{lock.lock}|{job.label}")
         if job.kind == "increment" and random.random() < 0.05:
@@ -316,6 +330,12 @@ class Workload:
         value = 1 if old is None else value_of(old) + 1
         large = slot.aspect == "frame" and random.random() < 0.1
         return datum_of(f"{lock.lock}|{value}", size=LARGE if large else 0)
+
+
+def told_of(item: Item) -> str:
+    """Return an item as a story shows it."""
+    access = Access(item.access).name.lower().replace("_", " ")
+    return f"{access} {item.context}/{item.entity}/{item.aspect}"
 
 
 def datum_of(text: str, *, size: int = 0) -> Datum:

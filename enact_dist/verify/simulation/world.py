@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from random import Random
+
+    from enact_dist.verify.simulation.schedule import Schedule
 
 MS = 1_000_000
 S = 1_000 * MS
@@ -44,10 +45,15 @@ class Clock:
 
 @dataclass(slots=True)
 class World:
-    """The queue of events, the randomness and the tallies of one run."""
+    """The queue of events, the schedule of faults and the tallies of one run.
 
-    random: Random
+    Attributes:
+        story: What happened, line by line with its true time in ns; None if nobody asks for it.
+    """
+
+    schedule: Schedule
     now_ns: int = 0
+    story: list[tuple[int, str]] | None = None
     tally: Counter[str] = field(default_factory=Counter)
     winding_down: bool = False
     _events: list[tuple[int, int, Callable[[], None]]] = field(default_factory=list)
@@ -67,6 +73,16 @@ class World:
             action()
         self.now_ns = max(self.now_ns, end_ns)
 
+    def tell(self, *parts: object) -> None:
+        """Add a line to the story of the run, if somebody asks for it."""
+        if self.story is not None:
+            self.story.append((self.now_ns, " ".join(str(part) for part in parts)))
+
+    def befell(self, fault: str, text: str) -> None:
+        """Note that a fault took place."""
+        self.schedule.note(fault, self.now_ns, text)
+        self.tell(f"[{fault}]", text)
+
     def violation(self, rule: str, *facts: object) -> None:
         """Stop the run: a rule is broken."""
         told = " ".join(str(fact) for fact in facts)
@@ -79,16 +95,17 @@ class Host:
     def __init__(self, world: World, name: str, *, drift_ppm: int, wall_offset_ns: int) -> None:
         self.world, self.name = world, name
         self._drift_ppm = drift_ppm
+        self.life = 0
         self.clock = self.new_clock()
         self.wall_offset_ns = wall_offset_ns
-        self.life = 0
         self.up = True
         self._paused_until_ns = 0
+        self._stood_at_ns = 0
         self._backlog: list[tuple[int, Callable[[], None]]] = []
 
     def new_clock(self) -> Clock:
         """Return a clock with a start and a rate of its own."""
-        random = self.world.random
+        random = self.world.schedule.stream(f"clock of {self.name} in life {self.life}")
         ppm = random.randint(-self._drift_ppm, self._drift_ppm)
         # It showed `offset` at this moment, wherever true time stands.
         now_ns = self.world.now_ns
@@ -126,16 +143,23 @@ class Host:
         else:
             action()
 
-    def pause(self, true_ns: int) -> None:
-        """Stand still for a while; what arrives is handled afterwards, in order."""
+    def pause(self, true_ns: int, *, suspended: bool = False) -> None:
+        """Stand still for a while; what arrives is handled afterwards, in order.
+
+        A host that is suspended stops its steady clock for as long.
+        """
         if self.paused:
             return
         self._paused_until_ns = self.world.now_ns + true_ns
+        self._stood_at_ns = self.local_ns if suspended else 0
         self.world.after(true_ns, self.resume)
 
     def resume(self) -> None:
         """Go on with what has queued up."""
         self._paused_until_ns = self.world.now_ns
+        if self._stood_at_ns:
+            self.clock.offset_ns -= self.local_ns - self._stood_at_ns
+            self._stood_at_ns = 0
         backlog, self._backlog = self._backlog, []
         for life, action in backlog:
             self._do(life, action)
@@ -144,5 +168,5 @@ class Host:
         """Go down; everything that this life had planned is void."""
         self.up = False
         self.life += 1
-        self._paused_until_ns = 0
+        self._paused_until_ns = self._stood_at_ns = 0
         self._backlog.clear()

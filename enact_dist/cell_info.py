@@ -1,0 +1,116 @@
+"""What a cell tells people about its locks, shards, actors and operators."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from enact_dist.core.messages import Holder
+
+
+@dataclass(frozen=True, slots=True)
+class LockInfo:
+    """One lock that is held or awaited at a shard; times in seconds.
+
+    Attributes:
+        number: What `Cell.break_lock` takes; unique within the shard's epoch.
+        modes: "read", "write" or both.
+        waits_for: Numbers of the locks in the way.
+    """
+
+    shard: str
+    number: int
+    lock_id: str
+    actor: str
+    host: str
+    pid: int
+    granted: bool
+    modes: str
+    age_s: float
+    lease_left_s: float
+    hold_left_s: float
+    slots: tuple[str, ...]
+    waits_for: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class ShardInfo:
+    """One shard of the cell; `reachable` False leaves everything else at zero.
+
+    Attributes:
+        open: False while a restarted shard waits for older leases to end.
+        clock_ahead_s: Its wall clock less ours, half a round trip taken off.
+        round_trip_s: Of the call that asked.
+        carrier: How this process's calls to it travel: "socket", or "zenoh" and why.
+        counters: Its statistics by name.
+    """
+
+    name: str
+    endpoint: str
+    reachable: bool
+    epoch: int = 0
+    open: bool = False
+    uptime_s: float = 0.0
+    slots: int = 0
+    size_bytes: int = 0
+    sessions: int = 0
+    locks: int = 0
+    clock_ahead_s: float = 0.0
+    round_trip_s: float = 0.0
+    carrier: str = ""
+    counters: dict[str, int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class ActorInfo:
+    """One session of a named actor, as the shards see it.
+
+    Attributes:
+        report: The actor's own statistics; empty where it gives none.
+    """
+
+    actor: str
+    host: str
+    pid: int
+    session: str
+    shards: tuple[str, ...]
+    lease_left_s: float
+    locks: int
+    report: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class AuditInfo:
+    """An act of an operator at a shard, or what came of one.
+
+    Attributes:
+        stamp_s: When, by the shard's wall clock, seconds since 1970.
+        kind: "broken" or "forced" (what was done), "confirmed" or "alarm" (what a lost shard said
+            when it was back), "settled" (somebody has seen to all alarms before).
+        text: Who or what, and the reason that was given.
+    """
+
+    shard: str
+    stamp_s: float
+    kind: str
+    text: str
+
+
+def lock_info(shard: str, holder: Holder) -> LockInfo:
+    """Return a shard's description of a lock in seconds."""
+    return LockInfo(
+        shard,
+        holder.number,
+        str(holder.lock),
+        holder.actor,
+        holder.host,
+        holder.pid,
+        holder.granted,
+        holder.modes,
+        holder.age_ns / 1e9,
+        holder.lease_left_ns / 1e9,
+        holder.hold_left_ns / 1e9,
+        holder.slots,
+        holder.waits_for,
+    )

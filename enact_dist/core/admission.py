@@ -1,0 +1,92 @@
+"""What is refused although the wire can carry it: requests that no honest client or shard makes.
+
+The wire checks types and lengths, the fence checks who holds what.  What is left would break the
+shard itself (an access that does not exist), everybody else (a name that nobody can read) or keep
+a lock for ever (a primary that nobody can ask).  Each function returns why, or None.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.core.messages import Refused
+from enact_dist.terms import Access, Durability, checked_name
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterable
+
+    from enact_dist.core.datum import Slot
+    from enact_dist.core.messages import AspectEntry, Commit, Finish, Item, Prepare, WriteItem
+    from enact_dist.core.records import PreparedRecord
+
+_ACCESSES: Final = frozenset(access.value for access in Access)
+_DURABILITIES: Final = ("", *(durability.value for durability in Durability))
+
+
+def wrong_access(items: Iterable[Item]) -> Refused | None:
+    """Refuse an access that there is not."""
+    for item in items:
+        if item.access not in _ACCESSES:
+            return _refused(f"access {item.access} was asked; there are {sorted(_ACCESSES)}")
+    return None
+
+
+def wrong_name(kind: str, name: str, *, slashes: bool) -> Refused | None:
+    """Refuse a name that other clients could not read."""
+    try:
+        checked_name(kind, name, slashes=slashes)
+    except ValueError as error:
+        return Refused("value", str(error))
+    return None
+
+
+def wrong_aspect(entry: AspectEntry) -> Refused | None:
+    """Refuse an aspect whose name or durability nobody could use."""
+    if entry.durability not in _DURABILITIES:
+        return _refused(
+            f"durability {entry.durability!r} of aspect {entry.name!r} was asked; there are"
+            f" {', '.join(filter(None, _DURABILITIES))}"
+        )
+    return wrong_name("aspect", entry.name, slashes=False)
+
+
+def wrong_writes(writes: Iterable[WriteItem]) -> Refused | None:
+    """Refuse two writes of one slot."""
+    seen: set[Slot] = set()
+    for write in writes:
+        if write.slot in seen:
+            return _refused(f"{write.slot} is written twice in one commit")
+        seen.add(write.slot)
+    return None
+
+
+def wrong_parties(message: Commit | Prepare, *, peers: Collection[str]) -> Refused | None:
+    """Refuse a commit over shards with one that cannot be told or asked, or with this one.
+
+    Args:
+        message: A commit with its participants, or a prepare with its primary.
+        peers: The other shards of the cell.
+    """
+    named = getattr(message, "participants", None)
+    for shard in (message.primary,) if named is None else named:  # type: ignore[union-attr]
+        if shard not in peers:
+            known = ", ".join(sorted(peers)) or "none"
+            return _refused(
+                f"{shard!r} was named to commit {message.lock} with this shard; the other shards"
+                f" of the cell are: {known}"
+            )
+    return None
+
+
+def wrong_finish(message: Finish, record: PreparedRecord) -> Refused | None:
+    """Refuse the word of a shard that is not the primary."""
+    if message.position.shard == record.primary:
+        return None
+    return _refused(
+        f"shard {message.position.shard!r} is said to have committed {message.lock}, which was"
+        f" prepared for shard {record.primary!r}"
+    )
+
+
+def _refused(text: str) -> Refused:
+    return Refused("protocol", text)

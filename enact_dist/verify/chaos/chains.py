@@ -1,0 +1,288 @@
+"""From the journals of a run to a history: which states each slot went through.
+
+No journal shows a shard's inside.  What a slot held is known from those who looked, the last lock
+over everything among them, and from those who wrote: a version that nobody saw belongs to the lock
+that was told that it committed it, or else to the only one that may have.  A lock whose end is
+unknown counts as soon as one of its versions was seen.
+
+A volatile slot counts its versions anew after each restart, so it is told restart by restart; a
+commit over several shards may be applied after a restart as another version than it was promised.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.terms import Access, pattern_matches
+from enact_dist.verify.chaos.journal import UNSEEN
+from enact_dist.verify.chaos.workload import MADE, VOLATILE
+from enact_dist.verify.checker import NOTHING, Anomaly, Checker, LockStory, Reading, State, Told
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from enact_dist.verify.chaos.evidence import Evidence, LockRecord, Restart
+
+_ANY_TIME: Final = (0, 1 << 62)
+_FIRST: Final = 0
+"""Epoch under which slots that keep their versions over restarts are told."""
+
+
+class History:
+    """The history of a run, ready for the checker.
+
+    Attributes:
+        chains: Slot → its states.
+        oddities: What is wrong before any order is looked for.
+        guessed: States that one of several locks has written, and nobody saw.
+    """
+
+    def __init__(self, evidence: Evidence) -> None:
+        self._locks = evidence.locks
+        self._restarts: dict[str, list[Restart]] = defaultdict(list)
+        for restart in evidence.restarts:
+            self._restarts[restart.shard].append(restart)
+        self.chains: dict[str, list[State]] = {}
+        self.oddities: list[Anomaly] = []
+        self.guessed: dict[str, None] = {}
+        self._seen: dict[str, dict[tuple[int, int], dict[str, None]]] = defaultdict(dict)
+        self._untimed: dict[str, tuple[int, int]] = {}
+        self._viewed: list[tuple[str, int, str]] = []
+        self._claims: dict[str, dict[tuple[int, int], list[tuple[LockRecord, str]]]] = {}
+        self._names: dict[str, dict[tuple[int, int], str]] = {}
+        self._claimed: dict[tuple[str, str], tuple[int, int]] = {}
+        for record in self._locks.values():
+            self._note_claims(record)
+        for record in self._locks.values():
+            self._note_seen(record)
+        self._note_viewed()
+        for slot in self._seen:
+            self._build(slot)
+        self._made: dict[str, list[str]] = {}
+
+    def checker(self) -> Checker:
+        """Return the checker of this history."""
+        stories = [self._story(record) for record in self._locks.values()]
+        stories += [LockStory(name, 0, None, Told.UNKNOWN) for name in self.guessed]
+        events = {
+            _name_of(restart): (restart.down_ns, restart.ready_ns)
+            for restarts in self._restarts.values()
+            for restart in restarts[1:]
+        }
+        return Checker(stories, self.chains, events=events | self._untimed)
+
+    def anomalies(self) -> list[Anomaly]:
+        """Return everything that is wrong with it."""
+        return [*self.oddities, *self.checker().anomalies()]
+
+    # ---------------------------------------------------------------- what is known
+
+    def _note_claims(self, record: LockRecord) -> None:
+        for slot, version, writer in record.writes:
+            at = (_epoch(record, slot), version)
+            claims = self._claims.setdefault(slot, {})
+            claims.setdefault(at, []).append((record, writer))
+            self._claimed[record.id, slot] = at
+
+    def _note_seen(self, record: LockRecord) -> None:
+        for slot, version, writer, protected in record.seen:
+            seen = self._seen[slot]  # a slot that was looked at has a chain, be it empty
+            if version == 0 or writer == UNSEEN:
+                continue
+            at = (_epoch(record, slot), version)
+            claimed = self._claimed.get((writer, slot), at)
+            if not _is_volatile(slot):
+                if writer and claimed != at:
+                    facts = (f"{slot}: {writer} wrote {claimed[1]}, {record.id} read {version}",)
+                    self.oddities.append(Anomaly("a datum under another version", facts))
+            elif not protected:
+                self._viewed.append((slot, version, writer))
+                continue
+            seen.setdefault(at, {})[writer] = None
+
+    def _note_viewed(self) -> None:
+        """Take the views of volatile slots, which know no epoch, where nobody else has looked."""
+        known = {(slot, w) for slot, seen in self._seen.items() for ws in seen.values() for w in ws}
+        for slot, version, writer in self._viewed:
+            if (slot, writer) in known:
+                continue
+            epoch, promised = self._claimed.get((writer, slot), (_FIRST, version))
+            if promised != version:
+                # Applied after a restart: the next one, as nobody saw it in a later epoch.
+                later = (r.epoch for r in self._restarts[_shard_of(slot)] if r.epoch > epoch)
+                epoch = min(later, default=epoch)
+            self._seen[slot].setdefault((epoch, version), {})[writer] = None
+
+    # ---------------------------------------------------------------- chains
+
+    def _build(self, slot: str) -> None:
+        """Tell a slot state by state."""
+        states: list[State] = []
+        names = self._names[slot] = {}
+        seen = self._seen[slot]
+        found_at: dict[str, tuple[int, int]] = {}
+        for at in sorted(seen):
+            for writer in seen[at]:
+                if writer and found_at.setdefault(writer, at) != at:
+                    facts = (f"{slot}: {writer} as {found_at[writer]} and as {at}",)
+                    self.oddities.append(Anomaly("one write stands twice", facts))
+        for epoch, restart in self._epochs(slot):
+            if restart is not None:
+                name = f"null {epoch} 0"
+                names[epoch, 0] = name
+                states.append(State(name, self._emptied_by(restart, slot), 0))
+            newest = max((version for since, version in seen if since == epoch), default=0)
+            for version in range(1, newest + 1):
+                at = (epoch, version)
+                there = self._states_at(slot, at, found_at)
+                names[at] = next((str(state.name) for state in there), "")
+                states += there
+        self.chains[slot] = states
+
+    def _emptied_by(self, restart: Restart, slot: str) -> str:
+        """Return who set a volatile slot to null at a restart.
+
+        A promise holds over it: its commit may have been told before the restart and be applied
+        after it, so of this slot nothing says when it was emptied.
+        """
+        first = self._seen[slot].get((restart.epoch, 1), ())
+        promised = [w for w in first if self._claimed.get((w, slot), (0, 0))[0] < restart.epoch]
+        if not promised:
+            return _name_of(restart)
+        name = f"{_name_of(restart)} under {promised[0]}"
+        self._untimed[name] = _ANY_TIME
+        return name
+
+    def _epochs(self, slot: str) -> Iterable[tuple[int, Restart | None]]:
+        """Return the epochs in which a slot counts anew, with the restarts that began them."""
+        if not _is_volatile(slot):
+            return [(_FIRST, None)]
+        first, *others = self._restarts[_shard_of(slot)]
+        return [(first.epoch, None), *((restart.epoch, restart) for restart in others)]
+
+    def _states_at(
+        self, slot: str, at: tuple[int, int], found_at: dict[str, tuple[int, int]]
+    ) -> list[State]:
+        """Return what stood under a version: one state, unless something is wrong."""
+        version = at[1]
+        writers = list(self._seen[slot].get(at, ()))
+        states = [State(writer, writer, version) for writer in writers if writer]
+        if "" in writers:
+            states.append(self._claimed_state(slot, at, null=True, found_at=found_at))
+        if not states and (self._may_be(slot, at, found_at) or _is_volatile(slot)):
+            states.append(self._claimed_state(slot, at, null=False, found_at=found_at))
+        return states
+
+    def _may_be(
+        self, slot: str, at: tuple[int, int], found_at: dict[str, tuple[int, int]]
+    ) -> list[tuple[LockRecord, str]]:
+        """Return who may have written a version that nobody saw; who was told so comes alone."""
+        claims = [
+            (record, writer)
+            for record, writer in self._claims.get(slot, {}).get(at, ())
+            if record.told is not Told.NOT and found_at.get(record.id, at) == at
+        ]
+        sure = [claim for claim in claims if claim[0].told is Told.COMMITTED]
+        return sure or claims
+
+    def _claimed_state(
+        self,
+        slot: str,
+        at: tuple[int, int],
+        *,
+        null: bool,
+        found_at: dict[str, tuple[int, int]],
+    ) -> State:
+        claims = self._may_be(slot, at, found_at)
+        if null:
+            claims = [claim for claim in claims if not claim[1]]
+        version = at[1]
+        if len(claims) == 1:
+            ((record, writer),) = claims
+            return State(writer or f"null {version}", record.id, version)
+        name = f"null {version}" if null else f"unseen {at[0]} {version}"
+        if null and not claims:
+            return State(name, f"nobody's {slot} {version}", version)
+        guess = f"one of {[record.id for record, _ in claims]} at {slot} {version}"
+        self.guessed[guess] = None
+        return State(name, guess, version)
+
+    # ---------------------------------------------------------------- stories
+
+    def _story(self, record: LockRecord) -> LockStory:
+        reads: list[Reading] = []
+        views: list[Reading] = []
+        for slot, version, writer, protected in record.seen:
+            reading = self._reading(record, slot, version, writer, protected=protected)
+            if reading is not None:
+                (reads if protected or slot in record.expected else views).append(reading)
+        reads += self._absent(record)
+        shards = {_shard_of(slot) for slot, _, _ in record.writes}
+        return LockStory(
+            record.id,
+            record.begun_ns,
+            record.ended_ns,
+            record.told,
+            reads,
+            views,
+            writes=[slot for slot, _, _ in record.writes if not _is_volatile(slot)],
+            outlives_restarts=len(shards) > 1,
+        )
+
+    def _reading(
+        self, record: LockRecord, slot: str, version: int, writer: str, *, protected: bool
+    ) -> Reading | None:
+        if writer not in ("", UNSEEN):
+            return Reading(slot, writer)
+        if _is_volatile(slot) and not protected:
+            return None  # null in which epoch, nobody knows
+        at = (_epoch(record, slot), version)
+        if version == 0:
+            return Reading(slot, self._names[slot].get(at, NOTHING))
+        name = self._names[slot].get(at)
+        return Reading(slot, name or f"unknown {version}")
+
+    def _absent(self, record: LockRecord) -> list[Reading]:
+        """Return what the patterns of a lock did not show, and so said to be null."""
+        if record.granted_ns is None or (not record.seen and not record.tried):
+            return []
+        shown = {slot for slot, *_ in record.seen}
+        absent = []
+        for access, context, pattern, aspect in record.items:
+            if Access(access).each:
+                made = self._matching(f"{context}:", pattern, aspect)
+                absent += [Reading(slot, NOTHING) for slot in made if slot not in shown]
+        return absent
+
+    def _matching(self, context: str, pattern: str, aspect: str) -> list[str]:
+        """Return the slots that a pattern covers; all made things are of one context."""
+        assert aspect == MADE
+        found = self._made.get(pattern)
+        if found is None:
+            found = self._made[pattern] = [
+                slot
+                for slot in self.chains
+                if slot.endswith(f"/{aspect}")
+                and slot.startswith(context)
+                and pattern_matches(pattern, slot[len(context) : -len(aspect) - 1])
+            ]
+        return found
+
+
+def _is_volatile(slot: str) -> bool:
+    return slot.endswith(f"/{VOLATILE}")
+
+
+def _shard_of(slot: str) -> str:
+    """Return the shard that a thing is pinned to; of made things, some name of their own."""
+    _, shard, _ = slot.partition(":")[2].split("/")[:3]
+    return shard
+
+
+def _epoch(record: LockRecord, slot: str) -> int:
+    return record.epochs.get(_shard_of(slot), _FIRST) if _is_volatile(slot) else _FIRST
+
+
+def _name_of(restart: Restart) -> str:
+    return f"restart {restart.epoch} of {restart.shard}"

@@ -1,0 +1,141 @@
+"""One run: a cell on hosts of its own, clients, faults, rest, and a last look at everything."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import time
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.errors import ConfigError, LinkError
+from enact_dist.verify.chaos import daemon
+from enact_dist.verify.chaos.cell import END_S, TestedCell
+from enact_dist.verify.chaos.evidence import FAULTS, SETTINGS
+from enact_dist.verify.chaos.faults import DECK, Injector
+from enact_dist.verify.chaos.hosts import open_hosts
+from enact_dist.verify.chaos.journal import Journal
+from enact_dist.verify.checker import Told
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+    from pathlib import Path
+
+
+TTL_S: Final = 1.0
+CLIENTS_PER_HOST: Final = 2
+WATCHER_HOST: Final = "watch"
+REST_S: Final = 10.0
+"""How long locks may be left after the last client has gone; leases end after one TTL."""
+
+
+@dataclass(frozen=True, slots=True)
+class ChaosSettings:
+    """What a run is told.
+
+    Attributes:
+        seconds: How long faults happen.
+        seed: What faults and clients are drawn from.
+        namespaces_required: Whether to fail where there are no network namespaces.
+        daemon_module: Runs a shard; tests put a broken one in its place.
+        deck: How many faults of each kind come in turn.
+    """
+
+    seconds: float
+    seed: int
+    shards: int = 3
+    actors: int = 8
+    namespaces_required: bool = False
+    daemon_module: str = daemon.MODULE
+    deck: Mapping[str, int] = field(default_factory=lambda: DECK)
+
+
+def run(settings: ChaosSettings, folder: Path, *, progress: Callable[[str, float], None]) -> None:
+    """Run once; everything that happened is in `folder` afterwards, also where it went wrong.
+
+    Args:
+        settings: What to do.
+        folder: Existing and empty.
+        progress: Gets what is being done, and how many seconds of faults are left.
+
+    Raises:
+        ConfigError: The folder is not empty.
+        LinkError: Namespaces are required and cannot be made.
+    """
+    if any(folder.iterdir()):
+        raise ConfigError(f"{folder} is not empty; name a new folder")
+    shards = tuple(f"s{index}" for index in range(settings.shards))
+    groups = tuple(f"g{index}" for index in range(-(-settings.actors // CLIENTS_PER_HOST)))
+    hosts = open_hosts(
+        (*shards, *groups, WATCHER_HOST),
+        other_clock=groups[-1],
+        required=settings.namespaces_required,
+    )
+    log = Journal(folder / FAULTS)
+    told = {
+        "seed": settings.seed,
+        "seconds": settings.seconds,
+        "shards": settings.shards,
+        "actors": settings.actors,
+        "ttl_s": TTL_S,
+        "missing": hosts.missing,
+        "groups": {f"a{i}": groups[i // CLIENTS_PER_HOST] for i in range(settings.actors)},
+    }
+    (folder / SETTINGS).write_text(json.dumps(told, indent=1) + "\n")
+    cell = TestedCell(
+        folder,
+        hosts,
+        shards,
+        log,
+        ttl_s=TTL_S,
+        seed=settings.seed,
+        daemon_module=settings.daemon_module,
+    )
+    try:
+        progress("starting", settings.seconds)
+        cell.start(shards, told["groups"], watcher_host=WATCHER_HOST)  # type: ignore[arg-type]
+        injector = Injector(
+            cell, hosts, groups, log, seed=settings.seed, ttl_s=TTL_S, deck=settings.deck
+        )
+        injector.run(settings.seconds, progress=lambda left_s: progress("faults", left_s))
+        progress("coming to rest", 0.0)
+        _rest(cell, log)
+    except LinkError as error:
+        log.write("failure", "a process failed", str(error))
+    finally:
+        cell.close()
+        hosts.close()
+        log.close()
+
+
+def _rest(cell: TestedCell, log: Journal) -> None:
+    """Let everything end by itself, and look at what is left."""
+    cell.wait_ready()
+    for client in cell.clients.values():
+        client.process.tell("stop")
+    for client in cell.clients.values():
+        client.process.expect("done", timeout_s=END_S)
+    cell.watcher.tell("final")
+    told = cell.watcher.expect("final", timeout_s=END_S)
+    if told != Told.COMMITTED.value:
+        log.write("failure", "not everything can be read at the end", told)
+    cell.watcher.tell(f"rest {REST_S}")
+    left = int(cell.watcher.expect("left", timeout_s=END_S))
+    if left:
+        what = f"{left} locks" if left > 0 else "a shard that does not answer"
+        log.write("failure", "a lock is left", what)
+    cell.watcher.tell("end")
+    cell.watcher.expect("done", timeout_s=END_S)
+    for shard in cell.shards.values():
+        shard.ready.clear()
+        shard.process.signal(signal.SIGTERM)
+    for name, shard in cell.shards.items():
+        status = shard.process.wait_status(END_S)
+        if status != 0:
+            log.write("failure", "a shard does not end well", f"{name}: {status}")
+
+
+def seed_of_now() -> int:
+    """Return a seed that no run had before."""
+    return (time.time_ns() // 1000 ^ os.getpid()) % 10**9

@@ -1,0 +1,205 @@
+"""Real shards and clients as processes of a throw-away cell, for whoever measures or breaks them.
+
+A process here is asked with lines on its standard input and tells with lines on its output; the
+clock that its lines quote is the machine's monotonic one, which all processes share.
+"""
+
+from __future__ import annotations
+
+import os
+import queue
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.errors import LinkError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+LINE_S: Final = 30.0
+"""How long a line may stay out before the process counts as hung."""
+COMMAND: Final = "enact_dist.cli.main"
+
+
+def free_port() -> int:
+    """Return a TCP port of the loopback that nobody listens at."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+class LineProcess:
+    """A child process, `python -m module words…`, whose lines can be waited for.
+
+    Args:
+        module: What to run; its arguments are `words`.
+        words: See `module`.
+        log: Gets what it writes to its standard error.
+        before: A command that ends by running the one that follows it, such as `nsenter`.
+
+    Attributes:
+        started_s: Monotonic time just before it was started.
+        ready_s: When it said that it serves; 0 for clients.
+    """
+
+    def __init__(
+        self, module: str, words: Sequence[str], log: Path, *, before: Sequence[str] = ()
+    ) -> None:
+        self.name = f"{module} {' '.join(words)}"
+        self.started_s = time.monotonic()
+        self.ready_s = 0.0
+        self._log = log
+        self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+        with log.open("ab") as errors:
+            self._popen = subprocess.Popen(
+                [*before, sys.executable, "-m", module, *words],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=errors,
+                text=True,
+                env={**os.environ, "PYTHONUNBUFFERED": "1"},
+            )
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self._popen.stdout is not None
+        for line in self._popen.stdout:
+            self._lines.put(line.rstrip("\n"))
+        self._lines.put(None)
+
+    @property
+    def pid(self) -> int:
+        """The process id."""
+        return self._popen.pid
+
+    def expect(self, start: str, *, timeout_s: float = LINE_S) -> str:
+        """Return what follows `start` on the next line that begins with it.
+
+        Raises:
+            LinkError: The process ended first, or the line stayed out.
+        """
+        deadline_s = time.monotonic() + timeout_s
+        while True:
+            try:
+                line = self._lines.get(timeout=max(0.0, deadline_s - time.monotonic()))
+            except queue.Empty:
+                raise self._error(f"said no line {start!r} within {timeout_s:g} s") from None
+            if line is None:
+                raise self._error(f"ended ({self._popen.wait()}) before it said {start!r}")
+            if line.startswith(start):
+                return line[len(start) :].strip()
+
+    def _error(self, found: str) -> LinkError:
+        last = self._log.read_text(errors="replace")[-2000:].strip()
+        return LinkError(f"{self.name} {found}; its log ends with: {last or 'nothing'}")
+
+    def tell(self, line: str) -> None:
+        """Send one line."""
+        assert self._popen.stdin is not None
+        self._popen.stdin.write(line + "\n")
+        self._popen.stdin.flush()
+
+    @property
+    def status(self) -> int | None:
+        """Its exit status; None while it runs."""
+        return self._popen.poll()
+
+    def wait_status(self, timeout_s: float) -> int | None:
+        """Wait for its end for so long; return its exit status, None while it runs."""
+        try:
+            return self._popen.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            return None
+
+    def signal(self, number: int) -> None:
+        """Send it a signal."""
+        self._popen.send_signal(number)
+
+    def kill(self) -> float:
+        """SIGKILL it; return the monotonic time at which it was gone, in seconds."""
+        self._popen.send_signal(signal.SIGKILL)
+        return self.wait_ended()
+
+    def wait_ended(self) -> float:
+        """Wait until it has ended by itself; return when, as `kill` does."""
+        self._popen.wait(LINE_S)
+        return time.monotonic()
+
+    def end(self) -> None:
+        """Kill what still runs and give back everything; twice is harmless."""
+        if self._popen.poll() is None:
+            self._popen.kill()
+        self._popen.wait()
+        self._reader.join()
+        for pipe in (self._popen.stdin, self._popen.stdout):
+            if pipe is not None:
+                pipe.close()
+
+
+class CellProcesses:
+    """The shards of one cell on the loopback, and clients that join it.  A context manager.
+
+    Args:
+        folder: Existing and empty: for `cell.toml`, data and logs.
+        shards: Their names.
+        pins: Entity pattern → shard.
+        ttl_s: Session TTL of the cell.
+    """
+
+    def __init__(
+        self, folder: Path, shards: Sequence[str], *, pins: dict[str, str], ttl_s: float
+    ) -> None:
+        self.folder = folder
+        self.file = folder / "cell.toml"
+        self.shards: dict[str, LineProcess] = {}
+        self._all: list[LineProcess] = []
+        lines = [
+            'name = "verify"',
+            'worlds = ["online"]',
+            f"session_ttl_s = {ttl_s}",
+            f'data_folder = "{folder}/data"',
+        ]
+        for name in shards:
+            lines += [f"[shards.{name}]", f'listen = "tcp/127.0.0.1:{free_port()}"']
+        for pattern, shard in pins.items():
+            lines += ["[[pins]]", f'entities = "{pattern}"', f'shard = "{shard}"']
+        self.file.write_text("\n".join(lines) + "\n")
+
+    def start_shard(self, name: str) -> LineProcess:
+        """Start a shard's daemon; return once it serves."""
+        words = ("shard", "run", name, "--cell", str(self.file))
+        daemon = self._start(COMMAND, words, f"{name}.log")
+        self.shards[name] = daemon
+        daemon.expect("ready:")
+        daemon.ready_s = time.monotonic()
+        return daemon
+
+    def start_client(self, module: str, *words: str) -> LineProcess:
+        """Start a client; its first word is the cell's file."""
+        log = f"client-{len(self._all)}.log"
+        return self._start(module, (str(self.file), *words), log)
+
+    def _start(self, module: str, words: Sequence[str], log: str) -> LineProcess:
+        process = LineProcess(module, words, self.folder / log)
+        self._all.append(process)
+        return process
+
+    def end(self, process: LineProcess) -> None:
+        """End one process before the others."""
+        process.end()
+        self._all.remove(process)
+
+    def __enter__(self) -> CellProcesses:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for process in reversed(self._all):
+            process.end()

@@ -1,0 +1,100 @@
+"""The rules of clients: alone with a lock (I7), nothing stale, what they are told is true (I5)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from enact_dist.core.multilock import Phase
+from enact_dist.terms import Access, Durability
+from enact_dist.verify.simulation.history import TOLD_NOT, Entry, History, conflict
+
+if TYPE_CHECKING:
+    from enact_dist.core.datum import Datum
+    from enact_dist.core.lock_parts import Reading
+    from enact_dist.core.multilock import MultiLock
+    from enact_dist.verify.simulation.client_host import ClientHost
+    from enact_dist.verify.simulation.model import Model
+    from enact_dist.verify.simulation.world import World
+
+
+class ClientJudge:
+    """Looks at what clients believe, read and are told."""
+
+    def __init__(self, world: World, history: History, model: Model) -> None:
+        self._world, self._history, self._model = world, history, model
+        self._fail = world.violation
+        self.clients: list[ClientHost] = []
+
+    def holds(self, host: ClientHost, entry: Entry) -> None:
+        """A thread has its lock."""
+        self._world.tally["locks held"] += 1
+        self.check_beliefs(host)
+
+    def check_beliefs(self, host: ClientHost) -> None:
+        """I7: whoever believes in a lock now is alone with it."""
+        entries = self._history.entries
+        mine = _believed(host)
+        if not mine:
+            return
+        for other in self.clients:
+            if not other.up:
+                continue
+            for theirs in _believed(other):
+                for lock in mine:
+                    if lock is not theirs and conflict(
+                        entries[lock.lock].items, entries[theirs.lock].items
+                    ):
+                        self._fail("I7 two believers", lock.lock, theirs.lock)
+
+    def datum_seen(self, reading: Reading, datum: Datum | None) -> None:
+        """A thread looks at a datum, from the grant, its cache or a fetch: is it the right one?"""
+        picture = self._model.pictures[reading.shard]
+        state = reading.state
+        for one in reversed(picture.chains.get(state.slot, ())):
+            if one.epoch <= reading.epoch and one.name == (state.version, state.stamp_ns):
+                same = (one.datum is None) == (datum is None) and (
+                    datum is None or one.datum is None or bytes(datum.body) == bytes(one.datum.body)
+                )
+                if not same:
+                    self._fail("no stale datum is served", reading, one)
+                return
+        if (state.version, state.stamp_ns) != (0, 0) or datum is not None:
+            self._fail("what is read was committed", reading)
+
+    def told(self, host: ClientHost, entry: Entry) -> None:
+        """A thread was told how its lock ended: is it true?"""
+        self._world.tally[f"told: {entry.told.value if entry.told else '-'}"] += 1
+        applied = any(entry.id in picture.applied for picture in self._model.pictures.values())
+        refusal = entry.lock.refusal
+        if refusal is not None and not (
+            self._model.clocks_were_set and refusal.code == "clock_skew"
+        ):
+            self._fail("nothing is refused", entry.id, refusal)
+        applied = applied or entry.id in self._model.permitted_losses
+        if entry.told is Phase.COMMITTED and entry.lock.versions and not applied:
+            self._fail("I5 told committed, not visible", entry.id)
+        if entry.told in TOLD_NOT and applied and not self._may_be_gone(entry):
+            self._fail("I5 told not committed, but visible", entry.id, entry.told, entry.lock.cause)
+
+        if entry.told is Phase.COMMITTED:
+            self._check_confirmed(entry)
+
+    def _check_confirmed(self, entry: Entry) -> None:
+        """P3: each part was asked, at its end, whether it had been held all the time."""
+        for part in entry.lock.parts:
+            picture = self._model.pictures[part.shard]
+            if part.token != picture.confirmed.get(entry.id):
+                self._fail("P3 every lock is confirmed", entry.id, part.shard, part.token)
+
+    def _may_be_gone(self, entry: Entry) -> bool:
+        """Whether a restart may have undone the lock's writes: volatile, or `os` and power cut."""
+        written = (item for item in entry.items if Access(item.access).writes)
+        volatile = all(
+            self._model.durabilities[item.aspect] is Durability.VOLATILE for item in written
+        )
+        return volatile or entry.id in self._model.permitted_losses
+
+
+def _believed(host: ClientHost) -> list[MultiLock]:
+    now_ns = host.local_ns
+    return [lock for lock in host.client.live_locks() if lock.valid(now_ns)]

@@ -1,0 +1,147 @@
+"""Runs many seeds, on as many processes as wanted, and adds up what happened."""
+
+from __future__ import annotations
+
+import itertools
+import multiprocessing
+import signal
+import time
+from collections import Counter
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+from enact_dist.verify.simulation.scenario import Result, Scenario
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+_FRESH_NS = 1_000_000
+
+
+def fresh_seed() -> int:
+    """Return a first seed that nobody has begun with: milliseconds since 1970.
+
+    No machine runs a thousand seeds per second, so that a later series never meets an earlier one.
+    """
+    return time.time_ns() // _FRESH_NS
+
+
+@dataclass(slots=True)
+class Totals:
+    """What a series of seeds has shown.
+
+    Attributes:
+        cpu_s: Of all processes that ran seeds.
+        interrupted: Ended with Ctrl-C, so that fewer seeds ran than were asked for.
+    """
+
+    first: int
+    seeds: int = 0
+    simulated_s: float = 0.0
+    wall_s: float = 0.0
+    cpu_s: float = 0.0
+    tally: Counter[str] = field(default_factory=Counter)
+    failures: list[Result] = field(default_factory=list)
+    interrupted: bool = False
+
+    def add(self, result: Result, cpu_s: float) -> None:
+        """Add what one seed has shown."""
+        self.seeds += 1
+        self.simulated_s += result.simulated_s
+        self.cpu_s += cpu_s
+        self.tally += result.tally
+        if result.violation:
+            self.failures.append(result)
+
+    @property
+    def crashes(self) -> int:
+        """Shards that died, and clients that were killed."""
+        return sum(self.tally[name] for name in ("crashes", "power cuts", "clients killed"))
+
+    @property
+    def partitions(self) -> int:
+        """Links that were cut for a while."""
+        return sum(n for name, n in self.tally.items() if name.startswith("partitions"))
+
+
+def run_series(
+    first: int,
+    *,
+    count: int | None = None,
+    seconds: float | None = None,
+    at_least: int = 0,
+    jobs: int = 1,
+    step: int = 1,
+    keep_going: bool = False,
+    on_progress: Callable[[Totals], None] = lambda _totals: None,
+) -> Totals:
+    """Run seeds until enough have run, the time is over or one breaks a rule.
+
+    Args:
+        first: The first seed.
+        count: How many seeds at most.
+        seconds: How long at most; what runs then is waited for.
+        at_least: So many seeds run even if the time is over.
+        jobs: Processes that run them.
+        step: From one seed to the next.
+        keep_going: Do not stop at a broken rule.
+        on_progress: Called after every seed.
+    """
+    totals, started_s = Totals(first), time.monotonic()
+
+    def wanted() -> Iterator[int]:
+        """Give the next seed, as long as there is time for one and no reason to stop."""
+        numbers = itertools.count() if count is None else iter(range(count))
+        for number in numbers:
+            over = seconds is not None and time.monotonic() - started_s >= seconds
+            if over and number >= at_least:
+                return
+            if totals.failures and not keep_going:
+                return
+            yield first + number * step
+
+    try:
+        for result, cpu_s in _here(wanted()) if jobs == 1 else _on_processes(wanted(), jobs):
+            totals.add(result, cpu_s)
+            on_progress(totals)
+    except KeyboardInterrupt:
+        totals.interrupted = True
+    totals.wall_s = time.monotonic() - started_s
+    return totals
+
+
+def _run(seed: int) -> tuple[Result, float]:
+    before_s = time.process_time()
+    result = Scenario(seed).run()
+    if not result.violation:
+        result = replace(result, faults=(), locks=())
+    return result, time.process_time() - before_s
+
+
+def _here(seeds: Iterator[int]) -> Iterator[tuple[Result, float]]:
+    for seed in seeds:
+        yield _run(seed)
+
+
+def _on_processes(seeds: Iterator[int], jobs: int) -> Iterator[tuple[Result, float]]:
+    context = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(jobs, mp_context=context, initializer=_ignore_interrupts)
+    under_way: set[Future[tuple[Result, float]]] = set()
+    try:
+        while True:
+            # One more than there are processes, so that none waits for its next seed.
+            for seed in itertools.islice(seeds, jobs + 1 - len(under_way)):
+                under_way.add(pool.submit(_run, seed))
+            if not under_way:
+                return
+            done, under_way = wait(under_way, return_when=FIRST_COMPLETED)
+            for future in done:
+                yield future.result()
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _ignore_interrupts() -> None:
+    """Leave Ctrl-C to the process that started this one."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)

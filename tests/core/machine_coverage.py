@@ -1,0 +1,96 @@
+"""How often each cell (state, event) was met: counted, asserted and printed.
+
+A state machine that never gets anywhere finds nothing, and says so to nobody.  So each cell has to
+be hit a number of times, and each cell that cannot be hit is listed with its reason and must not be.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+FULL_EXAMPLES = 500
+"""Examples of the full amount, each of up to `STEPS` steps: `ENACT_MACHINE_EXAMPLES=500`."""
+STEPS = 100
+FULL_HITS = 50
+"""Hits of each cell that the full amount must bring."""
+
+
+def examples(usual: int) -> int:
+    """Return how many examples to run: what fits into CI, or what the environment asks for."""
+    return int(os.environ.get("ENACT_MACHINE_EXAMPLES", "0")) or usual
+
+
+def hits_wanted(count: int) -> int:
+    """Return the hits that so many examples owe each cell: half their share, short of the full."""
+    return FULL_HITS if count >= FULL_EXAMPLES else max(1, FULL_HITS * count // FULL_EXAMPLES // 2)
+
+
+class Coverage:
+    """Counts of cells over all examples of one run.
+
+    Args:
+        states: The rows.
+        events: The columns.
+        unreachable: Cells that no run can meet, with the reason.
+    """
+
+    def __init__(
+        self,
+        states: Sequence[str],
+        events: Sequence[str],
+        unreachable: Mapping[tuple[str, str], str],
+    ) -> None:
+        self.states, self.events, self.unreachable = states, events, unreachable
+        self.hits: Counter[tuple[str, str]] = Counter()
+        self.tally: Counter[str] = Counter()
+
+    def hit(self, state: str, event: str) -> None:
+        """Note that an event has met a state."""
+        self.hits[state, event] += 1
+
+    def problems(self, wanted: int) -> list[str]:
+        """Return the cells that were met too seldom, and those that were met against reason."""
+        unknown = self.hits.keys() - {(s, e) for s in self.states for e in self.events}
+        found = [f"unknown cell {cell}" for cell in unknown]
+        for state in self.states:
+            for event in self.events:
+                cell, hits = (state, event), self.hits[state, event]
+                if cell in self.unreachable and hits:
+                    found.append(f"{cell} was met {hits} times: {self.unreachable[cell]}")
+                elif cell not in self.unreachable and hits < wanted:
+                    found.append(f"{cell} was met {hits} times of {wanted}")
+        return found
+
+    @property
+    def rarest(self) -> int:
+        """The hits of the least met cell that can be met."""
+        return min(
+            self.hits[state, event]
+            for state in self.states
+            for event in self.events
+            if (state, event) not in self.unreachable
+        )
+
+    def table(self) -> str:
+        """Return the counts as text: one row per event, one column per state, `-` unreachable."""
+        names = [state.replace(" ", "_") for state in self.states]
+        first = max(map(len, self.events))
+        widths = [max(6, len(name)) for name in names]
+        head = " ".join(name.rjust(w) for name, w in zip(names, widths, strict=True))
+        lines = [f"{'':{first}} {head}"]
+        for event in self.events:
+            cells = [
+                "-" if (state, event) in self.unreachable else str(self.hits[state, event])
+                for state in self.states
+            ]
+            row = " ".join(cell.rjust(w) for cell, w in zip(cells, widths, strict=True))
+            lines.append(f"{event:{first}} {row}")
+        tally = ", ".join(f"{name} {count}" for name, count in sorted(self.tally.items()))
+        reachable = len(self.states) * len(self.events) - len(self.unreachable)
+        lines.append(f"{tally}; {reachable} cells, rarest {self.rarest}")
+        return "\n".join(lines)

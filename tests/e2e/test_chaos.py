@@ -1,0 +1,295 @@
+"""Real daemons and clients killed, stopped and cut off: no anomaly, and everything has happened.
+
+The run is made once; what it recorded is then doctored in memory, to see that the checker would
+have noticed.
+"""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from enact_dist.cli.main import main
+from enact_dist.errors import LinkError
+from enact_dist.verify.chaos import evidence, faults, runner
+from enact_dist.verify.chaos.figures import judge
+from enact_dist.verify.chaos.hosts import open_hosts
+from enact_dist.verify.checker import Told
+
+pytestmark = pytest.mark.slow
+SECONDS = float(os.environ.get("ENACT_CHAOS_SECONDS", "55"))
+
+
+@pytest.fixture(scope="module")
+def _namespaces():
+    """Skip where the system has no namespaces; the root conftest makes that a failure in CI."""
+    try:
+        open_hosts(("one",), other_clock="one", required=True).close()
+    except LinkError as error:
+        pytest.skip(str(error))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory, _namespaces):
+    """The folder of one run of all kinds of faults."""
+    kept = tmp_path_factory.mktemp("chaos") / "kept"
+    minutes = str(SECONDS / 60)
+    status = main(["verify", "--chaos", "--minutes", minutes, "--keep", str(kept), "--json"])
+    return kept, status
+
+
+@pytest.fixture
+def found(folder):
+    """The evidence of the run, for a test to doctor."""
+    return evidence.load(folder[0])
+
+
+def rules(found):
+    return {anomaly.rule for anomaly in judge(found).anomalies}
+
+
+def test_nothing_is_lost_doubled_or_half_done(folder):
+    """A run of every kind of fault: no anomaly, and none of the kinds is missing."""
+    kept, status = folder
+    verdict = judge(evidence.load(kept))
+
+    assert verdict.anomalies == []
+    assert status == 0
+    hit = verdict.faults
+    assert hit[faults.KILL_SHARD] + hit[faults.KILL_CLIENT] >= 10, hit
+    assert hit[faults.STOP_SHARD] + hit[faults.STOP_CLIENT] >= 10, hit
+    assert hit[faults.PARTITION] + hit[faults.ONE_WAY] >= 6, hit
+    assert hit[faults.RESTART] > 0
+    assert hit[faults.WALL_CLOCK] > 0
+    assert not verdict.missing
+    assert verdict.fenced > 0
+    assert verdict.counters["fenced"] > 0
+    assert verdict.counters["resolves_asked"] > 0
+    assert verdict.epoch_changes > 5
+    assert verdict.commits > 500
+    assert verdict.over_shards > 100
+    assert verdict.views_checked > 50
+    assert verdict.recovery["serving to first grant"].n > 3
+
+
+def processes_of(folder):
+    """Return the ids of other processes that name the folder."""
+    named, found = str(folder).encode(), []
+    for process in Path("/proc").iterdir():
+        if process.name.isdigit() and int(process.name) != os.getpid():
+            try:
+                if named in (process / "cmdline").read_bytes():
+                    found.append(int(process.name))
+            except OSError:
+                continue  # it has just ended
+    return found
+
+
+def test_nobody_is_left_afterwards(folder):
+    """No process still works in the folder of the run."""
+    assert processes_of(folder[0]) == []
+
+
+@pytest.mark.parametrize(
+    ("number", "status"), [(signal.SIGINT, 130), (signal.SIGKILL, -signal.SIGKILL)]
+)
+@pytest.mark.usefixtures("_namespaces")
+def test_nobody_is_left_when_the_run_is_broken_off(tmp_path, number, status):
+    """Ctrl-C, and even a kill of the runner, end every process, stopped ones too."""
+    kept = tmp_path / "kept"
+    command = [sys.executable, "-m", "enact_dist.cli.main", "verify", "--chaos", "--keep", kept]
+    with subprocess.Popen(
+        [*command, "--actors", "2"], stderr=subprocess.PIPE, text=True, start_new_session=True
+    ) as run:
+        for line in run.stderr:
+            if line.startswith("chaos: faults"):
+                break
+        working = processes_of(kept)
+        assert len(working) > 5
+        stopped = next(pid for pid in working if pid != run.pid)
+        os.kill(stopped, signal.SIGSTOP)
+
+        run.send_signal(number)
+
+        assert run.wait(30) == status
+    deadline_s = time.monotonic() + 10
+    while processes_of(kept) and time.monotonic() < deadline_s:
+        time.sleep(0.05)  # nothing tells when a process of somebody else has ended
+    assert processes_of(kept) == []
+
+
+def test_history_is_checked_again_from_its_folder(folder, capsys):
+    """`enact verify --history` says the same of the same journals."""
+    kept, status = folder
+
+    assert main(["verify", "--history", str(kept), "--json"]) == status
+    told = json.loads(capsys.readouterr().out)
+    assert told["commits"] == judge(evidence.load(kept)).commits
+
+
+# ---------------------------------------------------------------- doctored histories
+
+
+def kept_slot(found):
+    """Return a durable slot with many versions."""
+    final = found.locks["final.1"]
+    return max(
+        ((slot, version) for slot, version, _, _ in final.seen if slot.endswith("/kept")),
+        key=lambda seen: seen[1],
+    )
+
+
+def rewritten(record, change):
+    """Let a lock have seen something else; `change` gets and returns (slot, version, writer)."""
+    record.seen = [(*change(*reading), held) for *reading, held in record.seen]
+    record.writes = [change(*written) for written in record.writes]
+
+
+def test_swapped_versions_are_named(found):
+    """Two writers of one slot that trade places, wherever anybody saw or wrote them."""
+    slot, newest = kept_slot(found)
+    one, other = newest // 2, newest // 2 + 1
+
+    def change(at, version, writer):
+        swapped = {one: other, other: one}.get(version, version)
+        return (at, swapped, writer) if at == slot else (at, version, writer)
+
+    for record in found.locks.values():
+        rewritten(record, change)
+
+    assert rules(found) & {"stale read", "real time order is broken", "lost update"}
+
+
+def test_dropped_commit_is_named(found):
+    """The last commit of a slot is undone: the last reader sees what it had overwritten."""
+    slot, newest = kept_slot(found)
+    older = {
+        version: writer
+        for record in found.locks.values()
+        for at, version, writer, _ in record.seen
+        if at == slot
+    }
+    assert older[newest], "the last state is a datum"
+
+    def change(at, version, writer):
+        return (
+            (at, newest - 1, older.get(newest - 1, ""))
+            if (at, version)
+            == (
+                slot,
+                newest,
+            )
+            else (at, version, writer)
+        )
+
+    for record in found.locks.values():
+        if older[newest] != record.id:
+            record.seen = [(*change(*reading), held) for *reading, held in record.seen]
+
+    assert rules(found) & {"told committed, but lost", "half a commit"}
+
+
+def test_half_of_a_commit_is_named(found):
+    """A commit over shards of which one part never came: versions above it close the gap."""
+    final = {slot: version for slot, version, _, _ in found.locks["final.1"].seen}
+    record, (slot, version, _) = next(
+        (record, written)
+        for record in found.locks.values()
+        if record.told is Told.COMMITTED and len(record.writes) > 1
+        for written in record.writes
+        if written[0].endswith("/kept") and 1 < written[1] < final[written[0]] - 3
+    )
+
+    def change(at, seen, writer):
+        if at != slot or seen < version or (seen == version and writer != record.id):
+            return at, seen, writer
+        return at, seen - 1, writer
+
+    before = next(
+        (writer)
+        for other in found.locks.values()
+        for at, seen, writer, _ in other.seen
+        if (at, seen) == (slot, version - 1)
+    )
+    for other in found.locks.values():
+        if other is record:
+            continue
+        rewritten(other, change)
+        other.seen = [
+            (at, seen, before if (at, writer) == (slot, record.id) else writer, held)
+            for at, seen, writer, held in other.seen
+        ]
+
+    assert rules(found) & {"half a commit", "told committed, but lost"}
+
+
+def test_told_not_but_visible_is_named(found):
+    """A commit whose client was told no."""
+    record = next(
+        lock
+        for lock in found.locks.values()
+        if lock.told is Told.COMMITTED and any(slot.endswith("/kept") for slot, *_ in lock.writes)
+    )
+    record.told = Told.NOT
+
+    assert rules(found) & {"told not committed, but visible", "versions have a gap"}
+
+
+def test_reader_moved_in_time_is_named(found):
+    """A reader that is said to have begun after all others had ended read what was old by then."""
+    slot, newest = kept_slot(found)
+    record = next(
+        lock
+        for lock in found.locks.values()
+        if lock.told is Told.COMMITTED
+        and not lock.writes
+        and any(held and version < newest - 3 for at, version, _, held in lock.seen if at == slot)
+    )
+    late_ns = max(lock.ended_ns or 0 for lock in found.locks.values())
+    record.begun_ns, record.ended_ns = late_ns + 1, late_ns + 2
+
+    assert rules(found) & {"stale read"}
+
+
+def test_failure_of_a_process_is_an_anomaly(found):
+    """What the runner noted while it ran counts, too."""
+    found.failures.append(("a lock is left", "1 locks"))
+    restart = found.restarts[-1]
+    found.restarts[-1] = replace(restart, ready_ns=restart.ready_ns + 1)
+
+    assert rules(found) == {"a lock is left"}
+
+
+# ---------------------------------------------------------------- a broken shard
+
+
+@pytest.mark.usefixtures("_namespaces")
+def test_shard_without_a_fence_is_caught(tmp_path, monkeypatch):
+    """With commits applied though their locks were taken away, stopped clients do harm."""
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))
+    settings = runner.ChaosSettings(
+        20.0,
+        seed=5,
+        shards=2,
+        actors=4,
+        namespaces_required=True,
+        daemon_module="unfenced_daemon",
+        deck={faults.STOP_CLIENT: 1},
+    )
+    runner.run(settings, tmp_path, progress=lambda *_: None)
+
+    found = rules(evidence.load(tmp_path))
+
+    assert found & {
+        "one version was written twice",
+        "told committed, but lost",
+        "told not committed, but visible",
+        "lost update",
+        "a datum under another version",
+    }, found

@@ -1,0 +1,28 @@
+"""Shards killed at each step of a commit over shards: all or nothing, told truly, soon free."""
+
+import os
+
+import pytest
+from decision_rounds import PINS, STEP_AT, DecisionRounds, figures_to
+
+from enact_dist.link import client as link_client
+
+pytestmark = pytest.mark.slow
+ROUNDS = int(os.environ.get("ENACT_DECISION_KILLS", "10"))
+TTL_S = float(os.environ.get("DECISION_KILLS_TTL_S", "1.0"))
+
+
+@pytest.mark.parametrize("step", STEP_AT)
+def test_commit_is_all_or_nothing_when_shards_die_at(step, make_cell, monkeypatch):
+    """10 rounds per step, primary or participant or both die: told is true, locks end in 2 TTLs."""
+    monkeypatch.setattr(link_client, "FINISH_S", link_client.FINISH_S)  # undoes what rounds set
+    cell = make_cell(shards=("s0", "s1"), pins=PINS, ttl_s=TTL_S)
+    rounds = DecisionRounds(cell, step, ttl_s=TTL_S, seed=len(step))
+    try:
+        for number in range(ROUNDS):
+            rounds.run(number)
+    finally:
+        rounds.close()
+        figures_to(rounds.tally.line(step, TTL_S) if rounds.tally.rounds else f"{step}: no round")
+
+    assert rounds.tally.free_ttls(TTL_S, 1.0) <= 2.0, rounds.tally.free_s

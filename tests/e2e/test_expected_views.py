@@ -1,0 +1,283 @@
+"""What a lock has read, viewed and expected, judged over one embedded shard and over two daemons."""
+
+import signal
+import threading
+import time
+from dataclasses import dataclass, field
+
+import pytest
+from decision_rounds import COUNT, LEFT, PINS, RIGHT, start_trapped
+
+from enact_dist import Lock, Read, View, Write, connect, local
+from enact_dist.core.messages import Commit
+from enact_dist.errors import (
+    ChangedError,
+    CommitUnknownError,
+    LeaseLostError,
+    MisuseError,
+    ShardUnreachableError,
+)
+from enact_dist.link import client as link_client
+from enact_dist.verify.checker import Checker, LockStory, Reading, State, Told
+
+pytestmark = pytest.mark.slow
+TTL_S = 1.0
+
+
+def start_accounts(cell):
+    for entity in (LEFT, RIGHT):
+        cell.world("online").init(entity, COUNT, 0)
+    return cell
+
+
+@pytest.fixture
+def daemons(make_cell):
+    """Two shards with one account of 0 on each."""
+    cell = make_cell(shards=("s0", "s1"), pins=PINS, ttl_s=TTL_S)
+    for name in cell.ports:
+        start_trapped(cell, name)
+    return cell
+
+
+@pytest.fixture(params=["embedded", "daemons"])
+def joined(request):
+    """A connection to both accounts, in this process or over two daemons."""
+    if request.param == "embedded":
+        with local(worlds=["online"]) as cell:
+            yield start_accounts(cell)
+    else:
+        with connect(request.getfixturevalue("daemons").file) as cell:
+            yield start_accounts(cell)
+
+
+def seen(cell, *entities):
+    views = [View(cell.world("online"), entity, COUNT) for entity in entities]
+    snapshot = cell.world("online").view(*views)
+    return [snapshot[view] for view in views]
+
+
+# ---------------------------------------------------------------- each views what the other writes
+
+
+@dataclass
+class Skew:
+    """Two locks that each write one account and view the other; both have viewed before either ends."""
+
+    cell: object
+    expects: bool
+    in_turn: bool
+    viewed: threading.Barrier = field(default_factory=lambda: threading.Barrier(2))
+    first_ended: threading.Event = field(default_factory=threading.Event)
+    told: dict = field(default_factory=dict)
+    stories: list = field(default_factory=list)
+
+    def run(self):
+        threads = [
+            threading.Thread(target=self._lock, args=pair)
+            for pair in ((LEFT, RIGHT), (RIGHT, LEFT))
+        ]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        return self.told
+
+    def _lock(self, mine, other):
+        world = self.cell.world("online")
+        write, view = Write(world, mine, COUNT), View(world, other, COUNT)
+        begun_ns, error, base = time.monotonic_ns(), None, 0
+        try:
+            with Lock(write, view, wait_s=10.0) as lock:
+                base = lock.version(view)
+                lock[write] = lock[view] + 1
+                if self.expects:
+                    lock.expect(view)
+                self.viewed.wait(10.0)
+                if self.in_turn and mine == RIGHT:
+                    self.first_ended.wait(10.0)
+        except ChangedError as changed:
+            error = changed
+        finally:
+            if mine == LEFT:
+                self.first_ended.set()
+        self.told[str(mine)] = error
+        told = Told.NOT if error else Told.COMMITTED
+        self.stories.append((str(mine), str(other), base, begun_ns, time.monotonic_ns(), told))
+
+    def judged(self, *, views_count_as_reads):
+        """Return what the checker finds wrong; the accounts' versions before were 1."""
+        stories, chains = [], {str(LEFT): [State(1, "init", 1)], str(RIGHT): [State(1, "init", 1)]}
+        for mine, other, base, begun_ns, ended_ns, told in self.stories:
+            shown = (Reading(other, base),)
+            reads, views = (shown, ()) if views_count_as_reads else ((), shown)
+            own = (Reading(mine, 1),)
+            stories.append(LockStory(mine, begun_ns, ended_ns, told, own + reads, views, (mine,)))
+            if told is Told.COMMITTED:
+                chains[mine].append(State(2, mine, 2))
+        return Checker(stories, chains, events={"init": (0, 1)}).anomalies()
+
+
+@pytest.mark.parametrize("in_turn", [True, False])
+def test_of_two_locks_that_expect_what_the_other_writes_one_fails(joined, in_turn):
+    """With `expect` exactly one is told ChangedError in turn; at once, at least one; no anomaly."""
+    skew = Skew(joined, expects=True, in_turn=in_turn)
+
+    failed = [name for name, error in skew.run().items() if error is not None]
+
+    assert len(failed) == 1 if in_turn else failed
+    changed = [value for value in seen(joined, LEFT, RIGHT) if value]
+    assert len(changed) == 2 - len(failed), "what failed is not visible, what committed is"
+    assert skew.judged(views_count_as_reads=True) == []
+
+
+def test_two_locks_that_only_view_what_the_other_writes_both_commit(joined):
+    """Without `expect` a view protects nothing: both commit, and the checker names the cycle."""
+    skew = Skew(joined, expects=False, in_turn=True)
+
+    assert list(skew.run().values()) == [None, None]
+
+    assert seen(joined, LEFT, RIGHT) == [1, 1], "no serial order gives that"
+    assert skew.judged(views_count_as_reads=False) == [], "nothing was promised of views"
+    (anomaly,) = skew.judged(views_count_as_reads=True)
+    assert "rw account/left" in str(anomaly)
+    assert "rw account/right" in str(anomaly)
+
+
+# ---------------------------------------------------------------- a read that was lost before the end
+
+
+def write_right(cell, value):
+    right = Write(cell.world("online"), RIGHT, COUNT)
+    with Lock(right, wait_s=20.0) as lock:
+        lock[right] = value
+
+
+def test_lock_whose_read_shard_restarted_writes_nothing(daemons):
+    """Only the reading participant has lost the lock: the write on the other shard fails, too."""
+    with connect(daemons.file) as mine, connect(daemons.file) as other:
+        start_accounts(mine)
+        world = mine.world("online")
+        read, write = Read(world, RIGHT, COUNT), Write(world, LEFT, COUNT)
+        with pytest.raises(LeaseLostError, match="nothing was written"), Lock(read, write) as lock:
+            lock[write] = lock[read] + 1
+            daemons.kill("s1")
+            start_trapped(daemons, "s1")
+            thread = threading.Thread(target=write_right, args=(other, 5))
+            thread.start()
+            thread.join()
+
+        assert seen(other, LEFT, RIGHT) == [0, 5]
+
+
+def test_lock_whose_read_lease_expired_writes_nothing(daemons):
+    """A client that stood still for 3 TTLs: its read was overwritten, its write is refused."""
+    with connect(daemons.file) as other:
+        start_accounts(other)
+        client = daemons.worker("skew")
+        client.expect("holding")
+        client.signal(signal.SIGSTOP)
+        stopped_s = time.monotonic()
+        write_right(other, 5)  # granted when the lease has ended
+        while time.monotonic() - stopped_s < 3 * TTL_S:  # the claim is about three TTLs
+            assert seen(other, RIGHT) == [5]
+        client.signal(signal.SIGCONT)
+        client.tell("")
+
+        assert "nothing was written" in client.expect("lost", 30)
+        assert seen(other, LEFT, RIGHT) == [0, 5]
+
+
+def test_embedded_lock_that_was_held_too_long_writes_nothing():
+    """In one process, too: after the hold limit another wrote what was read."""
+    with local(worlds=["online"]) as cell:
+        start_accounts(cell)
+        world = cell.world("online")
+        read, write = Read(world, RIGHT, COUNT), Write(world, LEFT, COUNT)
+        with (
+            pytest.raises(LeaseLostError, match="held longer than its limit"),
+            Lock(read, write, hold_s=0.2) as lock,
+        ):
+            lock[write] = lock[read] + 1
+            thread = threading.Thread(target=write_right, args=(cell, 5))
+            thread.start()
+            thread.join()
+
+        assert seen(cell, LEFT, RIGHT) == [0, 5]
+
+
+# ---------------------------------------------------------------- answers that stay out
+
+
+class DeafTo:
+    """A carrier that loses the first answer to each commit."""
+
+    def __init__(self, inner):
+        self._inner = inner
+        self._lost = set()
+
+    def __getattr__(self, name):
+        return getattr(self._inner, name)
+
+    @property
+    def lost(self):
+        return len(self._lost)
+
+    def request(self, shard, message, *, timeout_s):
+        answer = self._inner.request(shard, message, timeout_s=timeout_s)
+        if isinstance(message, Commit) and message.lock not in self._lost:
+            self._lost.add(message.lock)
+            return None
+        return answer
+
+
+def test_commit_whose_answer_is_lost_is_told_committed_once(joined):
+    """20 commits over both accounts, each first answer lost: 20 told, 20 there, each with a place."""
+    carrier = joined._client.carrier = DeafTo(joined._client.carrier)
+    left, right = (Write(joined.world("online"), entity, COUNT) for entity in (LEFT, RIGHT))
+    positions = set()
+    for _ in range(20):
+        with Lock(left, right) as lock:
+            lock[left] += 1
+            lock[right] += 1
+        positions.add(lock.position)
+
+    assert carrier.lost == len(positions) == 20
+    assert seen(joined, LEFT, RIGHT) == [20, 20]
+
+
+@pytest.mark.parametrize(("step", "stands"), [("all-prepared", False), ("decided", True)])
+def test_unknown_commit_can_be_asked_about_when_its_shard_is_back(
+    daemons, monkeypatch, step, stands
+):
+    """CommitUnknownError only after the deadline; then the outcome, from any process, for long."""
+    monkeypatch.setattr(link_client, "FINISH_S", 1.0)
+    daemons.daemons["s0"].tell(f"arm {step}")
+    daemons.daemons["s0"].expect("armed")
+    with connect(daemons.file) as mine, connect(daemons.file) as other:
+        killer = threading.Thread(target=lambda: (
+            daemons.daemons["s0"].expect("reached"), daemons.kill("s0")
+        ))  # fmt: skip
+        left, right = (Write(mine.world("online"), entity, COUNT) for entity in (LEFT, RIGHT))
+        killer.start()
+        started_s = time.monotonic()
+        with pytest.raises(CommitUnknownError, match=r"cell\.outcome") as caught, Lock(left, right) as lock:  # fmt: skip
+            lock[left], lock[right] = 3, 4
+        killer.join()
+        assert time.monotonic() - started_s >= 1.0
+        with pytest.raises(ShardUnreachableError):
+            mine.outcome(caught.value.lock_id, timeout_s=0.2)
+
+        start_trapped(daemons, "s0")
+        for _ in range(5):  # later locks of the same client leave the outcome alone
+            with Lock(left, right, wait_s=20.0):
+                pass
+        found = [cell.outcome(caught.value.lock_id) for cell in (mine, other)]
+
+        assert found[0] == found[1]
+        assert (found[0] is not None) is stands
+        if stands:
+            assert found[0].shard == "s0"
+            assert mine.wait(found[0])
+            assert seen(other, LEFT, RIGHT) == [3, 4]
+        with pytest.raises(MisuseError, match="names no lock"):
+            mine.outcome("somebody")

@@ -1,0 +1,44 @@
+"""How soon locks are there again after something died, with real daemons and clients."""
+
+import time
+
+import pytest
+
+from enact_dist import Aspect, Entity, Lock, Write, connect
+from enact_dist.verify.recovery import measure
+
+pytestmark = pytest.mark.slow
+COUNT = Aspect("count", int)
+counter = Entity("counter")
+
+
+def test_idle_clients_with_a_long_ttl_let_a_restarted_shard_grant_at_once(make_cell):
+    """Clients learn of the restart by themselves, not at their next keep-alive, 5 s later."""
+    cell = make_cell(ttl_s=20.0).start_all()
+    with connect(cell.file, actor="idle") as idle, connect(cell.file, actor="asking") as asking:
+        idle.world("online").init(counter, COUNT, 1)
+        request = Write(asking.world("online"), counter, COUNT)
+        cell.kill()
+        cell.start()
+        started_s = time.monotonic()
+        with Lock(request, wait_s=15.0) as lock:
+            assert lock[request] == 1
+
+    assert time.monotonic() - started_s < 3.0
+
+
+@pytest.mark.timing
+def test_recovery_keeps_its_goals():
+    """Restart, dead client, dead holder and doubt: each figure twice, each within its goal."""
+    figures = measure(2, ttl_s=1.0)
+
+    assert [figure.name for figure in figures] == [
+        "shard restarted, all clients alive",
+        "shard restarted, one client dead",
+        "holder killed",
+        "client killed in doubt",
+    ]
+    for figure in figures:
+        assert len(figure.times_s) == 2
+        spare_s = 2.0 if "all clients" in figure.name else 0.5  # a machine that does other things
+        assert 0.0 < figure.times_s[-1] <= figure.goal_s + spare_s, figure

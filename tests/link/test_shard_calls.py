@@ -1,0 +1,174 @@
+"""Calls from shard to shard over real Zenoh sessions on the loopback."""
+
+import logging
+import threading
+import time
+
+import pytest
+
+from enact_dist.core.datum import LockId, Position, Token
+from enact_dist.core.messages import Finish, Finished, Resolve, Resolved, ShardEntry
+from enact_dist.errors import LinkError
+from enact_dist.link import shard_calls
+from enact_dist.link.shard_calls import ShardCalls
+
+LOCK = LockId("0" * 32, 0, 1)
+RESOLVE = Resolve(LOCK, Token(1, 1), "s0")
+
+
+@pytest.fixture
+def calling():
+    """Make the calls of shard `s0`: `calling(s1=endpoint, …)`; closed after the test."""
+    made = []
+
+    def make(**endpoints):
+        answers = []
+        shards = [ShardEntry(name, (endpoint,)) for name, endpoint in endpoints.items()]
+        calls = ShardCalls(
+            "cell",
+            "s0",
+            [ShardEntry("s0", ()), *shards],
+            lease_s=1.0,
+            answered=lambda *answer: answers.append(answer),
+        )
+        calls.answers = answers
+        made.append(calls)
+        return calls
+
+    yield make
+    for calls in made:
+        calls.close()
+
+
+def line_threads():
+    return [thread for thread in threading.enumerate() if thread.name == "enact-calls"]
+
+
+def test_call_is_answered_with_its_shard_and_request(daemon, calling, endpoint, until):
+    """Both kinds: what became of a lock, and that it has committed."""
+    daemon(endpoint, "s1")
+    calls = calling(s1=endpoint)
+    finish = Finish(LOCK, Position(5, "s0"))
+
+    calls.submit("s1", RESOLVE)
+    until(lambda: calls.answers or calls.submit("s1", RESOLVE))
+    calls.submit("s1", finish)
+    until(lambda: any(request == finish for _, request, _ in calls.answers))
+
+    resolved = Resolved(LOCK, "aborted", Position(0, "s1"))
+    assert calls.answers[0] == ("s1", RESOLVE, resolved)
+    assert calls.answers[-1] == ("s1", finish, Finished(LOCK))
+
+
+def test_shard_that_comes_late_is_reached_on_the_same_way(daemon, calling, endpoint, until):
+    """A shard that is away costs one thread, and nothing has to be started again."""
+    calls = calling(s1=endpoint)
+    for _ in range(200):
+        calls.submit("s1", RESOLVE)
+        time.sleep(0.001)
+    assert not calls.answers
+    assert len(line_threads()) == 1
+
+    daemon(endpoint, "s1")
+    until(lambda: calls.answers or calls.submit("s1", RESOLVE))
+
+    assert len(line_threads()) == 1
+
+
+def test_call_that_is_queued_is_not_queued_twice(calling, endpoint, monkeypatch):
+    """What the core asks again each second does not pile up behind a shard that hangs."""
+    asked, go_on = [], threading.Event()
+
+    def hang(line, calls):
+        asked.append(calls)
+        go_on.wait(5)
+        return []
+
+    monkeypatch.setattr(shard_calls._Line, "_answers", hang)
+    monkeypatch.setattr(shard_calls, "QUEUED_MAX", 3)
+    calls = calling(s1=endpoint)
+    calls.submit("s1", RESOLVE)
+    while not asked:
+        time.sleep(0.001)
+    for _ in range(100):
+        calls.submit("s1", RESOLVE)
+    for number in range(10):
+        calls.submit("s1", Resolve(LOCK, Token(1, number), "s0"))
+    go_on.set()
+    while len(asked) < 2:
+        time.sleep(0.001)
+
+    assert asked[0] == [RESOLVE]
+    assert len(asked[1]) == 3
+    assert asked[1].count(RESOLVE) == 1
+
+
+def test_way_that_could_not_be_opened_is_tried_again(
+    daemon, calling, endpoint, until, monkeypatch, caplog
+):
+    """A shortage of sockets at the first call must not cut two shards for ever."""
+    daemon(endpoint, "s1")
+    opened, real = [], shard_calls.open_session
+
+    def open_session(**options):
+        opened.append(options)
+        if len(opened) == 1:
+            raise LinkError("too many open files")
+        return real(**options)
+
+    monkeypatch.setattr(shard_calls, "open_session", open_session)
+    calls = calling(s1=endpoint)
+
+    until(lambda: calls.answers or calls.submit("s1", RESOLVE))
+
+    assert len(opened) == 2
+    assert "too many open files" in caplog.text
+
+
+def test_silence_is_told_once_and_so_is_its_end(
+    daemon, calling, endpoint, until, monkeypatch, caplog
+):
+    """A log of hours says the same thing once, with what to do."""
+    caplog.set_level(logging.INFO, "enact.link")
+    monkeypatch.setattr(shard_calls, "SILENT_S", 0.0)
+    calls = calling(s1=endpoint)
+    for _ in range(100):
+        calls.submit("s1", RESOLVE)
+        time.sleep(0.002)
+    until(lambda: "does not answer" in caplog.text)
+    assert caplog.text.count("does not answer") == 1
+
+    daemon(endpoint, "s1")
+    until(lambda: "answers again" in caplog.text or calls.submit("s1", RESOLVE))
+
+    assert caplog.text.count("answers again") == 1
+
+
+def test_shard_that_the_cell_has_no_more_is_told_once(calling, endpoint, caplog):
+    """The cell was restarted with another file while a lock was prepared."""
+    calls = calling(s1=endpoint)
+    for _ in range(5):
+        calls.submit("gone", RESOLVE)
+
+    assert caplog.text.count("shard gone") == 1
+    assert "force-abort" in caplog.text
+    assert not line_threads()
+
+
+def test_closing_does_not_wait_for_each_shard_that_is_away(calling, free):
+    """A drain has 2 s in all."""
+    calls = calling(**{f"s{number}": free() for number in range(1, 6)})
+    for number in range(1, 6):
+        calls.submit(f"s{number}", RESOLVE)
+    while len(line_threads()) < 5:
+        time.sleep(0.001)
+    started_s = time.monotonic()
+
+    calls.close()
+    calls.close()
+    calls.submit("s1", RESOLVE)
+
+    assert time.monotonic() - started_s < 1.5
+    for line in line_threads():
+        line.join(2)
+    assert not line_threads()

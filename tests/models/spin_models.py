@@ -1,0 +1,292 @@
+"""What is checked of each model with Spin, and how.
+
+A variant is one run: a model with some macros defined, searched exhaustively.  Either it *holds*,
+or it is a small wrong edit that must *break* a rule, or it must *reach* a place, so that what holds
+does not hold because nothing happens.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+from dataclasses import dataclass, field
+from pathlib import Path
+
+HERE = Path(__file__).parent
+HOLDS, BREAKS, REACHES = "holds", "breaks", "reaches"
+DEPTH_MAX = 200_000
+MINUTES_MAX = 10
+GOAL_BASE = 100
+"""Reached places are reported as rules from here on."""
+
+RULES = {
+    1: "I1 no two holders",
+    2: "I2 each version is built on the one before",
+    3: "I3 all or nothing",
+    5: "I5 what is told is true",
+    6: "I6 strict serializability",
+    7: "I7 no two believers",
+    9: "I9 never committed and aborted",
+    10: "I10 prepared keeps its lock",
+    12: "I12 nothing is left",
+    17: "I17 a commit in flight keeps its lock",
+    18: "I18 no commit is seen half",
+}
+
+
+class SpinError(Exception):
+    """Spin, the compiler or the search itself failed; nothing is known about the model."""
+
+
+@dataclass(frozen=True, slots=True)
+class Variant:
+    """One run.
+
+    Attributes:
+        model: File name without ending.
+        text: What this run is about.
+        expects: `HOLDS`, `BREAKS` or `REACHES`.
+        defines: Macros, as `spin -D` takes them.
+        rule: Which rule breaks, or which place is reached.
+    """
+
+    model: str
+    text: str
+    expects: str
+    defines: tuple[str, ...] = ()
+    rule: int = 0
+
+    @property
+    def name(self) -> str:
+        """Name for tables and test ids: the mutant's or goal's macro stands first."""
+        return f"{self.model}-{self.expects}-{'-'.join(self.defines) or 'plain'}"
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """What came of a run.
+
+    Attributes:
+        states: States stored.
+        depth: Depth reached; where a rule broke, the length of the way there.
+        seconds: CPU time of spin, compiler and search together.
+        rule: The rule that broke first, 0 for none; places reached from `GOAL_BASE` on.
+        unreached: Source lines that no state of this run executes.
+    """
+
+    states: int
+    depth: int
+    seconds: float
+    rule: int
+    unreached: frozenset[int] = field(default=frozenset())
+
+    def verdict(self, variant: Variant) -> str:
+        """Say in a few words what came of it."""
+        if not self.rule:
+            return "holds" if variant.expects == HOLDS else "NOT CAUGHT"
+        if self.rule > GOAL_BASE:
+            return "reached"
+        right = variant.expects == BREAKS and self.rule == variant.rule
+        return f"{'broken' if right else 'BROKEN'}: {RULES[self.rule]}"
+
+    def as_expected(self, variant: Variant) -> bool:
+        """Whether the run ended as it must."""
+        wanted = {HOLDS: 0, BREAKS: variant.rule, REACHES: GOAL_BASE + variant.rule}
+        return self.rule == wanted[variant.expects]
+
+
+def _commits() -> list[Variant]:
+    model, one = "commit_over_shards", ("CLIENTS=1", "LOCKS=2", "KINDS=4")
+    mutants = [
+        ("NO_FENCE", 3, "whoever once had the lock may prepare and commit"),
+        ("PREPARED_ENDS", 3, "a lease or a release ends what is prepared"),
+        ("IN_FLIGHT_ENDS", 17, "a lease ends a commit that the disk works on"),
+        ("FORGETS_OUTCOMES", 5, "a repeated commit finds no record of the first"),
+        ("FORGETS_DECISIONS", 9, "a primary that has committed answers that it has not"),
+        ("ABORTS_OPEN", 3, "a primary that has not decided yet says that it never will"),
+        ("COMMITS_WITHOUT_VOTES", 3, "a client commits before its participant has prepared"),
+        ("SKIPS_VALIDATION", 6, "reads on the other shard are not validated"),
+        ("GUESSES", 5, "a client takes silence after the commit for a no"),
+        ("PROMISES_EARLY", 3, "Prepared is answered before its record is durable"),
+        ("TELLS_EARLY", 3, "the participant hears of a decision before it is durable"),
+        ("NEVER_TELLS", 12, "neither a decision is told nor is it asked for"),
+        ("FORGETS_PREPARED", 3, "a restarted participant has lost what it has prepared"),
+        ("RESTORES_NO_LOCK", 10, "a restarted participant has what it prepared, not its lock"),
+    ]
+    goals = [
+        (1, "a read is validated"),
+        (2, "a client is told that it has committed"),
+        (3, "a commit under a lost lock is fenced"),
+        (4, "a commit never arrived before its shard restarted"),
+        (6, "a participant restarts between prepare and finish"),
+        (7, "a primary restarts after its decision, its client gone"),
+        (8, "an abort that the disk had not kept is asked for again"),
+        (9, "presumed abort ends what is prepared"),
+    ]
+    return [
+        Variant(model, "2 clients, 1 lock each, 1 restart of each shard", HOLDS),
+        Variant(model, "1 client, 2 locks, 1 restart of each shard", HOLDS, one),
+        *(Variant(model, text, BREAKS, (macro,), rule) for macro, rule, text in mutants),
+        Variant(
+            model,
+            "Finished is said before the end is durable",
+            BREAKS,
+            ("FINISHED_EARLY", *one),
+            9,
+        ),
+        *(Variant(model, text, REACHES, (f"GOAL={goal}",), goal) for goal, text in goals),
+        Variant(
+            model,
+            "a late resolve after all is finished and forgotten",
+            REACHES,
+            ("GOAL=5", *one),
+            5,
+        ),
+    ]
+
+
+def _grace() -> list[Variant]:
+    model = "grace"
+    mutants = [
+        ("NO_GRACE", "a restarted shard grants at once"),
+        ("SHORT_GRACE", "the grace is shorter than a belief"),
+        ("BLIND_ACKNOWLEDGEMENT", "any hello counts as an acknowledgement of the epoch"),
+        ("OLD_GRANT", "a client takes a grant of an epoch that is over"),
+        ("KEEPS_GRANTS", "a client acknowledges without dropping what it holds"),
+        ("WELCOMES_EARLY", "a session acts before its record is durable"),
+    ]
+    goals = [
+        (1, "the grace ends early: all have acknowledged"),
+        (2, "a lock is held in the second epoch"),
+        (3, "a grant of an epoch that is over is refused"),
+        (4, "a goodbye ends the grace"),
+        (5, "a keep-alive renews a belief that was over"),
+        (6, "the grace ends by time"),
+    ]
+    return [
+        Variant(model, "2 clients, 1 restart, any number of locks", HOLDS),
+        *(Variant(model, text, BREAKS, (macro,), 7) for macro, text in mutants),
+        *(Variant(model, text, REACHES, (f"GOAL={goal}",), goal) for goal, text in goals),
+    ]
+
+
+def _cuts() -> list[Variant]:
+    model = "cuts"
+    steady = ("RESTARTS=0", "ELSEWHERE=1")
+    restart = ("COMMITS=1", "CLOCK_MAX=4")
+    observer = (*restart, "OBSERVER=1")
+    mutants = [
+        ("FIRST_VIEWS", steady, "views are taken as they come"),
+        ("IGNORES_UNDECIDED", steady, "a view's end does not stay below what is undecided"),
+        ("CLOCK_STAYS", steady, "asked as of a stamp, a shard does not move its clock past it"),
+        ("STAMPS_ALONE", steady, "a commit's stamp does not come after those prepared"),
+        ("OLD_EPOCHS_COUNT", restart, "an answer of an epoch that is over counts"),
+        ("NO_GRACE", restart, "a restarted shard does not wait for whom it answered"),
+        ("NO_CONFIRMATION", observer, "an observer does not ask whether somebody restarted"),
+    ]
+    goals = [
+        (1, steady, "one round trip settles the cut"),
+        (2, steady, "a shard goes back to a state that is past"),
+        (3, restart, "a cut stands though a shard has restarted since"),
+        (4, restart, "an answer of an epoch that is over does not count"),
+        (5, steady, "an undecided commit stands in the way"),
+        (6, steady, "no cut is found"),
+        (7, observer, "an observer's first answers are confirmed"),
+        (8, observer, "an observer's first answers are not confirmed"),
+    ]
+    return [
+        Variant(model, "2 commits, stamps up to 6, views elsewhere too", HOLDS, steady),
+        Variant(model, "1 commit, stamps up to 4, 1 restart", HOLDS, restart),
+        Variant(model, "the same, seen by an observer", HOLDS, observer),
+        *(Variant(model, text, BREAKS, (macro, *size), 18) for macro, size, text in mutants),
+        *(
+            Variant(model, text, REACHES, (f"GOAL={goal}", *size), goal)
+            for goal, size, text in goals
+        ),
+    ]
+
+
+def _expected_views() -> list[Variant]:
+    model, one = "expected_views", ("ONE_SHARD=1",)
+    mutants = [
+        ("EXPECTS_NOTHING", (), "the views are not expected: both commit"),
+        ("BESIDE_WRITERS", (), "an expected view does not mind who holds the slot for writing"),
+        ("CALLED_ALONE", (), "a lock that views elsewhere is said to lie on one shard"),
+        ("EXPECTS_NOTHING", one, "the same on one shard: both commit"),
+        ("OVERLOOKS_IN_FLIGHT", one, "a commit that the disk works on is overlooked"),
+    ]
+    goals = [
+        (1, (), "an expectation is refused at the other shard"),
+        (2, one, "an expectation is refused by the commit itself"),
+        (3, (), "both commit, one after the other"),
+        (3, one, "both commit, one after the other, on one shard"),
+    ]
+    return [
+        Variant(model, "2 shards, 2 clients, 2 locks each", HOLDS),
+        Variant(model, "1 shard, 2 clients, 2 locks each", HOLDS, one),
+        *(Variant(model, text, BREAKS, (macro, *size), 6) for macro, size, text in mutants),
+        *(
+            Variant(model, text, REACHES, (f"GOAL={goal}", *size), goal)
+            for goal, size, text in goals
+        ),
+    ]
+
+
+VARIANTS = (*_commits(), *_grace(), *_cuts(), *_expected_views())
+MODELS = tuple(dict.fromkeys(variant.model for variant in VARIANTS))
+
+
+def verify(variant: Variant, folder: Path) -> Result:
+    """Search all states of one variant, in a folder of its own.
+
+    Raises:
+        SpinError: Something failed, or the search was not exhaustive.
+        FileNotFoundError: There is no spin, or no gcc.
+    """
+    defines = [f"-D{define}" for define in variant.defines]
+    _, spin_s = _run(folder, "spin", *defines, "-a", str(HERE / f"{variant.model}.pml"))
+    # A wrong edit is found soon: it is not worth the compiler's time.
+    effort = "-O1" if variant.expects == HOLDS else "-O0"
+    sizes = ("-DSAFETY", "-DNOCLAIM", "-DVECTORSZ=512")
+    _, gcc_s = _run(folder, "gcc", effort, "-w", *sizes, "-o", "pan", "pan.c")
+    said, search_s = _run(folder, "./pan", f"-m{DEPTH_MAX}", "-w22", f"-Q{MINUTES_MAX}")
+    return _read(said, spin_s + gcc_s + search_s)
+
+
+def _run(folder: Path, *command: str) -> tuple[str, float]:
+    """Run a command; return what it said and its CPU time in seconds."""
+    with (folder / "said").open("w+") as said:
+        child = subprocess.Popen(command, cwd=folder, stdout=said, stderr=said)
+        _, status, usage = os.wait4(child.pid, 0)
+        child.returncode = os.waitstatus_to_exitcode(status)
+        said.seek(0)
+        text = said.read()
+    if child.returncode:
+        raise SpinError(f"{command[0]} ended with {child.returncode}:\n{text}")
+    return text, usage.ru_utime + usage.ru_stime
+
+
+def _number(pattern: str, said: str) -> int:
+    found = re.search(pattern, said)
+    if found is None:
+        raise SpinError(f"nothing like {pattern!r} in what the search said:\n{said}")
+    return int(found[1])
+
+
+def _read(said: str, seconds: float) -> Result:
+    """Read what a search printed.  Only a broken rule may end it early."""
+    states = _number(r"(\d+) states, stored", said)
+    depth = _number(r"depth reached (\d+)", said)
+    errors = _number(r"errors: (\d+)", said)
+    broken = re.search(
+        r"assertion violated \(rule!=\(?(?:(\d+)\+)?(\d+)\)?\) \(at depth (\d+)\)", said
+    )
+    if broken is not None:
+        return Result(states, int(broken[3]), seconds, int(broken[1] or 0) + int(broken[2]))
+    whole = "Search not completed" not in said and "max search depth too small" not in said
+    if errors or not whole:
+        raise SpinError(f"the search went wrong:\n{said}")
+    lines = re.findall(r"\.pml:(\d+), state \d+, \"(.*)\"", said)
+    dead = {int(line) for line, text in lines if text != "-end-" and "assert" not in text}
+    return Result(states, depth, seconds, 0, frozenset(dead))

@@ -1,0 +1,28 @@
+"""What wrong edits of several files share."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from enact_dist.core.prepares import PrepareDesk
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    Patch = Callable[[Any, str, Any], None]
+
+
+def forgets_what_ended(patch: Patch) -> None:
+    """Keep the desk that asks primaries from stumbling over locks that a mutant ended."""
+    for name in ("ask", "undecided"):
+        patch(PrepareDesk, name, _without_ended(getattr(PrepareDesk, name)))
+
+
+def _without_ended(method: Any) -> Any:
+    def wrong(self: PrepareDesk) -> Any:
+        tenures = self._state.tenures.by_lock
+        for lock in [lock for lock in self._ask_ns if lock not in tenures]:
+            del self._ask_ns[lock]
+        yield from method(self)
+
+    return wrong

@@ -1,0 +1,117 @@
+"""Small wrong edits of the core that only a directed test of `tests/core` catches.
+
+An honest client under the simulator's faults seldom or never gets there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from mutant_parts import forgets_what_ended
+
+from enact_dist.core.commits import Commits
+from enact_dist.core.lock_desk import LockDesk
+from enact_dist.core.messages import Granted
+from enact_dist.core.multilock import MultiLock
+from enact_dist.core.records import Persist, PreparedEnded
+from enact_dist.core.sessions import Session, SessionTable
+from enact_dist.core.tenures import Tenures
+from enact_dist.core.view_desk import ViewDesk
+from enact_dist.terms import Durability
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    Patch = Callable[[Any, str, Any], None]
+
+
+def takes_grants_of_an_old_epoch(patch: Patch) -> None:
+    """A client believes in a late grant of an epoch that is over."""
+    on_acquiring = MultiLock._on_acquiring
+
+    def wrong(self: MultiLock, shard: str, answer: Any, now_ns: int) -> None:
+        if isinstance(answer, Granted):
+            answer = replace(answer, epoch=self.client.epoch(shard))
+        on_acquiring(self, shard, answer, now_ns)
+
+    patch(MultiLock, "_on_acquiring", wrong)
+
+
+def leases_end_late(patch: Patch) -> None:
+    """A lease ends one nanosecond after its TTL (`<` for `<=`)."""
+    lease_end_ns = Session.lease_end_ns
+    patch(Session, "lease_end_ns", lambda session, now_ns: lease_end_ns(session, now_ns) + 1)
+
+
+def compares_no_token(patch: Patch) -> None:
+    """The fence looks whether the lock is held, not under which token."""
+    fence = Commits._fence
+
+    def wrong(self: Commits, lock: Any, token: Any, tenure: Any) -> Any:
+        held = tenure is not None and tenure.token is not None
+        return fence(self, lock, tenure.token if held else token, tenure)
+
+    patch(Commits, "_fence", wrong)
+
+
+def stalls_count(patch: Patch) -> None:
+    """A shard that stood still takes everybody's lease for its own stall."""
+    patch(SessionTable, "stalled", lambda _table, _gap_ns: None)
+    patch(Tenures, "stalled", lambda _tenures, _gap_ns: None)
+
+
+def releases_end_a_commit_in_flight(patch: Patch) -> None:
+    """A late release takes the lock of a commit that the disk works on."""
+    on_release = LockDesk.on_release
+
+    def wrong(self: LockDesk, message: Any, reply_to: int) -> Any:
+        tenure = self._state.tenures.by_lock.get(message.lock)
+        if tenure is not None and tenure.prepared is None:
+            tenure.committing = False
+        yield from on_release(self, message, reply_to)
+
+    patch(LockDesk, "on_release", wrong)
+
+
+def releases_end_what_is_prepared(patch: Patch) -> None:
+    """A client's release aborts what is prepared, though its primary may have committed."""
+    on_release = LockDesk.on_release
+
+    def wrong(self: LockDesk, message: Any, reply_to: int) -> Any:
+        tenure = self._state.tenures.by_lock.get(message.lock)
+        if tenure is not None and tenure.prepared is not None and not tenure.committing:
+            yield Persist(0, (PreparedEnded(message.lock),), Durability.OS)
+            tenure.prepared = None
+        yield from on_release(self, message, reply_to)
+
+    patch(LockDesk, "on_release", wrong)
+    forgets_what_ended(patch)
+
+
+def views_do_not_renew(patch: Patch) -> None:
+    """A view is counted as seen, but does not lengthen the lease."""
+    on_take_view = ViewDesk.on_take_view
+
+    def wrong(self: ViewDesk, message: Any, reply_to: int) -> Any:
+        session = self._state.sessions.by_id.get(message.lock.session)
+        renewed_ns = session.renewed_ns if session is not None else 0
+        yield from on_take_view(self, message, reply_to)
+        if session is not None:
+            session.renewed_ns = renewed_ns
+
+    patch(ViewDesk, "on_take_view", wrong)
+
+
+DIRECTED = {
+    takes_grants_of_an_old_epoch: "test_grant_of_an_epoch_that_is_over_is_not_taken",
+    leases_end_late: "test_lease_ends_exactly_with_its_ttl",
+    compares_no_token: "test_forged_token_is_fenced",
+    stalls_count: "test_stalled_shard_takes_no_lease_for_its_own_stall",
+    releases_end_a_commit_in_flight: "test_lease_does_not_end_a_commit_in_flight",
+    releases_end_what_is_prepared: (
+        "test_prepared_lock_stays_when_its_client_or_an_operator_ends_it"
+    ),
+    views_do_not_renew: "test_everything_that_is_counted_renews",
+}
+"""Each with the test of `tests/core` that catches it."""

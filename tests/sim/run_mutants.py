@@ -1,0 +1,95 @@
+"""Plant each wrong edit of the core in turn and show what catches it: the table of the README.
+
+`python tests/sim/run_mutants.py` runs all of them, `… no_fence barges` some.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import NamedTuple
+
+import mutants
+
+from enact_dist.verify.simulation.scenario import Scenario
+
+SEEDS = 600
+"""A mutant that survives so many seeds counts as not caught."""
+ROOT = Path(__file__).parents[2]
+
+
+class Caught(NamedTuple):
+    """What caught a wrong edit: a rule after so many seeds, or a test (0 seeds).  "": nothing."""
+
+    name: str
+    by: str
+    seeds: int
+
+
+def simulate(mutant: mutants.Mutant, *, seeds: int = SEEDS) -> Caught:
+    """Run seeds from 0 on, with the edit and without the shard's own assertions."""
+    with mutants.planted(mutant):
+        for seed in range(seeds):
+            rule = Scenario(seed, through_wire=False, asserts=False).run().rule
+            if rule:
+                return Caught(mutant.__name__, rule, seed + 1)
+    return Caught(mutant.__name__, "", seeds)
+
+
+def run_directed(mutant: mutants.Mutant) -> Caught:
+    """Run the directed test in a process of its own, with the edit; it must fail."""
+    name = mutants.DIRECTED[mutant]
+    command = [sys.executable, __file__, "--under", mutant.__name__, name]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    failed = done.returncode == 1 and f"{name}" in done.stdout and " failed" in done.stdout
+    return Caught(mutant.__name__, f"`{name}`" if failed else "", 0)
+
+
+def catch(name: str) -> Caught:
+    """Find out what catches a wrong edit."""
+    mutant = BY_NAME[name]
+    return run_directed(mutant) if mutant in mutants.DIRECTED else simulate(mutant)
+
+
+def run_under(mutant: mutants.Mutant, test: str) -> int:
+    """Run the tests of `tests/core` of this name with an edit; return their status."""
+    import pytest
+
+    with mutants.planted(mutant):
+        return int(pytest.main(["-q", "-p", "no:cacheprovider", "tests/core", "-k", test]))
+
+
+BY_NAME = {mutant.__name__: mutant for mutant in mutants.ALL}
+
+
+def main() -> int:
+    """Print the table; status 1 if one was not caught."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("names", nargs="*", metavar="NAME", help="wrong edits (default: all)")
+    parser.add_argument("--jobs", type=int, default=2, help="processes")
+    parser.add_argument("--under", metavar="NAME", help="run a directed test with this edit")
+    options = parser.parse_args()
+    if options.under:
+        return run_under(BY_NAME[options.under], options.names[0])
+    wanted = options.names or list(BY_NAME)
+    called = {mutant.__name__: [] for mutant in mutants.ALL}
+    for name, mutant in mutants.NAMED.items():
+        called[mutant.__name__].append(name)
+    print("| wrong edit | seeds | caught by | known as |\n|---|---|---|---|")
+    caught = 0
+    with ProcessPoolExecutor(options.jobs) as pool:
+        for name, by, seeds in pool.map(catch, wanted):
+            caught += bool(by)
+            text = " ".join(BY_NAME[name].__doc__.split())
+            shown = seeds or "a test"
+            known = ", ".join(called[name])
+            print(f"| {text} | {shown} | {by or 'NOTHING'} | {known} |", flush=True)
+    print(f"\n{caught} of {len(wanted)} caught")
+    return 0 if caught == len(wanted) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
