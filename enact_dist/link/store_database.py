@@ -28,12 +28,10 @@ _PRAGMAS: Final = (
     "trusted_schema=OFF",
     "cache_size=-16384",  # KiB
 )
-_TABLE: Final = """
-CREATE TABLE IF NOT EXISTS record (
+_TABLE: Final = """CREATE TABLE record (
     id INTEGER PRIMARY KEY, kind INTEGER NOT NULL, batch INTEGER NOT NULL,
     key BLOB NOT NULL, body BLOB NOT NULL, crc INTEGER NOT NULL
-)
-"""
+)"""
 _CORRUPT: Final = frozenset({sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB, sqlite3.SQLITE_FORMAT})
 
 
@@ -73,15 +71,24 @@ class Database:
             self._connection.close()
             raise
 
-    def problems(self) -> list[str]:
-        """Return what SQLite's own check finds wrong with the file's structure."""
+    def problems(self, *, may_be_empty: bool) -> list[str]:
+        """Return what is wrong with the file's structure, as far as SQLite's own check goes.
+
+        SQLite also reads columns by what the file says of its table, so that must be as written.
+        """
         rows = self._connection.execute("PRAGMA quick_check(5)").fetchall()
         found = [str(problem) for (problem,) in rows]
-        return [] if found == ["ok"] else found
+        if found != ["ok"]:
+            return found
+        tables = self._connection.execute("SELECT sql FROM sqlite_schema").fetchall()
+        if tables == [(_TABLE,)] or (may_be_empty and not tables):
+            return []
+        return [f"its tables are {tables!r:.200} instead of one for records"]
 
     def make_table(self) -> None:
-        """Make the table of an empty database."""
-        self._connection.execute(_TABLE)
+        """Make the table of a database, unless a start before this one came so far."""
+        if not self._connection.execute("SELECT 1 FROM sqlite_schema").fetchall():
+            self._connection.execute(_TABLE)
 
     def rows(self) -> Iterator[DatabaseRow]:
         """Yield all rows, oldest identity first."""
@@ -131,5 +138,8 @@ class Database:
 
 def is_damage(failure: BaseException) -> bool:
     """Whether SQLite says that the file itself is wrong, not the system below it."""
+    if isinstance(failure, UnicodeDecodeError):
+        # It quotes what it cannot read, and the quotation is no text.
+        return True
     code = getattr(failure, "sqlite_errorcode", None)
     return isinstance(failure, sqlite3.DatabaseError) and (code or 0) & 0xFF in _CORRUPT

@@ -188,7 +188,7 @@ def open_database(folder: Path, found: Found) -> tuple[Database, Contents]:
     database = None
     try:
         database = Database(path)
-        problems = database.problems()
+        problems = database.problems(may_be_empty=found.is_first)
         if problems:
             refuse(path, f"is damaged: {'; '.join(problems)}")
         if found.is_first:
@@ -198,7 +198,7 @@ def open_database(folder: Path, found: Found) -> tuple[Database, Contents]:
     except BaseException as failure:
         if database is not None:
             database.close()
-        if isinstance(failure, sqlite3.Error) and is_damage(failure):
+        if is_damage(failure):
             refuse(path, f"is damaged: {failure}")
         raise
     return database, contents

@@ -10,14 +10,21 @@ import os
 from collections import Counter
 from typing import TYPE_CHECKING
 
+from hypothesis import HealthCheck, settings
+from hypothesis.stateful import run_state_machine_as_test
+
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
+
+    from hypothesis.stateful import RuleBasedStateMachine
 
 FULL_EXAMPLES = 500
 """Examples of the full amount, each of up to `STEPS` steps: `ENACT_MACHINE_EXAMPLES=500`."""
 STEPS = 100
 FULL_HITS = 50
 """Hits of each cell that the full amount must bring."""
+
+ROUNDS_MORE = 4
 
 
 def examples(usual: int) -> int:
@@ -28,6 +35,34 @@ def examples(usual: int) -> int:
 def hits_wanted(count: int) -> int:
     """Return the hits that so many examples owe each cell: half their share, short of the full."""
     return FULL_HITS if count >= FULL_EXAMPLES else max(1, FULL_HITS * count // FULL_EXAMPLES // 2)
+
+
+def settings_of(max_examples: int, **options: object) -> settings:
+    """Return settings with fresh seeds, whatever the environment is."""
+    return settings(
+        max_examples=max_examples,
+        stateful_step_count=STEPS,
+        deadline=None,
+        derandomize=False,
+        print_blob=True,
+        suppress_health_check=list(HealthCheck),
+        **options,
+    )
+
+
+def run_and_cover(machine: type[RuleBasedStateMachine], count: int, *tables: Coverage) -> list[str]:
+    """Run so many examples, and up to as many again while a cell is owed hits.
+
+    Returns:
+        What is wrong with the cells in the end: chance is given more time, never less to show.
+    """
+    wanted = hits_wanted(count)
+    run_state_machine_as_test(machine, settings=settings_of(count))
+    for _ in range(ROUNDS_MORE):
+        if all(table.rarest >= wanted for table in tables):
+            break
+        run_state_machine_as_test(machine, settings=settings_of(count // ROUNDS_MORE))
+    return [problem for table in tables for problem in table.problems(wanted)]
 
 
 class Coverage:

@@ -4,28 +4,15 @@ from __future__ import annotations
 
 import machine_table
 import pytest
-from hypothesis import HealthCheck, Phase, Verbosity, settings
+from hypothesis import Phase, Verbosity
 from hypothesis.stateful import run_state_machine_as_test
-from machine_coverage import STEPS, Coverage, examples, hits_wanted
+from machine_coverage import Coverage, examples, run_and_cover, settings_of
 from machine_table import ACTS, CLAIMS, NEWCOMERS, THERE, UNREACHABLE, TableMachine
 
 from enact_dist.core import lock_table, tenures
 from enact_dist.core.lock_table import CONFLICTS, Mode
 
 EXAMPLES = 150
-
-
-def settings_of(max_examples: int, **options: object) -> settings:
-    """Return settings with fresh seeds, whatever the environment is."""
-    return settings(
-        max_examples=max_examples,
-        stateful_step_count=STEPS,
-        deadline=None,
-        derandomize=False,
-        print_blob=True,
-        suppress_health_check=list(HealthCheck),
-        **options,
-    )
 
 
 def fresh_coverage() -> tuple[Coverage, Coverage]:
@@ -38,13 +25,11 @@ def fresh_coverage() -> tuple[Coverage, Coverage]:
 def test_table_agrees_with_the_definition_step_by_step():
     """The same holders, queue and blockers as sets and one list; every cell is met."""
     meetings, claims = fresh_coverage()
-    count = examples(EXAMPLES)
 
-    run_state_machine_as_test(TableMachine, settings=settings_of(count))
+    problems = run_and_cover(TableMachine, examples(EXAMPLES), meetings, claims)
 
     print(f"\n{meetings.table()}\n\n{claims.table()}")
-    wanted = hits_wanted(count)
-    assert not meetings.problems(wanted) + claims.problems(wanted)
+    assert not problems
 
 
 def barges(patch):

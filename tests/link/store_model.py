@@ -9,6 +9,8 @@ from enact_dist.core.records import (
     AuditRecord,
     DecisionDone,
     DecisionRecord,
+    ForcedEnded,
+    ForcedRecord,
     OutcomeRecord,
     PreparedEnded,
     PreparedRecord,
@@ -39,12 +41,13 @@ class State:
     aspects: dict = field(default_factory=dict)
     prepared: dict = field(default_factory=dict)
     decisions: dict = field(default_factory=dict)
-    audits: int = 0
+    given_up: dict = field(default_factory=dict)
+    audit: list = field(default_factory=list)
     forced: set = field(default_factory=set)
 
     def copy(self):
         parts = (getattr(self, name) for name in self.__dataclass_fields__)
-        return State(*(part if isinstance(part, int) else part.copy() for part in parts))
+        return State(*(part.copy() for part in parts))
 
     def after(self, batch):
         """Return the state after a batch of (durability, records)."""
@@ -89,8 +92,12 @@ class State:
             self.decisions[record.lock] = record
         elif isinstance(record, DecisionDone):
             self.decisions.pop(record.lock, None)
+        elif isinstance(record, ForcedRecord):
+            self.given_up[record.lock] = record
+        elif isinstance(record, ForcedEnded):
+            self.given_up.pop(record.lock, None)
         elif isinstance(record, AuditRecord):
-            self.audits += 1
+            self.audit.append(record)
         else:
             raise AssertionError(record)
 
@@ -109,15 +116,15 @@ class State:
 
     # ---------------------------------------------------------------- comparison
 
-    def difference(self, recovered, audits, *, power_cut):
+    def difference(self, recovered, *, power_cut):
         """Return what of a recovered state is not this one, "" where nothing is."""
-        if audits != self.audits:
-            return f"{audits} audits instead of {self.audits}"
         pairs = (
             ("sessions", {r.session: r for r in recovered.sessions}, self.sessions),
             ("worlds", set(recovered.worlds), self.worlds),
             ("aspects", {entry.name: entry for entry in recovered.aspects}, self.aspects),
             ("outcomes", {r.lock[:2]: r for r in recovered.outcomes}, self.outcomes),
+            ("given up", {r.lock: r for r in recovered.forced}, self.given_up),
+            ("audit", recovered.audit, self.audit),
             ("decisions", {r.lock: r for r in recovered.decisions}, self.decisions),
         )
         for name, found, expected in pairs:

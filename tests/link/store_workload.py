@@ -97,6 +97,7 @@ class Driver:
         self.seq = 0
         self.sessions = [record.session for record in recovered.sessions]
         self.prepared = [record.lock for record in recovered.prepared]
+        self.given_up = [record.lock for record in recovered.forced]
         self.unanswered = []
         for session in self.sessions:
             self.send(Hello(session, self.epoch, 10**10, "a", "h", 1, False))
@@ -232,16 +233,22 @@ class Driver:
         if how < 0.5:
             self.send(Finish(lock, Position(self.wall_ns, "s1")))
         elif how < 0.8:
-            kind = RESOLVED_COMMITTED if how < 0.6 else RESOLVED_ABORTED
-            answer = Resolved(lock, kind, Position(self.wall_ns, "s1"))
-            self.perform(self.handle(Called("s1", Resolve(lock, FAR_TOKEN, "s0"), answer)))
+            self.resolve(lock, RESOLVED_COMMITTED if how < 0.6 else RESOLVED_ABORTED)
         else:
             for holder in self.send(ListLocks()).holders:
                 if holder.lock == lock:
                     self.send(ForceAbort(holder.number, "test"))
+                    self.given_up.append(lock)
+
+    def resolve(self, lock, kind):
+        answer = Resolved(lock, kind, Position(self.wall_ns, "s1"))
+        self.perform(self.handle(Called("s1", Resolve(lock, FAR_TOKEN, "s0"), answer)))
 
     def hear(self):
-        """Let the other shard answer what it was told."""
+        """Let the other shard answer what it was told or asked."""
+        if self.given_up and self.rng.random() < 0.3:
+            lock = self.given_up.pop()
+            self.resolve(lock, self.rng.choice((RESOLVED_COMMITTED, RESOLVED_ABORTED)))
         calls, self.calls = self.calls, []
         for call in calls:
             if isinstance(call.request, Finish):

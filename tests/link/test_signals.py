@@ -94,12 +94,17 @@ def test_signal_that_another_thread_gets_is_heard():
 
 def test_forked_child_leaves_the_signals_of_its_parent_alone():
     """A child that is told to end ends, and its parent goes on."""
+    forked, say = os.pipe()
     with StopSignals() as signals:
         child = os.fork()
         if child == 0:
+            os.write(say, b".")
             time.sleep(30)
             os._exit(1)
+        os.read(forked, 1)
         os.kill(child, signal.SIGTERM)
         _, status = os.waitpid(child, 0)
         assert not signals.event.is_set()
     assert os.WTERMSIG(status) == signal.SIGTERM
+    os.close(forked)
+    os.close(say)

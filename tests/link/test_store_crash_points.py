@@ -35,7 +35,6 @@ from enact_dist.core.shard import Shard
 from enact_dist.errors import StoreError
 from enact_dist.link import store_mark
 from enact_dist.link.store import open_store
-from enact_dist.link.store_rows import Kind
 
 pytestmark = [
     pytest.mark.slow,
@@ -263,12 +262,9 @@ class Life:
             store, recovered = open_store(folder, unix_s=1)
         except StoreError as refused:
             return self.fail(image, crash, f"refused: {refused}")
-        audits = sum(row.kind == Kind.AUDIT for row in store._database.rows())
         differences = []
         for number in range(len(self.states) - 1, self.first[crash] - 1, -1):
-            difference = self.states[number].difference(
-                recovered, audits, power_cut=crash == "power"
-            )
+            difference = self.states[number].difference(recovered, power_cut=crash == "power")
             if not difference:
                 break
             differences.append(f"state {number}: {difference}")
@@ -283,6 +279,7 @@ class Life:
         lost = [record for record in recovered.slots if record.null_reason == "LOST"]
         self.counts["with lost bodies"] += any(not record.volatile for record in lost)
         self.counts["with prepared locks"] += bool(recovered.prepared)
+        self.counts["with locks given up"] += bool(recovered.forced)
         self.counts["with decisions"] += bool(recovered.decisions)
         store.close()
         if broken:

@@ -63,7 +63,7 @@ NAMED = {
     "commit before all is staged": over.commits_without_votes,
     "acquire in request order": one.asks_shards_in_the_order_of_the_request,
     "renew after expiry accepted": one.renews_what_is_over,
-    "history shares a reference": one.shows_the_present_for_the_past,
+    "history shares a reference": mutants_directed.shows_the_present_for_the_past,
 }
 
 

@@ -16,6 +16,7 @@ from enact_dist.core.messages import Granted
 from enact_dist.core.multilock import MultiLock
 from enact_dist.core.records import Persist, PreparedEnded
 from enact_dist.core.sessions import Session, SessionTable
+from enact_dist.core.slots import SlotMap
 from enact_dist.core.tenures import Tenures
 from enact_dist.core.view_desk import ViewDesk
 from enact_dist.terms import Durability
@@ -89,6 +90,11 @@ def releases_end_what_is_prepared(patch: Patch) -> None:
     forgets_what_ended(patch)
 
 
+def shows_the_present_for_the_past(patch: Patch) -> None:
+    """The history shares what it remembers with the present."""
+    patch(SlotMap, "at", lambda _slots, _slot, content, _at_ns: content)
+
+
 def views_do_not_renew(patch: Patch) -> None:
     """A view is counted as seen, but does not lengthen the lease."""
     on_take_view = ViewDesk.on_take_view
@@ -112,6 +118,7 @@ DIRECTED = {
     releases_end_what_is_prepared: (
         "test_prepared_lock_stays_when_its_client_or_an_operator_ends_it"
     ),
+    shows_the_present_for_the_past: "test_view_as_of_the_past_shows_the_past",
     views_do_not_renew: "test_everything_that_is_counted_renews",
 }
 """Each with the test of `tests/core` that catches it."""

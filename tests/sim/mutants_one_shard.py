@@ -378,11 +378,6 @@ def keeps_every_outcome(patch: Patch) -> None:
     patch(Commits, "_apply", wrong)
 
 
-def shows_the_present_for_the_past(patch: Patch) -> None:
-    """The history shares what it remembers with the present."""
-    patch(SlotMap, "at", lambda _slots, _slot, content, _at_ns: content)
-
-
 def renews_what_is_over(patch: Patch) -> None:
     """A shard answers a keep-alive as if the locks that it took away were still there."""
     take_away, on_keep_alive = Tenures.take_away, SessionDesk.on_keep_alive

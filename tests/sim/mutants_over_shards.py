@@ -66,7 +66,11 @@ def forgets_decisions_at_a_restart(patch: Patch) -> None:
 def loses_prepared_at_a_restart(patch: Patch) -> None:
     """A restarted participant has forgotten what it has prepared."""
     init = PrepareDesk.__init__
-    patch(PrepareDesk, "__init__", lambda self, state, _recovered: init(self, state, ()))
+
+    def wrong(self: PrepareDesk, state: Any, _recovered: Any, *others: Any) -> None:
+        init(self, state, (), *others)
+
+    patch(PrepareDesk, "__init__", wrong)
 
 
 def never_tells_participants(patch: Patch) -> None:
@@ -95,7 +99,11 @@ def expects_beside_writers(patch: Patch) -> None:
 
 def takes_the_first_views(patch: Patch) -> None:
     """Views over several shards are taken as they come, of one cut or not."""
-    patch(Cut, "settled", lambda cut, _epoch: cut._answers)
+
+    def wrong(cut: Cut, _epoch: Any, **_options: Any) -> Any:
+        return {shard: answer.viewed for shard, answer in cut._answers.items()}
+
+    patch(Cut, "settled", wrong)
 
 
 def views_do_not_wait_for_the_undecided(patch: Patch) -> None:

@@ -18,6 +18,8 @@ from enact_dist.verify.simulation.scenario import Scenario
 
 SEEDS = 600
 """A mutant that survives so many seeds counts as not caught."""
+MISFITS = {"TypeError", "AttributeError", "NameError", "KeyError"}
+"""What an edit raises whose place in the core has changed; that catches nothing."""
 ROOT = Path(__file__).parents[2]
 
 
@@ -34,6 +36,8 @@ def simulate(mutant: mutants.Mutant, *, seeds: int = SEEDS) -> Caught:
     with mutants.planted(mutant):
         for seed in range(seeds):
             rule = Scenario(seed, through_wire=False, asserts=False).run().rule
+            if rule in MISFITS:
+                raise RuntimeError(f"{mutant.__name__} does not fit the core any more: {rule}")
             if rule:
                 return Caught(mutant.__name__, rule, seed + 1)
     return Caught(mutant.__name__, "", seeds)

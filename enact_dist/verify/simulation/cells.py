@@ -45,8 +45,8 @@ def drawn(random: Random, *, faults: Faults | None = None) -> CellPlan:
     some = fault_options.drawn(random, shards=shards)
     return CellPlan(
         shards=shards,
-        clients=random.choice((2, 3, 4)),
-        lanes=random.choice((1, 2, 3)),
+        clients=random.choice((2, 3, 4, 5)),
+        lanes=random.choice((1, 2, 2, 3)),
         entities=random.choice((1, 2, 3, 4)),
         ttl_ns=random.choice((500 * MS, S, 2 * S)),
         work_ns=random.choice((WORK_NS, FAULTS_NS - S // 2)),

@@ -1,0 +1,276 @@
+"""Small wrong edits of the shard, each of which the machine must notice.
+
+A mutant replaces one decision of the core through `patch(owner, name, value)`; the shard's own
+assertions are off meanwhile.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from enact_dist.core.commits import Commits
+from enact_dist.core.decisions import Decisions
+from enact_dist.core.lock_desk import LockDesk
+from enact_dist.core.messages import Fenced, Finished, Prepared
+from enact_dist.core.prepares import PrepareDesk
+from enact_dist.core.records import Persist, Reply
+from enact_dist.core.session_desk import SessionDesk
+from enact_dist.core.sessions import Session, SessionTable
+from enact_dist.core.slots import Content
+from enact_dist.core.stamps import Stamps
+from enact_dist.core.tenures import Tenure, Tenures
+from enact_dist.core.view_desk import ViewDesk
+from enact_dist.terms import NullReason
+
+
+def lease_ends_a_nanosecond_late(patch):
+    """A lease lives one nanosecond too long."""
+    lease_end_ns = Session.lease_end_ns
+    patch(Session, "lease_end_ns", lambda session, now_ns: lease_end_ns(session, now_ns) + 1)
+
+
+def any_token_of_this_epoch(patch):
+    """The fence compares the epoch and forgets the number."""
+    fence = Commits._fence
+
+    def wrong(self, lock, token, tenure):
+        answer = fence(self, lock, token, tenure)
+        return None if isinstance(answer, Fenced) and tenure and tenure.token else answer
+
+    patch(Commits, "_fence", wrong)
+
+
+def grants_a_seq_again(patch):
+    """A released seq may be asked for once more."""
+    on_release = LockDesk.on_release
+
+    def wrong(self, message, reply_to):
+        held = message.lock in self._state.tenures.by_lock
+        yield from on_release(self, message, reply_to)
+        if held:
+            self._state.forget_top(message.lock)
+
+    patch(LockDesk, "on_release", wrong)
+
+
+def view_does_not_renew(patch):
+    """A view is counted, and does not lengthen the lease."""
+    on_take_view = ViewDesk.on_take_view
+
+    def wrong(self, message, reply_to):
+        session = self._state.sessions.known(message.lock.session)
+        before_ns = session.renewed_ns if session else 0
+        yield from on_take_view(self, message, reply_to)
+        if session:
+            session.renewed_ns = before_ns
+
+    patch(ViewDesk, "on_take_view", wrong)
+
+
+def prepared_locks_end_with_their_client(patch):
+    """A release or the end of a lease frees what is prepared."""
+    patch(Tenure, "bound", property(lambda tenure: tenure.committing))
+
+
+def commits_in_flight_expire(patch):
+    """A release or the end of a lease takes the lock of a commit at the disk."""
+    patch(Tenure, "bound", property(lambda tenure: tenure.prepared is not None))
+
+
+def _tells_early(patch, method, answer):
+    wrapped = getattr(PrepareDesk, method)
+
+    def wrong(self, *arguments):
+        for effect in wrapped(self, *arguments):
+            if isinstance(effect, Persist):
+                work = self._at_store[effect.ticket]
+                replies, work.replies = work.replies, []
+                yield from (Reply(reply_to, answer(work.record)) for reply_to in replies)
+            yield effect
+
+    patch(PrepareDesk, method, wrong)
+
+
+def promises_before_it_is_kept(patch):
+    """Prepared is answered while the disk still works on it."""
+    answer = lambda record: Prepared(record.lock, record.stamp_ns, record.versions)  # noqa: E731
+    _tells_early(patch, "on_prepare", answer)
+
+
+def finished_before_it_is_kept(patch):
+    """The primary may forget before the end is on disk."""
+    _tells_early(patch, "_finish", lambda record: Finished(record.lock))
+
+
+def aborts_what_is_open(patch):
+    """A primary that has not decided yet says that it never will."""
+    resolved = PrepareDesk._resolved
+
+    def wrong(self, message):
+        answer = resolved(self, message)
+        return replace(answer, kind="aborted") if answer.kind == "open" else answer
+
+    patch(PrepareDesk, "_resolved", wrong)
+
+
+def forgets_what_is_decided(patch):
+    """Whoever asks about a committed lock is told that it never was."""
+    patch(Commits, "position_of", lambda _self, _lock: None)
+
+
+def loses_prepared_at_a_restart(patch):
+    """A restarted participant has forgotten what it has prepared."""
+    init = PrepareDesk.__init__
+    wrong = lambda self, state, _recovered, *others: init(self, state, (), *others)  # noqa: E731
+    patch(PrepareDesk, "__init__", wrong)
+
+
+def tells_participants_once(patch):
+    """Who does not hear of a decision at once never does."""
+    tell = Decisions.tell
+
+    def wrong(self, now_ns):
+        yield from tell(self, now_ns)
+        for decision in self.by_lock.values():
+            decision.due_ns = 1 << 62
+
+    patch(Decisions, "tell", wrong)
+
+
+def blind_acknowledgement(patch):
+    """Any hello counts as an acknowledgement of the new epoch."""
+    hello = SessionTable.hello
+
+    def wrong(self, message, **options):
+        session, unrecorded = hello(self, message, **options)
+        session.acknowledged = True
+        return session, unrecorded
+
+    patch(SessionTable, "hello", wrong)
+
+
+def no_grace(patch):
+    """A restarted shard grants at once."""
+    patch(SessionTable, "in_grace", lambda _table, _now_ns: False)
+
+
+def leases_pay_for_a_stall(patch):
+    """A shard that stood still ends the leases that it did not hear renewed."""
+    patch(SessionTable, "stalled", lambda _table, _gap_ns: None)
+
+
+def hold_limits_pay_for_a_stall(patch):
+    """A shard that stood still ends locks that were held too long only by its own fault."""
+    patch(Tenures, "stalled", lambda _tenures, _gap_ns: None)
+
+
+def validated_once(patch):
+    """A repeated validation is told that the lock is gone."""
+    validate = Commits.validate
+
+    def wrong(self, message, **options):
+        session = self._sessions.known(message.lock.session)
+        lane = session.lanes.get(message.lock.lane) if session else None
+        if lane is not None and lane.validated and lane.validated[0] == message.lock:
+            lane.validated = None
+        yield from validate(self, message, **options)
+
+    patch(Commits, "validate", wrong)
+
+
+def expects_beside_writers(patch):
+    """An expected view does not mind that another lock may write it."""
+    patch(Commits, "_in_the_way", lambda _self, _slot, _lock: False)
+
+
+def expects_what_was(patch):
+    """An expected view is compared with what is visible, not with what is at the disk."""
+    patch(Commits, "_newest_version", lambda self, slot: self._slots[slot].version)
+
+
+def views_promise_too_much(patch):
+    """A view's end does not mind what is undecided."""
+    patch(ViewDesk, "_undecided_ns", lambda _desk, _items: 1 << 62)
+
+
+def stamps_follow_the_wall_clock(patch):
+    """Stamps are what the wall clock says, also when it was set back."""
+
+    def wrong(self, *, seen_ns, wall_ns):
+        self.last_ns = max(self.last_ns, wall_ns)
+        return max(wall_ns, seen_ns + 1)
+
+    patch(Stamps, "next", wrong)
+
+
+def keep_alives_free_nothing(patch):
+    """What a client does not want any more stays."""
+    on_keep_alive = SessionDesk.on_keep_alive
+    wrong = lambda self, message, to: on_keep_alive(self, replace(message, view=()), to)  # noqa: E731
+    patch(SessionDesk, "on_keep_alive", wrong)
+
+
+def vanished_waiters_keep_their_place(patch):
+    """A lock is granted to a process that is gone."""
+
+    def wrong(self, message, _):
+        sessions, now_ns = self._state.sessions, self._state.now_ns
+        sessions.token_seen(message.session, message.present, now_ns=now_ns)
+        return iter(())
+
+    patch(SessionDesk, "on_session_seen", wrong)
+
+
+def shows_before_it_is_kept(patch):
+    """Readers see a commit while the disk still works on it."""
+    make_durable = Commits._make_durable
+
+    def wrong(self, commit, *, now_ns):
+        for write, (slot, version) in zip(commit.writes, commit.outcome.versions, strict=True):
+            stamp_ns = commit.outcome.position.stamp_ns
+            self._slots.set(slot, Content(version, stamp_ns, write.datum, NullReason.DELETED))
+        yield from make_durable(self, commit, now_ns=now_ns)
+
+    patch(Commits, "_make_durable", wrong)
+
+
+def welcomes_early(patch):
+    """A session is welcomed before its record is on disk."""
+    answer_when_durable = SessionDesk._answer_when_durable
+
+    def wrong(self, reply_to, answer, records):
+        for effect in answer_when_durable(self, reply_to, answer, records):
+            yield effect
+            if isinstance(effect, Persist):
+                yield Reply(*self._answers_after[effect.ticket].pop())
+
+    patch(SessionDesk, "_answer_when_durable", wrong)
+
+
+ALL = (
+    lease_ends_a_nanosecond_late,
+    any_token_of_this_epoch,
+    grants_a_seq_again,
+    view_does_not_renew,
+    prepared_locks_end_with_their_client,
+    commits_in_flight_expire,
+    promises_before_it_is_kept,
+    finished_before_it_is_kept,
+    aborts_what_is_open,
+    forgets_what_is_decided,
+    loses_prepared_at_a_restart,
+    tells_participants_once,
+    blind_acknowledgement,
+    no_grace,
+    leases_pay_for_a_stall,
+    hold_limits_pay_for_a_stall,
+    validated_once,
+    expects_beside_writers,
+    expects_what_was,
+    views_promise_too_much,
+    stamps_follow_the_wall_clock,
+    keep_alives_free_nothing,
+    vanished_waiters_keep_their_place,
+    shows_before_it_is_kept,
+    welcomes_early,
+)
