@@ -314,6 +314,7 @@ class Shard:
         """Assert I1, I8, I10, I11 and the bookkeeping of all parts.  For tests and simulation."""
         self._prepares.assert_invariants()
         self.state.tenures.assert_invariants()
+        self.state.slots.retained.assert_invariants()
         if self.state.sessions.in_grace(self.state.now_ns):
             granted = [t for t in self.state.tenures.by_lock.values() if t.token is not None]
             assert all(t.prepared is not None for t in granted), "grant in grace"

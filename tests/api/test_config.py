@@ -38,6 +38,7 @@ shard = "left"
 
 [aspects.depth]
 durability = "volatile"
+retention = 8
 
 [aspects.flags]
 
@@ -96,10 +97,10 @@ def test_config_needs_only_a_name_and_a_shard():
 
 
 def test_config_lists_its_aspects_as_catalogue_entries():
-    """An aspect of the file has a durability and lets any type register."""
+    """An aspect of the file has a durability and a retention, and lets any type register."""
     assert parsed(FULL).aspect_entries() == (
-        AspectEntry("depth", "", "volatile"),
-        AspectEntry("flags", "", "durable"),
+        AspectEntry("depth", "", "volatile", 8),
+        AspectEntry("flags", "", "durable", 1),
     )
 
 
@@ -172,6 +173,8 @@ WRONG = {
     "pins type": ('name = "c"\n' + SHARD + '[pins]\nshard = "left"\n', 4, "'pins' is an array of tables ([[pins]]), not a table"),
     "pin type": ('name = "c"\npins = [\n1]\n' + SHARD, 3, "'pins' holds tables ([[pins]]), not an integer (1)"),
     "durability": ('name = "c"\n' + SHARD + '[aspects.x]\ndurability = "volatil"\n', 5, "unknown durability 'volatil' of aspect 'x'; did you mean 'volatile'?"),
+    "retention": ('name = "c"\n' + SHARD + "[aspects.x]\nretention = 0\n", 5, "'retention' in [aspects.x] is a number of versions from 1 to 256, not 0; the older ones are kept in memory until their shard restarts"),
+    "retention kind": ('name = "c"\n' + SHARD + "[aspects.x]\nretention = true\n", 5, "from 1 to 256, not True"),
     "aspect key": ('name = "c"\n' + SHARD + "[aspects]\nx = { durable = true }\n", 5, "unknown key 'durable' in [aspects.x]; did you mean 'durability'?"),
     "aspect name": ('name = "c"\n' + SHARD + '[aspects."a/b"]\n', 4, "'a/b' cannot name a aspect"),
     "no class": ('name = "c"\n' + SHARD + "[actors.x]\n", 4, "[actors.x] needs the key 'class'"),
