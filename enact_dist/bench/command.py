@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Final
 from enact_dist.bench.decisions import core_cases
 from enact_dist.bench.floors import Floors
 from enact_dist.bench.payloads import run_fetch, run_publish, run_wakeup
+from enact_dist.bench.pipeline import run_pipeline
 from enact_dist.bench.place import EMBEDDED, Place
 from enact_dist.bench.run import Run
 from enact_dist.bench.updates import run_durable, run_multi, run_update, run_waiters
@@ -51,8 +52,9 @@ BENCHES: Final[dict[str, Callable[[Run], None]]] = {
     "fetch": run_fetch,
     "publish": run_publish,
     "wakeup": run_wakeup,
+    "pipeline": run_pipeline,
 }
-BETWEEN_PROCESSES: Final = frozenset(("waiters", "wakeup"))
+BETWEEN_PROCESSES: Final = frozenset(("waiters", "wakeup", "pipeline"))
 """Benches that mean nothing within one process."""
 
 

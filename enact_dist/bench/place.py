@@ -14,7 +14,7 @@ from enact_dist.link.shared_folder import SHARED_FOLDER_VARIABLE
 from enact_dist.verify.daemons import LineProcess, free_port
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
     from enact_dist.cell import Cell
@@ -26,6 +26,9 @@ EMBEDDED: Final = "embedded"
 CARRIER_VARIABLE: Final = "ENACT_CARRIER"
 COMMAND: Final = "enact_dist.cli.main"
 WORKER: Final = "enact_dist.bench.worker"
+PIPELINE_WORKER: Final = "enact_dist.bench.pipeline_worker"
+WORKERS_S: Final = 120.0
+"""Many processes that start at once on few processors take this long at most."""
 END_S: Final = 5.0
 JOIN_S: Final = 10.0
 assert EMBEDDED not in CARRIERS
@@ -75,6 +78,7 @@ class Place:
         self._cells: dict[str, Cell] = {}
         self._stack = contextlib.ExitStack()
         self._logs = 0
+        self._daemons: list[LineProcess] = []
 
     def __enter__(self) -> Place:
         return self
@@ -112,11 +116,11 @@ class Place:
             lines += ["[[pins]]", f'entities = "{name}/**"', f'shard = "{name}"']
         file.write_text("\n".join(lines) + "\n")
         with environment(**{CARRIER_VARIABLE: "auto"}):
-            daemons = [
+            self._daemons = [
                 self._process(COMMAND, ("shard", "run", name, "--cell", str(file)))
                 for name in self.shard_names
             ]
-        for daemon in daemons:
+        for daemon in self._daemons:
             daemon.expect("ready:")
         return str(file)
 
@@ -142,6 +146,7 @@ class Place:
         if carrier == EMBEDDED:
             return carrier
         self.world(carrier)
+        self._cells[carrier].worlds()  # greets every shard, so that each says how it is reached
         ways = {shard.carrier for shard in self._cells[carrier].shards()}
         return "socket" if ways == {"socket"} else "zenoh"
 
@@ -166,13 +171,34 @@ class Place:
     # ---------------------------------------------------------------- workers
 
     @contextlib.contextmanager
-    def worker(self, role: str, *, carrier: str, **options: Any) -> Iterator[LineProcess]:
-        """Run `enact_dist.bench.worker` in a role; it has said ``ready:``."""
+    def workers(
+        self,
+        roles: Sequence[tuple[str, dict[str, Any]]],
+        *,
+        carrier: str,
+        module: str = WORKER,
+    ) -> Iterator[list[LineProcess]]:
+        """Run a process for each role with its options; all have said ``ready:``."""
         target = self.target
         with environment(**{CARRIER_VARIABLE: carrier}):
-            process = self._process(WORKER, (target, role, json.dumps(options)))
+            processes = [
+                self._process(module, (target, role, json.dumps(options)))
+                for role, options in roles
+            ]
         try:
-            process.expect("ready:")
-            yield process
+            for process in processes:
+                process.expect("ready:", timeout_s=WORKERS_S)
+            yield processes
         finally:
-            _end(process)
+            for process in processes:
+                _end(process)
+
+    @contextlib.contextmanager
+    def worker(self, role: str, *, carrier: str, **options: Any) -> Iterator[LineProcess]:
+        """Run `enact_dist.bench.worker` in a role; it has said ``ready:``."""
+        with self.workers([(role, options)], carrier=carrier) as (process,):
+            yield process
+
+    def daemon_pids(self) -> list[int]:
+        """Return the process ids of the daemons of an own cell."""
+        return [daemon.pid for daemon in self._daemons]
