@@ -24,9 +24,9 @@ _DURABILITIES: Final = ("", *(durability.value for durability in Durability))
 
 
 def wrong_access(items: Iterable[Item]) -> Refused | None:
-    """Refuse an access that there is not, and a lock on what was captured at some time."""
+    """Refuse an access that there is not, and a write or a pattern of what was captured when."""
     for item in items:
-        if item.captured_ns and item.access != Access.VIEW:
+        if item.captured_ns and item.access not in (Access.VIEW, Access.READ):
             return _refused(f"{item.entity}/{item.aspect} was asked by stamp; only a View can be")
         if item.access not in _ACCESSES:
             return _refused(f"access {item.access} was asked; there are {sorted(_ACCESSES)}")

@@ -25,8 +25,9 @@ class Item(NamedTuple):
 
     `entity` is a pattern where the access is one of the `…_EACH`.  `known` is the version that
     the client still has from this epoch (0: none): an unchanged datum is not sent again.
-    With `captured_ns` (a `VIEW` only) the newest retained version with that capture stamp is asked
-    instead of the newest one; where there is none, the slot shows as null outside retention.
+    With `captured_ns` (a `VIEW`, or the `READ` that stands for one where there is no cut) the
+    newest retained version with that capture stamp is asked instead of the newest one; where there
+    is none, the slot shows as null outside retention.
     """
 
     access: int

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import socket
+import sys
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -25,8 +28,10 @@ from enact_dist import (
 )
 from enact_dist.actor import Actor
 from enact_dist.actor_binding import BoundActor
+from enact_dist.actor_check import check_cell
 from enact_dist.actor_inbox import SetInbox, Watching
 from enact_dist.actor_process import ActorThread
+from enact_dist.config import load_config
 from enact_dist.core.datum import Position
 from enact_dist.core.messages import Pin, PlacementMap, ShardEntry
 from enact_dist.core.shard_state import ShardSettings
@@ -171,6 +176,43 @@ def test_large_data_of_a_set_are_those_of_its_stamp(cell):
     assert (left == 1).all()
     assert (right == 1).all()
     assert (online.view(together.requests[0])[together.requests[0]] == 2).all()
+
+
+def test_set_that_is_written_twice_is_never_shown_half(cell):
+    """One consistent cut over shards: both data of the first commit of a stamp, or of the second."""
+    twice = Aspect("twice", str, Durability.VOLATILE, retention=32)
+    online = cell.world("online")
+    together = Together([View(online, entity, twice) for entity in (LEFT, RIGHT)])
+    writes = [Write(online, entity, twice) for entity in (LEFT, RIGHT)]
+    begun, enough, errors = threading.Event(), threading.Event(), []
+
+    def write():
+        try:
+            for stamp_ns in itertools.takewhile(lambda _: not enough.is_set(), itertools.count(1)):
+                for letter in "ab":
+                    with Lock(*writes) as lock:
+                        for request in writes:
+                            lock.put(request, f"{stamp_ns}{letter}", stamp_ns=stamp_ns)
+                    begun.set()
+        except Exception as error:
+            errors.append(error)
+
+    writer = threading.Thread(target=write)
+    writer.start()
+    assert begun.wait(PATIENCE_S)
+    seen = set()
+    end_s = time.monotonic() + PATIENCE_S
+    while len(seen) < 20 and not errors and time.monotonic() < end_s:
+        snapshot = online.view(together)
+        seen.add((snapshot.captured_ns, *snapshot[together]))
+    enough.set()
+    writer.join()
+
+    assert not errors
+    assert all(left == right and left[:-1] == str(ns) for ns, left, right in seen), seen
+    assert len(seen) == 20
+    last = online.view(together)
+    assert last[together] == (f"{last.captured_ns}b",) * 2
 
 
 def test_snapshot_and_lock_refuse_a_set_that_they_were_not_made_with(cell):
@@ -414,3 +456,30 @@ def test_eight_cameras_eight_workers_and_one_consumer_of_whole_sets(cell):
     assert found.last_incomplete == (
         f"set of stamp {stamp_of(dropped)}: without online:camera/{camera}/mask"
     )
+
+
+@pytest.mark.parametrize(("retention", "found"), [(1, 2), (8, 0)])
+def test_check_warns_of_a_set_that_nobody_retains(tmp_path, monkeypatch, retention, found):
+    """By the word of the file or of the actor, whichever is larger."""
+    bare = Aspect("bare", int)
+
+    class Bare(Actor):
+        depths = Together([View(role, entity, bare) for entity in (LEFT, RIGHT)])
+        total = Write(role, SYSTEM, TOTAL)
+        triggers = (depths,)
+
+        def update(self, lock):
+            lock[self.total] = sum(lock[self.depths])
+
+    monkeypatch.setattr(sys.modules[__name__], "Bare", Bare, raising=False)
+    monkeypatch.setitem(sys.modules, "set_actors", sys.modules[__name__])
+    file = tmp_path / "cell.toml"
+    file.write_text(
+        'name = "c"\nworlds = ["online"]\n[shards.s]\nlisten = "tcp/127.0.0.1:7447"\n'
+        f'[aspects.bare]\nretention = {retention}\n[actors.a]\nclass = "set_actors:Bare"\n'
+    )
+
+    warnings = [one for one in check_cell(load_config(file)) if one.kind == "set not retained"]
+
+    assert len(warnings) == found
+    assert all("[aspects.bare]" in one.text for one in warnings)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import pytest
-from shard_bench import ShardBench, datum, item, lock_id, slot
+from shard_bench import TTL_NS, ShardBench, datum, item, lock_id, slot
 
+from enact_dist.core.client import Client
 from enact_dist.core.datum import Datum, Slot
 from enact_dist.core.messages import (
     AspectEntry,
@@ -19,6 +20,7 @@ from enact_dist.core.messages import (
     Registered,
     Release,
     Sessions,
+    ShardEntry,
     Slice,
     SlotState,
     Survey,
@@ -158,7 +160,23 @@ def test_lock_shows_views_by_stamp_beside_its_own_data(cameras):
     assert [state.version for state in granted.states] == [0, 1]
 
 
-@pytest.mark.parametrize("access", [Access.READ, Access.WRITE, Access.VIEW_EACH])
+def test_view_that_gets_no_cut_is_asked_by_stamp_under_a_read_lock(cameras):
+    """Where undecided commits stand in the way of every cut, the client locks what it views."""
+    for seq, stamp_ns in enumerate((100, 200), 1):
+        capture(cameras, seq, stamp_ns)
+    client = Client("bob", ttl_ns=TTL_NS)
+    client.learn_placement(cameras.settings.placement._replace(shards=(ShardEntry("s0", ()),)))
+    asked = item(V, "cam", "mask")._replace(captured_ns=100)
+    ((_, items),) = client.plan((asked,), lock_views=True).locks
+    assert [one.access for one in items] == [Access.READ]
+
+    granted = cameras.granted(lock_id("bob", 0, 1), *items)
+
+    assert [(state.version, state.captured_ns) for state in granted.states] == [(1, 100)]
+    assert cameras.acquire(lock_id("ann", 1, 3), item(W, "cam", "mask")) is None
+
+
+@pytest.mark.parametrize("access", [Access.WRITE, Access.READ_EACH, Access.VIEW_EACH])
 def test_only_a_view_can_be_asked_by_stamp(cameras, access):
     """A lock is about the present, and a pattern has no one stamp."""
     asked = Item(access, "online", "cam", "mask", 0, 100)
