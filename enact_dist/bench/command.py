@@ -7,7 +7,7 @@ import os
 import platform
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -89,6 +89,7 @@ def names_of(arguments: argparse.Namespace) -> list[str]:
 def run(arguments: argparse.Namespace) -> int:
     """Measure, print, and return the exit status: a goal that is missed is no failure."""
     names = names_of(arguments)
+    found = machine()  # its load is that of others, before this adds its own
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="enact-bench-")))
         memory_root = MEMORY if MEMORY.is_dir() else None
@@ -110,9 +111,9 @@ def run(arguments: argparse.Namespace) -> int:
             BENCHES[name](measured)
         rows = measured.rows()
     if arguments.json:
-        print_json({"machine": machine(), "rows": [row.as_json() for row in rows]})
+        print_json({"machine": found, "rows": [row.as_json() for row in rows]})
     else:
-        _print(rows)
+        _print(found, rows)
     return 0
 
 
@@ -176,9 +177,11 @@ def _cells(row: Row) -> tuple[str, ...]:
     return row.name, row.variant, median, p99, f"{row.n:,}", ratio, row.goal or "", met
 
 
-def _print(rows: Sequence[Row]) -> None:
-    found = machine()
-    print(f"{found['processor']}, {found['cores']} cores, Python {found['python']}")
+def _print(found: Mapping[str, object], rows: Sequence[Row]) -> None:
+    print(
+        f"{found['processor']}, {found['cores']} cores, Python {found['python']}, load before"
+        f" {found['load']}"
+    )
     print_table(COLUMNS, [_cells(row) for row in rows], empty="nothing was measured")
     judged = [row for row in rows if row.goal is not None]
     missed = [row for row in judged if row.met is False]

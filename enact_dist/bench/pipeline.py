@@ -71,8 +71,8 @@ def run_pipeline(run: Run) -> None:
         )
     )
     run.add_row(_row("the same work without sharing", round(bare.cores, 3), "cores", bare_ticks))
-    run.add_row(_row("memory growth", round(shared.grown_bytes / MEGA, 2), "MB", ticks))
-    run.add_row(_row("shared files growth", round(shared.files_bytes / MEGA, 2), "MB", ticks))
+    run.add_row(_row("memory growth", round(shared.grown_bytes / MEGA, 2) + 0.0, "MB", ticks))
+    run.add_row(_row("shared files growth", round(shared.files_bytes / MEGA, 2) + 0.0, "MB", ticks))
 
 
 def _row(
