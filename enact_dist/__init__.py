@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from enact_dist.cell import Cell
     from enact_dist.connecting import connect, local
     from enact_dist.lock import Lock
+    from enact_dist.together import Together
     from enact_dist.watch import Change, Watch
     from enact_dist.wire.codecs import register_codec
     from enact_dist.world import Snapshot, WorldContext
@@ -53,6 +54,7 @@ __all__ = [
     "Read",
     "ReadEach",
     "Snapshot",
+    "Together",
     "View",
     "ViewEach",
     "Watch",
@@ -72,6 +74,7 @@ _HOME_OF = {
     "Change": "watch",
     "Lock": "lock",
     "Snapshot": "world",
+    "Together": "together",
     "Watch": "watch",
     "WorldContext": "world",
     "connect": "connecting",

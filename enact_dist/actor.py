@@ -36,6 +36,7 @@ from enact_dist.terms import (
     patterns_overlap,
     refuse_duplicates,
 )
+from enact_dist.together import Together
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -79,6 +80,10 @@ class Actor:
       no request stands for the triggering entity (only single entities and ``…Each``), one update
       sees everything: all changes share one run, and `lock.entity` is the one that changed last.
       A datum that became null triggers only through ``…Each``: there the set has changed.
+    - with one `Together` as the only trigger: once per complete set of data that bear the same
+      capture stamp, in the order of their stamps; at the start for the newest one.  `lock[…]` of
+      the `Together`, or of a `View` in it, shows the data of that stamp, whatever came later.
+      Sets that stay incomplete are counted and named, see `enact actor ls`.
     - with `every_s`: at that rate, on a grid without drift; late ticks are counted as missed.
       A tick whose lock was refused is over: the next one takes a newer measurement.
     - with neither: once, then the actor is done.
@@ -99,7 +104,9 @@ class Actor:
         declaration: What the class declares, checked.
     """
 
-    triggers: ClassVar[Sequence[Read[Any] | View[Any] | ReadEach[Any] | ViewEach[Any]]] = ()
+    triggers: ClassVar[
+        Sequence[Read[Any] | View[Any] | ReadEach[Any] | ViewEach[Any] | Together[Any]]
+    ] = ()
     shared: ClassVar[Sequence[LockRequest[Any]]] = ()
     every_s: float | None = None
     wait_s: float = 10.0
@@ -141,6 +148,7 @@ class Declaration:
         shared: Writes that are declared to have other writers.
         roles: Names of the world roles that the requests use, in order of appearance.
         per_entity: Whether some request stands for the triggering entity.
+        together: The set that triggers, whose views are the `triggers`; None without one.
     """
 
     actor: str
@@ -149,6 +157,7 @@ class Declaration:
     shared: tuple[Declared, ...]
     roles: tuple[str, ...]
     per_entity: bool
+    together: Together[Any] | None = None
 
     @staticmethod
     def of(actor_class: type[Actor]) -> Declaration:
@@ -158,13 +167,17 @@ class Declaration:
             MisuseError: A request without a `World` role, two accesses to one datum, a trigger
                 that is not declared or not a reading request or written by the actor itself, both
                 `triggers` and `every_s`, a pattern that no triggering entity can match, an
-                `update` without any request.
+                `update` without any request, a `Together` that is not the only trigger.
         """
         requests = _requests_of(actor_class)
+        together = _together_of(actor_class, requests)
         declaration = Declaration(
             actor=actor_class.__name__,
             requests=requests,
-            triggers=_chosen(actor_class, "triggers", requests),
+            triggers=together.requests
+            if together is not None
+            else _chosen(actor_class, "triggers", requests),
+            together=together,
             shared=_chosen(actor_class, "shared", requests),
             roles=tuple(dict.fromkeys(request.world.name for request in requests.values())),
             per_entity=any(stands_for_trigger(request) for request in requests.values()),
@@ -203,13 +216,47 @@ def same_data(one: Declared, other: Declared) -> bool:
     )
 
 
-def _requests_of(actor_class: type[Actor]) -> dict[str, Declared]:
-    requests: dict[str, Declared] = {}
+def _attributes(actor_class: type[Actor]) -> dict[str, Declared | Together[Any]]:
+    """Return the class attributes that declare data, those of base classes first."""
+    declared: dict[str, Declared | Together[Any]] = {}
     for base in reversed(actor_class.__mro__):
         for name, value in vars(base).items():
-            requests.pop(name, None)
-            if isinstance(value, LockRequest):
-                requests[name] = value
+            declared.pop(name, None)
+            if isinstance(value, LockRequest | Together):
+                declared[name] = value
+    return declared
+
+
+def _together_of(
+    actor_class: type[Actor], requests: Mapping[str, Declared]
+) -> Together[Any] | None:
+    """Return the set that triggers an actor, checked."""
+    declared = [one for one in _attributes(actor_class).values() if isinstance(one, Together)]
+    if not declared and not any(isinstance(one, Together) for one in actor_class.triggers):
+        return None
+    name = actor_class.__name__
+    if len(declared) != 1 or list(actor_class.triggers) != declared:
+        raise MisuseError(
+            f"{name} declares {declared or 'no Together'} and triggers {actor_class.triggers!r};"
+            " a Together is a class attribute of its actor and its only trigger"
+        )
+    for attribute, request in requests.items():
+        if stands_for_trigger(request):
+            raise MisuseError(
+                f"{name}.{attribute} is {request!r}: its pattern stands for the triggering entity,"
+                f" but a set triggers {name}; name one entity, or use"
+                f" {type(request).__name__}Each for all that match"
+            )
+    return declared[0]
+
+
+def _requests_of(actor_class: type[Actor]) -> dict[str, Declared]:
+    requests: dict[str, Declared] = {}
+    for name, value in _attributes(actor_class).items():
+        if isinstance(value, Together):
+            requests |= {f"{name}[{index}]": one for index, one in enumerate(value.requests)}
+        else:
+            requests[name] = value
     for name, request in requests.items():
         if not isinstance(request.world, World):
             raise MisuseError(

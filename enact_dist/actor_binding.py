@@ -11,8 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 from enact_dist.actor import Actor, Declared, same_data, stands_for_trigger
 from enact_dist.actor_lock import ActorLock
+from enact_dist.actor_sets import PendingSets
 from enact_dist.errors import MisuseError
-from enact_dist.terms import Entities, Entity, refuse_duplicates
+from enact_dist.reading import slot_of
+from enact_dist.terms import Entities, Entity, View, refuse_duplicates
 
 if TYPE_CHECKING:
     import threading
@@ -71,6 +73,7 @@ class BoundActor:
         *,
         wait_s: float | None = None,
         stop: threading.Event | None = None,
+        captured_ns: int = 0,
     ) -> ActorLock:
         """Return the lock of one update, not yet taken.
 
@@ -78,6 +81,7 @@ class BoundActor:
             entity: The triggering entity; None for a source or an actor that runs once.
             wait_s: How long to wait for it; None: as long as the actor says.
             stop: Ends the waiting once it is set.
+            captured_ns: Capture stamp of the set that triggered it; 0 without one.
         """
         bound = {
             declared: self._bound(declared, entity)
@@ -89,12 +93,33 @@ class BoundActor:
             wait_s=self.actor.wait_s if wait_s is None else wait_s,
             hold_s=self.actor.hold_s,
             stop=stop,
+            together=self.declaration.together,
+            captured_ns=captured_ns,
         )
 
     def check_usable(self) -> None:
         """Raise `MisuseError` if the cell was closed, or belongs to a parent process."""
         for context in self.contexts.values():
             context.session.client.check_usable()
+
+    def set_views(self) -> tuple[View[Any], ...]:
+        """Return the views of the actor's set, bound; none without a set."""
+        together = self.declaration.together
+        return tuple(
+            View(self.contexts[view.world.name], view.entity, view.aspect)
+            for view in (together.requests if together is not None else ())
+        )
+
+    def pending_sets(self) -> PendingSets | None:
+        """Return an empty account of the sets that trigger the actor; None without a set."""
+        together = self.declaration.together
+        if together is None:
+            return None
+        views = self.set_views()
+        first = views[0].entity
+        assert isinstance(first, Entity)
+        names = [str(slot_of(view)) for view in views]
+        return PendingSets(names, entity=first, open_max=together.open_max)
 
     def watched(self) -> tuple[Watched, ...]:
         """Return what must be watched to see every change of a trigger datum."""

@@ -15,6 +15,8 @@ error    own trigger          an actor that, as bound, writes what triggers it
 error    two writers          two actors that write one slot, not both declaring it as `shared`
 warning  unwritten trigger    a trigger that no actor writes: only a write from outside runs it
 warning  unwritten read       a reading request for data that no actor writes
+warning  set not retained     the aspects of a `Together` retain one version: a set is gone as soon
+                              as one of its slots moves on
 warning  unused aspect        `cell.toml` configures an aspect that no actor names: misspelt?
 =======  ===================  ===================================================================
 
@@ -151,6 +153,7 @@ def check_cell(config: CellConfig, *, initial: Collection[str] = ()) -> tuple[Fi
         except Exception as error:  # noqa: BLE001 (importing a module can raise anything)
             findings.append(Finding("error", "no such actor", (actor.name,), str(error)))
     findings += check_actors(actors, worlds=config.worlds, initial=initial)
+    findings += _sets(actors, {entry.name: entry.retention for entry in config.aspects})
     named = {
         request.aspect.name
         for actor in actors
@@ -168,6 +171,24 @@ def check_cell(config: CellConfig, *, initial: Collection[str] = ()) -> tuple[Fi
                 )
             )
     return _ordered(findings)
+
+
+def _sets(actors: Iterable[ActorDeclaration], configured: Mapping[str, int]) -> Iterator[Finding]:
+    """Find sets whose data nobody retains, by the word of `cell.toml` or of the actor."""
+    for actor in actors:
+        together = actor.actor_class.declaration.together
+        for request in together.requests if together is not None else ():
+            aspect = request.aspect
+            if max(aspect.retention, configured.get(aspect.name, 1)) == 1:
+                yield Finding(
+                    "warning",
+                    "set not retained",
+                    (actor.name,),
+                    f"{request!r} of {actor.name} is part of a set, and {aspect.name} retains one"
+                    " version: the set is gone as soon as this datum is written again; give"
+                    f" [aspects.{aspect.name}] or Aspect(…) a retention of as many versions as"
+                    " are under way at once",
+                )
 
 
 def _ordered(findings: Iterable[Finding]) -> tuple[Finding, ...]:

@@ -10,14 +10,17 @@ from __future__ import annotations
 import logging
 import random
 import threading
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Generic, Self, TypeVar
 
+from enact_dist.actor_sets import PendingSets
 from enact_dist.actor_triggers import BackOff, PendingTriggers, Trigger
 from enact_dist.errors import LinkError
 from enact_dist.link.clock import monotonic_ns
+from enact_dist.session import session_of
+from enact_dist.together import Captured, captured_versions
 
 if TYPE_CHECKING:
-    from collections.abc import Hashable, Iterator, Mapping
+    from collections.abc import Hashable, Iterator, Mapping, Sequence
 
     from enact_dist.actor_binding import BoundActor, Watched
     from enact_dist.terms import Entity
@@ -26,11 +29,14 @@ if TYPE_CHECKING:
 log = logging.getLogger("enact.actor")
 
 
-class Inbox:
-    """`PendingTriggers` that the watching threads fill and the actor's thread empties."""
+P = TypeVar("P", PendingTriggers, PendingSets)
 
-    def __init__(self, *, per_entity: bool) -> None:
-        self._pending = PendingTriggers(per_entity=per_entity)
+
+class _Box(Generic[P]):
+    """What is pending; the watching threads fill it, the actor's thread empties it."""
+
+    def __init__(self, pending: P) -> None:
+        self._pending: P = pending
         self._filled = threading.Condition()
         self._error: Exception | None = None
 
@@ -38,25 +44,6 @@ class Inbox:
     def skipped(self) -> int:
         """States that no update saw, so far."""
         return self._pending.skipped
-
-    def changed(self, source: int, entity: Entity, state: Hashable, *, missed: int = 0) -> None:
-        """Take note of a change; `missed` states before it were lost on the way."""
-        with self._filled:
-            self._pending.skipped += missed
-            if self._pending.changed(source, entity, state):
-                self._filled.notify_all()
-
-    def vanished(self, source: int, entity: Entity, state: Hashable, *, in_set: bool) -> None:
-        """Take note that a trigger datum is null."""
-        with self._filled:
-            if self._pending.vanished(source, entity, state, in_set=in_set):
-                self._filled.notify_all()
-
-    def used(self, states: Mapping[tuple[int, Entity], Hashable]) -> None:
-        """Take note of the states that an update that just ended has seen already."""
-        with self._filled:
-            for (source, entity), state in states.items():
-                self._pending.used(source, entity, state)
 
     def postpone(self, trigger: Trigger, due_ns: int) -> None:
         """Put a refused run back until `due_ns`."""
@@ -90,6 +77,69 @@ class Inbox:
                 self._filled.wait((wake_ns - now_ns) / 1e9)
 
 
+class Inbox(_Box[PendingTriggers]):
+    """`PendingTriggers` that the watching threads fill and the actor's thread empties."""
+
+    def __init__(self, *, per_entity: bool) -> None:
+        super().__init__(PendingTriggers(per_entity=per_entity))
+
+    def changed(self, source: int, entity: Entity, state: Hashable, *, missed: int = 0) -> None:
+        """Take note of a change; `missed` states before it were lost on the way."""
+        with self._filled:
+            self._pending.skipped += missed
+            if self._pending.changed(source, entity, state):
+                self._filled.notify_all()
+
+    def vanished(self, source: int, entity: Entity, state: Hashable, *, in_set: bool) -> None:
+        """Take note that a trigger datum is null."""
+        with self._filled:
+            if self._pending.vanished(source, entity, state, in_set=in_set):
+                self._filled.notify_all()
+
+    def used(self, states: Mapping[tuple[int, Entity], Hashable]) -> None:
+        """Take note of the states that an update that just ended has seen already."""
+        with self._filled:
+            for (source, entity), state in states.items():
+                self._pending.used(source, entity, state)
+
+
+class SetInbox(_Box[PendingSets]):
+    """`PendingSets` that the watching threads fill and the actor's thread empties."""
+
+    @property
+    def sets(self) -> PendingSets:
+        """The account of the sets, for its counters."""
+        return self._pending
+
+    def start(self, versions: Sequence[Sequence[Captured]]) -> None:
+        """Take what there is when the actor starts."""
+        with self._filled:
+            self._pending.start(versions)
+
+    def misses(self, member: int, version: int) -> bool:
+        """Whether versions before this one were not seen."""
+        with self._filled:
+            return self._pending.misses(member, version)
+
+    def captured(self, member: int, versions: Sequence[Captured]) -> None:
+        """Take versions of one member of the set, oldest first."""
+        with self._filled:
+            before = self._pending.incomplete
+            if self._pending.captured(member, versions):
+                self._filled.notify_all()
+            given_up = self._pending.incomplete - before
+            told = list(self._pending.told)[-given_up:] if given_up else []
+        for incomplete in told:
+            log.warning("incomplete %s", incomplete)
+
+    def gone(self, stamp_ns: int, missing: Sequence[int]) -> None:
+        """Count a complete set whose data were outside retention before its update could run."""
+        with self._filled:
+            self._pending.gone(stamp_ns, missing)
+            told = self._pending.told[-1]
+        log.warning("incomplete, outside retention before its update: %s", told)
+
+
 class Watching:
     """All watches of one actor while it runs; a context manager.
 
@@ -98,7 +148,7 @@ class Watching:
         inbox: Where its changes go.
     """
 
-    def __init__(self, bound: BoundActor, inbox: Inbox) -> None:
+    def __init__(self, bound: BoundActor, inbox: Inbox | SetInbox) -> None:
         self._bound = bound
         self._inbox = inbox
         self._over = threading.Event()
@@ -167,6 +217,10 @@ class Watching:
         declaration = self._bound.declaration
         if not declaration.covers(change.entity):
             return
+        if isinstance(self._inbox, SetInbox):
+            for index in watched.triggers.get(str(change.aspect), ()):
+                self._note_in_set(self._inbox, index, change)
+            return
         state = (change.version, change.position.stamp_ns)
         for index in watched.triggers.get(str(change.aspect), ()):
             if change.null:
@@ -174,3 +228,13 @@ class Watching:
                 self._inbox.vanished(index, change.entity, state, in_set=in_set)
             else:
                 self._inbox.changed(index, change.entity, state, missed=change.gap)
+
+    def _note_in_set(self, inbox: SetInbox, member: int, change: Change) -> None:
+        """Take a change of a set's member; where versions were missed, what is retained of it."""
+        versions = [
+            Captured(change.version, change.position.stamp_ns, change.captured_ns, change.null)
+        ]
+        if inbox.misses(member, change.version):
+            view = self._bound.set_views()[member]
+            versions = captured_versions(session_of((view,)), (view,))[0]
+        inbox.captured(member, versions)

@@ -11,10 +11,13 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from enact_dist.lock import Lock
 from enact_dist.reading import slot_of
 from enact_dist.terms import Entity, LockRequest, World
+from enact_dist.together import Together
 
 if TYPE_CHECKING:
     import threading
     from collections.abc import Mapping
+
+    from enact_dist.core.messages import Item
 
 T = TypeVar("T")
 
@@ -31,6 +34,8 @@ class ActorLock(Lock):
         wait_s: As for `Lock`.
         hold_s: As for `Lock`.
         stop: Ends the waiting for the lock within 0.2 s once it is set.
+        together: The set that triggers the actor, if one does.
+        captured_ns: Its capture stamp.
     """
 
     def __init__(
@@ -41,11 +46,25 @@ class ActorLock(Lock):
         wait_s: float,
         hold_s: float,
         stop: threading.Event | None = None,
+        together: Together[Any] | None = None,
+        captured_ns: int = 0,
     ) -> None:
         super().__init__(*bound.values(), wait_s=wait_s, hold_s=hold_s)
         self._interrupt = stop
         self._entity = entity
         self._bound = bound
+        self._together = together
+        self._captured_ns = captured_ns
+        views = together.requests if together is not None else ()
+        self._in_set: tuple[Any, ...] = tuple(bound[view] for view in views)
+
+    def _item_of(self, request: LockRequest[Any]) -> Item:
+        captured_ns = self._captured_ns if request in self._in_set else 0
+        return self._session.item_of(request, captured_ns)
+
+    def missing(self) -> list[int]:
+        """Return which data of the set were outside retention at the grant, by their index."""
+        return [index for index, view in enumerate(self._in_set) if self._is_null(slot_of(view))]
 
     def _own(self, request: Any) -> Any:
         if isinstance(request, LockRequest) and isinstance(request.world, World):
@@ -63,7 +82,9 @@ class ActorLock(Lock):
             if state is not None
         }
 
-    def __getitem__(self, request: LockRequest[Any]) -> Any:
+    def __getitem__(self, request: Any) -> Any:
+        if isinstance(request, Together) and request == self._together:
+            return tuple(super(ActorLock, self).__getitem__(view) for view in self._in_set)
         return super().__getitem__(self._own(request))
 
     def get(self, request: LockRequest[Any], default: Any = None) -> Any:
@@ -89,6 +110,8 @@ class ActorLock(Lock):
         """`Lock.version` of a declared request."""
         return super().version(self._own(request))
 
-    def stamp_ns(self, request: LockRequest[Any]) -> int:
-        """`Lock.stamp_ns` of a declared request."""
+    def stamp_ns(self, request: LockRequest[Any] | Together[Any]) -> int:
+        """`Lock.stamp_ns` of a declared request, or the capture stamp of the set."""
+        if isinstance(request, Together) and request == self._together:
+            return self._captured_ns
         return super().stamp_ns(self._own(request))

@@ -52,6 +52,11 @@ class ActorStatistics:
         last_update_unix_s: When it ended, seconds since 1970 by the actor's clock; 0 if none.
         lock_wait_p50_ms: Median wait for the lock over the newest 512 attempts.
         lock_wait_p99_ms: 99th percentile of the same.
+        incomplete: Sets of data with one capture stamp (`Together`) that never ran, because some
+            of them never came, or left retention before.
+        last_incomplete: The newest of these: its stamp and what was missing.
+        late: Data whose set was over when they came.
+        unstamped: Data that could be in no set, because their writer gave no stamp.
     """
 
     name: str = ""
@@ -68,6 +73,10 @@ class ActorStatistics:
     last_update_unix_s: float = 0.0
     lock_wait_p50_ms: float = 0.0
     lock_wait_p99_ms: float = 0.0
+    incomplete: int = 0
+    last_incomplete: str = ""
+    late: int = 0
+    unstamped: int = 0
 
 
 class RateMeter:

@@ -20,6 +20,7 @@ the first kind, and after the second it is over.  `KeyboardInterrupt` and the li
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 import random
 import threading
@@ -29,8 +30,13 @@ from weakref import WeakKeyDictionary
 
 from enact_dist.actor import Actor, check_period
 from enact_dist.actor_binding import BoundActor
-from enact_dist.actor_inbox import Inbox, Watching
-from enact_dist.actor_report import ActorRecord, ActorStatistics, encode_reports
+from enact_dist.actor_inbox import Inbox, SetInbox, Watching
+from enact_dist.actor_report import (
+    ERROR_LENGTH_MAX,
+    ActorRecord,
+    ActorStatistics,
+    encode_reports,
+)
 from enact_dist.actor_triggers import BackOff, FixedRate
 from enact_dist.errors import (
     ChangedError,
@@ -41,6 +47,8 @@ from enact_dist.errors import (
     MisuseError,
 )
 from enact_dist.link.clock import monotonic_ns, wall_ns
+from enact_dist.session import session_of
+from enact_dist.together import captured_versions
 
 if TYPE_CHECKING:
     from enact_dist.actor_lock import ActorLock
@@ -123,6 +131,8 @@ class ActorRun:
         self._stop = stop
         self._wait_s = wait_s
         self._on_error = on_error
+        sets = self._bound.pending_sets()
+        self._sets = SetInbox(sets) if sets is not None else None
         self._inbox = Inbox(per_entity=self._bound.declaration.per_entity)
         self._back_off = BackOff()
         self.name = name or type(actor).__name__
@@ -137,7 +147,18 @@ class ActorRun:
     def statistics(self) -> ActorStatistics:
         """Return what the actor has done so far."""
         self._record.skipped = self._inbox.skipped
-        return self._record.snapshot(monotonic_ns())
+        statistics = self._record.snapshot(monotonic_ns())
+        if self._sets is None:
+            return statistics
+        sets = self._sets.sets
+        return dataclasses.replace(
+            statistics,
+            skipped=sets.skipped,
+            incomplete=sets.incomplete,
+            last_incomplete=str(sets.told[-1])[:ERROR_LENGTH_MAX] if sets.told else "",
+            late=sets.late,
+            unstamped=sets.unstamped,
+        )
 
     def run(self) -> ActorStatistics:
         """Run until stopped or done; see `run_actor`."""
@@ -145,7 +166,9 @@ class ActorRun:
         try:
             self._record.state = "running"
             self._report(now=True)
-            if self._bound.declaration.triggers:
+            if self._sets is not None:
+                self._run_sets(self._sets)
+            elif self._bound.declaration.triggers:
                 self._run_triggered()
             elif self._every_s is not None:
                 self._run_source(self._every_s)
@@ -169,6 +192,28 @@ class ActorRun:
                         self._inbox.postpone(trigger, monotonic_ns() + round(pause_s * 1e9))
                 self._report()
 
+    def _run_sets(self, inbox: SetInbox) -> None:
+        """Run once per complete set: first for the newest one that there is, then as they come."""
+        views, refused = self._bound.set_views(), 0
+        while not self._stop.is_set():
+            try:
+                inbox.start(captured_versions(session_of(views), views))
+                break
+            except LinkError as error:
+                self._record.refused(error, unknown=False)
+                self._report()
+                self._stop.wait(self._pause_s(refused))
+                refused += 1
+        with Watching(self._bound, inbox):
+            while not self._stop.is_set():
+                trigger = inbox.take(STOP_LOOK_S)
+                if trigger is not None:
+                    error_ = self._attempt(None, captured_ns=trigger.captured_ns)
+                    if isinstance(error_, REFUSALS):
+                        pause_s = self._pause_s(trigger.refused)
+                        inbox.postpone(trigger, monotonic_ns() + round(pause_s * 1e9))
+                self._report()
+
     def _run_source(self, every_s: float) -> None:
         rate = FixedRate(every_s, start_ns=monotonic_ns())
         missed = 0
@@ -190,16 +235,21 @@ class ActorRun:
             self._stop.wait(self._pause_s(refused))
             refused += 1
 
-    def _attempt(self, entity: Entity | None) -> Exception | None:
+    def _attempt(self, entity: Entity | None, *, captured_ns: int = 0) -> Exception | None:
         """Run `update` once under its lock; return what ended it early."""
         asked_ns, granted_ns = monotonic_ns(), 0
+        missing: list[int] = []
         seen: dict[tuple[int, Entity], tuple[int, int]] = {}
         try:
-            lock = self._bound.lock(entity, wait_s=self._wait_s, stop=self._stop)
+            lock = self._bound.lock(
+                entity, wait_s=self._wait_s, stop=self._stop, captured_ns=captured_ns
+            )
             with lock:
                 granted_ns = monotonic_ns()
+                missing = lock.missing()
                 seen = self._seen(lock)
-                self._actor.update(lock)
+                if not missing:
+                    self._actor.update(lock)
         except REFUSALS as error:
             if isinstance(error, LockTimeoutError) and self._stop.is_set():
                 return error  # told to stop while it waited: nothing was refused
@@ -213,7 +263,11 @@ class ActorRun:
             ending = error
         else:
             ended_ns = monotonic_ns()
-            self._record.updated(took_ns=ended_ns - granted_ns, now_ns=ended_ns, wall_ns=wall_ns())
+            if missing and self._sets is not None:
+                self._sets.gone(captured_ns, missing)
+            else:
+                took_ns = ended_ns - granted_ns
+                self._record.updated(took_ns=took_ns, now_ns=ended_ns, wall_ns=wall_ns())
             ending = None
         self._record.waited((granted_ns or monotonic_ns()) - asked_ns)
         if not isinstance(ending, REFUSALS):

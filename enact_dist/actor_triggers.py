@@ -33,12 +33,14 @@ class Trigger:
     """One run to do: for which entity, and how often in a row it was refused before.
 
     `states` are the changes that it stands for: (index of the trigger request, entity) → state.
+    `captured_ns` is the capture stamp of the set that it stands for, 0 if it is none.
     """
 
     key: str
     entity: Entity
     refused: int = 0
     states: dict[tuple[int, str], Hashable] = field(default_factory=dict)
+    captured_ns: int = 0
 
 
 class PendingTriggers:

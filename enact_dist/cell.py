@@ -269,6 +269,7 @@ class Cell:
             locks=sum(session.locks for session in answer.sessions),
             clock_ahead_s=ahead_ns / 1e9,
             round_trip_s=round_trip_s,
+            carrier=self._client.carrier.way_to(shard),
             counters={counter.name: counter.value for counter in answer.counters},
         )
 

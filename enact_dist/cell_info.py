@@ -42,6 +42,7 @@ class ShardInfo:
         open: False while a restarted shard waits for older leases to end.
         clock_ahead_s: Its wall clock less ours, half a round trip taken off.
         round_trip_s: Of the call that asked.
+        carrier: How this process's calls to it travel: "socket", or "zenoh" and why.
         counters: Its statistics by name.
     """
 
@@ -57,6 +58,7 @@ class ShardInfo:
     locks: int = 0
     clock_ahead_s: float = 0.0
     round_trip_s: float = 0.0
+    carrier: str = ""
     counters: dict[str, int] = field(default_factory=dict)
 
 

@@ -36,7 +36,9 @@ session_ttl_s          2.0            a holder that dies loses its locks after t
                                       (0.2 to 60)
 data_folder            none           parent of the shards' folders; without one, and without
                                       a `folder`, a shard keeps everything in memory only
-carrier                "zenoh"        how messages travel between processes
+carrier                "auto"         how messages travel between processes: "zenoh"; "socket"
+                                      (of this host, an error elsewhere); "auto" takes sockets
+                                      where it can
 [shards.NAME]          at least one   a shard daemon
   listen               required       endpoint or endpoints it opens, ``tcp/host:port``
   advertise            listen         endpoint or endpoints at which others reach it; required
@@ -49,6 +51,9 @@ carrier                "zenoh"        how messages travel between processes
   shard                required       name of a shard
 [aspects.NAME]         none           an aspect whose commits differ from the rest
   durability           "durable"      "durable", "os" or "volatile"
+  retention            1              how many versions of each datum stay readable by capture
+                                      stamp, the newest included (1 to 256); the older ones are
+                                      in memory until the shard restarts, whatever the durability
 [actors.NAME]          none           an actor process
   class                required       ``package.module:Class``
   worlds               {}             role of the class = world context of the cell
@@ -91,7 +96,7 @@ from enact_dist.config_values import (
 )
 from enact_dist.core.messages import Pin
 from enact_dist.errors import ConfigError
-from enact_dist.terms import Durability, Entities, checked_name
+from enact_dist.terms import RETENTION_MAX, Durability, Entities, checked_name
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -283,7 +288,7 @@ def _pin(table: Table, shards: tuple[ShardConfig, ...]) -> Pin:
 
 
 def _aspect(name: str, table: Table) -> AspectConfig:
-    table.refuse_unknown("durability")
+    table.refuse_unknown("durability", "retention")
     _check_title(name, "aspect", table)
     found = table.take_str("durability", Durability.DURABLE.value)
     known = [durability.value for durability in Durability]
@@ -293,7 +298,18 @@ def _aspect(name: str, table: Table) -> AspectConfig:
             f"unknown durability {found!r} of aspect {name!r}{suggestion(found, known)}"
             f" (known: {', '.join(known)})",
         )
-    return AspectConfig(name, Durability(found))
+    return AspectConfig(name, Durability(found), _retention(table))
+
+
+def _retention(table: Table) -> int:
+    found = table.values.get("retention", 1)
+    if type(found) is not int or not 1 <= found <= RETENTION_MAX:
+        table.refuse(
+            "retention",
+            f"'retention' in {table.title} is a number of versions from 1 to {RETENTION_MAX}, not"
+            f" {found!r}; the older ones are kept in memory until their shard restarts",
+        )
+    return found
 
 
 def _actor(name: str, table: Table, worlds: tuple[str, ...]) -> ActorConfig:

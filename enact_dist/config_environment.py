@@ -14,8 +14,9 @@ ENACT_SHARD_<NAME>_FOLDER     shards.NAME.folder
 `<NAME>` is the shard's name in capitals, with ``_`` for ``.`` and ``-``.  Relative folders are
 relative to the working folder.  A variable that starts with ``ENACT_SHARD_`` and names no shard or
 no such key, or that is close to one of the others, is a `ConfigError`: a misspelt override must
-not end as a silent default.  `ENACT_CELL` (which cell the command line talks to) is not a
-key of the file.
+not end as a silent default.  `ENACT_CELL` (which cell the command line talks to) and
+`ENACT_SHARED_FOLDER` (where processes of one host meet, see `link.shared_folder`) are no keys of
+the file.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.config_table import suggestion
+from enact_dist.config_types import CARRIER_DEFAULT
 from enact_dist.config_values import (
     CARRIERS,
     TTL_S_MAX,
@@ -41,7 +43,12 @@ if TYPE_CHECKING:
 
     from enact_dist.config_types import CellConfig, ShardConfig
 
-_CELL_NAMES: Final = ("ENACT_SESSION_TTL_S", "ENACT_DATA_FOLDER", "ENACT_CARRIER")
+_CELL_NAMES: Final = (
+    "ENACT_SESSION_TTL_S",
+    "ENACT_DATA_FOLDER",
+    "ENACT_CARRIER",
+    "ENACT_SHARED_FOLDER",
+)
 _SHARD_PREFIX: Final = "ENACT_SHARD_"
 _SHARD_KEYS: Final = ("LISTEN", "ADVERTISE", "FOLDER")
 _CLOSE: Final = 0.85
@@ -79,6 +86,8 @@ def _refuse_unknown(config: CellConfig, ours: Mapping[str, str]) -> None:
                 f"the environment sets {name}, which is no key of a shard of {config.path}"
                 f"{suggestion(name, of_shards)} (known: {', '.join(of_shards)})"
             )
+        if name.startswith(_SHARD_PREFIX):
+            continue  # one of them, so it is spelt right
         close = difflib.get_close_matches(name, _CELL_NAMES, n=1, cutoff=_CLOSE)
         if close and name not in _CELL_NAMES:
             raise ConfigError(f"the environment sets {name}; did you mean {close[0]}?")
@@ -101,6 +110,15 @@ def _carrier(text: str) -> str:
     if text not in CARRIERS:
         raise ConfigError(f"ENACT_CARRIER={text!r} is unknown (known: {', '.join(CARRIERS)})")
     return text
+
+
+def carrier_of(environment: Mapping[str, str]) -> str:
+    """Return the carrier that the environment asks for where no `cell.toml` does.
+
+    Raises:
+        ConfigError: There is none of that name.
+    """
+    return _carrier(environment.get("ENACT_CARRIER", CARRIER_DEFAULT))
 
 
 def _moved(config: CellConfig, data_folder: Path) -> CellConfig:

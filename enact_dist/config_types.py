@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 TTL_S_DEFAULT: Final = 2.0
 """Session TTL in seconds: a dead holder blocks others that long; shorter needs a quiet network."""
 
-CARRIER_DEFAULT: Final = "zenoh"
+CARRIER_DEFAULT: Final = "auto"
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,10 +52,12 @@ class AspectConfig:
     Attributes:
         name: Name of the aspect.
         durability: What its commits survive; wins over the actors' own word.
+        retention: Versions of each datum that stay readable, the newest included.
     """
 
     name: str
     durability: Durability
+    retention: int = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,7 +143,10 @@ class CellConfig:
 
     def aspect_entries(self) -> tuple[AspectEntry, ...]:
         """Return the aspects with their durability and no fingerprint: any type may register."""
-        return tuple(AspectEntry(entry.name, "", entry.durability.value) for entry in self.aspects)
+        return tuple(
+            AspectEntry(entry.name, "", entry.durability.value, entry.retention)
+            for entry in self.aspects
+        )
 
     def shard_settings(self, name: str) -> ShardSettings:
         """Return what the core of shard `name` has to know.

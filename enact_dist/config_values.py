@@ -5,8 +5,12 @@ from __future__ import annotations
 import re
 from typing import Final
 
-CARRIERS: Final = ("zenoh",)
-"""How messages may travel between processes; `local()` needs none of them."""
+CARRIERS: Final = ("auto", "zenoh", "socket")
+"""How messages may travel between processes; `local()` needs none of them.
+
+"auto" takes a socket between processes of one host and Zenoh for all others; "socket" makes it an
+error where there is none.
+"""
 
 TTL_S_MIN: Final = 0.2
 """Shorter leases end in ordinary scheduling pauses of a loaded machine."""

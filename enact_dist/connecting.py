@@ -42,19 +42,23 @@ def connect(
         ShardUnreachableError: No shard answered in time; the message names shards and endpoints.
         ConfigError: The `cell.toml` cannot be used, or `target` is neither file nor endpoint.
     """
+    from enact_dist.config_environment import carrier_of
     from enact_dist.link.joining import join
 
     name, ttl_s = "", TTL_S
+    carrier = carrier_of(os.environ)
     endpoints: tuple[str, ...] = (str(target),)
     if not _is_endpoint(target):
         from enact_dist.config import load_config
 
         _refuse_no_file(target)
         config = load_config(Path(target))
-        name, ttl_s = config.name, config.ttl_s
+        name, ttl_s, carrier = config.name, config.ttl_s, config.carrier
         endpoints = tuple(e for entry in config.placement_map().shards for e in entry.endpoints)
     client = _client(actor, ttl_s=ttl_s, observer=observer)
-    cell_name, cell_client, welcome = join(name, endpoints, client, timeout_s=timeout_s)
+    cell_name, cell_client, welcome = join(
+        name, endpoints, client, timeout_s=timeout_s, carrier=carrier
+    )
     try:
         cell_client.start(welcome)
     except BaseException:

@@ -316,7 +316,8 @@ def _shard(shard: ShardInfo) -> Iterator[Finding]:
 
 def _connection(subject: str, shard: ShardInfo) -> Finding:
     state = "" if shard.open else ", still waits for leases of before its restart"
-    text = f"{shard.endpoint} answers in {shard.round_trip_s * 1e3:.2f} ms{state}"
+    took = f"{shard.round_trip_s * 1e3:.2f} ms over {shard.carrier}"
+    text = f"{shard.endpoint} answers in {took}{state}"
     if shard.round_trip_s > ROUND_TRIP_S_WARN:
         remedy = "every lock takes two round trips: look for a busy host or a slow link"
         return Finding(Level.WARN, subject, text, remedy)

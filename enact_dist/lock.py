@@ -28,6 +28,7 @@ from enact_dist.errors import (
 from enact_dist.reading import EachData, Readings, check_requested, slot_of
 from enact_dist.session import session_of
 from enact_dist.terms import Access, Entity, refuse_duplicates
+from enact_dist.together import Together
 from enact_dist.wire.limits import BODY_BYTES_MAX, ITEMS_MAX
 from enact_dist.writable import WritableEach
 
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
     from types import TracebackType
 
     from enact_dist.core.datum import Position
+    from enact_dist.core.messages import Item
     from enact_dist.core.multilock import MultiLock
     from enact_dist.terms import (
         Aspect,
@@ -166,7 +168,7 @@ class Lock:
             self._asking = True
             _thread.lock = self
             lock = client.acquire(
-                [self._session.item_of(request) for request in self._requests],
+                [self._item_of(request) for request in self._requests],
                 wait_s=self._wait_s,
                 hold_s=self._hold_s,
                 interrupt=self._interrupt,
@@ -185,6 +187,9 @@ class Lock:
                 client.release(begun[-1])  # only does something if interrupted after the grant
             raise
         return self
+
+    def _item_of(self, request: LockRequest[Any]) -> Item:
+        return self._session.item_of(request)
 
     def __exit__(
         self,
@@ -227,13 +232,15 @@ class Lock:
     # ---------------------------------------------------------------- data
 
     @overload
+    def __getitem__(self, request: Together[T]) -> tuple[T, ...]: ...
+    @overload
     def __getitem__(self, request: WriteEach[T]) -> WritableEach[T]: ...
     @overload
     def __getitem__(self, request: LockRequestEach[T]) -> Mapping[Entity, T]: ...
     @overload
     def __getitem__(self, request: LockRequestOne[T]) -> T: ...
-    def __getitem__(self, request: LockRequest[Any]) -> Any:
-        """Return the datum; for a pattern, the data by entity.
+    def __getitem__(self, request: Any) -> Any:
+        """Return the datum; for a pattern, the data by entity; for an actor's set, all its data.
 
         Raises:
             NullDatumError: The world context does not know it.
@@ -395,8 +402,10 @@ class Lock:
         state = self._readings.state(slot_of(request))
         return state.version if state is not None else 0
 
-    def stamp_ns(self, request: LockRequestOne[Any]) -> int:
-        """Return when the datum was captured, as its writer said (0: not said)."""
+    def stamp_ns(self, request: LockRequestOne[Any] | Together[Any]) -> int:
+        """Return when the datum, or an actor's set, was captured, as its writer said (0: not)."""
+        if isinstance(request, Together):
+            raise MisuseError(f"{request!r} is no part of this lock; an actor's trigger can be")
         self._check(request)
         slot = slot_of(request)
         return 0 if self._is_null(slot) else self._readings.datum(slot).stamp_ns

@@ -75,7 +75,12 @@ class Session:
             if len(self._entries) >= ENTRIES_MAX:
                 self._entries.clear()  # programs that make an aspect anew for each lock
             durability = aspect.durability.value if aspect.durability is not None else ""
-            entry = AspectEntry(aspect.name, fingerprint(aspect.datum_type), durability)
+            entry = AspectEntry(
+                aspect.name,
+                fingerprint(aspect.datum_type),
+                durability,
+                aspect.retention if aspect.retention > 1 else 0,
+            )
             known = self._entries[id(aspect)] = (aspect, entry)
         return known[1]
 
@@ -83,8 +88,11 @@ class Session:
         """Return the name of the shard that owns the slot."""
         return shard_of(slot.entity, self.client.core.placement)
 
-    def item_of(self, request: LockRequest[Any]) -> Item:
-        """Return the protocol's line for a request, with the version that the cache holds."""
+    def item_of(self, request: LockRequest[Any], captured_ns: int = 0) -> Item:
+        """Return the protocol's line for a request, with the version that the cache holds.
+
+        With `captured_ns` it asks for the version with that capture stamp.
+        """
         context, entity, aspect = request.address
         if request.access.each:
             return Item(int(request.access), context, entity, aspect)
@@ -93,7 +101,7 @@ class Session:
         slot = Slot(context, entity, aspect)
         shard = self.shard_of(slot)
         known = self.cache.version(slot, shard, self.client.core.epoch(shard))
-        return Item(int(request.access), context, entity, aspect, known)
+        return Item(int(request.access), context, entity, aspect, known, captured_ns)
 
 
 def session_of(requests: tuple[LockRequest[Any], ...]) -> Session:

@@ -33,6 +33,9 @@ T_co = TypeVar("T_co", covariant=True)
 NAME_LENGTH_MAX: Final = 200
 """Longest name of an entity, aspect or world context; keeps every key of the wire below 1 kB."""
 
+RETENTION_MAX: Final = 256
+"""Most versions of one slot that an aspect may retain."""
+
 _SEGMENT = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.\-]*\Z")
 _PATTERN_SEGMENT = re.compile(r"(?:\*\*|(?!.*\*\*)[A-Za-z0-9_*][A-Za-z0-9_.\-*]*)\Z")
 
@@ -218,17 +221,27 @@ class Aspect(Generic[T]):
             frozen dataclass of these, or a type with a registered codec.
         durability: What a commit of this aspect survives; ``None`` leaves it to `cell.toml`
             (there: `durable` unless written otherwise).  `cell.toml` wins over this argument.
+        retention: How many versions of each datum stay readable by capture stamp (`Together`), the
+            newest one included; of several numbers, that of `cell.toml` too, the largest counts.
+            The older ones are in memory until their shard restarts, whatever the durability, and
+            within a limit of 256 MiB per shard (counter `retained_dropped`).
 
     Raises:
-        ValueError: The name is not allowed.
+        ValueError: The name is not allowed, or `retention` does not lie in 1 to 256.
     """
 
     name: str
     datum_type: type[T]
     durability: Durability | None = None
+    retention: int = 1
 
     def __post_init__(self) -> None:
         checked_name("aspect", self.name, slashes=False)
+        if type(self.retention) is not int or not 1 <= self.retention <= RETENTION_MAX:
+            raise ValueError(
+                f"retention of aspect {self.name!r} is {self.retention!r}; it must be a number of"
+                f" versions from 1 to {RETENTION_MAX}"
+            )
 
     def __str__(self) -> str:
         return self.name

@@ -23,11 +23,14 @@ from typing import TYPE_CHECKING, Final
 from enact_dist.actor_binding import BoundActor
 from enact_dist.actor_triggers import PendingTriggers
 from enact_dist.connecting import local
+from enact_dist.session import session_of
+from enact_dist.together import captured_versions
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
     from enact_dist.actor import Actor
+    from enact_dist.actor_sets import IncompleteSet, PendingSets
     from enact_dist.cell import Cell
     from enact_dist.terms import Entity
 
@@ -105,7 +108,8 @@ def run_once(actor: Actor, cell: Cell, worlds: Mapping[str, str] | None = None) 
 
     An actor with triggers is updated once per entity whose trigger datum is new to this actor
     object: all existing ones at the first call, those that changed since at the next.  A source,
-    or an actor that runs once, is updated once.  `start` and `stop` are called around it.
+    or an actor that runs once, is updated once.  One with a `Together` is updated once per complete
+    set: at the first call for the newest one.  `start` and `stop` are called around it.
 
     Args:
         actor: The actor.
@@ -125,6 +129,8 @@ def run_once(actor: Actor, cell: Cell, worlds: Mapping[str, str] | None = None) 
         if not bound.declaration.triggers:
             _update(bound, None)
             return 1
+        if bound.declaration.together is not None:
+            return _update_sets(actor, bound)
         pending = _pending(actor, bound)
         updates = 0
         while trigger := pending.take(0):
@@ -138,6 +144,41 @@ def run_once(actor: Actor, cell: Cell, worlds: Mapping[str, str] | None = None) 
 def _update(bound: BoundActor, entity: Entity | None) -> None:
     with bound.lock(entity) as lock:
         bound.actor.update(lock)
+
+
+def incomplete_sets(actor: Actor) -> tuple[IncompleteSet, ...]:
+    """Return the sets that `run_once` of this actor object gave up so far, with what was missing.
+
+    The newest 16; those from before the first call are not the actor's business.
+    """
+    pending: PendingSets | None = vars(actor).get("_pending_in_test")
+    return tuple(pending.told) if pending is not None else ()
+
+
+def _update_sets(actor: Actor, bound: BoundActor) -> int:
+    """Update an actor once per complete set that is new to this actor object."""
+    views = bound.set_views()
+    session = session_of(views)
+    pending: PendingSets | None = vars(actor).get("_pending_in_test")
+    versions = captured_versions(session, views)
+    if pending is None:
+        pending = bound.pending_sets()
+        assert pending is not None
+        vars(actor)["_pending_in_test"] = pending
+        pending.start(versions)
+    else:
+        pending.captured_all(versions)
+    updates = 0
+    while trigger := pending.take(0):
+        lock = bound.lock(None, captured_ns=trigger.captured_ns)
+        with lock:
+            missing = lock.missing()
+            if missing:
+                pending.gone(trigger.captured_ns, missing)
+                continue
+            bound.actor.update(lock)
+        updates += 1
+    return updates
 
 
 def _pending(actor: Actor, bound: BoundActor) -> PendingTriggers:

@@ -44,6 +44,7 @@ class Change:
         position: Where the commit stands in time.
         gap: How many versions of this slot were skipped before this one.
         null: Whether the slot is null now.
+        captured_ns: When the datum was captured, as its writer said (0: not said, or null).
     """
 
     entity: Entity
@@ -52,6 +53,7 @@ class Change:
     position: Position
     gap: int
     null: bool
+    captured_ns: int = 0
 
 
 @dataclass(slots=True)
@@ -128,9 +130,9 @@ class Watch:
             self._try_list_again(notice.shard)
             return
         following.number = notice.number
-        for slot, version, stamp_ns, null in notice.changes:
+        for slot, version, stamp_ns, null, captured_ns in notice.changes:
             if self._covers(slot):
-                self._note(notice.shard, slot, version, stamp_ns, null=null)
+                self._note(notice.shard, slot, version, stamp_ns, null=null, captured=captured_ns)
 
     def _covers(self, slot: Slot) -> bool:
         return (
@@ -163,7 +165,14 @@ class Watch:
             null = bool(state.null_reason)
             if null and state.slot not in self._known:
                 continue
-            self._note(shard, state.slot, state.version, state.stamp_ns, null=null)
+            self._note(
+                shard,
+                state.slot,
+                state.version,
+                state.stamp_ns,
+                null=null,
+                captured=state.captured_ns,
+            )
         self._note_vanished(shard, {state.slot for state in states})
         self._following[shard] = _Following(answer.epoch, answer.notice_number, listed=True)
 
@@ -174,7 +183,16 @@ class Watch:
             if gone and self._client.shard_of(slot.entity) == shard:
                 self._note(shard, slot, *VANISHED, null=True)
 
-    def _note(self, shard: str, slot: Slot, version: int, stamp_ns: int, *, null: bool) -> None:
+    def _note(
+        self,
+        shard: str,
+        slot: Slot,
+        version: int,
+        stamp_ns: int,
+        *,
+        null: bool,
+        captured: int = 0,
+    ) -> None:
         """Add a change unless it is known.
 
         A state is known by version and stamp: durable slots keep both over a restart of their
@@ -191,7 +209,9 @@ class Watch:
         self._known[slot] = (version, stamp_ns)
         self._missed += gap
         position = Position(stamp_ns, shard)
-        self._pending.append(Change(Entity(slot.entity), slot.aspect, version, position, gap, null))
+        self._pending.append(
+            Change(Entity(slot.entity), slot.aspect, version, position, gap, null, captured)
+        )
 
     def close(self) -> None:
         """End the watch; a `next` that waits returns None within 0.1 s."""

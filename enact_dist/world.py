@@ -16,6 +16,7 @@ from enact_dist.lock import Lock, refuse_inside_lock
 from enact_dist.reading import EachData, Readings, check_requested, null_error, slot_of
 from enact_dist.session import session_of
 from enact_dist.terms import Aspect, Context, Entities, Entity, NullReason, View, Write
+from enact_dist.together import Together, captured_versions, newest_set_ns
 from enact_dist.watch import Watch
 from enact_dist.wire.limits import ITEMS_MAX
 
@@ -86,17 +87,19 @@ class WorldContext(Context):
             lock[request] = datum
         return True
 
-    def view(self, *requests: LockRequest[Any]) -> Snapshot:
+    def view(self, *requests: LockRequest[Any] | Together[Any]) -> Snapshot:
         """Read committed data without a lock.
 
         All data are of one moment, over shards too: every commit is shown whole or not at all.
 
         Args:
-            requests: `View`s and `ViewEach`es of this cell.
+            requests: `View`s and `ViewEach`es of this cell, and at most one `Together`: then the
+                newest set of it that is complete is shown, and the rest as it is now.
 
         Raises:
             LockHeldError: This thread holds a lock; name the views in it instead.
             MisuseError: A request locks.
+            NullDatumError: The `Together` has no complete set.
         """
         refuse_inside_lock("view")
         return take_snapshot(requests)
@@ -179,8 +182,11 @@ def _info(state: SlotState, shard: str) -> SlotInfo:
     )
 
 
-def take_snapshot(requests: tuple[LockRequest[Any], ...], *, register: bool = True) -> Snapshot:
-    """Take a view of `requests`; large data are fetched before this returns."""
+def take_snapshot(
+    asked: tuple[LockRequest[Any] | Together[Any], ...], *, register: bool = True
+) -> Snapshot:
+    """Take a view of what is asked; large data are fetched before this returns."""
+    together, requests = _spread(asked)
     if not requests:
         raise MisuseError("a view of nothing: name at least one View or ViewEach")
     if len(requests) > ITEMS_MAX:
@@ -195,7 +201,12 @@ def take_snapshot(requests: tuple[LockRequest[Any], ...], *, register: bool = Tr
         session.register_aspects(aspects.values(), requests=requests)
     for attempt in range(1, VIEWS_MAX + 1):
         try:
-            return Snapshot(_view(session, requests), requests)
+            captured_ns = _newest_set_ns(session, together) if together is not None else 0
+            snapshot = Snapshot(
+                _view(session, requests, together, captured_ns), requests, together, captured_ns
+            )
+            if together is None or attempt == VIEWS_MAX or snapshot.has_set():
+                return snapshot  # what has left retention just now is null in it
         except LeaseLostError:
             # A shard restarted, or the session rested too long, between the view and its data.
             if attempt == VIEWS_MAX:
@@ -203,10 +214,49 @@ def take_snapshot(requests: tuple[LockRequest[Any], ...], *, register: bool = Tr
     raise AssertionError("a view ends in its data or an error")
 
 
-def _view(session: Session, requests: tuple[LockRequest[Any], ...]) -> Readings:
+def _spread(
+    asked: tuple[LockRequest[Any] | Together[Any], ...],
+) -> tuple[Together[Any] | None, tuple[LockRequest[Any], ...]]:
+    """Return the set that is asked for, and all requests, those of the set in its place."""
+    sets = [request for request in asked if isinstance(request, Together)]
+    if len(sets) > 1:
+        raise MisuseError(f"one view shows one set; take {sets[1]!r} in a view of its own")
+    requests: list[LockRequest[Any]] = []
+    for request in asked:
+        requests += request.requests if isinstance(request, Together) else (request,)
+    return (sets[0] if sets else None), tuple(requests)
+
+
+def _newest_set_ns(session: Session, together: Together[Any]) -> int:
+    """Return the capture stamp of the newest complete set."""
+    versions = captured_versions(session, together.requests)
+    captured_ns = newest_set_ns(versions)
+    if not captured_ns:
+        found = "; ".join(
+            f"{slot_of(request)} has {sorted({one.captured_ns for one in each})[-3:] or 'none'}"
+            for request, each in zip(together.requests, versions, strict=True)
+        )
+        raise NullDatumError(
+            f"no capture stamp is common to all {len(versions)} data (newest stamps, 0 is unsaid:"
+            f" {found}); write with lock.put(…, stamp_ns=…), and let the aspects retain as many"
+            " versions as are under way at once",
+            reason=NullReason.OUTSIDE_RETENTION.value,
+        )
+    return captured_ns
+
+
+def _view(
+    session: Session,
+    requests: tuple[LockRequest[Any], ...],
+    together: Together[Any] | None,
+    captured_ns: int,
+) -> Readings:
     """Take one view and fetch what is large."""
     client = session.client
-    items: list[Item] = [session.item_of(request) for request in requests]
+    in_set = together.requests if together is not None else ()
+    items: list[Item] = [
+        session.item_of(request, captured_ns if request in in_set else 0) for request in requests
+    ]
     lock = client.acquire(items, wait_s=VIEW_WAIT_S, hold_s=VIEW_WAIT_S)
     try:
         readings = Readings(client, session.cache, lock.lock, lock.states, lambda: None)
@@ -220,23 +270,45 @@ def _view(session: Session, requests: tuple[LockRequest[Any], ...]) -> Readings:
 
 
 class Snapshot:
-    """Data as of one view, indexed by the requests it was made with."""
+    """Data as of one view, indexed by the requests it was made with.
 
-    def __init__(self, readings: Readings, requests: tuple[LockRequest[Any], ...]) -> None:
+    Attributes:
+        captured_ns: The capture stamp of its `Together`, 0 where none was asked for.
+    """
+
+    def __init__(
+        self,
+        readings: Readings,
+        requests: tuple[LockRequest[Any], ...],
+        together: Together[Any] | None = None,
+        captured_ns: int = 0,
+    ) -> None:
         self._readings = readings
         self._requests = {request: request for request in requests}
+        self._together = together
+        self.captured_ns = captured_ns
 
+    def has_set(self) -> bool:
+        """Whether no datum of the `Together` is null."""
+        requests = self._together.requests if self._together is not None else ()
+        states = [self._readings.state(slot_of(request)) for request in requests]
+        return all(state is not None and not state.null_reason for state in states)
+
+    @overload
+    def __getitem__(self, request: Together[T]) -> tuple[T, ...]: ...
     @overload
     def __getitem__(self, request: LockRequestEach[T]) -> Mapping[Entity, T]: ...
     @overload
     def __getitem__(self, request: LockRequestOne[T]) -> T: ...
-    def __getitem__(self, request: LockRequest[Any]) -> Any:
-        """Return the datum; for a pattern, the data by entity.
+    def __getitem__(self, request: LockRequest[Any] | Together[Any]) -> Any:
+        """Return the datum; for a pattern, the data by entity; for a set, its data in order.
 
         Raises:
             NullDatumError: The world context does not know it.
             NotRequestedError: The view did not ask for it.
         """
+        if isinstance(request, Together):
+            return tuple(self[one] for one in request.requests)
         check_requested(request, self._requests, "view")
         if request.access.each:
             return EachData(self._readings, request)

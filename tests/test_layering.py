@@ -72,11 +72,24 @@ def test_planted_violation_is_found(tmp_path):
 
 
 def test_only_link_imports_zenoh():
-    """Zenoh, sockets' own carrier, stands behind one layer."""
+    """Zenoh, sockets' own carrier, stands behind one layer; who looks at it alone says so."""
+    looks = {"enact_dist/doctor.py", "enact_dist/bench/raw_zenoh.py"}
     users = [f for f in python_files(PACKAGE) if "zenoh" in {n.split(".")[0] for n in imports(f)}]
-    assert {file.parent.name for file in users} <= {"link"} | {
-        file.parent.name for file in users if file.name == "doctor.py"
-    }
+    above = [file for file in users if file.parent.name != "link"]
+    assert {str(file.relative_to(ROOT)) for file in above} <= looks
+
+
+def test_only_their_verbs_load_benches_and_judges():
+    """What measures or breaks a cell is no part of a running one: its verb loads it, at use."""
+    for part, others in (("bench", ()), ("verify", ("bench",))):
+        for file in python_files(PACKAGE):
+            if file.parent.name in {part, *others} or f"/{part}/" in str(file):
+                continue
+            loads = any(name.startswith(f"enact_dist.{part}") for name in imports(file))
+            assert not loads or file == PACKAGE / "cli" / f"{part}.py", file
+        tree = ast.parse((PACKAGE / "cli" / f"{part}.py").read_text("utf-8"))
+        top = [node.module for node in tree.body if isinstance(node, ast.ImportFrom)]
+        assert not any(name.startswith(f"enact_dist.{part}") for name in top)
 
 
 def test_geometry_knows_nothing_of_enact_dist():

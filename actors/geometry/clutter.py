@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from actors.geometry.open3d_on_use import open3d
+from actors.geometry.open3d_arrays import point_cloud
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -44,7 +44,7 @@ def diagonal_m(points_m: Points) -> float:
 
 def thinned(points_m: Points, voxel_m: float) -> npt.NDArray[np.float64]:
     """Return one point, the mean, per occupied cell of a grid of edge `voxel_m`, (K, 3)."""
-    cloud = open3d_cloud(points_m).voxel_down_sample(voxel_m)
+    cloud = point_cloud(points_m).voxel_down_sample(voxel_m)
     return np.asarray(cloud.points).copy()
 
 
@@ -69,7 +69,7 @@ def without_large_planes(
     while len(planes) < PLANES_MAX and len(points_m) > 100:
         plane = largest_plane(points_m, reach_m=plane_reach_m(voxel_m), random=random)
         index = np.flatnonzero(np.abs(points_m @ plane[:3] + plane[3]) < plane_reach_m(voxel_m))
-        labels = np.asarray(open3d_cloud(points_m[index]).cluster_dbscan(4.0 * voxel_m, 10))
+        labels = np.asarray(point_cloud(points_m[index]).cluster_dbscan(4.0 * voxel_m, 10))
         wide = [
             label
             for label in range(labels.max(initial=-1) + 1)
@@ -123,7 +123,7 @@ def clusters_of(points_m: Points, *, gap_m: float, points_min: int) -> list[Poin
     """
     if len(points_m) == 0:
         return []
-    labels = np.asarray(open3d_cloud(points_m).cluster_dbscan(gap_m, 10))
+    labels = np.asarray(point_cloud(points_m).cluster_dbscan(gap_m, 10))
     sizes = np.bincount(labels[labels >= 0], minlength=1)
     order = np.argsort(-sizes, kind="stable")[:CLUSTERS_MAX]
     return [points_m[labels == label] for label in order if sizes[label] >= points_min]
@@ -135,10 +135,3 @@ def plane_reach_m(voxel_m: float) -> float:
     At 1 m a depth camera scatters by some 10 mm.
     """
     return max(2.0 * voxel_m, 0.010)
-
-
-def open3d_cloud(points_m: Points) -> Any:  # Open3D has no types
-    """Return points (N, 3) as a cloud of Open3D."""
-    o3d = open3d()
-    # float32 here would cost half a second per 300,000 points: converted one by one.
-    return o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points_m.astype(np.float64)))

@@ -22,12 +22,12 @@ import numpy as np
 from actors.geometry.clutter import (
     clusters_of,
     diagonal_m,
-    open3d_cloud,
     plane_reach_m,
     spacing,
     thinned,
     without_large_planes,
 )
+from actors.geometry.open3d_arrays import point_cloud
 from actors.geometry.open3d_on_use import open3d
 from actors.geometry.poses import inverse, moved, small_motion
 
@@ -200,7 +200,7 @@ class _Described:
         self.points_m = points_m
         self.voxel_m = voxel_m
         self.sight = sight or _Sight(None, np.empty((0, 4)))
-        cloud = open3d_cloud(points_m)
+        cloud = point_cloud(points_m)
         near, wide = (
             o3d.geometry.KDTreeSearchParamHybrid(radius, count)
             for radius, count in ((3.0 * voxel_m, 30), (6.0 * voxel_m, 100))
@@ -320,7 +320,7 @@ def _showing(model: _Described, placed_m: Points) -> npt.NDArray[np.bool_]:
     showing = above.all(axis=1)
     if eye_m is not None:
         radius_m = 100.0 * diagonal_m(placed_m)
-        _, index = open3d_cloud(placed_m).hidden_point_removal(
+        _, index = point_cloud(placed_m).hidden_point_removal(
             np.asarray(eye_m, np.float64), radius_m
         )
         showing &= np.isin(np.arange(len(placed_m)), index)

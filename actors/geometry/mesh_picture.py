@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from actors.geometry.open3d_arrays import tensor
 from actors.geometry.open3d_on_use import open3d
 from actors.geometry.poses import looking_at, moved
 from actors.geometry.rendering import directions
@@ -186,13 +187,11 @@ class _Scene:
         self.normals = np.concatenate(normals)
         self.low, self.high = self.corners.min((0, 1)), self.corners.max((0, 1))
         self.span_m = float(np.linalg.norm(self.high - self.low))
-        o3d = open3d()
-        self._tensor = o3d.core.Tensor
-        self._rays = o3d.t.geometry.RaycastingScene()
+        self._rays = open3d().t.geometry.RaycastingScene()
         count = len(self.corners)
         self._rays.add_triangles(
-            self._tensor(np.ascontiguousarray(self.corners.reshape(-1, 3))),
-            self._tensor(np.arange(3 * count, dtype=np.uint32).reshape(-1, 3)),
+            tensor(self.corners.reshape(-1, 3)),
+            tensor(np.arange(3 * count, dtype=np.uint32).reshape(-1, 3)),
         )
 
     def first_hits(self, eye: Floats, rays: Floats) -> _Hits:
@@ -216,12 +215,12 @@ class _Scene:
     def is_free(self, places: Floats, towards: Floats) -> npt.NDArray[np.bool_]:
         """Say for each place whether nothing stands in the given direction."""
         rays = np.concatenate([places, towards], axis=1).astype(np.float32)
-        blocked = self._rays.test_occlusions(self._tensor(np.ascontiguousarray(rays)))
+        blocked = self._rays.test_occlusions(tensor(rays))
         return ~np.asarray(blocked.numpy())
 
     def _cast(self, origins: Floats, rays: Floats) -> Any:
         full = np.concatenate([origins, rays], axis=1).astype(np.float32)
-        return self._rays.cast_rays(self._tensor(np.ascontiguousarray(full)))
+        return self._rays.cast_rays(tensor(full))
 
 
 def _corner_colours(body: Body, triangles: npt.NDArray[np.int64]) -> Floats:

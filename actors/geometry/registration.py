@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from actors.geometry.fusion import vertex_normals
+from actors.geometry.open3d_arrays import point_cloud, tensor
 from actors.geometry.open3d_on_use import open3d
 from actors.geometry.poses import inverse, moved, on_tray, yaw_between, yaw_of
 from actors.geometry.rendering import ray_scene
@@ -85,7 +86,7 @@ def register(
     points = cloud.points_m[chosen].astype(float)
     scene = ray_scene(surface.vertices_m, surface.triangles)
     normals = vertex_normals(surface.vertices_m, surface.triangles)
-    source, target = _open3d_cloud(points, None), _open3d_cloud(surface.vertices_m, normals)
+    source, target = point_cloud(points), point_cloud(surface.vertices_m, normals)
     seeds = _seeds(surface, points.mean(axis=0), expected)
     rough = [upright_icp(source, target, seed) for seed in seeds] + seeds
     field = OutlineField(surface, scene)
@@ -109,7 +110,6 @@ class OutlineField:
     def __init__(self, surface: Surface, scene: Any) -> None:
         from scipy.ndimage import binary_closing, distance_transform_edt
 
-        o3d = open3d()
         self._low = surface.vertices_m[:, :2].min(axis=0) - OUTLINE_MARGIN_M
         high = surface.vertices_m[:, :2].max(axis=0) + OUTLINE_MARGIN_M
         columns, rows = np.ceil((high - self._low) / OUTLINE_CELL_M).astype(int)
@@ -118,7 +118,7 @@ class OutlineField:
         rays = np.zeros((rows, columns, 6), np.float32)
         rays[..., 0], rays[..., 1] = np.meshgrid(x, y)
         rays[..., 2], rays[..., 5] = surface.vertices_m[:, 2].max() + 0.1, -1.0
-        hit = np.isfinite(scene.cast_rays(o3d.core.Tensor(rays))["t_hit"].numpy())
+        hit = np.isfinite(scene.cast_rays(tensor(rays))["t_hit"].numpy())
         inside = binary_closing(hit, iterations=2) | hit
         outwards = distance_transform_edt(~inside) + distance_transform_edt(inside) - 0.5
         self._distance_m = OUTLINE_CELL_M * outwards
@@ -231,19 +231,7 @@ def mean_distance(scene: Any, points_m: Pose, pose: Pose) -> float:
 
 
 def _distances(scene: Any, points_m: Pose, pose: Pose) -> Pose:
-    o3d = open3d()
-
-    local = moved(points_m, inverse(pose)).astype(np.float32)
+    local = tensor(moved(points_m, inverse(pose)), np.float32)
     # One thread: a thousand points take 1 ms, and waking others cost 4 on a busy machine.
-    found = scene.compute_distance(o3d.core.Tensor(local), nthreads=1)
+    found = scene.compute_distance(local, nthreads=1)
     return np.asarray(found.numpy(), np.float64)
-
-
-def _open3d_cloud(points_m: npt.NDArray[np.floating], normals: Pose | None) -> Any:
-    o3d = open3d()
-
-    # Open3D converts float32 one by one, half a second for 300,000 points: hence float64.
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points_m.astype(np.float64)))
-    if normals is not None:
-        cloud.normals = o3d.utility.Vector3dVector(normals)
-    return cloud

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from actors.geometry.open3d_arrays import tensor
 from actors.geometry.open3d_on_use import open3d
 from actors.geometry.poses import inverse, moved
 
@@ -49,14 +50,8 @@ def ray_scene(vertices_m: npt.NDArray[np.floating], triangles: npt.NDArray[np.in
         vertices_m: (N, 3), metres.
         triangles: (M, 3), vertex numbers.
     """
-    o3d = open3d()
-
-    scene = o3d.t.geometry.RaycastingScene()
-    # Open3D may write to memory it was given read-only: it gets its own copies.
-    scene.add_triangles(
-        o3d.core.Tensor(np.array(vertices_m, np.float32)),
-        o3d.core.Tensor(np.array(triangles, np.uint32)),
-    )
+    scene = open3d().t.geometry.RaycastingScene()
+    scene.add_triangles(tensor(vertices_m, np.float32), tensor(triangles, np.uint32))
     return scene
 
 
@@ -100,9 +95,7 @@ def cast(scene: Any, rays: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
     Returns:
         (H, W) float32, NaN where nothing is hit.
     """
-    o3d = open3d()
-
     full = np.zeros((*rays.shape[:2], 6), np.float32)
     full[..., 3:] = rays
-    hit = scene.cast_rays(o3d.core.Tensor(full))["t_hit"].numpy()
+    hit = scene.cast_rays(tensor(full))["t_hit"].numpy()
     return np.where(np.isfinite(hit), hit, np.float32(np.nan)).astype(np.float32)

@@ -15,8 +15,10 @@ import numpy as np
 
 from actors.geometry.coloured_surface import ColouredSurface
 from actors.geometry.depth import frame_points
+from actors.geometry.open3d_arrays import image, tensor
 from actors.geometry.open3d_on_use import open3d
 from actors.geometry.poses import inverse
+from actors.geometry.rendering import ray_scene
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -116,16 +118,16 @@ def fuse_frames(
         block_resolution=BLOCK_EDGE,
         block_count=BLOCKS,
     )
-    matrix = core.Tensor(_matrix(frames[0].depth.acquisition.camera))
+    matrix = tensor(_matrix(frames[0].depth.acquisition.camera))
     depth_mm_max = depth_m_max * 1000.0
     in_reach = [
         f for f in frames if ((f.depth.depth_mm > 0) & (f.depth.depth_mm < depth_mm_max)).any()
     ]
     for frame in in_reach:  # Open3D raises on a frame that touches nothing
-        camera_from_world = core.Tensor(inverse(frame.world_from_camera))
+        camera_from_world = tensor(inverse(frame.world_from_camera))
         # uint16 with uint8 is one of the two pairs that Open3D integrates; mixed ones raise.
-        depth = o3d.t.geometry.Image(core.Tensor(frame.depth.depth_mm))
-        colour = o3d.t.geometry.Image(core.Tensor(frame.colour))
+        depth = image(frame.depth.depth_mm)
+        colour = image(frame.colour)
         view = (matrix, camera_from_world, 1000.0, depth_m_max)
         blocks = grid.compute_unique_block_coordinates(depth, *view)
         grid.integrate(blocks, depth, colour, matrix, matrix, *view[1:])
@@ -161,13 +163,11 @@ def residual(
     Returns:
         Median and 95th percentile of the unsigned distance.
     """
-    o3d = open3d()
-    scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(surface.vertices_m.astype(np.float32), surface.triangles.astype(np.uint32))
+    scene = ray_scene(surface.vertices_m, surface.triangles)
     points_m = np.concatenate(
         [view_cloud(frame, stride=8, depth_m_max=depth_m_max)[0] for frame in frames]
     )
-    distance_m = scene.compute_distance(points_m.astype(np.float32)).numpy()
+    distance_m = scene.compute_distance(tensor(points_m, np.float32)).numpy()
     return Residual(float(np.median(distance_m)), float(np.quantile(distance_m, 0.95)))
 
 

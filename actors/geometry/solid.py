@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from actors.geometry.depth import grid_normals, mean_known, points_grid
+from actors.geometry.open3d_arrays import tensor
 from actors.geometry.open3d_on_use import open3d
 from actors.geometry.poses import inverse
 
@@ -213,10 +214,8 @@ def _zero_surface(
     field: Floats, low_m: Pose, voxel_m: float
 ) -> tuple[Floats, npt.NDArray[np.int64]]:
     """Return the triangles where the distance is zero, in metres."""
-    o3d = open3d()
-
-    volume = o3d.core.Tensor(np.ascontiguousarray(field.transpose(2, 1, 0)))
-    mesh = o3d.t.geometry.TriangleMesh.create_isosurfaces(volume, [0.0])
+    volume = tensor(field.transpose(2, 1, 0))
+    mesh = open3d().t.geometry.TriangleMesh.create_isosurfaces(volume, [0.0])
     vertices = mesh.vertex.positions.numpy()
     if len(vertices) == 0:
         return np.empty((0, 3), np.float32), np.empty((0, 3), np.int64)

@@ -161,32 +161,43 @@ def list_actors(arguments: argparse.Namespace) -> int:
         print_json(infos)
         return DONE
     print_table(
-        ("actor", "host", "pid", "state", "updates", "rate", "failures", "refused", "wait p99",
-         "last update", "lease left", "locks", "last error"),
+        ("actor", "host", "pid", "state", "updates", "rate", "failures", "refused", "incomplete",
+         "wait p99", "last update", "lease left", "locks", "last error"),
         [row for info in infos for row in _rows(info)],
         empty="no actor is connected",
     )  # fmt: skip
+    for report in (report for info in infos for report in _reports(info)):
+        if report.incomplete or report.late or report.unstamped:
+            last = f", the newest a {report.last_incomplete}" if report.last_incomplete else ""
+            print(
+                f"{report.name}: {report.incomplete} incomplete sets{last}; {report.late} data too"
+                f" late for their set, {report.unstamped} without a stamp"
+            )
     return DONE
 
 
-def _rows(info: ActorInfo) -> Iterator[tuple[object, ...]]:
+def _reports(info: ActorInfo) -> tuple[ActorStatistics, ...]:
     from enact_dist.actor_report import read_reports
 
-    here, left = (info.host, info.pid), (shown_s(info.lease_left_s), info.locks)
     try:
-        reports = read_reports(info.report)
+        return read_reports(info.report)
     except ProtocolError:
-        reports = ()  # a session that reports something of its own
+        return ()  # a session that reports something of its own
+
+
+def _rows(info: ActorInfo) -> Iterator[tuple[object, ...]]:
+    here, left = (info.host, info.pid), (shown_s(info.lease_left_s), info.locks)
+    reports = _reports(info)
     for report in reports:
         ago_s = time.time() - report.last_update_unix_s
         last = f"{shown_s(max(0.0, ago_s))} ago" if report.last_update_unix_s else "never"
         yield (
             report.name, *here, report.state, report.updates, f"{report.rate_hz:.1f}/s",
-            report.failures, report.refused, f"{report.lock_wait_p99_ms:.1f} ms", last, *left,
-            report.last_error or "-",
+            report.failures, report.refused, report.incomplete,
+            f"{report.lock_wait_p99_ms:.1f} ms", last, *left, report.last_error or "-",
         )  # fmt: skip
     if not reports:
-        yield (info.actor, *here, "connected", *["-"] * 6, *left, "-")
+        yield (info.actor, *here, "connected", *["-"] * 7, *left, "-")
 
 
 def check_actors(arguments: argparse.Namespace) -> int:

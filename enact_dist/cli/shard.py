@@ -88,6 +88,7 @@ def run_shard(arguments: argparse.Namespace) -> int:
             folder=shard.folder,
             log_format=arguments.log_format,
             link_lease_s=config.ttl_s / 2,
+            carrier=config.carrier,
         )
     )
 

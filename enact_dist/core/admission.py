@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.messages import Refused
-from enact_dist.terms import Access, Durability, checked_name
+from enact_dist.terms import RETENTION_MAX, Access, Durability, checked_name
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable
@@ -24,8 +24,10 @@ _DURABILITIES: Final = ("", *(durability.value for durability in Durability))
 
 
 def wrong_access(items: Iterable[Item]) -> Refused | None:
-    """Refuse an access that there is not."""
+    """Refuse an access that there is not, and a write or a pattern of what was captured when."""
     for item in items:
+        if item.captured_ns and item.access not in (Access.VIEW, Access.READ):
+            return _refused(f"{item.entity}/{item.aspect} was asked by stamp; only a View can be")
         if item.access not in _ACCESSES:
             return _refused(f"access {item.access} was asked; there are {sorted(_ACCESSES)}")
     return None
@@ -41,11 +43,16 @@ def wrong_name(kind: str, name: str, *, slashes: bool) -> Refused | None:
 
 
 def wrong_aspect(entry: AspectEntry) -> Refused | None:
-    """Refuse an aspect whose name or durability nobody could use."""
+    """Refuse an aspect whose name, durability or retention nobody could use."""
     if entry.durability not in _DURABILITIES:
         return _refused(
             f"durability {entry.durability!r} of aspect {entry.name!r} was asked; there are"
             f" {', '.join(filter(None, _DURABILITIES))}"
+        )
+    if not 0 <= entry.retention <= RETENTION_MAX:
+        return _refused(
+            f"retention {entry.retention} of aspect {entry.name!r} was asked; it must lie between"
+            f" 1 and {RETENTION_MAX}"
         )
     return wrong_name("aspect", entry.name, slashes=False)
 

@@ -175,6 +175,10 @@ class Client:
         """Note that these shards may not show a commit of ours yet."""
         self._unsettled.update(dict.fromkeys(participants, stamp_ns))
 
+    def unsettled_ns(self, shard: str) -> int:
+        """Return the stamp of a commit of ours that a shard may not show yet (0: none)."""
+        return self._unsettled.get(shard, 0)
+
     def viewed(self, shard: str, until_ns: int) -> None:
         """Note that a shard shows everything up to a stamp."""
         if self._unsettled.get(shard, until_ns + 1) <= until_ns:

@@ -298,8 +298,10 @@ class Commits:
         """Make writes visible; return what a notice tells of them."""
         changes = []
         for write, (slot, version) in zip(writes, versions, strict=True):
-            self._slots.replace(slot, Content(version, stamp_ns, write.datum, NullReason.DELETED))
-            changes.append(Change(slot, version, stamp_ns, write.datum is None))
+            content = Content(version, stamp_ns, write.datum, NullReason.DELETED)
+            self._slots.replace(slot, content, retention=self._catalogue.retention(slot.aspect))
+            captured_ns = write.datum.stamp_ns if write.datum is not None else 0
+            changes.append(Change(slot, version, stamp_ns, write.datum is None, captured_ns))
         self._count("bytes_written", sum(w.datum.size for w in writes if w.datum))
         return changes
 

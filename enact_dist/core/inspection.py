@@ -90,13 +90,18 @@ def sessions(state: ShardState) -> Sessions:
 
 
 def _counted(state: ShardState) -> dict[str, int]:
-    """Return the statistics, and the alarms that nobody has seen to, of earlier epochs too."""
-    alarms = state.audit.alarms
-    return state.counters | ({"alarms": alarms} if alarms else {})
+    """Return the statistics, retention, and alarms nobody has seen to, of earlier epochs too."""
+    retained = state.slots.retained
+    others = {
+        "alarms": state.audit.alarms,
+        "retained_bytes": retained.bytes,
+        "retained_dropped": retained.dropped,
+    }
+    return state.counters | {name: count for name, count in others.items() if count}
 
 
 def surveyed(state: ShardState, message: Survey, *, stamp_ns: int) -> Surveyed:
-    """List the slots that match, null ones too, without their data."""
+    """List the slots that match, null ones too, without their data; retained versions if asked."""
     states: list[SlotState] = []
     for column in state.slots.columns():
         if message.contexts and column.context not in message.contexts:
@@ -107,5 +112,7 @@ def surveyed(state: ShardState, message: Survey, *, stamp_ns: int) -> Surveyed:
             if not message.patterns or any(
                 pattern_matches(pattern, slot.entity) for pattern in message.patterns
             ):
+                retained = state.slots.retained.of(slot) if message.retained else ()
+                states += [state_of(slot, older, with_datum=False) for older in retained]
                 states.append(state_of(slot, content, with_datum=False))
     return Surveyed(state.epoch, state.commits.notice_number, stamp_ns, tuple(states))

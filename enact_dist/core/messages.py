@@ -25,6 +25,9 @@ class Item(NamedTuple):
 
     `entity` is a pattern where the access is one of the `…_EACH`.  `known` is the version that
     the client still has from this epoch (0: none): an unchanged datum is not sent again.
+    With `captured_ns` (a `VIEW`, or the `READ` that stands for one where there is no cut) the
+    newest retained version with that capture stamp is asked instead of the newest one; where there
+    is none, the slot shows as null outside retention.
     """
 
     access: int
@@ -32,6 +35,7 @@ class Item(NamedTuple):
     entity: str
     aspect: str
     known: int = 0
+    captured_ns: int = 0
 
 
 class SlotState(NamedTuple):
@@ -39,7 +43,8 @@ class SlotState(NamedTuple):
 
     `datum` is None when the slot is null (then `null_reason` says why), when the client knows
     this version already (`same`), or when the datum is large and waits to be fetched (`large`).
-    `size` is the body's length in bytes in every case but null.
+    `size` is the body's length in bytes in every case but null.  `captured_ns` is the datum's own
+    stamp, in every case but null, too.
     """
 
     slot: Slot
@@ -50,6 +55,7 @@ class SlotState(NamedTuple):
     same: bool
     large: bool
     null_reason: str
+    captured_ns: int = 0
 
 
 class Holder(NamedTuple):
@@ -99,11 +105,16 @@ class GrantLeft(NamedTuple):
 
 
 class AspectEntry(NamedTuple):
-    """An aspect of the catalogue: its type's fingerprint and its durability ("" = unsaid)."""
+    """An aspect of the catalogue: its type's fingerprint and its durability ("" = unsaid).
+
+    `retention` is how many versions of each slot stay readable, the newest one included (0: unsaid,
+    which is 1); of several that ask, the largest counts.
+    """
 
     name: str
     fingerprint: str
     durability: str
+    retention: int = 0
 
 
 class ShardEntry(NamedTuple):
@@ -355,11 +366,13 @@ class Survey:
     """List slots without their data.  Answer: `Surveyed`.
 
     Empty `contexts` or `aspects` mean all; `patterns` are entity patterns, empty means all.
+    With `retained` the retained versions of each slot come before its newest one, oldest first.
     """
 
     contexts: tuple[str, ...]
     patterns: tuple[str, ...]
     aspects: tuple[str, ...]
+    retained: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -427,6 +440,8 @@ class Welcome:
     placement: PlacementMap
     worlds: tuple[str, ...]
     aspects: tuple[AspectEntry, ...]
+    shared: str = ""
+    shared_nonce: bytes = b""
 
 
 @dataclass(frozen=True, slots=True)
@@ -700,12 +715,13 @@ class Refused:
 
 
 class Change(NamedTuple):
-    """One committed write, without its data."""
+    """One committed write, without its data; `captured_ns` is the datum's own stamp (0: none)."""
 
     slot: Slot
     version: int
     stamp_ns: int
     null: bool
+    captured_ns: int = 0
 
 
 @dataclass(frozen=True, slots=True)

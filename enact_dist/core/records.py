@@ -245,6 +245,16 @@ class SessionSeen:
 
 
 @dataclass(frozen=True, slots=True)
+class SessionDied:
+    """The kernel has said that a session's process has ended, which no message can say.
+
+    Whoever reports it has to know: a lost connection alone proves nothing.
+    """
+
+    session: str
+
+
+@dataclass(frozen=True, slots=True)
 class Tick:
     """Time has passed; the inbox was empty."""
 
@@ -254,4 +264,4 @@ class Drain:
     """The shard is about to stop: grant nothing new, answer parked requests."""
 
 
-Event = Persisted | Called | SessionSeen | Tick | Drain
+Event = Persisted | Called | SessionSeen | SessionDied | Tick | Drain

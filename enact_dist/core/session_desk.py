@@ -25,6 +25,7 @@ from enact_dist.core.records import (
     Persist,
     Record,
     Reply,
+    SessionDied,
     SessionEnded,
     SessionRecord,
     SessionSeen,
@@ -79,6 +80,8 @@ class SessionDesk:
             self._state.settings.placement,
             tuple(self._state.catalogue.worlds),
             tuple(self._state.catalogue.aspects.values()),
+            self._state.settings.shared,
+            self._state.settings.shared_nonce,
         )
         if unrecorded and session.session not in self._recording:
             # A session that a restart would not know could lose its grants without the grace, so
@@ -180,6 +183,13 @@ class SessionDesk:
         """End a session at its own wish."""
         yield from self.end(message.session, "its session said goodbye")
         yield Reply(reply_to, Released())
+
+    def on_session_died(self, message: SessionDied, _: int) -> Iterator[Effect]:
+        """End a session whose process is proven to be gone: nobody believes in its locks."""
+        if message.session in self._state.sessions.by_id:
+            self._state.count("sessions_died")
+            yield Story("session.died", f"the process of session {message.session} ended")
+            yield from self.end(message.session, "its process died")
 
     def end(self, session: str, cause: str) -> Iterator[Effect]:
         """End a session: free its locks, forget its pins, keep its outcomes."""

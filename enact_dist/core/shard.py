@@ -56,6 +56,7 @@ from enact_dist.core.records import (
     Persisted,
     Recovered,
     Reply,
+    SessionDied,
     SessionSeen,
     Tick,
 )
@@ -92,6 +93,7 @@ class Shard:
             KeepAlive: self._sessions.on_keep_alive,
             Goodbye: self._sessions.on_goodbye,
             SessionSeen: self._sessions.on_session_seen,
+            SessionDied: self._sessions.on_session_died,
             Acquire: self._locks.on_acquire,
             TakeView: self._views.on_take_view,
             Fetch: self._locks.on_fetch,
@@ -312,6 +314,7 @@ class Shard:
         """Assert I1, I8, I10, I11 and the bookkeeping of all parts.  For tests and simulation."""
         self._prepares.assert_invariants()
         self.state.tenures.assert_invariants()
+        self.state.slots.retained.assert_invariants()
         if self.state.sessions.in_grace(self.state.now_ns):
             granted = [t for t in self.state.tenures.by_lock.values() if t.token is not None]
             assert all(t.prepared is not None for t in granted), "grant in grace"

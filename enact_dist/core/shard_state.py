@@ -44,6 +44,8 @@ class ShardSettings:
         aspects: Aspects whose durability the cell decides; their fingerprints may be empty.
         ttl_ns_max: Longest lease a session may ask for.
         fetch_bytes_max: Largest part of a datum in one answer.
+        shared: Name of this start's folder of shared memory ("": it shares none).
+        shared_nonce: What stands in there for a client to find.
     """
 
     name: str
@@ -52,6 +54,8 @@ class ShardSettings:
     aspects: tuple[AspectEntry, ...] = ()
     ttl_ns_max: int = 60_000_000_000
     fetch_bytes_max: int = FETCH_BYTES_MAX
+    shared: str = ""
+    shared_nonce: bytes = b""
 
 
 class ShardState:

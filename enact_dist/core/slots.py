@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from enact_dist.core.datum import Column, Datum, Slot
 from enact_dist.core.messages import AspectEntry, SlotState
 from enact_dist.core.past import Past
+from enact_dist.core.retained import Retained
 from enact_dist.terms import Access, Durability, NullReason, pattern_matches
 
 if TYPE_CHECKING:
@@ -39,6 +40,7 @@ class Content:
 
 
 NOTHING: Final = Content(0, 0, None, NullReason.NEVER_SET)
+_OUTSIDE: Final = Content(0, 0, None, NullReason.OUTSIDE_RETENTION)
 
 
 class Shown(NamedTuple):
@@ -58,7 +60,7 @@ class Shown(NamedTuple):
 class SlotMap:
     """All slots of one shard by context and aspect."""
 
-    __slots__ = ("_answer_bytes_max", "_columns", "bytes", "count", "past")
+    __slots__ = ("_answer_bytes_max", "_columns", "bytes", "count", "past", "retained")
 
     def __init__(
         self, recovered: Iterable[SlotRecord], *, answer_bytes_max: int = ANSWER_BYTES_MAX
@@ -68,6 +70,7 @@ class SlotMap:
         self.count = 0
         self.bytes = 0
         self.past = Past()
+        self.retained = Retained()
         for record in recovered:
             if record.volatile:
                 self.set(record.slot, Content(0, 0, None, NullReason.LOST))
@@ -88,9 +91,18 @@ class SlotMap:
         column = self._columns.get(Column(slot.context, slot.aspect))
         return column is not None and slot.entity in column
 
-    def replace(self, slot: Slot, content: Content) -> None:
-        """Put a newly committed state in place of the old one, which stays known for a while."""
-        self.past.keep(slot, self[slot], until_ns=content.stamp_ns)
+    def replace(self, slot: Slot, content: Content, *, retention: int = 1) -> None:
+        """Put a newly committed state in place of the old one, which stays known for a while.
+
+        Args:
+            slot: The slot.
+            content: Its new state.
+            retention: How many versions stay readable, the new one included.
+        """
+        old = self[slot]
+        self.past.keep(slot, old, until_ns=content.stamp_ns)
+        if retention > 1:
+            self.retained.keep(slot, old, count=retention - 1)
         self.set(slot, content)
 
     def at(self, slot: Slot, content: Content, at_ns: int) -> Content:
@@ -98,6 +110,15 @@ class SlotMap:
         if not at_ns or content.stamp_ns <= at_ns:
             return content
         return self.past.at(slot, at_ns) or content
+
+    def captured(self, slot: Slot, newest: Content, captured_ns: int) -> Content:
+        """Return the newest version up to `newest` with a capture stamp, null if none is left."""
+        if newest.datum is not None and newest.datum.stamp_ns == captured_ns:
+            return newest
+        found = self.retained.captured(slot, captured_ns, version_max=newest.version)
+        if found is not None:
+            return found
+        return newest if newest.datum is None else _OUTSIDE
 
     def set(self, slot: Slot, content: Content) -> None:
         """Put a new committed state in place of the old one."""
@@ -138,7 +159,11 @@ class SlotMap:
                 found = [(slot, self[slot])]
             for slot, newest in found:
                 content = self.at(slot, newest, at_ns)
+                # Of the newest one as of then, too, where an older version is asked: what was
+                # captured when is certain only from its commit on.
                 from_ns = max(from_ns, content.stamp_ns)
+                if item.captured_ns:
+                    content = self.captured(slot, content, item.captured_ns)
                 if content.datum is None and each:
                     continue
                 state = state_of(slot, content, known=item.known, inline_max=left)
@@ -170,7 +195,15 @@ def state_of(
     else:
         shown = replace(datum, body=b"", size=0) if large else datum
     return SlotState(
-        slot, content.version, content.stamp_ns, datum.size, shown, same, large and not same, ""
+        slot,
+        content.version,
+        content.stamp_ns,
+        datum.size,
+        shown,
+        same,
+        large and not same,
+        "",
+        datum.stamp_ns,
     )
 
 
@@ -193,11 +226,12 @@ class Catalogue:
             self.aspects[entry.name] = self._with_configured(entry)
 
     def _with_configured(self, entry: AspectEntry) -> AspectEntry:
-        """Let the cell's configuration decide the durability."""
+        """Let the cell's configuration decide the durability, and the larger retention count."""
         configured = self._configured.get(entry.name)
         durability = configured.durability if configured else ""
         durability = durability or entry.durability or Durability.DURABLE.value
-        return entry._replace(durability=durability)
+        retention = max(entry.retention, configured.retention if configured else 0)
+        return entry._replace(durability=durability, retention=retention)
 
     def register(self, entry: AspectEntry) -> tuple[AspectEntry, bool] | str:
         """Register an aspect; return its entry and whether it is new, or why it is refused."""
@@ -216,7 +250,14 @@ class Catalogue:
                 f"aspect {entry.name!r} is registered as {known.durability}, and was now asked as"
                 f" {wanted.durability}; state one durability in cell.toml or in Aspect(…)"
             )
+        if known.retention < wanted.retention:
+            known = self.aspects[entry.name] = known._replace(retention=wanted.retention)
         return known, False
+
+    def retention(self, aspect: str) -> int:
+        """Return how many versions of a slot of this aspect stay readable."""
+        entry = self.aspects.get(aspect)
+        return max(1, entry.retention) if entry is not None else 1
 
     def durability(self, aspect: str) -> Durability:
         """Return what a commit of this (registered) aspect survives."""

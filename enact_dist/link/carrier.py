@@ -36,13 +36,11 @@ class NoticeFeed(Protocol):
 
 
 class Carrier(Protocol):
-    """Moves requests to shards and brings back their answers.
+    """Moves requests to shards and brings back their answers."""
 
-    Attributes:
-        fetch_bytes: How large a slice of a datum is asked for in one call, at most.
-    """
-
-    fetch_bytes: int
+    @property
+    def fetch_bytes(self) -> int:
+        """How large a slice of a datum is asked for in one call, at most."""
 
     def request(self, shard: str, message: Request, *, timeout_s: float) -> Answer | None:
         """Send one request and return its answer, or None if there was none in time.
@@ -69,6 +67,9 @@ class Carrier(Protocol):
 
     def add_endpoints(self, entries: Sequence[ShardEntry]) -> None:
         """Connect to further shards; those already in reach stay as they are."""
+
+    def way_to(self, shard: str) -> str:
+        """Return how calls to a shard travel now, for people: "zenoh", "socket", …."""
 
     def tell_returns(self, returned: Callable[[str], None]) -> None:
         """Call `returned` with the name of each shard that comes (back) into reach.

@@ -58,4 +58,5 @@ def _agrees(known: AspectEntry | None, wanted: AspectEntry) -> bool:
         known is not None
         and known.fingerprint == wanted.fingerprint
         and wanted.durability in ("", known.durability)
+        and wanted.retention <= known.retention
     )

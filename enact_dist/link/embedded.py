@@ -122,6 +122,10 @@ class EmbeddedCarrier:
     def add_endpoints(self, entries: Sequence[ShardEntry]) -> None:
         """Do nothing: there is no other shard."""
 
+    def way_to(self, shard: str) -> str:
+        """Return how calls travel: not at all."""
+        return "call"
+
     def tell_returns(self, returned: Callable[[str], None]) -> None:
         """Do nothing: the shard is in reach as long as this process lives."""
 

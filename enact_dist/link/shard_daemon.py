@@ -15,14 +15,17 @@ import socket
 import sys
 import threading
 import time
-from dataclasses import dataclass
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
 from logging.handlers import QueueHandler, QueueListener
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.errors import ConfigError, EnactError, LinkError
 from enact_dist.link.host import open_host
 from enact_dist.link.shard_calls import ShardCalls
+from enact_dist.link.shared_folder import SharedFolder
 from enact_dist.link.signals import StopSignals
+from enact_dist.link.socket_service import SocketService
 from enact_dist.link.zenoh_config import close_session, open_session
 from enact_dist.link.zenoh_discovery import FoundShard, find_shards
 from enact_dist.link.zenoh_service import ZenohService
@@ -58,6 +61,8 @@ class DaemonSettings:
         folder: Where its data live; None keeps them in memory only.
         log_format: "text" or "json" (one object per line).
         link_lease_s: A connection counts as lost after so long without a sign of life.
+        carrier: How clients of this host may reach it: "auto" by a socket too, if there can be
+            one; "socket" makes it an error if there cannot; "zenoh" makes none.
     """
 
     cell: str
@@ -66,6 +71,7 @@ class DaemonSettings:
     folder: Path | None = None
     log_format: str = "text"
     link_lease_s: float = 1.0
+    carrier: str = "auto"
 
 
 class RunningShard:
@@ -76,15 +82,22 @@ class RunningShard:
         self._ended = threading.Event()
         self._stopping = threading.Lock()
         self._stopped = False
-        self.host: ShardHost = open_host(
-            settings.shard, settings.folder, on_failure=lambda _: self._ended.set()
-        )
-        try:
-            self._session = open_session(listen=settings.listen, lease_s=settings.link_lease_s)
-        except EnactError:
-            self.host.close()
-            raise
+        self._shared = _shared_folder(settings)
         shard = settings.shard
+        if self._shared is not None:
+            shard = replace(shard, shared=self._shared.name, shared_nonce=self._shared.nonce)
+        with ExitStack() as undo:
+            if self._shared is not None:
+                undo.callback(self._shared.close)
+            self.host: ShardHost = open_host(
+                shard, settings.folder, on_failure=lambda _: self._ended.set()
+            )
+            undo.callback(self.host.close)
+            self._sockets = self._shared and SocketService(self.host, self._shared)
+            if self._sockets is not None:
+                undo.callback(self._sockets.close)
+            self._session = open_session(listen=settings.listen, lease_s=settings.link_lease_s)
+            undo.pop_all()
         self._calls = ShardCalls(
             settings.cell,
             shard.name,
@@ -121,9 +134,30 @@ class RunningShard:
             self.host.drain()  # who asked meanwhile is parked: answer them, too
             self.host.close()
             self._calls.close()
+            if self._sockets is not None:
+                self._sockets.close()
             self._service.close()
             close_session(self._session)
+            if self._shared is not None:
+                self._shared.close()
             self._ended.set()
+
+
+def _shared_folder(settings: DaemonSettings) -> SharedFolder | None:
+    """Make the folder that the shard shares with processes of its host.
+
+    Raises:
+        LinkError: It is asked for and cannot be made.
+    """
+    if settings.carrier == "zenoh":
+        return None
+    try:
+        return SharedFolder(settings.cell, settings.shard.name)
+    except LinkError as error:
+        if settings.carrier == "socket":
+            raise
+        _log.warning("no memory is shared on this host: %s", error)
+        return None
 
 
 def start_shard(settings: DaemonSettings) -> RunningShard:

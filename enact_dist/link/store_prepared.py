@@ -30,7 +30,7 @@ def prepared_row(record: PreparedRecord) -> tuple[Key, bytes]:
     """Return the row of a prepared lock, without its data."""
     body = [
         list(record.token),
-        [list(item) for item in record.items],
+        [list(item[:5]) for item in record.items],
         [[*entry.slot, entry.version] for entry in record.versions],
         record.stamp_ns,
         record.primary,

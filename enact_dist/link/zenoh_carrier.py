@@ -288,6 +288,10 @@ class ZenohCarrier:
                 pumps.append(self._pump_into(feed, link))
         return link
 
+    def way_to(self, shard: str) -> str:
+        """Return how calls travel, for people."""
+        return "zenoh"
+
     def tell_returns(self, returned: Callable[[str], None]) -> None:
         """Call `returned` with the name of each shard that comes (back) into reach."""
         self._returned = returned
@@ -307,10 +311,14 @@ class ZenohCarrier:
         """Open a feed of the notices of all shards, those of shards added later included."""
         self._check_usable()
         feed = NoticeQueue()
-        feed.on_close = lambda: self._unsubscribe(feed)
+        feed.on_close = lambda: self.stop_feeding(feed)
+        self.feed_into(feed)
+        return feed
+
+    def feed_into(self, feed: NoticeQueue) -> None:
+        """Let the notices of all shards go into `feed`, too, which may have other sources."""
         with self._mutex:
             self._feeds[feed] = [self._pump_into(feed, link) for link in self._links]
-        return feed
 
     def _pump_into(self, feed: NoticeQueue, link: _Link) -> _Pump:
         subscriber = link.session.declare_subscriber(
@@ -322,7 +330,8 @@ class ZenohCarrier:
         thread.start()
         return _Pump(subscriber, thread)
 
-    def _unsubscribe(self, feed: NoticeQueue) -> None:
+    def stop_feeding(self, feed: NoticeQueue) -> None:
+        """Bring no more notices into `feed`."""
         with self._mutex:
             pumps = self._feeds.pop(feed, [])
         if self._pid != os.getpid():

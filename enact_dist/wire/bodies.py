@@ -26,12 +26,12 @@ _DATUM: Final = (bytes, int, int, int)
 
 
 class BodyWriter:
-    """Collects the bodies of a frame that is written."""
+    """Collects the bodies of a frame that is written; `parts` are they with their padding."""
 
-    __slots__ = ("_end", "_parts")
+    __slots__ = ("_end", "parts")
 
     def __init__(self) -> None:
-        self._parts: list[bytes | memoryview] = []
+        self.parts: list[bytes | memoryview] = []
         self._end = 0
 
     def add(self, datum: Datum) -> tuple[bytes, int, int, int]:
@@ -53,16 +53,10 @@ class BodyWriter:
                 f"data of more than {PAYLOAD_BYTES_MAX} bytes in one message; write fewer at once"
             )
         if start > self._end:
-            self._parts.append(_PADDING[: start - self._end])
+            self.parts.append(_PADDING[: start - self._end])
         self._end = start + size
-        self._parts.append(datum.body)
+        self.parts.append(datum.body)
         return datum.encoding, start, size, datum.stamp_ns
-
-    def payload(self) -> bytes | None:
-        """Return all bodies in one; None where there are none.  A single one is not copied."""
-        if len(self._parts) == 1:
-            return bytes(self._parts[0])
-        return b"".join(self._parts) if self._parts else None
 
 
 class BodyReader:

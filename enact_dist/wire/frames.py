@@ -99,6 +99,18 @@ def encode_frame(message: m.Message) -> tuple[bytes, bytes | None]:
     Raises:
         ProtocolError: A value cannot travel, or the message is over a limit.
     """
+    header, bodies = encode_parts(message)
+    if len(bodies) == 1:
+        return header, bytes(bodies[0])
+    return header, b"".join(bodies) if bodies else None
+
+
+def encode_parts(message: m.Message) -> tuple[bytes, list[bytes | memoryview]]:
+    """Return the header and the pieces of the payload in order, none of them copied.
+
+    Raises:
+        ProtocolError: As `encode_frame`.
+    """
     try:
         code, values, writers = _writers[type(message)]
         parts = [FRAME_VERSION, code, *values(message)]
@@ -113,7 +125,7 @@ def encode_frame(message: m.Message) -> tuple[bytes, bytes | None]:
             f"{type(message).__name__} has a header of {len(header)} bytes; at most"
             f" {HEADER_BYTES_MAX}; ask for less at once"
         )
-    return header, bodies.payload()
+    return header, bodies.parts
 
 
 def decode_frame(header: bytes, payload: bytes | memoryview = b"") -> m.Message:

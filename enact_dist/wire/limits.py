@@ -10,8 +10,9 @@ from typing import Final
 
 from enact_dist.terms import NAME_LENGTH_MAX
 
-FRAME_VERSION: Final = 2
-"""Version of the frames; both ends must speak the same.  2: commits over shards."""
+FRAME_VERSION: Final = 4
+"""Version of the frames; both ends must speak the same.  2: commits over shards; 3: a WELCOME
+names shared memory."""
 DATUM_VERSION: Final = 1
 """Version of the encoding of data; these are stored, so old versions stay readable."""
 

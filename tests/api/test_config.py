@@ -38,6 +38,7 @@ shard = "left"
 
 [aspects.depth]
 durability = "volatile"
+retention = 8
 
 [aspects.flags]
 
@@ -96,10 +97,10 @@ def test_config_needs_only_a_name_and_a_shard():
 
 
 def test_config_lists_its_aspects_as_catalogue_entries():
-    """An aspect of the file has a durability and lets any type register."""
+    """An aspect of the file has a durability and a retention, and lets any type register."""
     assert parsed(FULL).aspect_entries() == (
-        AspectEntry("depth", "", "volatile"),
-        AspectEntry("flags", "", "durable"),
+        AspectEntry("depth", "", "volatile", 8),
+        AspectEntry("flags", "", "durable", 1),
     )
 
 
@@ -162,7 +163,7 @@ WRONG = {
     "ttl type": ('name = "c"\nsession_ttl_s = true\n' + SHARD, 2, "'session_ttl_s' in the file is a number, not a boolean (True)"),
     "ttl range": ('name = "c"\nsession_ttl_s = 0.01\n' + SHARD, 2, "must lie between 0.2 and 60, not 0.01"),
     "ttl nan": ('name = "c"\nsession_ttl_s = nan\n' + SHARD, 2, "must lie between 0.2 and 60, not nan"),
-    "carrier": ('name = "c"\ncarrier = "mqtt"\n' + SHARD, 2, "unknown carrier 'mqtt' (known: zenoh)"),
+    "carrier": ('name = "c"\ncarrier = "mqtt"\n' + SHARD, 2, "unknown carrier 'mqtt' (known: auto, zenoh, socket)"),
     "world name": ('name = "c"\nworlds = [\n  "a",\n  "b c",\n]\n' + SHARD, 4, "'b c' cannot name a world context"),
     "world twice": ('name = "c"\nworlds = ["a",\n"a"]\n' + SHARD, 3, "the world context 'a' is listed twice"),
     "worlds type": ('name = "c"\nworlds = {}\n' + SHARD, 2, "'worlds' in the file is an array of strings, not a table ({})"),
@@ -172,6 +173,8 @@ WRONG = {
     "pins type": ('name = "c"\n' + SHARD + '[pins]\nshard = "left"\n', 4, "'pins' is an array of tables ([[pins]]), not a table"),
     "pin type": ('name = "c"\npins = [\n1]\n' + SHARD, 3, "'pins' holds tables ([[pins]]), not an integer (1)"),
     "durability": ('name = "c"\n' + SHARD + '[aspects.x]\ndurability = "volatil"\n', 5, "unknown durability 'volatil' of aspect 'x'; did you mean 'volatile'?"),
+    "retention": ('name = "c"\n' + SHARD + "[aspects.x]\nretention = 0\n", 5, "'retention' in [aspects.x] is a number of versions from 1 to 256, not 0; the older ones are kept in memory until their shard restarts"),
+    "retention kind": ('name = "c"\n' + SHARD + "[aspects.x]\nretention = true\n", 5, "from 1 to 256, not True"),
     "aspect key": ('name = "c"\n' + SHARD + "[aspects]\nx = { durable = true }\n", 5, "unknown key 'durable' in [aspects.x]; did you mean 'durability'?"),
     "aspect name": ('name = "c"\n' + SHARD + '[aspects."a/b"]\n', 4, "'a/b' cannot name a aspect"),
     "no class": ('name = "c"\n' + SHARD + "[actors.x]\n", 4, "[actors.x] needs the key 'class'"),
@@ -257,7 +260,7 @@ def test_data_folder_override_leaves_a_folder_of_its_own():
 WRONG_ENVIRONMENT = [
     ("ENACT_SESSION_TTL_S", "fast", "ENACT_SESSION_TTL_S='fast' is no number of seconds"),
     ("ENACT_SESSION_TTL_S", "nan", "ENACT_SESSION_TTL_S='nan' is no number of seconds"),
-    ("ENACT_CARRIER", "mqtt", r"ENACT_CARRIER='mqtt' is unknown \(known: zenoh\)"),
+    ("ENACT_CARRIER", "mqtt", r"ENACT_CARRIER='mqtt' is unknown \(known: auto, zenoh, socket\)"),
     ("ENACT_SESSION_TTL", "2", "did you mean ENACT_SESSION_TTL_S"),
     ("ENACT_SHARD_LEFT_LISTN", "x", "did you mean 'ENACT_SHARD_LEFT_LISTEN'"),
     ("ENACT_SHARD_MIDDLE_LISTEN", "x", "no key of a shard of /cells/demo/cell.toml"),

@@ -48,6 +48,7 @@ from enact_dist.core.records import (
     DecisionRecord,
     PreparedEnded,
     PreparedRecord,
+    SessionDied,
     Tick,
 )
 from enact_dist.terms import Access
@@ -181,6 +182,13 @@ class TestPreparedIgnores:
         bench.ask(event)
 
         assert ANN in bench.shard.state.tenures.by_lock
+        assert bench.shard.state.tenures.by_lock[ANN].prepared is not None
+
+    def test_prepared_lock_stays_when_its_process_dies(self, bench):
+        """A proven death says nothing about what the primary decided."""
+        prepared(bench)
+        bench.event(SessionDied("ann"))
+
         assert bench.shard.state.tenures.by_lock[ANN].prepared is not None
 
     def test_prepared_lock_outlives_its_lease_and_hold_limit(self, bench):

@@ -38,7 +38,7 @@ from enact_dist.core.messages import (
     WriteItem,
     WrongShard,
 )
-from enact_dist.core.records import Drain, SessionEnded, SessionSeen
+from enact_dist.core.records import Drain, SessionDied, SessionEnded, SessionSeen
 from enact_dist.terms import Access
 
 R, W, V = Access.READ, Access.WRITE, Access.VIEW
@@ -102,6 +102,37 @@ class TestEnd:
 
         assert isinstance(bench.acquire(BOB, item(W)), Granted)
         assert [record.session for record in bench.recovered(2).sessions] == ["bob"]
+
+    def test_proven_death_frees_everything_at_once_and_is_remembered(self, bench):
+        """Whose process is gone believes in nothing: nobody waits for its lease."""
+        bench.hello("ann", "bob")
+        grant = bench.granted(ANN, item(W))
+        waiting = bench.send(bench.acquire_request(BOB, item(W)))
+        bench.event(SessionDied("ann"))
+
+        assert isinstance(bench.answers[waiting], Granted)
+        assert isinstance(bench.commit(ANN, grant.token, (slot(), "2")), EpochChanged)
+        assert bench.counter("sessions_died") == 1
+        assert [record.session for record in bench.recovered(2).sessions] == ["bob"]
+
+    def test_proven_death_ends_the_grace_that_waits_for_it(self, bench):
+        """After a restart nobody waits for a dead process to acknowledge the epoch."""
+        bench.hello("ann")
+        bench.restart()
+        bench.event(SessionDied("ann"))
+        bench.hello("bob", known_epoch=bench.shard.epoch)
+
+        assert isinstance(bench.acquire(BOB, item(W)), Granted)
+
+    def test_proven_death_of_a_stranger_changes_nothing(self, bench):
+        """A session that said goodbye before its process ended is not ended twice."""
+        bench.hello("ann")
+        bench.ask(Goodbye("ann"))
+        log = list(bench.log)
+        bench.event(SessionDied("ann"))
+
+        assert bench.log == log
+        assert bench.counter("sessions_died") == 0
 
     def test_goodbye_before_the_session_is_durable_is_remembered(self, bench):
         """The end follows the beginning into the log, however quick."""

@@ -26,7 +26,7 @@ def free_port():
 class Process:
     """A child process whose lines of output can be waited for."""
 
-    def __init__(self, arguments, log):
+    def __init__(self, arguments, log, **variables):
         self.log = log
         self.lines = queue.Queue()
         self.seen = []
@@ -37,7 +37,7 @@ class Process:
                 stderr=errors,
                 stdin=subprocess.PIPE,
                 text=True,
-                env={**os.environ, "PYTHONUNBUFFERED": "1"},
+                env={**os.environ, "PYTHONUNBUFFERED": "1", **variables},
             )
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
@@ -90,8 +90,9 @@ class Process:
 class Cell:
     """Shard daemons of one cell, and workers that join it."""
 
-    def __init__(self, folder, *, shards=("s0",), ttl_s=2.0, aspects="", pins=""):
+    def __init__(self, folder, *, shards=("s0",), ttl_s=2.0, aspects="", pins="", carrier="auto"):
         self.folder = folder
+        self.variables = {"ENACT_CARRIER": carrier}
         self.ports = {name: free_port() for name in shards}
         self.file = folder / "cell.toml"
         lines = ['name = "e2e"', 'worlds = ["online", "training"]', f"session_ttl_s = {ttl_s}"]
@@ -104,7 +105,7 @@ class Cell:
 
     def start(self, name="s0", *, launcher=("-m", "enact_dist.cli.main")):
         arguments = [*launcher, "shard", "run", name, "--cell", str(self.file)]
-        daemon = Process(arguments, self.folder / f"{name}.log")
+        daemon = Process(arguments, self.folder / f"{name}.log", **self.variables)
         self.processes.append(daemon)
         self.daemons[name] = daemon
         daemon.expect("ready:")
@@ -121,7 +122,8 @@ class Cell:
 
     def worker(self, role, *arguments):
         log = self.folder / f"{role}.{len(self.processes)}.log"
-        process = Process([str(WORKER), role, str(self.file), *map(str, arguments)], log)
+        line = [str(WORKER), role, str(self.file), *map(str, arguments)]
+        process = Process(line, log, **self.variables)
         self.processes.append(process)
         return process
 
@@ -142,13 +144,19 @@ class Cell:
 
 
 @pytest.fixture
-def make_cell(tmp_path):
+def carrier(request):
+    """How messages travel; parametrise it indirectly, or leave it to the processes."""
+    return getattr(request, "param", "auto")
+
+
+@pytest.fixture
+def make_cell(tmp_path, carrier):
     cells = []
 
     def make(**options):
         folder = tmp_path / f"cell{len(cells)}"
         folder.mkdir()
-        cells.append(Cell(folder, **options))
+        cells.append(Cell(folder, **{"carrier": carrier, **options}))
         return cells[-1]
 
     yield make

@@ -23,6 +23,11 @@ def counted(cell, entity=counter):
         return joined.world("online").view(view).get(view, 0)
 
 
+both = pytest.mark.parametrize("carrier", ["zenoh", "socket"], indirect=True)
+"""What has to hold however messages travel."""
+
+
+@both
 def test_increments_of_four_processes_add_up(make_cell):
     """4 processes x 1,000 increments through locks are 4,000 exactly."""
     cell = make_cell().start_all()
@@ -32,6 +37,7 @@ def test_increments_of_four_processes_add_up(make_cell):
     assert counted(cell) == 4000
 
 
+@both
 def test_increments_add_up_when_shard_is_killed_and_restarted(make_cell):
     """The same with `kill -9` of the shard in the middle, twice: nothing lost, nothing doubled."""
     cell = make_cell().start_all()
@@ -98,6 +104,7 @@ def test_killed_holder_leaves_its_lock_within_one_ttl(make_cell):
     assert counted(cell) == 7
 
 
+@both
 def test_opposite_order_locks_neither_deadlock_nor_starve(make_cell):
     """8 processes lock random pairs in any order: all go on, nobody is overtaken, sums agree."""
     seconds = float(os.environ.get("ENACT_OPPOSITE_SECONDS", "20"))

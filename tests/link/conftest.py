@@ -1,9 +1,11 @@
 """Shards to talk to with plain messages: `peer` speaks for one session over any carrier."""
 
+import os
 import secrets
 import socket
 import subprocess
 import sys
+import tempfile
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -125,17 +127,40 @@ def daemon(make_settings):
         shard.stop(drain_s=0.0)
 
 
+@pytest.fixture(autouse=True)
+def shared_root(tmp_path_factory, monkeypatch):
+    """A root of shared folders of the test's own, in shared memory where there is some."""
+    memory = Path("/dev/shm")
+    parent = memory if memory.is_dir() else None
+    with tempfile.TemporaryDirectory(prefix="enact-test-", dir=parent) as root:
+        monkeypatch.setenv("ENACT_SHARED_FOLDER", root)
+        yield Path(root)
+
+
 @pytest.fixture
-def carry():
-    """Open carriers: `carry(endpoint, …)`; closed after the test."""
+def carry(request):
+    """Open carriers: `carry(endpoint, …)`; closed after the test.
+
+    Parametrised indirectly with "socket" they are socket carriers that have met shard `s0`.
+    """
+    from enact_dist.link.socket_carrier import SocketCarrier
     from enact_dist.link.zenoh_carrier import ZenohCarrier
 
     opened = []
+    over_socket = getattr(request, "param", "zenoh") == "socket"
 
     def open_carrier(*endpoints, session="", ttl_s=2.0, **options):
         session = session or secrets.token_hex(16)
-        opened.append(ZenohCarrier("cell", session, "tester", endpoints, ttl_s=ttl_s, **options))
-        return opened[-1]
+        carrier = ZenohCarrier("cell", session, "tester", endpoints, ttl_s=ttl_s, **options)
+        if over_socket:
+            carrier = SocketCarrier(carrier, session, forced=True)
+        opened.append(carrier)
+        if over_socket:
+            hello = Hello(session, 0, int(ttl_s * 1e9), "tester", "host", os.getpid(), True)
+            while carrier.request("s0", hello, timeout_s=1) is None:
+                assert carrier.calls["zenoh"] < 100
+            assert carrier.way_to("s0") == "socket"
+        return carrier
 
     yield open_carrier
     for carrier in opened:

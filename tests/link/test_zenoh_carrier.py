@@ -1,4 +1,4 @@
-"""Requests, answers, notices and tokens over real Zenoh sessions on the loopback."""
+"""Requests, answers, notices and tokens between processes, over Zenoh and over sockets."""
 
 import os
 import queue
@@ -25,6 +25,9 @@ from enact_dist.link.zenoh_config import close_session, open_session
 from enact_dist.link.zenoh_discovery import FoundShard, discover, find_shards
 from enact_dist.wire.frames import encode_frame
 
+both = pytest.mark.parametrize("carry", ["zenoh", "socket"], indirect=True)
+"""What every carrier between processes has to do."""
+
 
 def speak(carrier, make_peer, **options):
     """Return a session that has said hello over `carrier`."""
@@ -33,6 +36,7 @@ def speak(carrier, make_peer, **options):
     return peer
 
 
+@both
 def test_carrier_brings_an_answer_from_a_shard(daemon, carry, endpoint):
     """A request travels to the daemon and its answer back."""
     daemon(endpoint)
@@ -42,6 +46,7 @@ def test_carrier_brings_an_answer_from_a_shard(daemon, carry, endpoint):
     assert isinstance(answer, Locks)
 
 
+@both
 def test_carrier_keeps_many_calls_in_flight_at_once(daemon, carry, endpoint):
     """100 parked calls and one quick one are under way together; the quick one comes at once."""
     daemon(endpoint)
@@ -55,6 +60,7 @@ def test_carrier_keeps_many_calls_in_flight_at_once(daemon, carry, endpoint):
     assert time.monotonic() - started_s < 2.0
 
 
+@both
 def test_carrier_says_unknown_when_an_answer_takes_too_long(daemon, carry, endpoint):
     """A call that is parked for longer than its caller waits returns None."""
     daemon(endpoint)
@@ -64,6 +70,7 @@ def test_carrier_says_unknown_when_an_answer_takes_too_long(daemon, carry, endpo
     assert answer is None
 
 
+@both
 def test_carrier_says_unknown_at_once_when_the_shard_is_away(daemon, carry, endpoint):
     """A request to a shard that is not there returns None well before its time is over."""
     daemon(endpoint)
@@ -84,18 +91,22 @@ def test_carrier_names_the_endpoint_when_nobody_is_there(carry, endpoint):
     assert caught.value.endpoint == endpoint
 
 
+@both
 def test_carrier_moves_large_data_in_slices_byte_for_byte(daemon, carry, make_peer, endpoint):
-    """3 MB written in one commit come back in slices of the carrier's size, the same bytes."""
+    """9 MB written in one commit come back in slices of the carrier's size, the same bytes."""
     daemon(endpoint)
     carrier = carry(endpoint)
     peer = speak(carrier, make_peer)
-    body = os.urandom(3_000_000)
+    body = os.urandom(9_000_000)
     assert isinstance(peer.write("cup", body), Committed)
 
     granted = peer.acquire("cup")
     state = granted.states[0]
     fetches = [
-        ("s0", Fetch(granted.lock, peer.epoch, state.slot, state.version, start, 1 << 20))
+        (
+            "s0",
+            Fetch(granted.lock, peer.epoch, state.slot, state.version, start, carrier.fetch_bytes),
+        )
         for start in range(0, len(body), carrier.fetch_bytes)
     ]
     slices = carrier.request_all(fetches, timeout_s=10)
@@ -105,6 +116,7 @@ def test_carrier_moves_large_data_in_slices_byte_for_byte(daemon, carry, make_pe
     assert b"".join(bytes(part.body.body) for part in slices) == body
 
 
+@both
 def test_carrier_brings_notices_of_every_commit_in_order(daemon, carry, make_peer, endpoint):
     """A feed has each commit of another client once, numbered without a gap."""
     daemon(endpoint)
@@ -123,6 +135,7 @@ def test_carrier_brings_notices_of_every_commit_in_order(daemon, carry, make_pee
     assert numbers == list(range(first.number, first.number + 51))
 
 
+@both
 def test_carrier_holds_its_token_while_it_is_open(daemon, carry, make_peer, endpoint, until):
     """The shard sees the session's token soon after the start and no more after the end."""
     daemon(endpoint)
@@ -139,6 +152,7 @@ def test_carrier_holds_its_token_while_it_is_open(daemon, carry, make_peer, endp
     until(lambda: not present())
 
 
+@both
 def test_carrier_reaches_further_shards_when_it_learns_of_them(daemon, carry, endpoint, free):
     """A shard known by its advertised endpoint only is reached, and sees the token."""
     second = free()
@@ -154,6 +168,7 @@ def test_carrier_reaches_further_shards_when_it_learns_of_them(daemon, carry, en
     assert carrier.endpoint_of("s1") == second
 
 
+@both
 def test_carrier_feeds_notices_of_shards_that_it_learns_of_later(
     daemon, carry, make_peer, endpoint, free, until
 ):
@@ -191,6 +206,7 @@ def test_carrier_tells_when_a_shard_comes_into_reach_again(daemon, carry, endpoi
     assert "enact-presence" not in {thread.name for thread in threading.enumerate()}
 
 
+@both
 def test_carrier_keeps_its_link_when_a_shard_advertises_another_address(daemon, carry, endpoint):
     """A shard in reach stays reached although its advertised endpoint leads nowhere from here."""
     daemon(endpoint)
@@ -201,6 +217,7 @@ def test_carrier_keeps_its_link_when_a_shard_advertises_another_address(daemon, 
     assert isinstance(carrier.request("s0", ListLocks(), timeout_s=5), Locks)
 
 
+@both
 def test_carrier_reconnects_by_itself_when_a_shard_comes_back(daemon, carry, endpoint, until):
     """After a restart at the same endpoint calls are answered again, by the new epoch."""
     before = daemon(endpoint)
@@ -215,6 +232,7 @@ def test_carrier_reconnects_by_itself_when_a_shard_comes_back(daemon, carry, end
     assert new.epoch > old.epoch
 
 
+@both
 def test_carrier_wakes_pending_calls_when_it_is_closed(daemon, carry, endpoint):
     """A thread that waits for an answer gets None when another thread closes the carrier."""
     daemon(endpoint)

@@ -49,6 +49,7 @@ HAPPENED = (
     "log prefixes replayed",
     "drains",
     "clients killed",
+    "deaths proven",
     "goodbyes",
     "pauses",
     "pauses longer than the TTL",

@@ -10,7 +10,7 @@ from random import Random
 from typing import TYPE_CHECKING
 
 from enact_dist.core.messages import Goodbye
-from enact_dist.core.records import Drain
+from enact_dist.core.records import Drain, SessionDied
 from enact_dist.verify.simulation.client_host import ClientHost
 from enact_dist.verify.simulation.shard_host import ShardHost
 from enact_dist.verify.simulation.world import MS, Host, S
@@ -155,7 +155,16 @@ class Injector:
         number = next(number for number, host in self.clients.items() if host is client)
         self.token_of(client)
         self.replace(number)
+        for host in self._shards.values():
+            if luck.random() < 0.4:
+                self._prove_death(client, host, delay_ns=luck.randrange(20 * MS))
         return f"{client.name} {'says goodbye and ends' if leaves else 'is killed'}"
+
+    def _prove_death(self, client: ClientHost, shard: ShardHost, *, delay_ns: int) -> None:
+        """Tell a shard what the kernel of its host knows; messages may still be under way."""
+        self._world.tally["deaths proven"] += 1
+        died = SessionDied(client.client.session)
+        self._world.after(delay_ns, lambda: shard.receive(lambda: shard.event(died)))
 
     def _pause_one(self, luck: Random) -> str:
         # One among all hosts; a client that is left out of a run is not paused.

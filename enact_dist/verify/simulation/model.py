@@ -33,6 +33,7 @@ from enact_dist.core.records import (
     Publish,
     Recovered,
     Reply,
+    SessionDied,
     SlotRecord,
 )
 from enact_dist.terms import Access, Durability, pattern_matches
@@ -183,7 +184,8 @@ class Model:
         """Judge one step: what came in, and what the shard decided."""
         picture = self.pictures[host.name]
         acknowledged = isinstance(message, Hello) and message.known_epoch == picture.epoch
-        if isinstance(message, Hello | Goodbye) and (acknowledged or isinstance(message, Goodbye)):
+        ended = isinstance(message, Goodbye | SessionDied)
+        if isinstance(message, Hello | Goodbye | SessionDied) and (acknowledged or ended):
             picture.grace_waits_for.pop(message.session, None)
         self._check_commits(host, effects, picture)
         self._locks.judge(host, message, picture)

@@ -1,0 +1,188 @@
+"""Runs the benches that `enact bench` was asked for, and prints what they found."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import platform
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.bench.decisions import core_cases
+from enact_dist.bench.floors import Floors
+from enact_dist.bench.payloads import run_fetch, run_publish, run_wakeup
+from enact_dist.bench.pipeline import run_pipeline
+from enact_dist.bench.place import EMBEDDED, Place
+from enact_dist.bench.run import Run
+from enact_dist.bench.updates import run_durable, run_multi, run_update, run_waiters
+from enact_dist.cli.output import print_json, print_table
+from enact_dist.errors import MisuseError
+from enact_dist.link.shared_folder import MEMORY
+
+if TYPE_CHECKING:
+    import argparse
+
+    from enact_dist.bench.rows import Row
+
+SECONDS_S: Final = 3.0
+"""Measuring time of each line unless given."""
+COLUMNS: Final = ("bench", "variant", "median", "p99", "n", "x floor", "goal", "met")
+
+
+def run_floor(run: Run) -> None:
+    """What the machine and the bare transports do."""
+    run.measure([run.floors.case(variant) for _, variant in Floors.every()])
+
+
+def run_core(run: Run) -> None:
+    """The shard's decisions alone."""
+    run.measure(core_cases())
+
+
+BENCHES: Final[dict[str, Callable[[Run], None]]] = {
+    "floor": run_floor,
+    "core": run_core,
+    "update": run_update,
+    "multi": run_multi,
+    "durable": run_durable,
+    "waiters": run_waiters,
+    "fetch": run_fetch,
+    "publish": run_publish,
+    "wakeup": run_wakeup,
+    "pipeline": run_pipeline,
+}
+BETWEEN_PROCESSES: Final = frozenset(("waiters", "wakeup", "pipeline"))
+"""Benches that mean nothing within one process."""
+
+
+def carriers_of(arguments: argparse.Namespace) -> tuple[str, ...]:
+    """Return what the benches that compare carriers go over."""
+    if arguments.embedded:
+        return (EMBEDDED,)
+    if arguments.carrier != "auto":
+        return (arguments.carrier,)
+    if arguments.connect is not None:
+        return ("auto",)
+    return (EMBEDDED, "zenoh", "socket")
+
+
+def names_of(arguments: argparse.Namespace) -> list[str]:
+    """Return the benches to run, in the order of the table.
+
+    Raises:
+        MisuseError: One is named that needs several processes, and there is to be one.
+    """
+    asked = set(arguments.names or BENCHES)
+    if arguments.embedded:
+        lost = sorted(asked & BETWEEN_PROCESSES) if arguments.names else []
+        if lost:
+            raise MisuseError(
+                f"{', '.join(lost)} between processes cannot run --embedded; leave one of both out"
+            )
+        asked -= BETWEEN_PROCESSES
+    return [name for name in BENCHES if name in asked]
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Measure, print, and return the exit status: a goal that is missed is no failure."""
+    names = names_of(arguments)
+    found = machine()  # its load is that of others, before this adds its own
+    with contextlib.ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="enact-bench-")))
+        memory_root = MEMORY if MEMORY.is_dir() else None
+        memory = Path(
+            stack.enter_context(tempfile.TemporaryDirectory(prefix="enact-bench-", dir=memory_root))
+        )
+        place = stack.enter_context(
+            Place(
+                folder,
+                target=arguments.connect,
+                shards=arguments.shards or 1,
+                carriers=carriers_of(arguments),
+            )
+        )
+        floors = stack.enter_context(Floors(folder, memory))
+        told = stack.enter_context(_progress())
+        measured = Run(place, floors, seconds_s=arguments.seconds_s or SECONDS_S, told=told)
+        for name in names:
+            BENCHES[name](measured)
+        rows = measured.rows()
+    if arguments.json:
+        print_json({"machine": found, "rows": [row.as_json() for row in rows]})
+    else:
+        _print(found, rows)
+    return 0
+
+
+@contextlib.contextmanager
+def _progress() -> Iterator[Callable[[str], None]]:
+    """Give a function that shows what is being measured, if anybody watches."""
+    if not sys.stderr.isatty():
+        yield lambda _text: None
+        return
+    from rich.console import Console
+
+    with Console(stderr=True).status("starting") as status:
+        yield status.update
+
+
+def machine() -> dict[str, object]:
+    """Return what the figures were measured on."""
+    from importlib.metadata import PackageNotFoundError, version
+
+    model = platform.processor() or platform.machine()
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                model = line.partition(":")[2].strip()
+                break
+    try:
+        zenoh = version("eclipse-zenoh")
+    except PackageNotFoundError:
+        zenoh = "unknown"
+    return {
+        "processor": model,
+        "cores": os.cpu_count(),
+        "system": platform.platform(),
+        "python": platform.python_version(),
+        "zenoh": zenoh,
+        "load": round(os.getloadavg()[0], 2),
+    }
+
+
+# ---------------------------------------------------------------- the table
+
+
+def shown_us(value_us: float) -> str:
+    """Return a time with three digits and its unit."""
+    for unit, size_us in (("µs", 1.0), ("ms", 1e3), ("s", 1e6)):
+        value = value_us / size_us
+        if value < 1000.0 or unit == "s":
+            digits = 0 if value >= 100.0 else 1 if value >= 10.0 else 2
+            return f"{value:.{digits}f} {unit}"
+    raise AssertionError
+
+
+def _cells(row: Row) -> tuple[str, ...]:
+    if row.value is not None:
+        median, p99 = f"{row.value:g} {row.unit or ''}".strip(), ""
+    else:
+        median = shown_us(row.median_us) if row.median_us is not None else ""
+        p99 = shown_us(row.p99_us) if row.p99_us is not None else ""
+    met = "" if row.goal is None else {True: "yes", False: "NO", None: "?"}[row.met]
+    ratio = "" if row.ratio is None else f"{row.ratio:.2f}"
+    return row.name, row.variant, median, p99, f"{row.n:,}", ratio, row.goal or "", met
+
+
+def _print(found: Mapping[str, object], rows: Sequence[Row]) -> None:
+    print(
+        f"{found['processor']}, {found['cores']} cores, Python {found['python']}, load before"
+        f" {found['load']}"
+    )
+    print_table(COLUMNS, [_cells(row) for row in rows], empty="nothing was measured")
+    judged = [row for row in rows if row.goal is not None]
+    missed = [row for row in judged if row.met is False]
+    print(f"{len(judged)} goals, {len(missed)} not met")

@@ -1,0 +1,198 @@
+"""The floors: what this machine and the bare transports do by themselves, in the same run.
+
+========================  ===================================================================
+floor                     what it is
+========================  ===================================================================
+zenoh query               one raw query and its answer, 64 bytes, between two Python processes
+zenoh pub/sub             a publication and the one that comes back for it
+zenoh reply SIZE          a query whose answer has so many bytes, into Python's memory
+socket echo               64 bytes to a Python process and back over a Unix socket
+memcpy SIZE               `bytes` copied into memory that is there already
+write SIZE                `write()` of so many bytes to a new file in shared memory
+mmap SIZE                 such a file opened, mapped, its first byte read, and let go
+fdatasync                 4 kB appended to a file of the data's disk and forced out
+========================  ===================================================================
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import mmap
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.bench.raw_socket import RawSocket
+from enact_dist.bench.rows import Case
+from enact_dist.bench.timing import PAUSE_S, timed
+from enact_dist.errors import MisuseError
+from enact_dist.verify.daemons import LineProcess, free_port
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from enact_dist.bench.raw_zenoh import RawZenoh
+    from enact_dist.bench.rows import Key
+
+PAUSED: Final = ", paused"
+"""Ends the name of a variant with pauses between the acts."""
+QUERY: Final = ("floor", "zenoh query")
+QUERY_PAUSED: Final = ("floor", "zenoh query" + PAUSED)
+PUBLISH: Final = ("floor", "zenoh pub/sub")
+ECHO: Final = ("floor", "socket echo")
+ECHO_PAUSED: Final = ("floor", "socket echo" + PAUSED)
+FDATASYNC: Final = ("floor", "fdatasync")
+SIZES: Final = {"1 kB": 1_024, "0.9 MB": 921_600, "10 MB": 10_000_000, "100 MB": 100_000_000}
+"""Bytes of the payloads that are measured."""
+
+
+def reply(size: str) -> Key:
+    """Return the floor of a fetch over the network."""
+    return ("floor", f"zenoh reply {size}")
+
+
+def written(size: str) -> Key:
+    """Return the floor of a publication in shared memory."""
+    return ("floor", f"write {size}")
+
+
+def mapped(size: str) -> Key:
+    """Return the floor of a fetch in shared memory."""
+    return ("floor", f"mmap {size}")
+
+
+def copied(size: str) -> Key:
+    """Return the floor of a copy."""
+    return ("floor", f"memcpy {size}")
+
+
+class Floors:
+    """Measures floors; starts the processes behind them at their first use.  A context manager.
+
+    Args:
+        folder: Where data would be kept: its disk is measured.
+        memory: A folder in shared memory.
+    """
+
+    def __init__(self, folder: Path, memory: Path) -> None:
+        self._folder, self._memory = folder, memory
+        self._stack = contextlib.ExitStack()
+
+    def __enter__(self) -> Floors:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    @staticmethod
+    def every() -> list[Key]:
+        """Return all floors."""
+        plain = [QUERY, QUERY_PAUSED, PUBLISH, ECHO, ECHO_PAUSED, FDATASYNC]
+        by_size = (copied, written, mapped, reply)
+        return plain + [floor(size) for floor in by_size for size in SIZES]
+
+    def case(self, variant: str) -> Case:
+        """Return the case of a floor.
+
+        Raises:
+            MisuseError: There is none of that name.
+        """
+        bare = variant.removesuffix(PAUSED)
+        pause_s = PAUSE_S if bare != variant else 0.0
+        act = self._act(bare)
+        return Case("floor", variant, lambda seconds_s: timed(act, seconds_s, pause_s=pause_s))
+
+    def _act(self, variant: str) -> Callable[[], object]:
+        if variant == "zenoh query":
+            return self._zenoh.query
+        if variant == "zenoh pub/sub":
+            return self._zenoh.publish
+        if variant == "socket echo":
+            return self._socket.echo
+        if variant == "fdatasync":
+            return self._fdatasync
+        kind, _, size = variant.partition(" ")
+        if kind == "zenoh":
+            raw, size = self._zenoh, size.removeprefix("reply ")
+            return functools.partial(raw.query, SIZES[size])
+        by_kind = {"memcpy": self._memcpy, "write": self._write, "mmap": self._mmap}
+        if kind not in by_kind or size not in SIZES:
+            raise MisuseError(f"there is no floor {variant!r}")
+        return by_kind[kind](SIZES[size])
+
+    # ---------------------------------------------------------------- transports
+
+    def _process(self, module: str, word: str) -> None:
+        process = LineProcess(module, (word,), self._folder / f"{module}.log")
+        self._stack.callback(process.end)
+        process.expect("ready:")
+
+    @functools.cached_property
+    def _zenoh(self) -> RawZenoh:
+        from enact_dist.bench.raw_zenoh import RawZenoh
+
+        port = free_port()
+        self._process("enact_dist.bench.raw_zenoh", str(port))
+        return self._stack.enter_context(RawZenoh(port))
+
+    @functools.cached_property
+    def _socket(self) -> RawSocket:
+        path = self._memory / "echo"
+        self._process("enact_dist.bench.raw_socket", str(path))
+        return self._stack.enter_context(RawSocket(path))
+
+    # ---------------------------------------------------------------- memory and disk
+
+    @staticmethod
+    def _memcpy(size: int) -> Callable[[], object]:
+        source, target = memoryview(bytes(b"x" * size)), memoryview(bytearray(size))
+
+        def copy() -> None:
+            target[:] = source
+
+        return copy
+
+    def _write(self, size: int) -> Callable[[], object]:
+        body = memoryview(b"x" * size)
+        path = self._memory / f"written-{size}"
+
+        def write() -> None:
+            path.unlink(missing_ok=True)
+            descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+            try:
+                done = 0
+                while done < size:
+                    done += os.write(descriptor, body[done:])
+            finally:
+                os.close(descriptor)
+
+        self._stack.callback(path.unlink, missing_ok=True)
+        return write
+
+    def _mmap(self, size: int) -> Callable[[], object]:
+        path = self._memory / f"mapped-{size}"
+        path.write_bytes(b"x" * size)
+        self._stack.callback(path.unlink, missing_ok=True)
+
+        def map_and_look() -> int:
+            descriptor = os.open(path, os.O_RDONLY)
+            try:
+                with mmap.mmap(descriptor, size, prot=mmap.PROT_READ) as found:
+                    return found[0]
+            finally:
+                os.close(descriptor)
+
+        return map_and_look
+
+    @functools.cached_property
+    def _fdatasync(self) -> Callable[[], object]:
+        descriptor = os.open(self._folder / "forced", os.O_WRONLY | os.O_CREAT, 0o600)
+        self._stack.callback(os.close, descriptor)
+        block = b"x" * 4096
+
+        def append_and_force() -> None:
+            os.write(descriptor, block)
+            os.fdatasync(descriptor)
+
+        return append_and_force

@@ -1,0 +1,235 @@
+"""Benches `fetch`, `publish` and `wakeup`: arrays of some sizes, read and written under locks.
+
+A fetch is divided by mapping a file of that size from shared memory (over the network: by a raw
+Zenoh answer of that size), a publication by writing such a file.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from enact_dist.bench.floors import QUERY, SIZES, mapped, reply, written
+from enact_dist.bench.place import EMBEDDED
+from enact_dist.bench.rows import Case, Goal, Key, at_most, times
+from enact_dist.bench.timing import timed
+from enact_dist.lock import Lock
+from enact_dist.terms import Aspect, Durability, Entity, Read, Write
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from numpy.typing import NDArray
+
+    from enact_dist.bench.run import Run
+    from enact_dist.verify.daemons import LineProcess
+    from enact_dist.world import WorldContext
+
+SMALL: Final = "1 kB"
+LARGEST: Final = "100 MB"
+WAIT_S: Final = 60.0
+WAKEUPS: Final = {"64 B": (64, 500.0, 0.003), "0.9 MB": (921_600, 800.0, 0.02)}
+"""Bytes, goal in microseconds, and seconds between two changes."""
+
+
+def entity(size: str) -> Entity:
+    """Return the entity whose array has that size."""
+    return Entity(f"array/{size.replace(' ', '')}")
+
+
+ARRAY: Final[Aspect[Any]] = Aspect("volatile_array", np.ndarray, Durability.VOLATILE)
+
+
+def store(world: WorldContext, of: Entity, array: NDArray[Any]) -> None:
+    """Write an array under a lock of its own."""
+    write = Write(world, of, ARRAY)
+    with Lock(write, wait_s=WAIT_S) as lock:
+        lock[write] = array
+
+
+def fetch(world: WorldContext, of: Entity) -> float:
+    """Read an array under a lock; return its first element plus its last."""
+    read = Read(world, of, ARRAY)
+    with Lock(read, wait_s=WAIT_S) as lock:
+        array = lock[read]
+        return float(array[0]) + float(array[-1])
+
+
+def floats(size: int) -> NDArray[np.float32]:
+    """Return an array of so many bytes, of shape (size / 4,), float32."""
+    return np.arange(size // 4, dtype=np.float32)
+
+
+# ---------------------------------------------------------------- fetch
+
+
+def run_fetch(run: Run) -> None:
+    """Read an array: one that this process has seen, one written anew, one from another host."""
+    place = run.place
+    if EMBEDDED in place.carriers:
+        run.measure(_embedded_fetches(place.world(EMBEDDED)))
+    if place.embedded:
+        return
+    with place.worker("storer", carrier=place.carrier) as storer:
+        fresh = _Storer(storer)
+        world = place.world(place.carrier)
+        for size in SIZES:
+            fresh.store(size)
+            fetch(world, entity(size))
+        cases = []
+        for size in SIZES:
+            cases += _fetches(world, size, fresh)
+        run.measure(cases)
+        with place.far_world() as far:
+            run.measure([_far_fetch(far, size, fresh) for size in SIZES])
+
+
+class _Storer:
+    """A worker that writes arrays when told to."""
+
+    def __init__(self, worker: LineProcess) -> None:
+        self._worker = worker
+
+    def store(self, size: str) -> None:
+        """Have an array of that size written anew; return once it is."""
+        self._worker.tell(f"{entity(size).name} {SIZES[size]}")
+        self._worker.expect("stored:", timeout_s=WAIT_S)
+
+
+def _same_as_small(variant: str) -> Goal:
+    return times(1.3, ("fetch", variant.format(SMALL)), "≤ 1.3 x 1 kB")
+
+
+def _embedded_fetches(world: WorldContext) -> list[Case]:
+    goal = at_most(60.0, "≤ 60 µs")
+    for size in (SMALL, LARGEST):
+        store(world, entity(size), floats(SIZES[size]))
+    return [
+        Case("fetch", f"embedded, {size}", _fetching(world, size), mapped(size), goal)
+        for size in (SMALL, LARGEST)
+    ]
+
+
+def _fetching(
+    world: WorldContext, size: str, before: Callable[[], None] | None = None
+) -> Callable[[float], Sequence[float]]:
+    return lambda seconds_s: timed(lambda: fetch(world, entity(size)), seconds_s, before=before)
+
+
+def _fetches(world: WorldContext, size: str, fresh: _Storer) -> list[Case]:
+    seen, anew = "{}, seen before", "{}, written anew"
+    largest = size == LARGEST
+    return [
+        Case(
+            "fetch",
+            seen.format(size),
+            _fetching(world, size),
+            mapped(size),
+            _same_as_small(seen) if largest else None,
+        ),
+        Case(
+            "fetch",
+            anew.format(size),
+            _fetching(world, size, lambda: fresh.store(size)),
+            mapped(size),
+            _same_as_small(anew) if largest else None,
+        ),
+    ]
+
+
+def _far_fetch(world: WorldContext, size: str, fresh: _Storer) -> Case:
+    floor: Key = reply(size)
+    return Case(
+        "fetch",
+        f"{size}, written anew, no common memory",
+        _fetching(world, size, lambda: fresh.store(size)),
+        floor,
+        times(1.0 / 0.8, floor, "≥ 0.8 of raw Zenoh"),
+    )
+
+
+# ---------------------------------------------------------------- publish
+
+
+def run_publish(run: Run) -> None:
+    """Write an array under a lock: from `with` to the end of the block."""
+    place = run.place
+    carrier = EMBEDDED if place.embedded else place.carrier
+    world = place.world(carrier)
+    cases = []
+    for size, count in SIZES.items():
+        goal = times(1.2, written(size), "≤ 1.2 x write()") if size == LARGEST else None
+        cases.append(Case("publish", size, _storing(world, size, count), written(size), goal))
+    run.measure(cases)
+
+
+def _storing(world: WorldContext, size: str, count: int) -> Callable[[float], Sequence[float]]:
+    def measure(seconds_s: float) -> Sequence[float]:
+        array = floats(count)
+        return timed(lambda: store(world, entity(f"out/{size}"), array), seconds_s)
+
+    return measure
+
+
+# ---------------------------------------------------------------- wakeup
+
+
+def run_wakeup(run: Run) -> None:
+    """From the commit of a change in one process to another one that has it, under a lock."""
+    run.measure(
+        [
+            Case(
+                "wakeup",
+                size,
+                _waking(run, count, gap_s),
+                QUERY,
+                at_most(goal_us, f"≤ {goal_us / 1e3:g} ms"),
+            )
+            for size, (count, goal_us, gap_s) in WAKEUPS.items()
+        ]
+    )
+
+
+def _waking(run: Run, size: int, gap_s: float) -> Callable[[float], Sequence[float]]:
+    place = run.place
+    world = place.world(place.carrier)
+    of = Entity(f"wakeup/{size}")
+    read = Read(world, of, ARRAY)
+
+    def measure(seconds_s: float) -> Sequence[float]:
+        from time import perf_counter_ns
+
+        count = max(5, math.ceil(seconds_s / (gap_s + 0.002)))
+        options: dict[str, Any] = {
+            "entity": of.name, "bytes": size, "gap_s": gap_s, "count": count,
+        }  # fmt: skip
+        found: dict[int, float] = {}
+        with (
+            place.worker("notifier", carrier=place.carrier, **options) as notifier,
+            world.watch(of, ARRAY) as watch,
+        ):
+            notifier.tell("go")
+            last = -1
+            while last < count - 1:
+                if watch.next(timeout_s=WAIT_S) is None:
+                    notifier.expect("done:", timeout_s=0.0)
+                    break
+                with Lock(read, wait_s=WAIT_S) as lock:
+                    # From here on the array can be used; the clock is the same in all processes.
+                    seq, sent_ns = (int(number) for number in lock[read][:16].view(np.int64))
+                    had_ns = perf_counter_ns()
+                if seq > last:
+                    last = seq
+                    found[seq] = (had_ns - sent_ns) / 1e3
+            notifier.expect("done:", timeout_s=WAIT_S)
+        return list(found.values())
+
+    return measure
+
+
+def said(numbers: Sequence[Any]) -> str:
+    """Return numbers as one line that `json.loads` reads."""
+    return json.dumps(list(numbers), separators=(",", ":"))

@@ -1,0 +1,204 @@
+"""Where benches run: a throw-away cell of real daemons, a cell that runs, or this process."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+from typing import TYPE_CHECKING, Any, Final
+
+from enact_dist.config_values import CARRIERS
+from enact_dist.connecting import connect, local
+from enact_dist.link.shared_folder import SHARED_FOLDER_VARIABLE
+from enact_dist.verify.daemons import LineProcess, free_port
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+    from pathlib import Path
+
+    from enact_dist.cell import Cell
+    from enact_dist.world import WorldContext
+
+WORLD: Final = "bench"
+"""The world context that all benches write into; made if it does not exist."""
+EMBEDDED: Final = "embedded"
+CARRIER_VARIABLE: Final = "ENACT_CARRIER"
+COMMAND: Final = "enact_dist.cli.main"
+WORKER: Final = "enact_dist.bench.worker"
+PIPELINE_WORKER: Final = "enact_dist.bench.pipeline_worker"
+WORKERS_S: Final = 120.0
+"""Many processes that start at once on few processors take this long at most."""
+END_S: Final = 5.0
+JOIN_S: Final = 10.0
+assert EMBEDDED not in CARRIERS
+
+
+@contextlib.contextmanager
+def environment(**wanted: str) -> Iterator[None]:
+    """Set environment variables for as long as the block runs."""
+    before = {name: os.environ.get(name) for name in wanted}
+    os.environ.update(wanted)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def _end(process: LineProcess) -> None:
+    """Ask a process to leave, so that it cleans up; end it if it does not."""
+    if process.status is None:
+        process.signal(signal.SIGTERM)
+        process.wait_status(END_S)
+    process.end()
+
+
+class Place:
+    """Opens cells and starts workers in them.  A context manager.
+
+    Args:
+        folder: Existing and empty: for `cell.toml`, data and logs.
+        target: A cell that runs; None starts one of its own at the first use.
+        shards: How many daemons that one has.
+        carriers: How benches that compare them reach the cell, `EMBEDDED` among others.
+    """
+
+    def __init__(
+        self, folder: Path, *, target: str | None, shards: int, carriers: tuple[str, ...]
+    ) -> None:
+        self.folder = folder
+        self.carriers = carriers
+        self.own = target is None
+        self.shard_names = tuple(f"s{number}" for number in range(shards)) if self.own else ()
+        self._target = target
+        self._cells: dict[str, Cell] = {}
+        self._stack = contextlib.ExitStack()
+        self._logs = 0
+        self._daemons: list[LineProcess] = []
+
+    def __enter__(self) -> Place:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    @property
+    def embedded(self) -> bool:
+        """Whether nothing but this process is asked for."""
+        return self.carriers == (EMBEDDED,)
+
+    @property
+    def carrier(self) -> str:
+        """The carrier of benches that do not compare them."""
+        return self.carriers[0] if len(self.carriers) == 1 else "auto"
+
+    @property
+    def target(self) -> str:
+        """What clients connect to; the daemons of an own cell are started for it."""
+        if self._target is None:
+            self._target = self._start_daemons()
+        return self._target
+
+    def _start_daemons(self) -> str:
+        file = self.folder / "cell.toml"
+        lines = [
+            'name = "bench"',
+            f'worlds = ["{WORLD}"]',
+            f"data_folder = {json.dumps(str(self.folder / 'data'))}",
+        ]
+        for name in self.shard_names:
+            lines += [f"[shards.{name}]", f'listen = "tcp/127.0.0.1:{free_port()}"']
+        for name in self.shard_names:
+            lines += ["[[pins]]", f'entities = "{name}/**"', f'shard = "{name}"']
+        file.write_text("\n".join(lines) + "\n")
+        with environment(**{CARRIER_VARIABLE: "auto"}):
+            self._daemons = [
+                self._process(COMMAND, ("shard", "run", name, "--cell", str(file)))
+                for name in self.shard_names
+            ]
+        for daemon in self._daemons:
+            daemon.expect("ready:")
+        return str(file)
+
+    def _process(self, module: str, words: tuple[str, ...]) -> LineProcess:
+        self._logs += 1
+        process = LineProcess(module, words, self.folder / f"process-{self._logs}.log")
+        self._stack.callback(_end, process)
+        return process
+
+    # ---------------------------------------------------------------- cells
+
+    def world(self, carrier: str) -> WorldContext:
+        """Return the benches' world context as this process reaches it over a carrier."""
+        if carrier not in self._cells:
+            self._cells[carrier] = self._stack.enter_context(self._opened(carrier))
+        return self._cells[carrier].create_world(WORLD)
+
+    def way(self, carrier: str) -> str:
+        """Return how calls over a carrier travel: "socket", "zenoh" or `EMBEDDED`.
+
+        Over several shards it is "socket" only where all are reached by one.
+        """
+        if carrier == EMBEDDED:
+            return carrier
+        self.world(carrier)
+        self._cells[carrier].worlds()  # greets every shard, so that each says how it is reached
+        ways = {shard.carrier for shard in self._cells[carrier].shards()}
+        return "socket" if ways == {"socket"} else "zenoh"
+
+    def _opened(self, carrier: str) -> Cell:
+        if carrier == EMBEDDED:
+            return local(self.folder / EMBEDDED, worlds=[WORLD])
+        target = self.target
+        with environment(**{CARRIER_VARIABLE: carrier}):
+            return connect(target, actor="bench", timeout_s=JOIN_S)
+
+    @contextlib.contextmanager
+    def far_world(self) -> Iterator[WorldContext]:
+        """Give the world context as a client of another host has it: no memory in common."""
+        other = self.folder / "elsewhere"
+        other.mkdir(mode=0o700, exist_ok=True)
+        target = self.target
+        with environment(**{CARRIER_VARIABLE: "zenoh", SHARED_FOLDER_VARIABLE: str(other)}):
+            cell = connect(target, actor="bench-far", timeout_s=JOIN_S)
+        with cell:
+            yield cell.create_world(WORLD)
+
+    # ---------------------------------------------------------------- workers
+
+    @contextlib.contextmanager
+    def workers(
+        self,
+        roles: Sequence[tuple[str, dict[str, Any]]],
+        *,
+        carrier: str,
+        module: str = WORKER,
+    ) -> Iterator[list[LineProcess]]:
+        """Run a process for each role with its options; all have said ``ready:``."""
+        target = self.target
+        with environment(**{CARRIER_VARIABLE: carrier}):
+            processes = [
+                self._process(module, (target, role, json.dumps(options)))
+                for role, options in roles
+            ]
+        try:
+            for process in processes:
+                process.expect("ready:", timeout_s=WORKERS_S)
+            yield processes
+        finally:
+            for process in processes:
+                _end(process)
+
+    @contextlib.contextmanager
+    def worker(self, role: str, *, carrier: str, **options: Any) -> Iterator[LineProcess]:
+        """Run `enact_dist.bench.worker` in a role; it has said ``ready:``."""
+        with self.workers([(role, options)], carrier=carrier) as (process,):
+            yield process
+
+    def daemon_pids(self) -> list[int]:
+        """Return the process ids of the daemons of an own cell."""
+        return [daemon.pid for daemon in self._daemons]

@@ -1,0 +1,163 @@
+"""What a bench measures and how it is judged: samples, goals, cases and the rows of the table."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final, TypeAlias
+
+Key: TypeAlias = tuple[str, str]
+"""Name of the bench and the variant in it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """Many times of the same act.
+
+    Attributes:
+        median_us: Half of them took no longer, microseconds.
+        p99_us: 99 of 100 took no longer, microseconds.
+        n: How many there are.
+    """
+
+    median_us: float
+    p99_us: float
+    n: int
+
+
+Figures: TypeAlias = Mapping[Key, Sample]
+
+
+def sample_of(times_us: Sequence[float]) -> Sample:
+    """Return what many times have in common.
+
+    Raises:
+        ValueError: There are none.
+    """
+    if not times_us:
+        raise ValueError("nothing was measured")
+    ordered = sorted(times_us)
+    at = min(len(ordered) - 1, int(len(ordered) * 0.99))
+    return Sample(statistics.median(ordered), ordered[at], len(ordered))
+
+
+@dataclass(frozen=True, slots=True)
+class Goal:
+    """What a figure should keep to.
+
+    Attributes:
+        text: For people.
+        limit_us: The longest median, from the other figures of the same run; None where those
+            were not measured.
+        p99_us: The longest 99th percentile; None where none is set.
+    """
+
+    text: str
+    limit_us: Callable[[Figures], float | None]
+    p99_us: float | None = None
+
+    def met(self, sample: Sample, figures: Figures) -> bool | None:
+        """Say whether `sample` keeps to it; None where that cannot be told from this run."""
+        limit_us = self.limit_us(figures)
+        if limit_us is None:
+            return None
+        return sample.median_us <= limit_us and (
+            self.p99_us is None or sample.p99_us <= self.p99_us
+        )
+
+
+def at_most(limit_us: float, text: str, *, p99_us: float | None = None) -> Goal:
+    """Return a goal of a fixed time in microseconds."""
+    return Goal(text, lambda _figures: limit_us, p99_us)
+
+
+def times(factor: float, of: Key, text: str, *, plus: tuple[float, Key] | None = None) -> Goal:
+    """Return a goal of so many times another median, plus so many times a further one."""
+
+    def limit_us(figures: Figures) -> float | None:
+        if of not in figures or (plus is not None and plus[1] not in figures):
+            return None
+        more_us = plus[0] * figures[plus[1]].median_us if plus is not None else 0.0
+        return factor * figures[of].median_us + more_us
+
+    return Goal(text, limit_us)
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One line of a bench.
+
+    Attributes:
+        name: The bench.
+        variant: What is different in this line.
+        measure: Acts for so many seconds, and returns the time of each act in microseconds.
+        floor: The figure that this one is divided by.
+        goal: What it should keep to, if anything.
+    """
+
+    name: str
+    variant: str
+    measure: Callable[[float], Sequence[float]]
+    floor: Key | None = None
+    goal: Goal | None = None
+
+    @property
+    def key(self) -> Key:
+        """Under which its figure is kept."""
+        return (self.name, self.variant)
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One line of the table; what it does not have is None.
+
+    Attributes:
+        name: The bench.
+        variant: What is different in this line.
+        median_us: Microseconds; None for a figure that is no time.
+        p99_us: Microseconds.
+        n: Of how many.
+        ratio: The median over that of the floor of the same run.
+        goal: In words.
+        met: Whether it is kept to; None without one, or where this run cannot tell.
+        value: The figure that is no time.
+        unit: Of `value`.
+    """
+
+    name: str
+    variant: str
+    median_us: float | None
+    p99_us: float | None
+    n: int
+    ratio: float | None = None
+    goal: str | None = None
+    met: bool | None = None
+    value: float | None = None
+    unit: str | None = None
+
+    def as_json(self) -> dict[str, object]:
+        """Return the row as it stands in JSON: `value` and `unit` only where there is one."""
+        found = {name: getattr(self, name) for name in TIME_FIELDS}
+        if self.value is not None:
+            found |= {"value": self.value, "unit": self.unit}
+        return found
+
+
+TIME_FIELDS: Final = ("name", "variant", "median_us", "p99_us", "n", "ratio", "goal", "met")
+
+
+def row_of(case: Case, figures: Figures) -> Row:
+    """Return the line of a case that was measured."""
+    sample = figures[case.key]
+    floor = figures.get(case.floor) if case.floor is not None else None
+    return Row(
+        case.name,
+        case.variant,
+        round(sample.median_us, 2),
+        round(sample.p99_us, 2),
+        sample.n,
+        round(sample.median_us / floor.median_us, 3) if floor is not None else None,
+        case.goal.text if case.goal is not None else None,
+        case.goal.met(sample, figures) if case.goal is not None else None,
+    )

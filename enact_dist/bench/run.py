@@ -1,0 +1,84 @@
+"""One run of benches: measures cases in rounds, keeps the best round of each, makes the rows.
+
+Two cores of a shared machine swing by a factor of two within seconds.  So all cases of a bench are
+measured in turn, several times over, and of each the round with the lowest median counts: a
+figure and its floor come from the machine's good moments alike.
+"""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.bench.floors import Floors
+from enact_dist.bench.rows import Case, Key, Row, Sample, row_of, sample_of
+
+if TYPE_CHECKING:
+    from enact_dist.bench.place import Place
+
+ROUNDS: Final = 3
+
+
+def _place_of(key: Key) -> int:
+    """Return the place of a row in its part of the table: floors in their own order."""
+    return Floors.every().index(key) if key[0] == "floor" else 0
+
+
+class Run:
+    """What one command measures.
+
+    Args:
+        place: Where the cell is.
+        floors: What the machine and the transport can do.
+        seconds_s: Measuring time of each case, all rounds together.
+        told: Called with what is being measured.
+    """
+
+    def __init__(
+        self, place: Place, floors: Floors, *, seconds_s: float, told: Callable[[str], None]
+    ) -> None:
+        self.place, self.floors = place, floors
+        self.seconds_s = seconds_s
+        self.told = told
+        self._figures: dict[Key, Sample] = {}
+        self._cases: dict[Key, Case] = {}
+        self._others: list[Row] = []
+
+    def measure(self, cases: Sequence[Case], *, rounds: int = ROUNDS) -> None:
+        """Measure all cases in turn, with the floors that they are compared with."""
+        floors = {case.floor for case in cases if case.floor is not None}
+        every = [self.floors.case(floor[1]) for floor in sorted(floors)] + list(cases)
+        for number in range(rounds):
+            for case in every:
+                self.told(f"{case.name}: {case.variant} ({number + 1} of {rounds})")
+                self._keep(case, sample_of(self._measured(case, self.seconds_s / rounds)))
+
+    @staticmethod
+    def _measured(case: Case, seconds_s: float) -> Sequence[float]:
+        # A collection in the middle is the program's cost only if the act itself makes garbage
+        # cycles; what earlier cases left behind is collected before.
+        gc.collect()
+        return case.measure(seconds_s)
+
+    def _keep(self, case: Case, sample: Sample) -> None:
+        self._cases.setdefault(case.key, case)
+        best = self._figures.get(case.key)
+        if best is None or sample.median_us < best.median_us:
+            self._figures[case.key] = sample
+
+    def add(self, case: Case, times_us: Sequence[float]) -> None:
+        """Add a case that was measured elsewhere."""
+        self._keep(case, sample_of(times_us))
+
+    def add_row(self, row: Row) -> None:
+        """Add a figure that is no time."""
+        self._others.append(row)
+
+    def rows(self) -> list[Row]:
+        """Return all lines so far, floors first."""
+        found = [row_of(case, self._figures) for case in self._cases.values()]
+        names = list(dict.fromkeys(row.name for row in (*found, *self._others)))
+        names.sort(key=lambda name: name != "floor")
+        ordered = sorted(found, key=lambda row: _place_of((row.name, row.variant)))
+        return [row for name in names for row in (*ordered, *self._others) if row.name == name]

@@ -1,0 +1,288 @@
+"""Benches `update`, `multi`, `durable` and `waiters`: small data under locks.
+
+An update is lock, read an int, write it, release.  Rows over Zenoh and in the process are divided
+by one raw Zenoh query, rows over sockets by one echo of a Unix socket, each with pauses if the row
+has pauses.  Where several benches need no comparison of carriers, "auto" is the fastest one.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import threading
+import time
+from typing import TYPE_CHECKING, Any, Final
+
+from enact_dist.bench.floors import (
+    ECHO,
+    ECHO_PAUSED,
+    FDATASYNC,
+    PAUSED,
+    QUERY,
+    QUERY_PAUSED,
+)
+from enact_dist.bench.place import EMBEDDED
+from enact_dist.bench.rows import Case, Goal, Key, at_most, times
+from enact_dist.bench.timing import PAUSE_S, timed
+from enact_dist.lock import Lock
+from enact_dist.terms import Aspect, Durability, Entity, Read, Write
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
+    from enact_dist.bench.run import Run
+    from enact_dist.world import WorldContext
+
+FOUR: Final = 4
+WAIT_S: Final = 60.0
+REDIS_ONE_US: Final = 200.0
+REDIS_FOUR_US: Final = 260.0
+"""Redis with a Lua lock, lease and fencing, through redis-py, on the machine of the README."""
+THREADS: Final = (2, 8, 32)
+
+
+def slots(
+    world: WorldContext,
+    count: int,
+    durability: Durability = Durability.VOLATILE,
+    *,
+    entity: str = "counter",
+) -> list[Write[int]]:
+    """Return so many slots of one entity, hence of one shard."""
+    return [
+        Write(world, Entity(entity), Aspect(f"{durability.value}_{number}", int, durability))
+        for number in range(count)
+    ]
+
+
+def update(writes: Iterable[Write[int]], reads: Iterable[Read[int]] = ()) -> None:
+    """Lock all, read all, add one to what can be written, release."""
+    writes, reads = tuple(writes), tuple(reads)
+    with Lock(*reads, *writes, wait_s=WAIT_S) as lock:
+        for read in reads:
+            lock.get(read, 0)
+        for write in writes:
+            lock[write] = lock.get(write, 0) + 1
+
+
+def floor_of(way: str, *, paused: bool = False) -> Key:
+    """Return what a round trip is divided by, by the way that it takes."""
+    if way in {"zenoh", EMBEDDED}:
+        return QUERY_PAUSED if paused else QUERY
+    return ECHO_PAUSED if paused else ECHO
+
+
+# ---------------------------------------------------------------- update
+
+
+def run_update(run: Run) -> None:
+    """Whole updates: every durability class, one slot and four, back to back and with pauses."""
+    cases = []
+    for carrier in run.place.carriers:
+        world, way = run.place.world(carrier), run.place.way(carrier)
+        for durability in (Durability.VOLATILE, Durability.OS, Durability.DURABLE):
+            for count in (1, FOUR) if durability is Durability.VOLATILE else (1,):
+                cases += [
+                    _update_case(carrier, way, world, durability, count, paused=paused)
+                    for paused in (False, True)
+                ]
+    run.measure(cases)
+
+
+def _variant(carrier: str, durability: Durability, count: int, *, paused: bool) -> str:
+    slots_said = "" if count == 1 else f", {count} slots"
+    return f"{carrier}, {durability.value}{slots_said}{PAUSED if paused else ''}"
+
+
+def _update_case(
+    carrier: str,
+    way: str,
+    world: WorldContext,
+    durability: Durability,
+    count: int,
+    *,
+    paused: bool,
+) -> Case:
+    writes = slots(world, count, durability)
+    pause_s = PAUSE_S if paused else 0.0
+    return Case(
+        "update",
+        _variant(carrier, durability, count, paused=paused),
+        lambda seconds_s: timed(lambda: update(writes), seconds_s, pause_s=pause_s),
+        floor_of(way, paused=paused),
+        _update_goal(carrier, way, durability, count, paused=paused),
+    )
+
+
+def _update_goal(
+    carrier: str, way: str, durability: Durability, count: int, *, paused: bool
+) -> Goal | None:
+    if way == EMBEDDED:
+        volatile = durability is Durability.VOLATILE and count == 1 and not paused
+        return at_most(120.0, "≤ 120 µs") if volatile else None
+    if way != "zenoh":
+        if durability is not Durability.VOLATILE or paused:
+            return None
+        limit_us = REDIS_ONE_US if count == 1 else REDIS_FOUR_US
+        return at_most(limit_us, f"≤ {limit_us:.0f} µs (Redis)")
+    if count == FOUR:
+        one = ("update", _variant(carrier, durability, 1, paused=paused))
+        return times(1.2, one, "≤ 1.2 x one slot")
+    floor = floor_of(way, paused=paused)
+    if durability is Durability.VOLATILE:
+        return times(2.3, floor, "≤ 2.3 x query")
+    if durability is Durability.OS:
+        return times(2.6, floor, "≤ 2.6 x query")
+    return times(2.6, floor, "≤ 2.6 x query + 1.5 fdatasync", plus=(1.5, FDATASYNC))
+
+
+# ---------------------------------------------------------------- multi
+
+
+def run_multi(run: Run) -> None:
+    """One lock over several slots: two read and two written, many, and some of every shard."""
+    cases = []
+    for carrier in run.place.carriers:
+        world, floor = run.place.world(carrier), floor_of(run.place.way(carrier))
+        writes = slots(world, 2, entity="multi")
+        reads = [Read(world, Entity("multi/read"), write.aspect) for write in writes]
+        many = slots(world, 32, entity="multi")
+        cases += [
+            _multi_case(carrier, floor, "2 read, 2 written", writes, reads),
+            _multi_case(carrier, floor, "32 written", many),
+        ]
+        if carrier != EMBEDDED and len(run.place.shard_names) > 1:
+            spread = [
+                write for shard in run.place.shard_names
+                for write in slots(world, 1, entity=f"{shard}/multi")
+            ]  # fmt: skip
+            cases.append(
+                _multi_case(carrier, floor, f"1 written on each of {len(spread)} shards", spread)
+            )
+    run.measure(cases)
+
+
+def _multi_case(
+    carrier: str, floor: Key, what: str, writes: list[Write[int]], reads: Iterable[Read[int]] = ()
+) -> Case:
+    reads = tuple(reads)
+    return Case(
+        "multi",
+        f"{carrier}, {what}",
+        lambda seconds_s: timed(lambda: update(writes, reads), seconds_s),
+        floor,
+    )
+
+
+# ---------------------------------------------------------------- durable
+
+
+def run_durable(run: Run) -> None:
+    """Durable commits: one at a time, from several threads, and one with 10 MB."""
+    import numpy as np
+
+    carrier = EMBEDDED if run.place.embedded else run.place.carrier
+    world = run.place.world(carrier)
+    large = Write(world, Entity("durable"), Aspect("durable_large", np.ndarray))
+    body = np.zeros(10_000_000, np.uint8)
+    counters = slots(world, 8, Durability.DURABLE, entity="durable")
+
+    def store() -> None:
+        with Lock(large, wait_s=WAIT_S) as lock:
+            lock[large] = body
+
+    one = Case(
+        "durable",
+        "one slot",
+        lambda seconds_s: timed(lambda: update(counters[:1]), seconds_s),
+        FDATASYNC,
+    )
+    cases = [one]
+    for threads in (2, 8):
+        acts = [_updating(counters[number]) for number in range(threads)]
+        variant = f"{threads} threads, each its own slot, per commit"
+        cases.append(Case("durable", variant, _side_by_side(acts), FDATASYNC))
+    cases.append(Case("durable", "10 MB", lambda seconds_s: timed(store, seconds_s), FDATASYNC))
+    run.measure(cases)
+
+
+def _updating(write: Write[int]) -> Callable[[], None]:
+    return lambda: update((write,))
+
+
+def _side_by_side(acts: list[Callable[[], None]]) -> Callable[[float], list[float]]:
+    """Let each act repeat in a thread of its own; one time per tenth: its length by its acts."""
+
+    def measure(seconds_s: float) -> list[float]:
+        counts = [0] * len(acts)
+        failed: list[BaseException] = []
+        end = threading.Event()
+
+        def repeat(number: int) -> None:
+            try:
+                while not end.is_set():
+                    acts[number]()
+                    counts[number] += 1
+            except BaseException as error:  # noqa: BLE001 (raised again below)
+                failed.append(error)
+
+        threads = [threading.Thread(target=repeat, args=(n,)) for n in range(len(acts))]
+        for thread in threads:
+            thread.start()
+        found_us = _per_act_us(counts, seconds_s, failed)
+        end.set()
+        for thread in threads:
+            thread.join()
+        if failed:
+            raise failed[0]
+        return found_us
+
+    return measure
+
+
+def _per_act_us(counts: list[int], seconds_s: float, failed: list[BaseException]) -> list[float]:
+    found_us: list[float] = []
+    end_s = time.perf_counter() + seconds_s
+    while (time.perf_counter() < end_s or not found_us) and not failed:
+        before, started_s = sum(counts), time.perf_counter()
+        time.sleep(max(0.05, seconds_s / 10.0))
+        done = sum(counts) - before
+        if done:
+            found_us.append((time.perf_counter() - started_s) * 1e6 / done)
+    return found_us
+
+
+# ---------------------------------------------------------------- waiters
+
+
+def run_waiters(run: Run) -> None:
+    """Hand-over of one slot: how long nobody holds it while several threads wait for it."""
+    cases = [
+        Case("waiters", f"{count} threads in 2 processes, hand-over", _hand_over(run, count), QUERY)
+        for count in THREADS
+    ]
+    run.measure(cases)
+
+
+def _hand_over(run: Run, count: int) -> Callable[[float], list[float]]:
+    def measure(seconds_s: float) -> list[float]:
+        options: dict[str, Any] = {"threads": count // 2, "seconds_s": seconds_s}
+        place = run.place
+        with (
+            place.worker("waiter", carrier=place.carrier, **options) as left,
+            place.worker("waiter", carrier=place.carrier, **options) as right,
+        ):
+            left.tell("go")
+            right.tell("go")
+            held = [
+                (granted_ns, left_ns)
+                for worker in (left, right)
+                for granted_ns, left_ns in json.loads(
+                    worker.expect("held:", timeout_s=seconds_s + WAIT_S)
+                )
+            ]
+        held.sort()
+        # From the moment at which one began to leave its block to the grant of the next.
+        return [(after[0] - before[1]) / 1e3 for before, after in itertools.pairwise(held)]
+
+    return measure

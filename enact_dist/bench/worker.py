@@ -1,0 +1,112 @@
+"""A process beside the one that measures: `python -m enact_dist.bench.worker CELL ROLE OPTIONS`.
+
+========  =======================================================================================
+storer    writes an array anew at each line ``ENTITY BYTES``
+notifier  at a line, writes numbered and stamped arrays with pauses between them
+waiter    at a line, its threads queue for one slot; says when each had it and began to leave it
+========  =======================================================================================
+
+It says ``ready:`` once it has joined; it leaves when its standard input ends.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import threading
+import time
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from enact_dist.bench.payloads import ARRAY, WAIT_S, said, store
+from enact_dist.bench.place import WORLD
+from enact_dist.bench.updates import slots
+from enact_dist.connecting import connect
+from enact_dist.lock import Lock
+from enact_dist.terms import Entity, Write
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from enact_dist.world import WorldContext
+
+
+def _store(world: WorldContext, _options: dict[str, Any]) -> None:
+    arrays: dict[int, Any] = {}
+    print("ready:", flush=True)
+    for line in sys.stdin:
+        name, size = line.split()
+        count = int(size) // 4
+        array = arrays.setdefault(count, np.arange(count, dtype=np.float32))
+        array[0] += 1.0
+        store(world, Entity(name), array)
+        print("stored:", flush=True)
+
+
+def _notify(world: WorldContext, options: dict[str, Any]) -> None:
+    of = Entity(options["entity"])
+    write = Write(world, of, ARRAY)
+    array = np.zeros(options["bytes"], np.uint8)
+    head = array[:16].view(np.int64)
+    head[:] = -1, 0
+    store(world, of, array)
+    print("ready:", flush=True)
+    sys.stdin.readline()
+    for number in range(options["count"]):
+        time.sleep(options["gap_s"])
+        with Lock(write, wait_s=WAIT_S) as lock:
+            head[:] = number, time.perf_counter_ns()
+            lock[write] = array
+    print("done:", flush=True)
+    sys.stdin.read()
+
+
+def _wait(world: WorldContext, options: dict[str, Any]) -> None:
+    (write,) = slots(world, 1, entity="waiters")
+    with Lock(write, wait_s=WAIT_S):
+        pass
+    print("ready:", flush=True)
+    sys.stdin.readline()
+    end_s = time.monotonic() + options["seconds_s"]
+    held: list[tuple[int, int]] = []
+    failed: list[BaseException] = []
+
+    def queue_up() -> None:
+        try:
+            while time.monotonic() < end_s:
+                with Lock(write, wait_s=WAIT_S) as lock:
+                    granted_ns = time.perf_counter_ns()
+                    lock[write] = lock.get(write, 0) + 1
+                    left_ns = time.perf_counter_ns()
+                held.append((granted_ns, left_ns))
+        except BaseException as error:  # noqa: BLE001 (raised again below)
+            failed.append(error)
+
+    threads = [threading.Thread(target=queue_up) for _ in range(options["threads"])]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    if failed:
+        raise failed[0]
+    print("held:", said(held), flush=True)
+    sys.stdin.read()
+
+
+_ROLES: Final[dict[str, Callable[[WorldContext, dict[str, Any]], None]]] = {
+    "storer": _store,
+    "notifier": _notify,
+    "waiter": _wait,
+}
+
+
+def main(words: Sequence[str]) -> None:
+    """Play one role until the parent ends this process."""
+    target, role, options = words
+    with connect(target, actor=f"bench-{role}", timeout_s=20.0) as cell:
+        _ROLES[role](cell.create_world(WORLD), json.loads(options))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,311 @@
+"""The folder in shared memory through which processes of one host meet their shards.
+
+::
+
+    /dev/shm/enact-1000/             the root: ENACT_SHARED_FOLDER, or this one of the user
+        cell.shard.5f0c…/            one start of a shard: its socket, and what else it shares
+            nonce                    128 random bits, told in the shard's WELCOME
+
+Whether two processes share memory is not asked of host names or boot numbers, which containers
+have in common: a client opens *its own* path of that name and compares the nonce.
+
+Rules that a change must keep:
+
+- A folder belongs to one start of one shard, which holds an exclusive `flock` on it for as long
+  as it lives; whoever gets that lock may sweep the folder away.
+- The nonce is written after the lock was taken and before anybody is told the name.
+- Nobody but its owner, root and the group of a root that was given on purpose gets in.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import hmac
+import os
+import secrets
+import shutil
+import stat
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from enact_dist.errors import LinkError
+
+SHARED_FOLDER_VARIABLE: Final = "ENACT_SHARED_FOLDER"
+"""Names the root where the default does not fit: a tmpfs that containers have in common."""
+MEMORY: Final = Path("/dev/shm")  # noqa: S108 - the kernel's folder, not a temporary file
+NONCE: Final = "nonce"
+NONCE_BYTES: Final = 16
+NAME_BYTES_MAX: Final = 200
+"""Longest name of a folder; what a shard says is checked against it."""
+PART_CHARACTERS_MAX: Final = 60
+"""So much of the cell's and the shard's names stands in a folder's name, for people."""
+UNFINISHED_S: Final = 60.0
+"""A folder without a nonce is being made; one that stays so for longer was left behind."""
+ADDRESS_BYTES_MAX: Final = 107
+"""Longest path of a Unix socket; a longer one is reached through an open descriptor."""
+
+
+def shared_root() -> Path:
+    """Return the root as the environment has it, or the default of this user."""
+    given = os.environ.get(SHARED_FOLDER_VARIABLE)
+    return Path(given) if given else MEMORY / f"enact-{os.geteuid()}"
+
+
+@dataclass(frozen=True, slots=True)
+class Access:
+    """Who may enter what is made below a root.
+
+    Attributes:
+        group: The group that may, beside owner and root; None where none may.
+    """
+
+    group: int | None
+
+    @property
+    def folder_mode(self) -> int:
+        """Mode of a folder: files in it take over its group."""
+        return 0o700 if self.group is None else 0o2750
+
+    @property
+    def socket_mode(self) -> int:
+        """Mode of a socket: to connect is to write."""
+        return 0o600 if self.group is None else 0o660
+
+    @property
+    def file_mode(self) -> int:
+        """Mode of a file that clients read."""
+        return 0o400 if self.group is None else 0o440
+
+
+def _open_root(root: Path, *, make: bool) -> tuple[int, Access]:
+    """Open the root and say who may use what lies in it.
+
+    Raises:
+        LinkError: It is missing, or others could put their own in the place of ours.
+    """
+    chosen = bool(os.environ.get(SHARED_FOLDER_VARIABLE))
+    try:
+        if make:
+            root.mkdir(mode=0o700, parents=True, exist_ok=True)
+        # A link is followed only where somebody has chosen the path.
+        flags = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC | (0 if chosen else os.O_NOFOLLOW)
+        opened = os.open(root, flags)
+    except OSError as error:
+        raise LinkError(f"the shared folder {root} cannot be used: {error.strerror}") from None
+    found = os.fstat(opened)
+    mode = found.st_mode
+    problem = ""
+    if mode & stat.S_IWOTH and not mode & stat.S_ISVTX:
+        problem = "everybody may replace what lies in it (mode lacks the sticky bit)"
+    elif not chosen and found.st_uid != os.geteuid():
+        problem = f"it belongs to user {found.st_uid}"
+    if problem:
+        os.close(opened)
+        raise LinkError(
+            f"the shared folder {root} is refused: {problem}; correct it, or name another in"
+            f" {SHARED_FOLDER_VARIABLE}"
+        )
+    for_group = chosen and mode & stat.S_IWGRP and not mode & stat.S_IWOTH
+    return opened, Access(found.st_gid if for_group else None)
+
+
+class SharedFolder:
+    """The folder of this start of a shard; made empty, gone with `close`.  Shard side.
+
+    What earlier starts have left behind is swept away first.  Its descriptor holds the lock that
+    says that the shard lives; a process that is killed lets go of it.
+
+    Attributes:
+        name: Its name below the root, for the WELCOME.
+        nonce: What stands in its nonce file.
+        path: Where it is, as this process sees it.
+        descriptor: Of the folder, open until `close`.
+        access: Who may enter.
+
+    Raises:
+        LinkError: There is no place for it, or the place is not safe.
+    """
+
+    def __init__(self, cell: str, shard: str, *, root: Path | None = None) -> None:
+        root = root or shared_root()
+        opened, access = _open_root(root, make=True)
+        try:
+            _sweep(opened, root)
+            parts = (cell[:PART_CHARACTERS_MAX], shard[:PART_CHARACTERS_MAX])
+            self.name = f"{'.'.join(parts)}.{secrets.token_hex(8)}"
+            self.nonce = secrets.token_bytes(NONCE_BYTES)
+            self.path = root / self.name
+            self.access, self.descriptor = _make(opened, self.name, access)
+        except OSError as error:
+            raise LinkError(f"nothing can be made in {root}: {error.strerror}") from None
+        finally:
+            os.close(opened)
+        try:
+            self._write_nonce()
+        except OSError as error:
+            self.close()
+            raise LinkError(f"nothing can be written to {self.path}: {error.strerror}") from None
+
+    def _write_nonce(self) -> None:
+        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
+        written = os.open(NONCE, flags, self.access.file_mode, dir_fd=self.descriptor)
+        try:
+            os.fchmod(written, self.access.file_mode)
+            os.write(written, self.nonce)
+        finally:
+            os.close(written)
+
+    def address(self, name: str) -> str:
+        """Return a path by which a socket called `name` in here can be bound or reached."""
+        return address_in(self.descriptor, self.path, name)
+
+    def close(self) -> None:
+        """Remove the folder with all that is in it; twice is harmless."""
+        if self.descriptor >= 0:
+            shutil.rmtree(self.path, ignore_errors=True)
+            os.close(self.descriptor)
+            self.descriptor = -1
+
+
+def _make(root: int, name: str, access: Access) -> tuple[Access, int]:
+    """Make a folder and lock it; say who may enter in the end."""
+    os.mkdir(name, 0o700, dir_fd=root)
+    made = os.open(name, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC, dir_fd=root)
+    try:
+        # A sweeper that looks at it right now lets go at once: it finds no nonce.
+        fcntl.flock(made, fcntl.LOCK_EX)
+        if access.group is not None:
+            try:
+                os.fchown(made, -1, access.group)
+            except PermissionError:  # we are not in that group
+                access = Access(None)
+        os.fchmod(made, access.folder_mode)
+    except BaseException:
+        os.close(made)
+        raise
+    return access, made
+
+
+def _sweep(root: int, path: Path) -> None:
+    """Remove the folders of this user's shards that live no more."""
+    for entry in os.listdir(root):
+        try:
+            found = os.stat(entry, dir_fd=root, follow_symlinks=False)
+            if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.geteuid():
+                continue
+            flags = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
+            opened = os.open(entry, flags, dir_fd=root)
+        except OSError:  # gone meanwhile
+            continue
+        try:
+            if _is_left_behind(opened, found):
+                shutil.rmtree(path / entry, ignore_errors=True)
+        finally:
+            os.close(opened)
+
+
+def _is_left_behind(folder: int, found: os.stat_result) -> bool:
+    """Say whether a folder is one of ours that nobody holds; nobody can take it until closed."""
+    try:
+        fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        if error.errno in (errno.EWOULDBLOCK, errno.EACCES):
+            return False
+        raise
+    try:
+        size = os.stat(NONCE, dir_fd=folder, follow_symlinks=False).st_size
+    except FileNotFoundError:
+        # Being made right now, left behind while it was, or not ours at all.
+        return not os.listdir(folder) and time.time() - found.st_mtime > UNFINISHED_S
+    return size == NONCE_BYTES
+
+
+@dataclass(frozen=True, slots=True)
+class OpenedFolder:
+    """A shard's folder as a client has found it; to be closed.
+
+    Attributes:
+        descriptor: Of the folder.
+        path: Where it is, as this process sees it.
+        owner: The user that the shard runs as.
+    """
+
+    descriptor: int
+    path: Path
+    owner: int
+
+    def address(self, name: str) -> str:
+        """Return a path by which a socket called `name` in here can be reached."""
+        return address_in(self.descriptor, self.path, name)
+
+    def close(self) -> None:
+        """Let go of it; what was opened or connected through it stays."""
+        os.close(self.descriptor)
+
+
+def open_shared(name: str, nonce: bytes, *, root: Path | None = None) -> OpenedFolder:
+    """Open the folder that a shard has named, if it is the same one here.  Client side.
+
+    Raises:
+        LinkError: There is none, it is another one, or it is not safe; the message says which.
+    """
+    if not _is_plain(name) or len(nonce) != NONCE_BYTES:
+        raise LinkError(f"a shard names {name[:80]!r} as its shared folder, which cannot be one")
+    root = root or shared_root()
+    path = root / name
+    above, access = _open_root(root, make=False)
+    try:
+        flags = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
+        opened = os.open(name, flags, dir_fd=above)
+    except OSError as error:
+        raise LinkError(f"{path} is not shared with this process: {error.strerror}") from None
+    finally:
+        os.close(above)
+    try:
+        found = os.fstat(opened)
+        if found.st_mode & stat.S_IWOTH or (
+            found.st_uid not in (os.geteuid(), 0) and access.group is None
+        ):
+            raise LinkError(
+                f"{path} is refused: user {found.st_uid}, mode {stat.filemode(found.st_mode)}"
+            )
+        if not hmac.compare_digest(_read_nonce(opened, path), nonce):
+            raise LinkError(
+                f"{path} is another one than the shard's: the nonces differ, so these processes"
+                " have different shared memory"
+            )
+    except BaseException:
+        os.close(opened)
+        raise
+    return OpenedFolder(opened, path, found.st_uid)
+
+
+def _is_plain(name: str) -> bool:
+    return (
+        0 < len(name) <= NAME_BYTES_MAX
+        and name.isascii()
+        and not name.startswith(".")
+        and not set(name) & {"/", "\0"}
+    )
+
+
+def _read_nonce(folder: int, path: Path) -> bytes:
+    try:
+        opened = os.open(NONCE, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC, dir_fd=folder)
+    except OSError as error:
+        raise LinkError(f"{path / NONCE} cannot be read: {error.strerror}") from None
+    try:
+        return os.read(opened, NONCE_BYTES + 1)
+    finally:
+        os.close(opened)
+
+
+def address_in(folder: int, path: Path, name: str) -> str:
+    """Return a path of a socket that is short enough for its address."""
+    direct = str(path / name)
+    if len(os.fsencode(direct)) <= ADDRESS_BYTES_MAX:
+        return direct
+    return f"/proc/self/fd/{folder}/{name}"

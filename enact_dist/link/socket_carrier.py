@@ -1,0 +1,369 @@
+"""The carrier of a client whose shards may run on its own host: a socket there, Zenoh elsewhere.
+
+It stands in front of a `ZenohCarrier`, whose sessions and tokens exist in any case.  A shard's
+WELCOME names a shared folder; where this process sees the same folder, its calls go over the
+socket in there.  Whenever the socket is not to be had, a call goes over Zenoh instead and nobody
+notices.  A call that was sent over a socket that then breaks is *unknown*; it is not sent again
+here.
+
+With the socket forced, a WELCOME whose socket cannot be used is an error; before the first one,
+and after a shard went away, calls still take Zenoh, since the WELCOME itself has to come from
+somewhere.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+import weakref
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.core.messages import Welcome
+from enact_dist.errors import LinkError, MisuseError, ProtocolError
+from enact_dist.link.notices import NoticeQueue
+from enact_dist.link.socket_frames import Kind
+from enact_dist.link.socket_line import Connection, SocketLine
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from enact_dist.core.messages import Answer, Request, ShardEntry
+    from enact_dist.link.zenoh_carrier import ZenohCarrier
+
+FETCH_BYTES: Final = 4 << 20
+"""A slice over a socket delays nobody else; more than this no shard sends at once."""
+JOIN_S: Final = 1.0
+
+_log = logging.getLogger("enact.link")
+_open: weakref.WeakSet[SocketCarrier] = weakref.WeakSet()
+
+
+class SocketCarrier:
+    """Reaches shards over sockets where it can.  See `Carrier` for the methods; thread-safe.
+
+    Args:
+        behind: Reaches every shard; closed with this carrier.
+        session: For whom the connections speak.
+        forced: Whether a socket that cannot be used is an error.
+
+    Attributes:
+        calls: How many calls went over sockets, and how many over Zenoh.
+    """
+
+    def __init__(self, behind: ZenohCarrier, session: str, *, forced: bool = False) -> None:
+        self.calls = {"socket": 0, "zenoh": 0}
+        self._behind = behind
+        self._session = session
+        self._forced = forced
+        self._pid = os.getpid()
+        self._closed = False
+        self._mutex = threading.Lock()
+        self._lines: dict[str, SocketLine] = {}
+        self._epochs: dict[str, int] = {}
+        self._shards: set[str] = set()
+        self._feeds: dict[NoticeQueue, _Feed] = {}
+        _open.add(self)
+
+    @property
+    def fetch_bytes(self) -> int:
+        """How large a slice of a datum is asked for in one call, at most."""
+        lines = self._lines.values()
+        all_here = len(lines) == len(self._shards) and not any(line.problem for line in lines)
+        return FETCH_BYTES if lines and all_here else self._behind.fetch_bytes
+
+    # ---------------------------------------------------------------- requests
+
+    def request(self, shard: str, message: Request, *, timeout_s: float) -> Answer | None:
+        """Send one request and return its answer, or None if there was none in time.
+
+        Raises:
+            ProtocolError: An answer cannot be read, or two daemons answer for one shard.
+            MisuseError: The carrier is closed or was opened before a fork.
+            LinkError: The socket is forced, and the shard's cannot be used.
+        """
+        self._check_usable()
+        line = self._lines.get(shard)
+        connection = self._sent(line, message, timeout_s) if line is not None else None
+        if line is None or connection is None:
+            self.calls["zenoh"] += 1
+            answer = self._behind.request(shard, message, timeout_s=timeout_s)
+        else:
+            self.calls["socket"] += 1
+            answer = _received(line, connection)
+        if type(answer) is Welcome:
+            self.learn(answer)
+        return answer
+
+    def request_all(
+        self, requests: Sequence[tuple[str, Request]], *, timeout_s: float
+    ) -> list[Answer | None]:
+        """Send all requests before waiting for the first answer; answers in the same order.
+
+        Raises:
+            ProtocolError: As `request`.
+            MisuseError: As `request`.
+            LinkError: As `request`.
+        """
+        self._check_usable()
+        sent: dict[int, tuple[SocketLine, Connection]] = {}
+        answers: list[Answer | None] = [None] * len(requests)
+        try:
+            for index, (shard, message) in enumerate(requests):
+                line = self._lines.get(shard)
+                connection = self._sent(line, message, timeout_s) if line is not None else None
+                if line is not None and connection is not None:
+                    sent[index] = line, connection
+            others = [index for index in range(len(requests)) if index not in sent]
+            self.calls["socket"] += len(sent)
+            if others:
+                self.calls["zenoh"] += len(others)
+                asked = [requests[index] for index in others]
+                came = self._behind.request_all(asked, timeout_s=timeout_s)
+                for index, answer in zip(others, came, strict=True):
+                    answers[index] = answer
+            for index in list(sent):
+                answers[index] = _received(*sent.pop(index))
+        finally:
+            for line, connection in sent.values():  # something was raised before its turn
+                line.drop(connection)
+        for answer in answers:
+            if type(answer) is Welcome:
+                self.learn(answer)
+        return answers
+
+    @staticmethod
+    def _sent(line: SocketLine, message: Request, timeout_s: float) -> Connection | None:
+        """Send a request over a socket; None where nothing of it can have arrived."""
+        connection = line.take()
+        if connection is None:
+            return None
+        try:
+            connection.send(message, timeout_s)
+        except (BrokenPipeError, ConnectionResetError):
+            line.lost(connection)  # the shard's end was closed before: it will not read this
+            return None
+        except BlockingIOError:
+            line.drop(connection)  # it does not read: what it has got of this is no frame
+            return None
+        except BaseException:
+            line.drop(connection)
+            raise
+        return connection
+
+    def _check_usable(self) -> None:
+        if self._pid != os.getpid():
+            raise MisuseError(
+                f"this connection belongs to process {self._pid}, from which this one"
+                f" ({os.getpid()}) was forked; start it with the 'spawn' method"
+            )
+        if self._closed:
+            raise MisuseError("the connection to this cell is closed; connect again")
+
+    # ---------------------------------------------------------------- lines
+
+    def learn(self, welcome: Welcome) -> None:
+        """Take from a shard's WELCOME whether it shares memory with this process.
+
+        Raises:
+            LinkError: The socket is forced, and this one cannot be used.
+        """
+        shard, old = welcome.shard, None
+        with self._mutex:
+            if self._closed or welcome.epoch < self._epochs.get(shard, 0):
+                return
+            self._epochs[shard] = welcome.epoch
+            self._shards.add(shard)
+            line = self._lines.get(shard)
+            if line is None or line.name != welcome.shared:
+                old = self._lines.pop(shard, None)
+                line = None
+                if welcome.shared:
+                    line = SocketLine(shard, welcome.shared, welcome.shared_nonce, self._session)
+                    self._lines[shard] = line
+        if old is not None:
+            old.close()
+        if line is not None:
+            # A connection is there before anybody asks, and with it the kernel's word on our end.
+            line.try_again()
+            connection = line.take()
+            if connection is not None:
+                line.give_back(connection)
+        self._refuse_if_forced(shard, line)
+        for feed in list(self._feeds.values()):
+            feed.settle()
+
+    def _refuse_if_forced(self, shard: str, line: SocketLine | None) -> None:
+        problem = line.problem if line is not None else "it offers none"
+        if self._forced and problem:
+            raise LinkError(
+                f"the socket is asked for (ENACT_CARRIER=socket), and that of shard {shard} cannot"
+                f" be used: {problem}"
+            )
+
+    def way_to(self, shard: str) -> str:
+        """Return how calls to a shard travel now, for people: "socket" or "zenoh (why)"."""
+        line = self._lines.get(shard)
+        if line is None:
+            return "zenoh (the shard offers no socket)"
+        return f"zenoh ({line.problem})" if line.problem else "socket"
+
+    def add_endpoints(self, entries: Sequence[ShardEntry]) -> None:
+        """Connect to further shards; those already in reach stay as they are."""
+        self._behind.add_endpoints(entries)
+        self._shards.update(entry.name for entry in entries)
+        for feed in list(self._feeds.values()):
+            feed.settle()
+
+    def tell_returns(self, returned: Callable[[str], None]) -> None:
+        """Call `returned` with the name of each shard that comes (back) into reach."""
+        self._behind.tell_returns(returned)
+
+    def endpoint_of(self, shard: str) -> str:
+        """Return where the shard is expected, for messages to people."""
+        return self._behind.endpoint_of(shard)
+
+    # ---------------------------------------------------------------- notices
+
+    def subscribe(self) -> NoticeQueue:
+        """Open a feed of the notices of all shards, those of shards added later included."""
+        self._check_usable()
+        queue = NoticeQueue()
+        feed = _Feed(self, queue)
+        queue.on_close = lambda: self._unsubscribe(queue)
+        self._feeds[queue] = feed
+        feed.settle()
+        return queue
+
+    def _unsubscribe(self, queue: NoticeQueue) -> None:
+        feed = self._feeds.pop(queue, None)
+        if feed is not None and self._pid == os.getpid():
+            feed.close()
+
+    def lines(self) -> tuple[set[str], dict[str, SocketLine]]:
+        """Return the known shards, and the lines to those that have one."""
+        return set(self._shards), dict(self._lines)
+
+    @property
+    def behind(self) -> ZenohCarrier:
+        """The carrier that reaches every shard."""
+        return self._behind
+
+    # ---------------------------------------------------------------- end
+
+    def close(self) -> None:
+        """End all connections and pending calls (they return None); twice is harmless."""
+        if self._closed or self._pid != os.getpid():
+            return
+        with self._mutex:
+            self._closed = True
+        for queue in list(self._feeds):
+            queue.close()
+        for line in self._lines.values():
+            line.close()
+        self._behind.close()
+
+    def abandon(self) -> None:
+        """Let a forked child forget the parent's connections."""
+        for line in self._lines.values():
+            line.abandon()
+
+
+def _received(line: SocketLine, connection: Connection) -> Answer | None:
+    """Return the answer on a connection, or None where none will come."""
+    try:
+        answer = connection.receive()
+    except BlockingIOError:  # the time is over
+        line.drop(connection)
+        return None
+    except (EOFError, OSError):
+        line.lost(connection)
+        return None
+    except BaseException:  # an interrupt, too
+        line.drop(connection)
+        raise
+    line.give_back(connection)
+    return answer
+
+
+class _Feed:
+    """One feed of notices: a connection to each shard with a socket, Zenoh where one has none.
+
+    Both may bring the same notice for a while; the queue takes each number once, and a number that
+    is missing is noticed by whoever watches.
+    """
+
+    def __init__(self, carrier: SocketCarrier, queue: NoticeQueue) -> None:
+        self._carrier = carrier
+        self._queue = queue
+        self._mutex = threading.Lock()
+        self._pumps: dict[str, tuple[Connection, threading.Thread]] = {}
+        self._over_zenoh = False
+        self._closed = False
+
+    def settle(self) -> None:
+        """Open and close what has to be, after something changed."""
+        with self._mutex:
+            if self._closed:
+                return
+            shards, lines = self._carrier.lines()
+            for shard, line in lines.items():
+                if shard not in self._pumps:
+                    self._open_pump(shard, line)
+            need_zenoh = not shards or bool(shards - set(self._pumps))
+            if need_zenoh and not self._over_zenoh:
+                self._carrier.behind.feed_into(self._queue)
+            elif self._over_zenoh and not need_zenoh:
+                self._carrier.behind.stop_feeding(self._queue)
+            self._over_zenoh = need_zenoh
+
+    def _open_pump(self, shard: str, line: SocketLine) -> None:
+        connection = line.connect()
+        if connection is None:
+            return
+        try:
+            connection.exchange(Kind.WATCH, b"")
+        except (LinkError, ProtocolError, EOFError, OSError) as error:
+            _log.info("no notices over the socket to shard %s: %s", shard, error)
+            line.drop(connection)
+            return
+        thread = threading.Thread(
+            target=self._pump, args=(shard, line, connection), name="enact-notices", daemon=True
+        )
+        self._pumps[shard] = connection, thread
+        thread.start()
+
+    def _pump(self, shard: str, line: SocketLine, connection: Connection) -> None:
+        """Move notices from a connection into the queue until it ends."""
+        try:
+            for notice in connection.notices():
+                self._queue.put(notice)
+        except (ProtocolError, EOFError, OSError) as error:
+            if not self._closed:
+                _log.info("notices of shard %s end: %s", shard, error)
+        line.drop(connection)
+        with self._mutex:
+            self._pumps.pop(shard, None)
+        if not self._closed:
+            self.settle()
+
+    def close(self) -> None:
+        """End it; waits for its threads."""
+        with self._mutex:
+            self._closed = True
+            pumps = list(self._pumps.values())
+            if self._over_zenoh:
+                self._carrier.behind.stop_feeding(self._queue)
+        for connection, _ in pumps:
+            connection.wake()
+        for _, thread in pumps:
+            if thread is not threading.current_thread():
+                thread.join(JOIN_S)
+
+
+def _after_fork() -> None:
+    for carrier in list(_open):
+        carrier.abandon()
+
+
+os.register_at_fork(after_in_child=_after_fork)

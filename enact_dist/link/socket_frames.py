@@ -1,0 +1,199 @@
+"""How frames travel on a stream between two processes of one host.
+
+Each frame is a prefix of 16 bytes, the header and the payload::
+
+    "ED" | version of the stream | kind | length of the header | length of the payload
+      2              1               1             4                        8
+
+`Stream` reads one frame at a time into a buffer that it keeps; what is longer gets memory of its
+own, after its length was found to be within the limits.  The peer must not send a second frame
+before the first was answered (a feed of notices excepted), so a call costs one system call per
+direction.
+
+Rule to keep: a stream on which anything was unexpected is closed; a part of a frame would be taken
+for the beginning of the next.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+import mmap
+import socket
+import struct
+from collections.abc import Sequence
+from typing import Final
+
+from enact_dist.errors import ProtocolError
+from enact_dist.wire.limits import HEADER_BYTES_MAX, PAYLOAD_BYTES_MAX
+
+Buffer = bytes | memoryview
+
+STREAM_VERSION: Final = 1
+MAGIC: Final = b"ED"
+BUFFER_BYTES: Final = 32 << 10
+"""Kept per connection; frames up to this length are read without taking memory."""
+PARTS_MAX: Final = 512
+"""Pieces of memory that one system call may send together (the kernel allows 1024)."""
+ROUND_S: Final = 0.1
+"""Long waits are rounded up to this, so that the kernel is seldom told a new one."""
+
+_PREFIX: Final = struct.Struct("<2sBBIQ")
+PREFIX_BYTES: Final = _PREFIX.size
+_TIMEVAL: Final = struct.Struct("ll")
+
+
+class Kind(enum.IntEnum):
+    """What a frame is."""
+
+    OPEN = 1
+    """Client: I speak for this session (the header is its name)."""
+    OPENED = 2
+    """Shard: go on (the header is the shard's name)."""
+    REFUSED = 3
+    """Shard: no, for this reason (the header is text); nothing follows."""
+    MESSAGE = 4
+    """A request, its answer, or a notice: the frame of `wire.frames`."""
+    WATCH = 5
+    """Client: from now on send notices, I say nothing more."""
+
+
+_MESSAGE: Final = int(Kind.MESSAGE)
+_KINDS: Final = frozenset(int(kind) for kind in Kind)
+
+
+def prefixed(header: bytes, payload_bytes: int, kind: int = _MESSAGE) -> bytes:
+    """Return the beginning of a frame: the prefix and the header."""
+    return _PREFIX.pack(MAGIC, STREAM_VERSION, kind, len(header), payload_bytes) + header
+
+
+def send_frame(
+    connected: socket.socket, header: bytes, bodies: Sequence[Buffer] = (), kind: int = _MESSAGE
+) -> None:
+    """Send a frame whole; blocks while the peer does not read.
+
+    Raises:
+        OSError: The peer is gone, or did not read for as long as the socket waits.
+    """
+    if not bodies:
+        start = prefixed(header, 0, kind)
+        sent = connected.send(start)
+        if sent < len(start):
+            connected.sendall(memoryview(start)[sent:])
+        return
+    size = sum(map(len, bodies))
+    _send_parts(connected, [prefixed(header, size, kind), *bodies])
+
+
+def _send_parts(connected: socket.socket, parts: Sequence[Buffer]) -> None:
+    """Send pieces one after another, many of them in one call, none of them copied."""
+    for first in range(0, len(parts), PARTS_MAX):
+        group = parts[first : first + PARTS_MAX]
+        sent = connected.sendmsg(group)
+        for part in group:
+            if sent < len(part):
+                connected.sendall(memoryview(part)[sent:])
+                sent = 0
+            else:
+                sent -= len(part)
+
+
+def wait_at_most(connected: socket.socket, option: int, wait_s: float) -> None:
+    """Let the kernel end a blocked `SO_RCVTIMEO` or `SO_SNDTIMEO` call after a while.
+
+    Python's own timeouts would cost a further system call for each one that sends or receives.
+    0 stands for no limit.
+    """
+    seconds, fraction = divmod(wait_s, 1.0)
+    value = _TIMEVAL.pack(int(seconds), int(fraction * 1e6))
+    connected.setsockopt(socket.SOL_SOCKET, option, value)
+
+
+def rounded_s(wait_s: float) -> float:
+    """Return a time to wait, rounded up so that few different ones occur."""
+    step_s = ROUND_S if wait_s >= 1.0 else ROUND_S / 10
+    return math.ceil(max(wait_s, 0.001) / step_s - 1e-9) * step_s
+
+
+class Stream:
+    """Reads the frames of one connection.  For one thread at a time."""
+
+    __slots__ = ("_buffer", "_connected", "_filled", "_view")
+
+    def __init__(self, connected: socket.socket) -> None:
+        self._connected = connected
+        self._buffer = bytearray(BUFFER_BYTES)
+        self._view = memoryview(self._buffer)
+        self._filled = 0
+
+    def receive(self) -> tuple[int, bytes, Buffer]:
+        """Return kind, header and payload of the next frame; blocks until it is there.
+
+        Raises:
+            EOFError: The peer has closed the connection.
+            OSError: The connection is broken, or nothing came for as long as the socket waits.
+            ProtocolError: What came is no frame, or one over a limit.
+        """
+        filled, view = self._filled, self._view
+        while filled < PREFIX_BYTES:
+            filled += self._more(view[filled:] if filled else view)
+        kind, header_bytes, payload_bytes = _read_prefix(self._buffer)
+        length = PREFIX_BYTES + header_bytes + payload_bytes
+        if length > BUFFER_BYTES:
+            self._filled = 0
+            return self._receive_long(kind, header_bytes, payload_bytes, filled)
+        while filled < length:
+            filled += self._more(view[filled:])
+        end = PREFIX_BYTES + header_bytes
+        header = bytes(view[PREFIX_BYTES:end])
+        payload = bytes(view[end:length]) if payload_bytes else b""
+        self._filled = filled - length
+        if self._filled:  # notices may follow each other
+            view[: self._filled] = bytes(view[length:filled])
+        return kind, header, payload
+
+    def _more(self, into: memoryview) -> int:
+        count = self._connected.recv_into(into)
+        if not count:
+            raise EOFError("the connection was closed")
+        return count
+
+    def _receive_long(
+        self, kind: int, header_bytes: int, payload_bytes: int, filled: int
+    ) -> tuple[int, bytes, Buffer]:
+        """Read a frame that is longer than the buffer into memory of its own.
+
+        The memory is the kernel's and comes page by page as it is filled, so a length that is only
+        claimed costs nothing.
+        """
+        header, payload = memoryview(bytearray(header_bytes)), memoryview(bytearray())
+        if payload_bytes:
+            payload = memoryview(mmap.mmap(-1, payload_bytes))  # begins at a page
+        at = PREFIX_BYTES
+        for part in (header, payload):
+            taken = min(filled - at, len(part))
+            part[:taken] = self._view[at : at + taken]
+            at += taken
+            while taken < len(part):
+                taken += self._more(part[taken:])
+        return kind, bytes(header), payload.toreadonly()
+
+
+def _read_prefix(buffer: bytearray) -> tuple[int, int, int]:
+    """Return kind, length of the header and of the payload.
+
+    Raises:
+        ProtocolError: It is none of ours, or claims more than a frame may have.
+    """
+    magic, version, kind, header_bytes, payload_bytes = _PREFIX.unpack_from(buffer)
+    if magic != MAGIC or version != STREAM_VERSION or kind not in _KINDS:
+        raise ProtocolError(
+            f"{bytes(buffer[:4])!r} begins no frame of a stream of version {STREAM_VERSION}; run"
+            " the same release of enact-dist in all processes of this host"
+        )
+    if header_bytes > HEADER_BYTES_MAX or payload_bytes > PAYLOAD_BYTES_MAX:
+        raise ProtocolError(
+            f"a frame of {header_bytes} + {payload_bytes} bytes is announced; at most"
+            f" {HEADER_BYTES_MAX} + {PAYLOAD_BYTES_MAX}"
+        )
+    return kind, header_bytes, payload_bytes

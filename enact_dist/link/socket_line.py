@@ -1,0 +1,258 @@
+"""The way of one client to one shard of the same host: a few connections, one call on each.
+
+The calling thread sends and receives by itself, so that no other thread has to be woken: a round
+trip costs two system calls on either side.  A connection whose answer did not come in time is
+thrown away; a late answer never meets the next call.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import socket
+import threading
+import time
+from typing import TYPE_CHECKING, Final, cast, get_args
+
+from enact_dist.core.messages import Answer, Notice
+from enact_dist.errors import EnactError, LinkError, ProtocolError
+from enact_dist.link.shared_folder import open_shared
+from enact_dist.link.socket_frames import (
+    Kind,
+    Stream,
+    rounded_s,
+    send_frame,
+    wait_at_most,
+)
+from enact_dist.link.socket_peers import check_peer
+from enact_dist.wire.frames import decode_frame, encode_parts
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from enact_dist.core.messages import Request
+
+SOCKET_NAME: Final = "socket"
+CONNECTIONS_MAX: Final = 100
+"""Connections of one client to one shard; further calls take the other carrier."""
+IDLE_MAX: Final = 16
+"""Connections that are kept open for the next call."""
+CONNECT_S: Final = 0.5
+"""How long a shard has to take a connection: it is on this host."""
+SEND_S: Final = 3.0
+"""How long a shard may read nothing of a request before its connection is given up."""
+SLACK_S: Final = 1.0
+"""So much longer than asked, and at most twice as long, a call may be left without an answer: the
+two calls of a lock, which differ by that much, then share one time that the kernel knows."""
+RETRY_S_MIN: Final = 0.1
+RETRY_S_MAX: Final = 5.0
+"""Pause before a lost socket is tried again; doubles up to the second figure."""
+
+_ANSWERS: Final = frozenset(get_args(Answer))
+_log = logging.getLogger("enact.link")
+
+
+class Connection:
+    """One connection to a shard; for one call at a time."""
+
+    __slots__ = ("_stream", "_wait_s", "shard", "socket")
+
+    def __init__(self, shard: str, connected: socket.socket) -> None:
+        self.shard = shard
+        self.socket = connected
+        self._stream = Stream(connected)
+        self._wait_s = CONNECT_S
+
+    def send(self, request: Request, timeout_s: float) -> None:
+        """Send a request, whose answer `receive` waits for so long.
+
+        Raises:
+            OSError: The connection is gone.
+            ProtocolError: The request cannot travel.
+        """
+        header, bodies = encode_parts(request)
+        if not timeout_s <= self._wait_s <= timeout_s + min(timeout_s, SLACK_S):
+            self._wait_s = rounded_s(timeout_s)
+            wait_at_most(self.socket, socket.SO_RCVTIMEO, self._wait_s)
+        send_frame(self.socket, header, bodies)
+
+    def receive(self) -> Answer:
+        """Return the answer to the request that was sent.
+
+        Raises:
+            EOFError: The shard has closed the connection.
+            OSError: The connection is broken, or the time is over.
+            ProtocolError: What came is no answer.
+        """
+        kind, header, payload = self._stream.receive()
+        if kind != Kind.MESSAGE:
+            raise ProtocolError(
+                f"shard {self.shard} sent a frame of kind {kind} in place of an answer"
+                f" ({header.decode('utf-8', 'replace')})"
+            )
+        answer = decode_frame(header, payload)
+        if type(answer) not in _ANSWERS:
+            raise ProtocolError(f"shard {self.shard} answered with a {type(answer).__name__}")
+        return cast("Answer", answer)
+
+    def exchange(self, kind: Kind, header: bytes) -> None:
+        """Ask for something and be told that it is so.
+
+        Raises:
+            LinkError: The shard refuses, with its reason.
+            EOFError: As `receive`.
+            OSError: As `receive`.
+            ProtocolError: As `receive`.
+        """
+        send_frame(self.socket, header, kind=kind)
+        kind_of_answer, text, _ = self._stream.receive()
+        if kind_of_answer == Kind.REFUSED:
+            raise LinkError(text.decode("utf-8", "replace"))
+        if kind_of_answer != Kind.OPENED:
+            raise ProtocolError(f"a frame of kind {kind_of_answer} came in place of a greeting")
+        if kind == Kind.OPEN and text != self.shard.encode():
+            raise LinkError(f"shard {text!r} answers at the socket of {self.shard}")
+
+    def notices(self) -> Iterator[Notice]:
+        """Yield the notices that a shard sends since `WATCH`; ends only by an exception.
+
+        Raises:
+            EOFError: As `receive`.
+            OSError: As `receive`.
+            ProtocolError: What came is no notice.
+        """
+        wait_at_most(self.socket, socket.SO_RCVTIMEO, 0.0)
+        while True:
+            kind, header, payload = self._stream.receive()
+            notice = decode_frame(header, payload) if kind == Kind.MESSAGE else None
+            if not isinstance(notice, Notice):
+                raise ProtocolError(f"{type(notice).__name__} came in place of a notice")
+            yield notice
+
+    def wake(self) -> None:
+        """End the call that waits on it, from another thread."""
+        try:
+            self.socket.shutdown(socket.SHUT_RDWR)
+        except OSError:  # ended already
+            return
+
+
+class SocketLine:
+    """The connections of one session to one start of one shard.  Thread-safe.
+
+    Args:
+        shard: The shard's name.
+        name: Name of its shared folder, from its WELCOME.
+        nonce: What has to stand in there.
+        session: For whom the connections speak.
+
+    Attributes:
+        name: As given.
+        problem: Why the last attempt to connect failed; empty while all is well.
+    """
+
+    def __init__(self, shard: str, name: str, nonce: bytes, session: str) -> None:
+        self.shard = shard
+        self.name = name
+        self.problem = ""
+        self._nonce = nonce
+        self._session = session
+        self._idle: list[Connection] = []
+        self._open: set[Connection] = set()
+        self._mutex = threading.Lock()
+        self._retry_at_s = 0.0
+        self._retry_s = RETRY_S_MIN
+        self._closed = False
+
+    def take(self) -> Connection | None:
+        """Return a connection for one call; None while there is none to be had."""
+        try:
+            return self._idle.pop()
+        except IndexError:
+            return self.connect()
+
+    def give_back(self, connection: Connection) -> None:
+        """Keep a connection whose call was answered for the next one."""
+        if self._closed or len(self._idle) >= IDLE_MAX:
+            self.drop(connection)
+        else:
+            self._idle.append(connection)
+
+    def drop(self, connection: Connection) -> None:
+        """Throw a connection away: its answer did not come, or made no sense."""
+        with self._mutex:
+            self._open.discard(connection)
+        connection.socket.close()
+
+    def lost(self, connection: Connection) -> None:
+        """Note that a connection has broken: the others are doubtful, too."""
+        self.drop(connection)
+        with self._mutex:
+            idle, self._idle = self._idle, []
+        for other in idle:
+            self.drop(other)
+
+    def connect(self) -> Connection | None:
+        """Open one more connection; None where that fails, or is not yet to be tried again."""
+        if not self._may_connect():
+            return None
+        try:
+            connection = self._connected()
+        except (EnactError, EOFError, OSError) as error:
+            self.problem = str(error) or type(error).__name__
+            with self._mutex:
+                self._retry_at_s = time.monotonic() + self._retry_s
+                self._retry_s = min(2 * self._retry_s, RETRY_S_MAX)
+            _log.info("no socket to shard %s: %s", self.shard, self.problem)
+            return None
+        self.problem, self._retry_s = "", RETRY_S_MIN
+        with self._mutex:
+            self._open.add(connection)
+        if self._closed:  # meanwhile, by another thread
+            self.drop(connection)
+            return None
+        return connection
+
+    def _may_connect(self) -> bool:
+        rests = time.monotonic() < self._retry_at_s
+        return not self._closed and not rests and len(self._open) < CONNECTIONS_MAX
+
+    def _connected(self) -> Connection:
+        folder = open_shared(self.name, self._nonce)
+        connected = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        try:
+            wait_at_most(connected, socket.SO_SNDTIMEO, CONNECT_S)
+            wait_at_most(connected, socket.SO_RCVTIMEO, CONNECT_S)
+            connected.connect(folder.address(SOCKET_NAME))
+            check_peer(connected, users=frozenset((folder.owner, os.geteuid())), group=None)
+            connection = Connection(self.shard, connected)
+            connection.exchange(Kind.OPEN, self._session.encode())
+            wait_at_most(connected, socket.SO_SNDTIMEO, SEND_S)
+        except BaseException:
+            connected.close()
+            raise
+        finally:
+            folder.close()
+        return connection
+
+    def try_again(self) -> None:
+        """Forget the pause after a failure: the shard has just said that it is there."""
+        self._retry_at_s = 0.0
+
+    def abandon(self) -> None:
+        """Close what a forked child has inherited, without a word to the shard."""
+        self._closed = True
+        for connection in (*self._open,):
+            connection.socket.close()
+
+    def close(self) -> None:
+        """End all connections; calls under way return without an answer."""
+        with self._mutex:
+            self._closed = True
+            idle, self._idle = self._idle, []
+            left = [connection for connection in self._open if connection not in idle]
+            self._open.difference_update(idle)
+        for connection in idle:
+            connection.socket.close()
+        for connection in left:
+            connection.wake()

@@ -1,0 +1,188 @@
+"""Who is at the other end of a Unix socket, and whether it still lives: the kernel's word.
+
+That a connection has ended proves nothing about a process: it may have closed its descriptors, and
+a forked child may keep them open.  A descriptor of the *process* (pidfd) proves its death, and
+only that.  Where the kernel gives none, nobody is ever said to be dead.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import socket
+import struct
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+from enact_dist.errors import LinkError
+
+_CREDENTIALS: Final = struct.Struct("iII")
+_SO_PEERGROUPS: Final = 59
+_SO_PEERPIDFD: Final = 77  # Linux 6.5; also tells of processes in other containers
+GROUPS_MAX: Final = 1024
+LINGER_S: Final = 5.0
+"""A process closes its connections a moment before the kernel reports its end."""
+JOIN_S: Final = 0.5
+
+
+class Peer(NamedTuple):
+    """The process that connected, as the kernel noted it then (-1 or 0: not to be seen here)."""
+
+    pid: int
+    user: int
+    group: int
+
+
+def peer_of(connected: socket.socket) -> Peer:
+    """Return who is at the other end."""
+    size = _CREDENTIALS.size
+    raw = connected.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, size)
+    return Peer(*_CREDENTIALS.unpack(raw))
+
+
+def check_peer(connected: socket.socket, *, users: frozenset[int], group: int | None) -> Peer:
+    """Return who is at the other end if it is one of `users` or in `group`.
+
+    Raises:
+        LinkError: It is a stranger; the message names it.
+    """
+    peer = peer_of(connected)
+    if peer.user in users or (group is not None and group in _groups_of(connected, peer)):
+        return peer
+    allowed = f"user {' or '.join(map(str, sorted(users)))}"
+    if group is not None:
+        allowed += f" or group {group}"
+    raise LinkError(
+        f"process {peer.pid} of user {peer.user} and group {peer.group} is at the other end of a"
+        f" socket for {allowed}; run both as the same user, or share a folder of one group"
+    )
+
+
+def _groups_of(connected: socket.socket, peer: Peer) -> frozenset[int]:
+    try:
+        raw = connected.getsockopt(socket.SOL_SOCKET, _SO_PEERGROUPS, 4 * GROUPS_MAX)
+    except OSError:
+        raw = b""
+    return frozenset((peer.group, *struct.unpack(f"{len(raw) // 4}I", raw)))
+
+
+def process_of(connected: socket.socket) -> int | None:
+    """Return a descriptor of the process at the other end, or None where the kernel has none."""
+    try:
+        raw = connected.getsockopt(socket.SOL_SOCKET, _SO_PEERPIDFD, 4)
+        return int(struct.unpack("i", raw)[0])
+    except OSError:
+        pass
+    pid = peer_of(connected).pid
+    if pid <= 0 or not hasattr(os, "pidfd_open"):
+        return None
+    try:
+        return os.pidfd_open(pid)
+    except OSError:  # of another container, or gone before we looked: then its lease ends it
+        return None
+
+
+@dataclass(slots=True)
+class _Watched:
+    """One session's process, how many connections it has, and until when it is still watched."""
+
+    process: int
+    connections: int = 1
+    until_s: float = 0.0
+
+
+class Deaths:
+    """Watches the processes of sessions and reports each that ends.  Thread-safe.
+
+    Args:
+        died: Called with the session, from this watcher's own thread.
+    """
+
+    def __init__(self, died: Callable[[str], None]) -> None:
+        self._died = died
+        self._watched: dict[str, _Watched] = {}
+        self._session_of: dict[int, str] = {}
+        self._mutex = threading.Lock()
+        self._poll = select.epoll()
+        self._bell = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+        self._poll.register(self._bell, select.EPOLLIN)
+        self._closed = False
+        self._thread = threading.Thread(target=self._run, name="enact-deaths", daemon=True)
+        self._thread.start()
+
+    def connected(self, session: str, connection: socket.socket) -> None:
+        """Note one more connection of a session's process."""
+        with self._mutex:
+            watched = self._watched.get(session)
+            if watched is not None:
+                watched.connections += 1
+                return
+            process = process_of(connection) if not self._closed else None
+            if process is not None:
+                self._watched[session] = _Watched(process)
+                self._session_of[process] = session
+                self._poll.register(process, select.EPOLLIN)
+
+    def disconnected(self, session: str) -> None:
+        """Note that one connection has ended; after the last one it is watched a little longer."""
+        with self._mutex:
+            watched = self._watched.get(session)
+            if watched is None:
+                return
+            watched.connections -= 1
+            if not watched.connections:
+                watched.until_s = time.monotonic() + LINGER_S
+                os.eventfd_write(self._bell, 1)
+
+    def _run(self) -> None:
+        while not self._closed:
+            found = self._poll.poll(self._sweep())
+            for descriptor, _ in found:
+                if descriptor == self._bell:
+                    self._silence()
+                    continue
+                with self._mutex:
+                    session = self._session_of.get(descriptor)
+                    if session is not None:
+                        self._forget(session)
+                if session is not None:
+                    self._died(session)
+        with self._mutex:
+            for session in list(self._watched):
+                self._forget(session)
+            self._poll.close()
+            os.close(self._bell)
+
+    def _silence(self) -> None:
+        with contextlib.suppress(BlockingIOError):
+            os.eventfd_read(self._bell)
+
+    def _sweep(self) -> float:
+        """Forget the processes that have left; return how long to wait, in s (-1: for ever)."""
+        with self._mutex:
+            now_s = time.monotonic()
+            ends = {s: w.until_s for s, w in self._watched.items() if not w.connections}
+            for session, until_s in ends.items():
+                if until_s <= now_s:
+                    self._forget(session)
+            return min((end_s - now_s for end_s in ends.values() if end_s > now_s), default=-1.0)
+
+    def _forget(self, session: str) -> None:
+        watched = self._watched.pop(session)
+        del self._session_of[watched.process]
+        self._poll.unregister(watched.process)
+        os.close(watched.process)
+
+    def close(self) -> None:
+        """Watch nobody any more; twice is harmless."""
+        with self._mutex:
+            if self._closed:
+                return
+            self._closed = True
+            os.eventfd_write(self._bell, 1)
+        if threading.current_thread() is not self._thread:
+            self._thread.join(JOIN_S)

@@ -1,0 +1,485 @@
+"""Data of one capture stamp as one set: viewed, triggering, incomplete ones counted and named."""
+
+from __future__ import annotations
+
+import itertools
+import socket
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from enact_dist import (
+    Aspect,
+    Durability,
+    Entities,
+    Entity,
+    Lock,
+    Read,
+    Together,
+    View,
+    World,
+    Write,
+    connect,
+    local,
+    testing,
+)
+from enact_dist.actor import Actor
+from enact_dist.actor_binding import BoundActor
+from enact_dist.actor_check import check_cell
+from enact_dist.actor_inbox import SetInbox, Watching
+from enact_dist.actor_process import ActorThread
+from enact_dist.config import load_config
+from enact_dist.core.datum import Position
+from enact_dist.core.messages import Pin, PlacementMap, ShardEntry
+from enact_dist.core.shard_state import ShardSettings
+from enact_dist.errors import MisuseError, NotRequestedError, NullDatumError
+from enact_dist.link.shard_daemon import DaemonSettings, start_shard
+from enact_dist.together import captured_versions
+from enact_dist.watch import Change
+
+PATIENCE_S = 30.0
+KEPT = 4
+LEFT, RIGHT, SYSTEM = Entity("camera/left"), Entity("camera/right"), Entity("system")
+DEPTH = Aspect("depth", int, Durability.VOLATILE, retention=KEPT)
+TOTAL = Aspect("total", int, Durability.VOLATILE)
+role = World("online")
+
+
+@pytest.fixture(params=["local", "two shards"])
+def cell(request, tmp_path, monkeypatch):
+    """The left camera on one shard, the right one on another; or both in this process."""
+    if request.param == "local":
+        with local(worlds=["online"]) as opened:
+            yield opened
+        return
+    monkeypatch.setenv("ENACT_SHARED_FOLDER", str(tmp_path))
+    monkeypatch.setenv("ENACT_CARRIER", "socket")
+    with socket.socket() as one, socket.socket() as other:
+        for probe in (one, other):
+            probe.bind(("127.0.0.1", 0))
+        endpoints = [f"tcp/127.0.0.1:{probe.getsockname()[1]}" for probe in (one, other)]
+    names = ("s0", "s1")
+    placement = PlacementMap(
+        1,
+        tuple(ShardEntry(name, (at,)) for name, at in zip(names, endpoints, strict=True)),
+        (Pin(str(LEFT), "s0"), Pin(str(RIGHT), "s1")),
+    )
+    shards = [
+        start_shard(
+            DaemonSettings(
+                "cell", ShardSettings(name, placement, worlds=("online",)), (at,), carrier="socket"
+            )
+        )
+        for name, at in zip(names, endpoints, strict=True)
+    ]
+    try:
+        with connect(endpoints[0]) as opened:
+            yield opened
+    finally:
+        for shard in shards:
+            shard.stop(drain_s=0.0)
+
+
+def capture(cell, entity, stamp_ns, value=None, aspect=DEPTH):
+    """Commit a datum that was captured at a stamp; by default the stamp is its value, too."""
+    request = Write(cell.world("online"), entity, aspect)
+    with Lock(request) as lock:
+        lock.put(request, stamp_ns if value is None else value, stamp_ns=stamp_ns)
+
+
+def pair(world, **options):
+    return Together([View(world, entity, DEPTH) for entity in (LEFT, RIGHT)], **options)
+
+
+class Sum(Actor):
+    """Add up the depths of a set; tells the test, and waits for it at `gate`."""
+
+    depths = pair(role)
+    total = Write(role, SYSTEM, TOTAL)
+    triggers = (depths,)
+
+    def __init__(self):
+        self.seen = []
+        self.moved = threading.Condition()
+        self.gate = threading.Semaphore(1_000)
+
+    def update(self, lock):
+        with self.moved:
+            self.seen.append((lock.stamp_ns(self.depths), lock[self.depths]))
+            self.moved.notify_all()
+        assert self.gate.acquire(timeout=PATIENCE_S)
+        lock[self.total] = sum(lock[self.depths])
+
+    def wait_until_seen(self, count):
+        with self.moved:
+            assert self.moved.wait_for(lambda: len(self.seen) >= count, PATIENCE_S), self.seen
+
+
+# ---------------------------------------------------------------- views
+
+
+def test_view_shows_the_newest_complete_set_though_its_slots_have_moved_on(cell):
+    """The left camera is two frames ahead."""
+    for stamp_ns in (100, 200, 300, 400):
+        capture(cell, LEFT, stamp_ns)
+    for stamp_ns in (100, 200):
+        capture(cell, RIGHT, stamp_ns)
+    online = cell.world("online")
+    together, newest = pair(online), View(online, SYSTEM, TOTAL)
+    with Lock(Write(online, SYSTEM, TOTAL)) as lock:
+        lock[Write(online, SYSTEM, TOTAL)] = 7
+
+    snapshot = online.view(together, newest)
+
+    assert snapshot[together] == (200, 200)
+    assert (snapshot.captured_ns, snapshot[together.requests[0]], snapshot[newest]) == (200, 200, 7)
+
+
+def test_view_without_a_complete_set_says_what_each_has(cell):
+    """An error, not a set of different moments."""
+    capture(cell, LEFT, 100)
+    capture(cell, RIGHT, 200)
+    together = pair(cell.world("online"))
+
+    with pytest.raises(NullDatumError, match=r"camera/left.*\[100\].*camera/right.*\[200\]"):
+        cell.world("online").view(together)
+
+
+def test_set_is_found_only_as_far_as_its_aspect_retains(cell):
+    """Retention is bounded, and what is outside is not made up."""
+    capture(cell, RIGHT, 100)
+    for stamp_ns in range(100, 100 + 100 * KEPT, 100):
+        capture(cell, LEFT, stamp_ns)
+    together = pair(cell.world("online"))
+    assert cell.world("online").view(together).captured_ns == 100
+
+    capture(cell, LEFT, 1_000)
+
+    with pytest.raises(NullDatumError):
+        cell.world("online").view(together)
+
+
+def test_large_data_of_a_set_are_those_of_its_stamp(cell):
+    """What does not travel with the answer is fetched by version."""
+    cloud = Aspect("cloud", np.ndarray, Durability.VOLATILE, retention=3)
+    online = cell.world("online")
+    for stamp_ns in (1, 2):
+        for entity in (LEFT, RIGHT)[: 3 - stamp_ns]:
+            capture(cell, entity, stamp_ns, np.full(100_000, stamp_ns, np.uint8), cloud)
+    together = Together([View(online, entity, cloud) for entity in (LEFT, RIGHT)])
+
+    left, right = online.view(together)[together]
+
+    assert (left == 1).all()
+    assert (right == 1).all()
+    assert (online.view(together.requests[0])[together.requests[0]] == 2).all()
+
+
+def test_set_that_is_written_twice_is_never_shown_half(cell):
+    """One consistent cut over shards: both data of the first commit of a stamp, or of the second."""
+    twice = Aspect("twice", str, Durability.VOLATILE, retention=32)
+    online = cell.world("online")
+    together = Together([View(online, entity, twice) for entity in (LEFT, RIGHT)])
+    writes = [Write(online, entity, twice) for entity in (LEFT, RIGHT)]
+    begun, enough, errors = threading.Event(), threading.Event(), []
+
+    def write():
+        try:
+            for stamp_ns in itertools.takewhile(lambda _: not enough.is_set(), itertools.count(1)):
+                for letter in "ab":
+                    with Lock(*writes) as lock:
+                        for request in writes:
+                            lock.put(request, f"{stamp_ns}{letter}", stamp_ns=stamp_ns)
+                    begun.set()
+        except Exception as error:
+            errors.append(error)
+
+    writer = threading.Thread(target=write)
+    writer.start()
+    assert begun.wait(PATIENCE_S)
+    seen = set()
+    end_s = time.monotonic() + PATIENCE_S
+    while len(seen) < 20 and not errors and time.monotonic() < end_s:
+        snapshot = online.view(together)
+        seen.add((snapshot.captured_ns, *snapshot[together]))
+    enough.set()
+    writer.join()
+
+    assert not errors
+    assert all(left == right and left[:-1] == str(ns) for ns, left, right in seen), seen
+    assert len(seen) == 20
+    last = online.view(together)
+    assert last[together] == (f"{last.captured_ns}b",) * 2
+
+
+def test_snapshot_and_lock_refuse_a_set_that_they_were_not_made_with(cell):
+    """A Together is no lock request: what it shows may be past."""
+    online = cell.world("online")
+    capture(cell, LEFT, 1)
+    view = View(online, LEFT, DEPTH)
+
+    with pytest.raises(NotRequestedError):
+        _ = online.view(view)[pair(online)]
+    with pytest.raises(MisuseError, match="no lock request"):
+        Lock(pair(online))
+    with pytest.raises(MisuseError, match="one view shows one set"):
+        online.view(pair(online), Together(pair(online).requests[::-1]))
+    with Lock(view) as lock, pytest.raises(MisuseError, match="no part of this lock"):
+        lock.stamp_ns(pair(online))
+
+
+@pytest.mark.parametrize(
+    ("requests", "options", "error", "text"),
+    [
+        ([Read(role, LEFT, DEPTH), View(role, RIGHT, DEPTH)], {}, TypeError, "View of one entity"),
+        ([View(role, Entities("*"), DEPTH)] * 2, {}, TypeError, "View of one entity"),
+        ([View(role, LEFT, DEPTH)], {}, ValueError, "two or more"),
+        ([View(role, LEFT, DEPTH)] * 2, {}, ValueError, "two or more"),
+        (pair(role).requests, {"by": "version"}, ValueError, "by 'stamp' only"),
+        (pair(role).requests, {"open_max": 0}, ValueError, "between 1 and 256"),
+    ],
+)
+def test_set_that_could_never_be_told_complete_is_refused(requests, options, error, text):
+    """When it is written, not when it runs."""
+    with pytest.raises(error, match=text):
+        Together(requests, **options)
+
+
+# ---------------------------------------------------------------- triggers
+
+
+def test_actor_declares_a_set_as_its_only_trigger():
+    """Anything else could not say when it runs."""
+    assert Sum.declaration.together == pair(role)
+    assert list(Sum.declaration.requests) == ["depths[0]", "depths[1]", "total"]
+    other = View(role, SYSTEM, DEPTH)
+    with pytest.raises(MisuseError, match="only trigger"):
+        type("Two", (Sum,), {"other": other, "triggers": (Sum.depths, other)})
+    with pytest.raises(MisuseError, match="only trigger"):
+        type("Beside", (Sum,), {"triggers": ()})
+    with pytest.raises(MisuseError, match="stands for the triggering entity"):
+        type("Each", (Sum,), {"total": Write(role, Entities("camera/*"), TOTAL)})
+
+
+def test_run_once_updates_once_per_complete_set():
+    """At first for the newest one, then for each new one; incomplete ones are told."""
+    actor = Sum()
+    with testing.worlds("online") as cell:
+        for stamp_ns in (1, 2):
+            capture(cell, LEFT, stamp_ns)
+            capture(cell, RIGHT, stamp_ns)
+        assert testing.run_once(actor, cell) == 1
+        assert testing.run_once(actor, cell) == 0
+        for stamp_ns in (3, 4, 5):
+            capture(cell, LEFT, stamp_ns)
+        for stamp_ns in (3, 5):
+            capture(cell, RIGHT, stamp_ns)
+
+        assert testing.run_once(actor, cell) == 2
+
+        total = View(cell.world("online"), SYSTEM, TOTAL)
+        assert cell.world("online").view(total)[total] == 10
+    assert actor.seen == [(2, (2, 2)), (3, (3, 3)), (5, (5, 5))]
+    (incomplete,) = testing.incomplete_sets(actor)
+    assert str(incomplete) == "set of stamp 4: without online:camera/right/depth"
+
+
+def test_actor_runs_sets_in_order_whatever_came_meanwhile(cell):
+    """Each update shows the data of its stamp, though both slots have moved on."""
+    actor = Sum()
+    actor.gate = threading.Semaphore(0)
+    with ActorThread(actor, cell) as thread:
+        capture(cell, LEFT, 100)
+        capture(cell, RIGHT, 100)
+        actor.wait_until_seen(1)
+        for stamp_ns in (200, 300):
+            capture(cell, RIGHT, stamp_ns)
+            capture(cell, LEFT, stamp_ns)
+        actor.gate.release(3)
+        actor.wait_until_seen(3)
+
+    assert actor.seen == [(ns, (ns, ns)) for ns in (100, 200, 300)]
+    found = thread.statistics()
+    assert (found.updates, found.incomplete, found.skipped, found.late) == (3, 0, 0, 0)
+
+
+def test_set_that_left_retention_before_its_update_is_counted_with_what_is_missing(cell):
+    """A slow actor is told that it is too slow for what its aspects retain."""
+    actor = Sum()
+    actor.gate = threading.Semaphore(0)
+    with ActorThread(actor, cell) as thread:
+        capture(cell, LEFT, 1)
+        capture(cell, RIGHT, 1)
+        actor.wait_until_seen(1)
+        for stamp_ns in range(2, 2 + KEPT + 1):
+            capture(cell, RIGHT, stamp_ns)
+            capture(cell, LEFT, stamp_ns)
+        actor.gate.release(1_000)
+        actor.wait_until_seen(1 + KEPT)
+
+    found = thread.statistics()
+    assert [stamp_ns for stamp_ns, _ in actor.seen] == [1, 3, 4, 5, 6]
+    assert (found.updates, found.incomplete) == (1 + KEPT, 1)
+    assert found.last_incomplete == (
+        "set of stamp 2: without online:camera/left/depth, online:camera/right/depth"
+    )
+
+
+def test_versions_whose_notices_were_lost_are_asked_for(cell):
+    """A gap in the notices costs no set, as far as versions are retained."""
+    bound = BoundActor(Sum(), cell)
+    inbox = SetInbox(bound.pending_sets())
+    for stamp_ns in (1, 2, 3):
+        capture(cell, LEFT, stamp_ns)
+        capture(cell, RIGHT, stamp_ns)
+    newest = [each[-1] for each in captured_versions(
+        cell.world("online").session, bound.set_views()
+    )]  # fmt: skip
+    watching = Watching(bound, inbox)
+
+    for watched, entity, one in zip(bound.watched(), (LEFT, RIGHT), newest, strict=True):
+        position = Position(one.committed_ns, "s0")
+        change = Change(entity, "depth", one.version, position, 2, False, one.captured_ns)
+        watching._note(watched, change)
+
+    runs = [inbox.take(0.0) for _ in range(4)]
+    assert [run and run.captured_ns for run in runs] == [1, 2, 3, None]
+    assert inbox.sets.incomplete == 0
+
+
+# ---------------------------------------------------------------- the paper's first application
+
+TICKS = 12
+CAMERAS = [Entity(f"camera/{index}") for index in range(8)]
+FRAME = Aspect("frame", np.ndarray, Durability.VOLATILE)
+MASK = Aspect("mask", np.ndarray, Durability.VOLATILE, retention=TICKS)
+VOLUME = Aspect("volume", int, Durability.VOLATILE)
+DROPPED = (3, 5)
+"""Camera and tick of the frame that is never published."""
+START_NS = 1_700_000_000_000_000_000
+
+
+def stamp_of(tick):
+    return START_NS + tick * 100_000_000
+
+
+def silhouette(camera, tick):
+    """What camera `camera` sees at a tick: (48, 64) bool."""
+    mask = np.zeros((48, 64), bool)
+    mask[camera : camera + 10, 3 * tick : 3 * tick + 8] = True
+    return mask
+
+
+def silhouettes_of(camera):
+    """Return an actor that makes masks of one camera's frames."""
+
+    class Silhouettes(Actor):
+        frame = View(role, CAMERAS[camera], FRAME)
+        mask = Write(role, CAMERAS[camera], MASK)
+        triggers = (frame,)
+
+        def update(self, lock):
+            bright = lock[self.frame][..., 0] > 127
+            lock.put(self.mask, bright, stamp_ns=lock.stamp_ns(self.frame))
+
+    return Silhouettes()
+
+
+class VisualHull(Actor):
+    """Take eight masks of one moment."""
+
+    masks = Together([View(role, camera, MASK) for camera in CAMERAS], by="stamp")
+    volume = Write(role, SYSTEM, VOLUME)
+    triggers = (masks,)
+
+    def __init__(self):
+        self.sets = {}
+        self.all_seen = threading.Event()
+
+    def update(self, lock):
+        masks = lock[self.masks]
+        self.sets[lock.stamp_ns(self.masks)] = [mask.copy() for mask in masks]
+        lock[self.volume] = int(sum(mask.sum() for mask in masks))
+        if stamp_of(TICKS - 1) in self.sets:
+            self.all_seen.set()
+
+
+def publish(cell, camera, errors):
+    """Publish a camera's frames, each once the mask of the one before is there."""
+    online = cell.world("online")
+    request = Write(online, CAMERAS[camera], FRAME)
+    try:
+        with online.watch(CAMERAS[camera], MASK) as watch:
+            for tick in range(TICKS):
+                if (camera, tick) == DROPPED:
+                    continue
+                frame = np.zeros((48, 64, 3), np.uint8)
+                frame[silhouette(camera, tick)] = 255
+                with Lock(request) as lock:
+                    lock.put(request, frame, stamp_ns=stamp_of(tick))
+                change = watch.next(PATIENCE_S)
+                assert change is not None, f"no mask {tick} of camera {camera}"
+                assert change.captured_ns == stamp_of(tick)
+    except Exception as error:
+        errors.append(error)
+
+
+def test_eight_cameras_eight_workers_and_one_consumer_of_whole_sets(cell):
+    """Always eight masks of one stamp; the frame that a camera drops is counted and named."""
+    hull, errors = VisualHull(), []
+    workers = [ActorThread(silhouettes_of(camera), cell) for camera in range(8)]
+    cameras = [threading.Thread(target=publish, args=(cell, c, errors)) for c in range(8)]
+    with ActorThread(hull, cell) as thread:
+        for worker in workers:
+            worker.__enter__()
+        try:
+            for camera in cameras:
+                camera.start()
+            for camera in cameras:
+                camera.join()
+            assert not errors
+            assert hull.all_seen.wait(PATIENCE_S), (thread.statistics(), sorted(hull.sets))
+        finally:
+            for worker in workers:
+                worker.__exit__(None, None, None)
+
+    camera, dropped = DROPPED
+    assert list(hull.sets) == [stamp_of(tick) for tick in range(TICKS) if tick != dropped]
+    for tick in set(range(TICKS)) - {dropped}:
+        for index, mask in enumerate(hull.sets[stamp_of(tick)]):
+            assert (mask == silhouette(index, tick)).all(), (tick, index)
+    found = thread.statistics()
+    assert (found.updates, found.incomplete, found.late, found.unstamped) == (TICKS - 1, 1, 0, 0)
+    assert found.last_incomplete == (
+        f"set of stamp {stamp_of(dropped)}: without online:camera/{camera}/mask"
+    )
+
+
+@pytest.mark.parametrize(("retention", "found"), [(1, 2), (8, 0)])
+def test_check_warns_of_a_set_that_nobody_retains(tmp_path, monkeypatch, retention, found):
+    """By the word of the file or of the actor, whichever is larger."""
+    bare = Aspect("bare", int)
+
+    class Bare(Actor):
+        depths = Together([View(role, entity, bare) for entity in (LEFT, RIGHT)])
+        total = Write(role, SYSTEM, TOTAL)
+        triggers = (depths,)
+
+        def update(self, lock):
+            lock[self.total] = sum(lock[self.depths])
+
+    monkeypatch.setattr(sys.modules[__name__], "Bare", Bare, raising=False)
+    monkeypatch.setitem(sys.modules, "set_actors", sys.modules[__name__])
+    file = tmp_path / "cell.toml"
+    file.write_text(
+        'name = "c"\nworlds = ["online"]\n[shards.s]\nlisten = "tcp/127.0.0.1:7447"\n'
+        f'[aspects.bare]\nretention = {retention}\n[actors.a]\nclass = "set_actors:Bare"\n'
+    )
+
+    warnings = [one for one in check_cell(load_config(file)) if one.kind == "set not retained"]
+
+    assert len(warnings) == found
+    assert all("[aspects.bare]" in one.text for one in warnings)

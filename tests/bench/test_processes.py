@@ -1,0 +1,130 @@
+"""The processes of benches: raw floors answer, the pipeline takes sets of one tick."""
+
+import numpy as np
+import pytest
+
+from enact_dist.bench import pipeline
+from enact_dist.bench.decisions import Decider, granted_of, hand_over_us
+from enact_dist.bench.floors import ECHO, FDATASYNC, PUBLISH, QUERY, Floors
+from enact_dist.bench.pipeline_worker import head_of, mask_of, new_image
+from enact_dist.bench.place import EMBEDDED, Place, environment
+from enact_dist.bench.run import Run
+from enact_dist.bench.updates import slots, update
+from enact_dist.core.datum import Slot
+from enact_dist.errors import MisuseError
+
+
+@pytest.fixture
+def new_run(tmp_path):
+    """Return a function that makes a run in a cell of its own; ended after the test."""
+    opened = []
+
+    def make(*carriers):
+        folder = tmp_path / f"run{len(opened)}"
+        folder.mkdir()
+        place = Place(folder, target=None, shards=1, carriers=carriers)
+        floors = Floors(folder, folder)
+        opened.append((place, floors))
+        return Run(place, floors, seconds_s=0.03, told=lambda _text: None)
+
+    yield make
+    for place, floors in opened:
+        floors.__exit__()
+        place.__exit__()
+
+
+def test_every_kind_of_floor_gives_times(new_run):
+    """Raw transports, memory and disk; the largest sizes are left to the bench itself."""
+    run = new_run(EMBEDDED)
+    small = [key for key in Floors.every() if key[1].endswith(" 1 kB")]
+
+    for _, variant in [QUERY, PUBLISH, ECHO, FDATASYNC, *small]:
+        run.measure([run.floors.case(variant)], rounds=1)
+
+    rows = run.rows()
+    assert [(row.name, row.variant) for row in rows] == [
+        key for key in Floors.every() if key in {QUERY, PUBLISH, ECHO, FDATASYNC, *small}
+    ]
+    assert all(row.median_us > 0 for row in rows)
+
+
+def test_raw_query_brings_as_many_bytes_as_asked(new_run):
+    """The floor of a fetch moves the bytes that it is named after."""
+    raw = new_run(EMBEDDED).floors._zenoh
+
+    assert [raw.query(size) for size in (64, 921_600)] == [64, 921_600]
+
+
+def test_unknown_floor_is_refused(new_run):
+    """A floor that is spelt wrongly is no silent gap in the table."""
+    with pytest.raises(MisuseError, match="write 3 kB"):
+        new_run(EMBEDDED).floors.case("write 3 kB")
+
+
+def test_update_counts(new_run):
+    """What is measured is a real update: the datum is one larger after each."""
+    writes = slots(new_run(EMBEDDED).place.world(EMBEDDED), 2)
+    for _ in range(3):
+        update(writes)
+
+    view = writes[0].world.view
+    from enact_dist import View
+
+    for write in writes:
+        request = View(write.world, write.entity, write.aspect)
+        assert view(request)[request] == 3
+
+
+def test_each_commit_hands_the_slot_over():
+    """The core bench times commits that grant the next of those who wait, not empty ones."""
+    decider = Decider(2)
+    slot = Slot("bench", "counter0", "count")
+    first = granted_of(decider.acquire(0, 1, slot))
+    assert decider.acquire(0, 1, slot, session=1) == []
+
+    second = granted_of(decider.commit(first.lock, first.token, slot))
+
+    assert second.lock.session == "bench1"
+    assert second.states[0].version == 1
+    assert len(hand_over_us(0.001)) >= 1
+
+
+def test_environment_is_given_back(monkeypatch):
+    """A forced carrier does not stay behind."""
+    import os
+
+    monkeypatch.setenv("ENACT_CARRIER", "socket")
+    monkeypatch.delenv("ENACT_TEST_ONLY", raising=False)
+    with environment(ENACT_CARRIER="zenoh", ENACT_TEST_ONLY="1"):
+        assert os.environ["ENACT_CARRIER"] == "zenoh"
+    assert os.environ["ENACT_CARRIER"] == "socket"
+    assert "ENACT_TEST_ONLY" not in os.environ
+
+
+def test_mask_bears_the_tick_of_its_image():
+    """Sets are told apart by what stands in the pixels, not by what anybody claims."""
+    image = new_image()
+    head_of(image)[:] = 7, 123
+
+    mask = mask_of(image)
+
+    assert mask.shape == (480, 640)
+    assert head_of(mask).tolist() == [7, 123]
+    expected = (image[1:, :, 1] > image[1:, :, 0]).astype(np.uint8)
+    assert np.array_equal(mask[1:], expected)
+
+
+@pytest.mark.slow
+def test_pipeline_of_17_processes_takes_sets(new_run, monkeypatch):
+    """A short run: sets are taken, and every row is there."""
+    monkeypatch.setattr(pipeline, "TIMES", 50)  # of 0.03 s: 15 ticks
+    run = new_run("auto")
+
+    pipeline.run_pipeline(run)
+
+    rows = {row.variant: row for row in run.rows() if row.name == "pipeline"}
+    assert rows["image stored to 8 masks read"].n + rows["missed ticks"].value == 15
+    assert rows["image stored to 8 masks read"].median_us > 0
+    assert rows["the same work without sharing"].value > 0
+    assert rows["missed ticks"].met is (rows["missed ticks"].value == 0)
+    assert {"memory growth", "shared files growth"} <= set(rows)

@@ -1,0 +1,89 @@
+"""Samples, goals and rows: how figures are summed up and judged."""
+
+import pytest
+
+from enact_dist.bench.rows import Case, Goal, Sample, at_most, row_of, sample_of, times
+from enact_dist.bench.timing import COUNT_MIN, timed
+
+FLOOR, OTHER, MINE = ("floor", "query"), ("floor", "disk"), ("update", "mine")
+
+
+def figures(**medians_us):
+    return {
+        {"floor": FLOOR, "disk": OTHER, "mine": MINE}[name]: Sample(median_us, 2 * median_us, 9)
+        for name, median_us in medians_us.items()
+    }
+
+
+def case(goal=None, floor=FLOOR):
+    return Case(*MINE, lambda _seconds_s: (), floor, goal)
+
+
+def test_sample_is_median_and_99th_percentile():
+    """The order of the times does not matter."""
+    assert sample_of([float(n) for n in range(200, 0, -1)]) == Sample(100.5, 199.0, 200)
+
+
+def test_sample_of_nothing_is_refused():
+    """A figure that nobody measured is never zero."""
+    with pytest.raises(ValueError, match="nothing was measured"):
+        sample_of([])
+
+
+@pytest.mark.parametrize(("mine_us", "met"), [(229.0, True), (231.0, False)])
+def test_goal_in_floors_follows_the_floor_of_the_run(mine_us, met):
+    """2.3 raw queries are 230 µs where one takes 100."""
+    goal = times(2.3, FLOOR, "≤ 2.3 x query")
+
+    row = row_of(case(goal), figures(floor=100.0, mine=mine_us))
+
+    assert (row.met, row.ratio) == (met, pytest.approx(mine_us / 100.0))
+
+
+@pytest.mark.parametrize(("mine_us", "met"), [(560.0, True), (561.0, False)])
+def test_goal_may_allow_for_the_disk(mine_us, met):
+    """2.6 queries and 1.5 times the disk."""
+    goal = times(2.6, FLOOR, "…", plus=(1.5, OTHER))
+
+    assert row_of(case(goal), figures(floor=100.0, disk=200.0, mine=mine_us)).met is met
+
+
+def test_goal_without_its_floor_is_not_judged():
+    """What this run cannot tell is neither met nor missed."""
+    goal = times(1.2, OTHER, "…")
+
+    row = row_of(case(goal), figures(mine=1.0))
+
+    assert (row.met, row.ratio, row.goal) == (None, None, "…")
+
+
+@pytest.mark.parametrize(("p99_us", "met"), [(20.0, True), (19.0, False)])
+def test_goal_may_bound_the_99th_percentile_too(p99_us, met):
+    """A good median does not excuse a bad tail."""
+    goal = at_most(12.0, "…", p99_us=p99_us)
+
+    assert goal.met(Sample(10.0, 20.0, 9), {}) is met
+
+
+def test_row_without_a_goal_has_none():
+    """Nothing to keep to, nothing to judge."""
+    row = row_of(case(), figures(floor=2.0, mine=1.0))
+
+    assert (row.goal, row.met) == (None, None)
+    assert "value" not in row.as_json()
+
+
+def test_act_is_repeated_at_least_three_times():
+    """An act longer than the measuring time still gives a median."""
+    calls = []
+
+    times_us = timed(lambda: calls.append("act"), 1e-9, before=lambda: calls.append("before"))
+
+    assert len(times_us) >= COUNT_MIN
+    assert calls[::2] == ["before"] * (len(calls) // 2)
+    assert calls[1::2] == ["act"] * (len(calls) // 2)
+
+
+def test_goal_is_a_value():
+    """Two texts tell two goals apart."""
+    assert Goal("a", len) != Goal("b", len)

@@ -1,0 +1,61 @@
+"""`enact actor ls` names the sets that an actor never got."""
+
+import signal
+import time
+
+import pytest
+
+from enact_dist import Aspect, Entity, Lock, Write, connect
+
+MODULE = """\
+from enact_dist import Actor, Aspect, Entity, Together, View, World, Write
+
+DEPTH = Aspect("set_depth", int, retention=4)
+online = World("online")
+
+
+class Sum(Actor):
+    depths = Together([View(online, Entity(f"set/{side}"), DEPTH) for side in ("l", "r")])
+    total = Write(online, Entity("set"), Aspect("set_total", int))
+    triggers = (depths,)
+
+    def update(self, lock):
+        lock[self.total] = sum(lock[self.depths])
+"""
+DEPTH = Aspect("set_depth", int)
+PATIENCE_S = 30.0
+
+
+@pytest.fixture
+def summing(tmp_path, spawn, until, cell_file):
+    """The actor in a process of its own."""
+    (tmp_path / "set_actors.py").write_text(MODULE, encoding="utf-8")
+    process = spawn("actor", "run", "set_actors:Sum", "--cell", cell_file, "--name", "sum")
+    until(process, "ready: actor sum in cell clitest")
+    yield process
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(10) == 0
+
+
+def test_ls_counts_incomplete_sets_and_names_what_was_missing(summing, cell_file, enact):
+    """One line per actor that has some, and the counters in its JSON."""
+    with connect(cell_file) as cell:
+        online = cell.world("online")
+        for side, stamp_ns in (("l", 1), ("r", 1), ("l", 2), ("l", 3), ("r", 3), ("l", 0)):
+            request = Write(online, Entity(f"set/{side}"), DEPTH)
+            with Lock(request) as lock:
+                lock.put(request, stamp_ns, stamp_ns=stamp_ns)
+
+    end_s = time.monotonic() + PATIENCE_S
+    report = {}
+    while report.get("unstamped") != 1 and time.monotonic() < end_s:
+        infos = enact("actor", "ls", "--json", "--cell", cell_file).json
+        (report,) = [r for i in infos if i["actor"] == "sum" for r in i["report"]["actors"]]
+    table = enact("actor", "ls", "--cell", cell_file).out
+
+    assert (report["incomplete"], report["late"], report["unstamped"]) == (1, 0, 1)
+    assert report["last_incomplete"] == "set of stamp 2: without online:set/r/set_depth"
+    assert (
+        "sum: 1 incomplete sets, the newest a set of stamp 2: without online:set/r/set_depth;"
+        " 0 data too late for their set, 1 without a stamp\n"
+    ) in table

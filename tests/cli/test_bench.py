@@ -1,0 +1,148 @@
+"""`enact bench`: what it prints, what JSON has, how it ends.  No time is judged here."""
+
+import json
+
+import pytest
+
+from enact_dist.bench import command
+from enact_dist.cli import bench
+
+FIELDS = ["name", "variant", "median_us", "p99_us", "n", "ratio", "goal", "met"]
+SHORT = ("--seconds", "0.03")
+
+
+def rows_of(result):
+    assert result.status == 0, result.err
+    assert set(result.json) == {"machine", "rows"}
+    for row in result.json["rows"]:
+        assert list(row)[: len(FIELDS)] == FIELDS
+        assert set(row) - set(FIELDS) in (set(), {"value", "unit"})
+        assert row["n"] > 0
+        assert (row["median_us"] is None) == ("value" in row)
+        assert row["median_us"] is None or 0 < row["median_us"] <= row["p99_us"]
+        assert row["met"] in {None, True, False}
+        assert (row["goal"] is not None) or row["met"] is None
+    return {(row["name"], row["variant"]): row for row in result.json["rows"]}
+
+
+def test_updates_in_the_process_are_told_as_json(enact):
+    """Rows of every durability class beside the floor that divides them."""
+    result = enact("bench", "update", "--embedded", "--json", *SHORT)
+
+    rows = rows_of(result)
+    floor = rows["floor", "zenoh query"]
+    for durability in ("volatile", "os", "durable"):
+        row = rows["update", f"embedded, {durability}"]
+        assert row["ratio"] == pytest.approx(row["median_us"] / floor["median_us"], rel=0.01)
+        assert f"embedded, {durability}, paused" in {variant for _, variant in rows}
+    judged = rows["update", "embedded, volatile"]
+    assert judged["goal"] == "≤ 120 µs"
+    assert judged["met"] is (judged["median_us"] <= 120.0)
+    assert result.json["machine"]["cores"] > 0
+
+
+def test_core_is_a_table_for_people(enact):
+    """Names of the columns, the goals in words, and how many are missed."""
+    result = enact("bench", "core", *SHORT)
+
+    lines = result.out.splitlines()
+    assert result.status == 0
+    assert "cores, Python" in lines[0]
+    assert lines[1].split()[:2] == ["bench", "variant"]
+    (line,) = (line for line in lines if "acquire + commit, one slot" in line)
+    assert "≤ 50 µs" in line
+    assert line.split()[-1] in {"yes", "NO"}
+    (line,) = (line for line in lines if "goals," in line)
+    assert line.startswith("2 goals, ")
+
+
+@pytest.mark.slow
+def test_daemons_and_workers_are_started_and_ended(enact, tmp_path, monkeypatch):
+    """Benches between processes, over a throw-away cell of two shards; nothing is left behind."""
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr("tempfile.tempdir", None)
+    words = ("multi", "waiters", "wakeup", "--shards", "2", "--carrier", "zenoh", "--json")
+    rows = rows_of(enact("bench", *words, *SHORT))
+
+    assert rows["multi", "zenoh, 1 written on each of 2 shards"]["ratio"] > 0
+    assert rows["waiters", "8 threads in 2 processes, hand-over"]["n"] > 1
+    assert rows["wakeup", "64 B"]["goal"] == "≤ 0.5 ms"
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+def test_running_cell_is_measured(enact, cell_file):
+    """`--connect` writes into a world context of its own, over the carrier that is asked for."""
+    words = ("update", "--connect", str(cell_file), "--carrier", "zenoh", "--json")
+    rows = rows_of(enact("bench", *words, *SHORT))
+
+    assert rows["update", "zenoh, volatile"]["goal"] == "≤ 2.3 x query"
+    result = enact("world", "ls", "--cell", str(cell_file), "--json")
+    assert "bench" in json.dumps(result.json)
+
+
+@pytest.mark.slow
+def test_payloads_are_fetched_and_published_in_the_process(enact):
+    """All sizes, up to 100 MB."""
+    rows = rows_of(enact("bench", "fetch", "publish", "--embedded", "--json", *SHORT))
+
+    for key in (("fetch", "embedded, 100 MB"), ("publish", "1 kB"), ("publish", "100 MB")):
+        assert rows[key]["ratio"] > 0
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (("updates",), "known: floor, core, update"),
+        (("--seconds", "0"), "--seconds"),
+        (("--embedded", "--shards", "2"), "not allowed with"),
+        (("--carrier", "pigeon"), "pigeon"),
+    ],
+)
+def test_wrong_usage_is_refused(enact, capsys, words, text):
+    """Status 2, and what is wrong with the words."""
+    with pytest.raises(SystemExit) as left:
+        enact("bench", *words)
+
+    assert left.value.code == 2
+    assert text in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "text"),
+    [
+        (("bench", "wakeup", "--embedded"), 1, "wakeup between processes"),
+        (("bench", "multi", "--connect", "no-such-file.toml", *SHORT), 2, "no-such-file.toml"),
+    ],
+)
+def test_bench_that_cannot_run_as_asked_is_refused(enact, words, status, text):
+    """A cell that cannot be used is 2, a bench without its processes is 1; each says why."""
+    result = enact(*words)
+
+    assert result.status == status
+    assert text in result.err
+
+
+def test_unreachable_cell_is_its_own_status(enact, monkeypatch):
+    """A cell that does not answer is 3, as everywhere."""
+    monkeypatch.setattr("enact_dist.bench.place.JOIN_S", 0.3)
+
+    result = enact("bench", "multi", "--connect", "tcp/127.0.0.1:1")
+
+    assert result.status == 3
+    assert "tcp/127.0.0.1:1" in result.err
+
+
+def test_help_names_every_bench():
+    """The verb's names and what it can run are one list."""
+    assert tuple(command.BENCHES) == bench.NAMES
+
+
+def test_goal_that_is_missed_is_told_and_is_no_failure(enact, monkeypatch):
+    """An honest NO, with status 0."""
+    monkeypatch.setattr("enact_dist.bench.decisions.hand_over_us", lambda _seconds_s: [5e3])
+
+    result = enact("bench", "core", "--json", *SHORT)
+
+    row = rows_of(result)["core", "hand-over, 1,000 waiters"]
+    assert (row["median_us"], row["met"]) == (5e3, False)
