@@ -41,18 +41,21 @@ def test_signal_inside_a_wait_never_deadlocks():
 
     With `event.set()` inside the handler this hangs at once.
     """
+    enough = threading.Event()
+
+    def strike():
+        while not enough.is_set():
+            os.kill(os.getpid(), signal.SIGTERM)
+
     with StopSignals() as signals:
-        storm = threading.Thread(
-            target=lambda: [os.kill(os.getpid(), signal.SIGTERM) for _ in range(2000)]
-        )
+        storm = threading.Thread(target=strike)
         storm.start()
-        waits = 0
-        while storm.is_alive() or not signals.event.is_set():
+        assert signals.event.wait(20)
+        for _ in range(2000):
             signals.event.wait(0.0001)
-            waits += 1
+        enough.set()
         storm.join()
     assert signals.count > 0
-    assert waits > 0
 
 
 WAITING = """
