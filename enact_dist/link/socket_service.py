@@ -243,7 +243,7 @@ class _Connection:
     """
 
     __slots__ = (
-        "_answer", "_answered", "_rest", "_service", "_stream", "_thread", "connected",
+        "_answer", "_answered", "_late", "_rest", "_service", "_stream", "_thread", "connected",
         "ended", "reading", "session",
     )  # fmt: skip
 
@@ -253,6 +253,7 @@ class _Connection:
         self._thread = 0
         self._answer: Answer | None = None
         self._answered = threading.Lock()
+        self._late: Answer | None = None
         self._rest: memoryview | None = None
         self.connected = connected
         self.session = ""
@@ -332,25 +333,29 @@ class _Connection:
             self._send_answer()
 
     def _take(self, answer: Answer) -> None:
-        """Take the answer from the host, whose mutex is held: nothing here may wait."""
-        self._answer = answer
+        """Take the answer from the host, whose mutex is held: nothing here may wait.
+
+        Another thread leaves `_answer` alone: this connection's own may look at it at any moment,
+        and one of the two has to send.
+        """
         if threading.get_ident() == self._thread:
+            self._answer = answer
             return
         if size_of(answer) < BUFFER_BYTES:
             self._rest = self._send_what_fits(answer)
-            self._answer = None
+        else:
+            self._late = answer
         self._wake()
 
     def _send_answer(self) -> None:
         """Send the answer, or wait for whoever brings it and send what is left of it."""
-        answer = self._answer
+        answer, self._answer = self._answer, None
         if answer is None:
             self._answered.acquire()
-            rest, answer = self._rest, self._answer
+            answer, self._late = self._late, None
+            rest, self._rest = self._rest, None
             if rest is not None:
-                self._rest = None
                 self.connected.sendall(rest)
-        self._answer = None
         if answer is not None:
             self._send(answer)
 

@@ -1,6 +1,7 @@
 """Sockets between client and shard on one host: chosen, lost, refused, and what death proves."""
 
 import os
+import queue
 import socket
 import statistics
 import threading
@@ -254,6 +255,36 @@ def test_connection_without_a_greeting_is_refused_and_the_others_served(raw):
     assert b"begins no frame" in text
     assert counters(raw.shard)["connections_refused"] == 1
     assert isinstance(ask(raw(), ListLocks()), Locks)
+
+
+def test_answer_that_another_thread_brings_at_once_is_sent_once(raw, monkeypatch):
+    """The connection's thread looks for its answer while another one is sending it."""
+    near = raw()
+    stream = Stream(near)
+    sending, submit, threads = threading.Event(), raw.shard.host.submit, []
+    send_what_fits = socket_service._Connection._send_what_fits
+
+    def slowly(connection, answer):
+        sending.set()
+        time.sleep(0.1)  # as if the kernel had let the other thread run
+        return send_what_fits(connection, answer)
+
+    def brought_by_another(message, reply):
+        answers = queue.SimpleQueue()
+        submit(message, answers.put)
+        answer = answers.get(timeout=5)
+        threads.append(threading.Thread(target=reply, args=(answer,)))
+        threads[-1].start()
+        assert sending.wait(5)
+
+    monkeypatch.setattr(socket_service._Connection, "_send_what_fits", slowly)
+    monkeypatch.setattr(raw.shard.host, "submit", brought_by_another)
+    first = ask(near, AwaitStamp(0, 0), stream)
+    sending.clear()
+    threads[0].join()
+    second = ask(near, ListLocks(), stream)
+
+    assert (type(first), type(second)) == (Reached, Locks)
 
 
 def test_frame_that_cannot_be_read_is_refused_and_the_connection_goes_on(raw):
