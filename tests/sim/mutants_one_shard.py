@@ -338,8 +338,9 @@ def deleted_slots_start_anew(patch: Patch) -> None:
     """A slot that is set to null forgets its version."""
     put = SlotMap.replace
 
-    def wrong(self: SlotMap, slot: Any, content: Content) -> None:
-        put(self, slot, content if content.datum is not None else replace(content, version=0))
+    def wrong(self: SlotMap, slot: Any, content: Content, **options: Any) -> None:
+        kept = content if content.datum is not None else replace(content, version=0)
+        put(self, slot, kept, **options)
 
     patch(SlotMap, "replace", wrong)
 
