@@ -143,14 +143,15 @@ class Life:
         self.unix_s += rng.choice((1, 86_400 * 3))
         calls, words = self.recorded(rng.choice(("kill", "close")))
         stay = rng.choice(("kill", "power"))
-        pick = rng.randrange(len(calls))
+        last = max(index for index, call in enumerate(calls) if call.kind != "said")
+        pick = rng.randrange(last + 1)
         left = None
         self.states.append(self.states[-1].opened(self.unix_s * 10**9))
         for index, call in enumerate(calls):
             if call.kind == "said":
                 self.hear(*words.popleft())
                 continue
-            if call.kind == "sync" or index == len(calls) - 1:
+            if call.kind == "sync" or index == last:
                 images = self.cut_power()
                 if index >= pick and left is None and stay == "power":
                     left = self.after_power_cut(rng.choice(images))
