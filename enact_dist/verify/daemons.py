@@ -124,12 +124,14 @@ class LineProcess:
         self._popen.send_signal(number)
 
     def kill(self) -> float:
-        """SIGKILL it; return the monotonic time at which it was gone, in seconds."""
+        """SIGKILL it and wait for its end; return the monotonic time of the signal, in seconds."""
+        killed_s = time.monotonic()
         self._popen.send_signal(signal.SIGKILL)
-        return self.wait_ended()
+        self.wait_ended()
+        return killed_s
 
     def wait_ended(self) -> float:
-        """Wait until it has ended by itself; return when, as `kill` does."""
+        """Wait until it has ended; return the monotonic time, in seconds."""
         self._popen.wait(LINE_S)
         return time.monotonic()
 
@@ -152,10 +154,17 @@ class CellProcesses:
         shards: Their names.
         pins: Entity pattern → shard.
         ttl_s: Session TTL of the cell.
+        carrier: How messages travel, as in `cell.toml`.
     """
 
     def __init__(
-        self, folder: Path, shards: Sequence[str], *, pins: dict[str, str], ttl_s: float
+        self,
+        folder: Path,
+        shards: Sequence[str],
+        *,
+        pins: dict[str, str],
+        ttl_s: float,
+        carrier: str = "auto",
     ) -> None:
         self.folder = folder
         self.file = folder / "cell.toml"
@@ -166,6 +175,7 @@ class CellProcesses:
             'worlds = ["online"]',
             f"session_ttl_s = {ttl_s}",
             f'data_folder = "{folder}/data"',
+            f'carrier = "{carrier}"',
         ]
         for name in shards:
             lines += [f"[shards.{name}]", f'listen = "tcp/127.0.0.1:{free_port()}"']

@@ -5,7 +5,7 @@ figure                  from                                       to
 ======================  =========================================  ==============================
 restart, all alive      the start of the new daemon's process      a waiting client's grant
 restart, one dead       the moment in which it serves again        a waiting client's grant
-holder killed           the holder's end                           a waiting client's grant
+holder killed           the signal that kills the holder           a waiting client's grant
 in doubt                the end of a client that had prepared      a grant on both shards
 ======================  =========================================  ==============================
 
@@ -92,17 +92,18 @@ def measure(
         LinkError: A process ended or hung; the message quotes its log.
     """
     measured = []
-    for name, shards, goal_s, run in (
-        ("shard restarted, all clients alive", (SHARD,), 0.5, _all_alive),
-        ("shard restarted, one client dead", (SHARD,), ttl_s + 0.1, _one_dead),
-        ("holder killed", (SHARD,), ttl_s + 0.1, _holder_killed),
-        ("client killed in doubt", ("left", "right"), 2 * ttl_s, _in_doubt),
+    for name, carrier, shards, goal_s, run in (
+        ("shard restarted, all clients alive", "auto", (SHARD,), 0.5, _all_alive),
+        ("shard restarted, one client dead", "auto", (SHARD,), ttl_s + 0.1, _one_dead),
+        ("holder killed, seen over a network", "zenoh", (SHARD,), ttl_s + 0.1, _holder_killed),
+        ("holder killed on the shard's host", "auto", (SHARD,), 0.1, _holder_killed),
+        ("client killed in doubt", "auto", ("left", "right"), 2 * ttl_s, _in_doubt),
     ):
         say(f"{name}: {rounds} rounds")
         pins = {entity: shard if shard in shards else SHARD for entity, shard in PINS.items()}
         with (
             tempfile.TemporaryDirectory(prefix="enact-recovery-") as folder,
-            CellProcesses(Path(folder), shards, pins=pins, ttl_s=ttl_s) as cell,
+            CellProcesses(Path(folder), shards, pins=pins, ttl_s=ttl_s, carrier=carrier) as cell,
         ):
             for shard in shards:
                 cell.start_shard(shard)

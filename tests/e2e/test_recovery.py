@@ -35,7 +35,8 @@ def test_recovery_keeps_its_goals():
     assert [figure.name for figure in figures] == [
         "shard restarted, all clients alive",
         "shard restarted, one client dead",
-        "holder killed",
+        "holder killed, seen over a network",
+        "holder killed on the shard's host",
         "client killed in doubt",
     ]
     for figure in figures:

@@ -91,6 +91,7 @@ class TestedCell:
             'name = "chaos"',
             f"worlds = [{worlds}]",
             f"session_ttl_s = {ttl_s}",
+            'carrier = "zenoh"',  # namespaces share memory: a socket would lead around a cut
             f'data_folder = "{folder}/data"',
         ]
         for name in shards:
