@@ -22,6 +22,7 @@ from enact_dist.bench.floors import written
 from enact_dist.bench.pipeline_worker import CAMERAS, PERIOD_NS
 from enact_dist.bench.place import PIPELINE_WORKER
 from enact_dist.bench.rows import Case, Row, at_most
+from enact_dist.bench.timing import sleep_until
 from enact_dist.link.shared_folder import shared_root
 
 if TYPE_CHECKING:
@@ -125,17 +126,13 @@ class _Measured:
         self.uneven: int = said["uneven"]
 
     def _measure(self, pids: list[int], start_ns: int, total: int) -> None:
-        _sleep_until(start_ns + WARM_TICKS * PERIOD_NS)
+        sleep_until(start_ns + WARM_TICKS * PERIOD_NS)
         cpu_s, memory, files = _cpu_s(pids), _private_bytes(pids), _files_bytes()
         began_ns = time.perf_counter_ns()
-        _sleep_until(start_ns + total * PERIOD_NS)
+        sleep_until(start_ns + total * PERIOD_NS)
         self.cores = (_cpu_s(pids) - cpu_s) / ((time.perf_counter_ns() - began_ns) / 1e9)
         self.grown_bytes = _private_bytes(pids) - memory
         self.files_bytes = _files_bytes() - files
-
-
-def _sleep_until(moment_ns: int) -> None:
-    time.sleep(max(0.0, (moment_ns - time.perf_counter_ns()) / 1e9))
 
 
 def _cpu_s(pids: Sequence[int]) -> float:

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from enact_dist.bench.place import WORLD
+from enact_dist.bench.timing import sleep_until
 from enact_dist.connecting import connect
 from enact_dist.lock import Lock
 from enact_dist.terms import Aspect, Durability, Entities, Entity, Read, ReadEach, Write
@@ -86,8 +87,7 @@ class _Ticks:
 
     def wait(self, tick: int) -> None:
         """Sleep until a tick."""
-        moment_ns = self._start_ns + tick * PERIOD_NS
-        time.sleep(max(0.0, (moment_ns - time.perf_counter_ns()) / 1e9))
+        sleep_until(self._start_ns + tick * PERIOD_NS)
 
     def left_s(self) -> float:
         """Return how long a change may still come."""

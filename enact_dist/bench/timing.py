@@ -53,3 +53,8 @@ def _warm(act: Callable[[], object], seconds_s: float, before: Callable[[], obje
         act()
         if time.perf_counter() >= end_s:
             break
+
+
+def sleep_until(moment_ns: int) -> None:
+    """Sleep until a moment of `time.perf_counter_ns`, which all processes of a host share."""
+    time.sleep(max(0.0, (moment_ns - time.perf_counter_ns()) / 1e9))

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.core.messages import Refused
+from enact_dist.core.messages import Commit, Refused
 from enact_dist.terms import RETENTION_MAX, Access, Durability, checked_name
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable
 
     from enact_dist.core.datum import Slot
-    from enact_dist.core.messages import AspectEntry, Commit, Finish, Item, Prepare, WriteItem
+    from enact_dist.core.messages import AspectEntry, Finish, Item, Prepare, WriteItem
     from enact_dist.core.records import PreparedRecord
 
 _ACCESSES: Final = frozenset(access.value for access in Access)
@@ -74,8 +74,7 @@ def wrong_parties(message: Commit | Prepare, *, peers: Collection[str]) -> Refus
         message: A commit with its participants, or a prepare with its primary.
         peers: The other shards of the cell.
     """
-    named = getattr(message, "participants", None)
-    for shard in (message.primary,) if named is None else named:  # type: ignore[union-attr]
+    for shard in message.participants if isinstance(message, Commit) else (message.primary,):
         if shard not in peers:
             known = ", ".join(sorted(peers)) or "none"
             return _refused(

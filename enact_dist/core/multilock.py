@@ -221,7 +221,7 @@ class MultiLock:
             isinstance(answer, Refused) and self.phase is Phase.COMMITTING and self.sent_commit
         ):
             return False
-        return not isinstance(request, Commit) or answer.code == "overload"
+        return not isinstance(request, Commit) or answer.code == OVERLOAD
 
     def _silent(self, shard: str, request: Request, now_ns: int) -> None:
         self.silent_shard = shard

@@ -10,12 +10,51 @@ A carrier decides nothing.  Rules that each one keeps:
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol
+import os
+from typing import TYPE_CHECKING, Final, Protocol, cast, get_args
+
+from enact_dist.core.messages import Answer
+from enact_dist.errors import MisuseError, ProtocolError
+from enact_dist.wire.frames import decode_frame
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from enact_dist.core.messages import Answer, Notice, Request, ShardEntry
+    from enact_dist.core.messages import Notice, Request, ShardEntry
+
+
+_ANSWERS: Final = frozenset(get_args(Answer))
+
+
+def check_usable(pid: int, *, closed: bool) -> None:
+    """Raise unless a carrier is open and belongs to this process.
+
+    Args:
+        pid: The process that opened it.
+        closed: Whether `close` was called.
+
+    Raises:
+        MisuseError: It is closed or was opened before a fork.
+    """
+    if pid != os.getpid():
+        raise MisuseError(
+            f"this connection belongs to process {pid}, from which this one"
+            f" ({os.getpid()}) was forked; start it with the 'spawn' method"
+        )
+    if closed:
+        raise MisuseError("the connection to this cell is closed; connect again")
+
+
+def read_answer(shard: str, header: bytes, payload: bytes | memoryview) -> Answer:
+    """Return the answer that a shard's frame carries.
+
+    Raises:
+        ProtocolError: It cannot be read, or is no answer.
+    """
+    answer = decode_frame(header, payload)
+    if type(answer) not in _ANSWERS:
+        raise ProtocolError(f"shard {shard} answered with a {type(answer).__name__}")
+    return cast("Answer", answer)
 
 
 class NoticeFeed(Protocol):

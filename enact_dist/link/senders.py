@@ -19,14 +19,19 @@ from __future__ import annotations
 
 import threading
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final, Protocol
+
+from enact_dist.core.messages import Granted, Slice, Surveyed, Viewed
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from enact_dist.core.messages import Answer
 
 OUTSTANDING_BYTES_MAX: Final = 64 << 10
 """What a client may have outstanding before its own sender takes over: one transport batch."""
+SURVEYED_BYTES: Final = 160
+"""Estimated length of one slot in the answer to a `Survey`."""
 QUEUED_ANSWERS_MAX: Final = 1024
 """Answers that wait for one client; a client has some calls per thread in flight."""
 QUEUED_BYTES_MAX: Final = 256 << 20
@@ -196,3 +201,24 @@ class _Sender:
                 self._in_hand = 0
             elif self._may_end(self):
                 return
+
+
+def size_of(answer: Answer) -> int:
+    """Estimate the length of an answer's data in bytes, without encoding it."""
+    estimate = _SIZE_OF.get(type(answer))
+    return estimate(answer) if estimate is not None else 0
+
+
+def _size_of_states(answer: Granted | Viewed) -> int:
+    return sum(
+        SURVEYED_BYTES + (state.datum.size if state.datum is not None else 0)
+        for state in answer.states
+    )
+
+
+_SIZE_OF: Final[dict[type, Callable[[Any], int]]] = {
+    Granted: _size_of_states,
+    Viewed: _size_of_states,
+    Slice: lambda answer: answer.body.size,
+    Surveyed: lambda answer: SURVEYED_BYTES * len(answer.states),
+}

@@ -20,7 +20,8 @@ import weakref
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.messages import Welcome
-from enact_dist.errors import LinkError, MisuseError, ProtocolError
+from enact_dist.errors import LinkError, ProtocolError
+from enact_dist.link.carrier import check_usable
 from enact_dist.link.notices import NoticeQueue
 from enact_dist.link.socket_frames import Kind
 from enact_dist.link.socket_line import Connection, SocketLine
@@ -152,13 +153,7 @@ class SocketCarrier:
         return connection
 
     def _check_usable(self) -> None:
-        if self._pid != os.getpid():
-            raise MisuseError(
-                f"this connection belongs to process {self._pid}, from which this one"
-                f" ({os.getpid()}) was forked; start it with the 'spawn' method"
-            )
-        if self._closed:
-            raise MisuseError("the connection to this cell is closed; connect again")
+        check_usable(self._pid, closed=self._closed)
 
     # ---------------------------------------------------------------- lines
 

@@ -12,10 +12,11 @@ import os
 import socket
 import threading
 import time
-from typing import TYPE_CHECKING, Final, cast, get_args
+from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.messages import Answer, Notice
 from enact_dist.errors import EnactError, LinkError, ProtocolError
+from enact_dist.link.carrier import read_answer
 from enact_dist.link.shared_folder import open_shared
 from enact_dist.link.socket_frames import (
     Kind,
@@ -48,7 +49,6 @@ RETRY_S_MIN: Final = 0.1
 RETRY_S_MAX: Final = 5.0
 """Pause before a lost socket is tried again; doubles up to the second figure."""
 
-_ANSWERS: Final = frozenset(get_args(Answer))
 _log = logging.getLogger("enact.link")
 
 
@@ -90,10 +90,7 @@ class Connection:
                 f"shard {self.shard} sent a frame of kind {kind} in place of an answer"
                 f" ({header.decode('utf-8', 'replace')})"
             )
-        answer = decode_frame(header, payload)
-        if type(answer) not in _ANSWERS:
-            raise ProtocolError(f"shard {self.shard} answered with a {type(answer).__name__}")
-        return cast("Answer", answer)
+        return read_answer(self.shard, header, payload)
 
     def exchange(self, kind: Kind, header: bytes) -> None:
         """Ask for something and be told that it is so.

@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Final, cast, get_args
 from enact_dist.core.messages import Answer, Refused, Request
 from enact_dist.core.records import SessionDied
 from enact_dist.errors import LinkError, ProtocolError
+from enact_dist.link.senders import size_of
 from enact_dist.link.socket_frames import (
     BUFFER_BYTES,
     Kind,
@@ -34,7 +35,6 @@ from enact_dist.link.socket_frames import (
     wait_at_most,
 )
 from enact_dist.link.socket_peers import Deaths, check_peer
-from enact_dist.link.zenoh_service import size_of
 from enact_dist.wire.frames import decode_frame, encode_frame, encode_parts
 from enact_dist.wire.limits import NAME_CHARACTERS_MAX
 

@@ -25,12 +25,13 @@ import time
 from collections import deque
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Final, cast, get_args
+from typing import TYPE_CHECKING, Final
 
 import zenoh
 
 from enact_dist.core.messages import Answer, AwaitStamp, Commit, Fetch, Notice, Prepare
-from enact_dist.errors import MisuseError, ProtocolError, ShardUnreachableError
+from enact_dist.errors import ProtocolError, ShardUnreachableError
+from enact_dist.link.carrier import check_usable, read_answer
 from enact_dist.link.inside import Inside
 from enact_dist.link.notices import NoticeQueue
 from enact_dist.link.zenoh_config import QUEUED_MAX, close_session, keep_after_fork, open_session
@@ -44,7 +45,6 @@ if TYPE_CHECKING:
     from enact_dist.core.messages import Request, ShardEntry
 
 _log = logging.getLogger("enact.link")
-_ANSWERS: Final = frozenset(get_args(Answer))
 CONTROL_BYTES_MAX: Final = 16 << 10
 """Requests with more data than this leave the control priority to the others."""
 FETCH_BYTES: Final = 1 << 20
@@ -239,13 +239,7 @@ class ZenohCarrier:
             )
 
     def _check_usable(self) -> None:
-        if self._pid != os.getpid():
-            raise MisuseError(
-                f"this connection belongs to process {self._pid}, from which this one"
-                f" ({os.getpid()}) was forked; start it with the 'spawn' method"
-            )
-        if self._closed:
-            raise MisuseError("the connection to this cell is closed; connect again")
+        check_usable(self._pid, closed=self._closed)
 
     # ---------------------------------------------------------------- links
 
@@ -388,10 +382,7 @@ def answer_in(sample: zenoh.Sample, shard: str) -> Answer:
     Raises:
         ProtocolError: It cannot be read, or is no answer.
     """
-    answer = decode_frame(_bytes(sample.attachment), _bytes(sample.payload))
-    if type(answer) not in _ANSWERS:
-        raise ProtocolError(f"shard {shard} answered with a {type(answer).__name__}")
-    return cast("Answer", answer)
+    return read_answer(shard, _bytes(sample.attachment), _bytes(sample.payload))
 
 
 def wait_connected(session: zenoh.Session, wait_s: float) -> bool:

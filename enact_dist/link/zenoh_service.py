@@ -15,25 +15,21 @@ import logging
 import threading
 from collections.abc import Callable
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any, Final, cast, get_args
+from typing import TYPE_CHECKING, Final, cast, get_args
 
 import zenoh
 
 from enact_dist.core.messages import (
     Answer,
     Finish,
-    Granted,
     Reached,
     Refused,
     Request,
     Resolve,
-    Slice,
-    Surveyed,
-    Viewed,
 )
 from enact_dist.core.records import SessionSeen
 from enact_dist.errors import ProtocolError
-from enact_dist.link.senders import Senders
+from enact_dist.link.senders import Senders, size_of
 from enact_dist.link.zenoh_config import QUEUED_MAX, keep_after_fork
 from enact_dist.wire.frames import decode_frame, encode_frame
 from enact_dist.wire.keys import (
@@ -49,8 +45,6 @@ if TYPE_CHECKING:
     from enact_dist.link.host import ShardHost
 
 _log = logging.getLogger("enact.link")
-SURVEYED_BYTES: Final = 160
-"""Estimated length of one slot in the answer to a `Survey`."""
 _NOTICES: Final = "@notices"
 """Stands for all watchers together among the clients of `Senders`."""
 JOIN_S: Final = 0.5
@@ -249,24 +243,3 @@ def _client_getter(kind: type) -> Callable[[object], str]:
 
 _CLIENT_OF: Final = {kind: _client_getter(kind) for kind in get_args(Request)}
 """How to read from each request whose answer counts together with whose."""
-
-
-def size_of(answer: Answer) -> int:
-    """Estimate the length of an answer's data in bytes, without encoding it."""
-    estimate = _SIZE_OF.get(type(answer))
-    return estimate(answer) if estimate is not None else 0
-
-
-def _size_of_states(answer: Granted | Viewed) -> int:
-    return sum(
-        SURVEYED_BYTES + (state.datum.size if state.datum is not None else 0)
-        for state in answer.states
-    )
-
-
-_SIZE_OF: Final[dict[type, Callable[[Any], int]]] = {
-    Granted: _size_of_states,
-    Viewed: _size_of_states,
-    Slice: lambda answer: answer.body.size,
-    Surveyed: lambda answer: SURVEYED_BYTES * len(answer.states),
-}
