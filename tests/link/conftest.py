@@ -26,6 +26,7 @@ from enact_dist.core.messages import (
     WriteItem,
 )
 from enact_dist.core.shard_state import ShardSettings
+from enact_dist.link.socket_frames import Kind, Stream, send_frame
 from enact_dist.terms import Access
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -208,3 +209,24 @@ def program():
 def free():
     """Returns further endpoints of the loopback at which nobody listens yet."""
     return free_endpoint
+
+
+@pytest.fixture
+def raw(daemon, endpoint):
+    """Sockets to a shard without a client around them: `raw(session)`; the shard is `raw.shard`."""
+    shard, opened = daemon(endpoint), []
+
+    def connected(session="raw", *, greet=True):
+        folder = shard._shared
+        near = socket.socket(socket.AF_UNIX)
+        near.connect(folder.address("socket"))
+        opened.append(near)
+        if greet:
+            send_frame(near, session.encode(), kind=Kind.OPEN)
+            assert Stream(near).receive()[0] == Kind.OPENED
+        return near
+
+    connected.shard = shard
+    yield connected
+    for near in opened:
+        near.close()

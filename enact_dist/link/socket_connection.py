@@ -1,0 +1,206 @@
+"""One connection of a client to a shard of its host: a request, its answer, the next request.
+
+Its thread reads a request, lets the host decide, and sends the answer when the host has let go of
+it.  An answer that comes later (a grant after a wait) is sent by whoever brings it, as far as that
+goes without waiting; what does not fit is left to the connection's thread.
+"""
+
+from __future__ import annotations
+
+import logging
+import socket
+import threading
+from typing import TYPE_CHECKING, Final, cast, get_args
+
+from enact_dist.core.messages import Answer, Refused, Request
+from enact_dist.errors import LinkError, ProtocolError
+from enact_dist.link.senders import size_of
+from enact_dist.link.socket_frames import (
+    BUFFER_BYTES,
+    Kind,
+    Stream,
+    prefixed,
+    send_frame,
+    wait_at_most,
+)
+from enact_dist.link.socket_watcher import SocketWatcher
+from enact_dist.wire.frames import decode_frame, encode_frame, encode_parts
+from enact_dist.wire.limits import NAME_CHARACTERS_MAX
+
+if TYPE_CHECKING:
+    from enact_dist.link.socket_service import SocketService
+
+OPEN_S: Final = 1.0
+"""How long a new connection has to say for whom it speaks."""
+SEND_S: Final = 5.0
+"""How long a client may read nothing of an answer before its connection is given up."""
+
+_REQUESTS: Final = frozenset(get_args(Request))
+_log = logging.getLogger("enact.link")
+
+
+def end_socket(connected: socket.socket) -> None:
+    """Wake whoever waits on a socket; its own thread closes it."""
+    try:
+        connected.shutdown(socket.SHUT_RDWR)
+    except OSError:  # ended already
+        return
+
+
+class SocketConnection:
+    """One connection and its thread: a request, its answer, the next request.
+
+    Attributes:
+        reading: Whether the thread waits for a request, or has not noticed one yet.
+        ended: Set once the thread is through.
+    """
+
+    __slots__ = (
+        "_answer", "_answered", "_late", "_rest", "_service", "_stream", "_thread", "connected",
+        "ended", "reading", "session",
+    )  # fmt: skip
+
+    def __init__(self, service: SocketService, connected: socket.socket) -> None:
+        self._service = service
+        self._stream = Stream(connected)
+        self._thread = 0
+        self._answer: Answer | None = None
+        self._answered = threading.Lock()
+        self._late: Answer | None = None
+        self._rest: memoryview | None = None
+        self.connected = connected
+        self.session = ""
+        self.reading = False
+        self.ended = threading.Event()
+
+    def run(self) -> None:
+        """Serve until either side ends the connection."""
+        self._thread = threading.get_ident()
+        self._answered.acquire()
+        try:
+            wait_at_most(self.connected, socket.SO_RCVTIMEO, OPEN_S)
+            wait_at_most(self.connected, socket.SO_SNDTIMEO, SEND_S)
+            if self._open():
+                try:
+                    self._serve()
+                finally:
+                    self._service.left(self, self.session)
+        except BlockingIOError:
+            self._service.host.count("answers_dropped")
+            _log.warning("session %s does not read; its connection is closed", self.session[:8])
+        except (EOFError, OSError):
+            pass
+        except ProtocolError as error:
+            self._refuse(error)
+        finally:
+            self.connected.close()
+            self.ended.set()
+
+    def _open(self) -> bool:
+        """Learn for whom the connection speaks; say whether it may."""
+        try:
+            kind, header, payload = self._stream.receive()
+        except BlockingIOError:
+            return False
+        if kind != Kind.OPEN or payload or not 0 < len(header) <= NAME_CHARACTERS_MAX:
+            raise ProtocolError("a connection did not say for whom it speaks")
+        try:
+            self.session = header.decode("ascii")
+            self._service.admit(self, self.session)
+        except (LinkError, UnicodeDecodeError) as error:
+            self._refuse(error)
+            return False
+        wait_at_most(self.connected, socket.SO_RCVTIMEO, 0.0)
+        send_frame(self.connected, self._service.host.name.encode(), kind=Kind.OPENED)
+        return True
+
+    def _refuse(self, error: Exception) -> None:
+        self._service.host.count("connections_refused")
+        _log.warning("a connection is refused: %s", error)
+        try:
+            send_frame(self.connected, str(error).encode()[: BUFFER_BYTES // 2], kind=Kind.REFUSED)
+        except OSError:
+            return
+
+    def _serve(self) -> None:
+        receive, host = self._stream.receive, self._service.host
+        while True:
+            self.reading = True
+            kind, header, payload = receive()
+            if kind != Kind.MESSAGE:
+                if kind == Kind.WATCH:
+                    self.reading = False
+                    SocketWatcher(self._service, self.connected).run()
+                    return
+                raise ProtocolError(f"a frame of kind {kind} came in place of a request")
+            try:
+                message = decode_frame(header, payload)
+                if type(message) not in _REQUESTS:
+                    raise ProtocolError(f"{type(message).__name__} is no request")
+            except ProtocolError as error:
+                host.count("frames_refused")
+                self._send(Refused("protocol", str(error)))
+                continue
+            host.submit(cast("Request", message), self._take)
+            self.reading = False
+            self._send_answer()
+
+    def _take(self, answer: Answer) -> None:
+        """Take the answer from the host, whose mutex is held: nothing here may wait.
+
+        Another thread leaves `_answer` alone: this connection's own may look at it at any moment,
+        and one of the two has to send.
+        """
+        if threading.get_ident() == self._thread:
+            self._answer = answer
+            return
+        if size_of(answer) < BUFFER_BYTES:
+            self._rest = self._send_what_fits(answer)
+        else:
+            self._late = answer
+        self._wake()
+
+    def _send_answer(self) -> None:
+        """Send the answer, or wait for whoever brings it and send what is left of it."""
+        answer, self._answer = self._answer, None
+        if answer is None:
+            self._answered.acquire()
+            answer, self._late = self._late, None
+            rest, self._rest = self._rest, None
+            if rest is not None:
+                self.connected.sendall(rest)
+        if answer is not None:
+            self._send(answer)
+
+    def _send(self, answer: Answer) -> None:
+        try:
+            header, bodies = encode_parts(answer)
+        except ProtocolError as error:
+            _log.warning("answer %s not sent: %s", type(answer).__name__, error)
+            raise EOFError from error  # closed, which tells the client *unknown*
+        send_frame(self.connected, header, bodies)
+
+    def _send_what_fits(self, answer: Answer) -> memoryview | None:
+        """Send without waiting; return what is left for the connection's thread."""
+        try:
+            header, payload = encode_frame(answer)
+            frame = prefixed(header, len(payload or b"")) + (payload or b"")
+            sent = self.connected.send(frame, socket.MSG_DONTWAIT)
+        except BlockingIOError:
+            sent = 0
+        except (OSError, ProtocolError) as error:
+            _log.info("answer %s not sent: %s", type(answer).__name__, error)
+            end_socket(self.connected)
+            return None
+        return memoryview(frame)[sent:] if sent < len(frame) else None
+
+    def end(self) -> None:
+        """Let the thread end soon, wherever it waits."""
+        end_socket(self.connected)
+        self._wake()
+
+    def _wake(self) -> None:
+        try:
+            self._answered.release()
+        except RuntimeError:  # an answer and the end came at the same moment
+            return

@@ -1,0 +1,177 @@
+"""Who is at the other end of a socket, and what its death proves."""
+
+import os
+import socket
+import statistics
+import threading
+import time
+
+import pytest
+from socket_parts import COUNT, CUP, add_one, counters
+
+from enact_dist import Entity, Lock, Write, connect
+from enact_dist.errors import LinkError
+from enact_dist.link.socket_peers import Deaths, check_peer, peer_of
+
+
+def test_peer_of_another_user_is_refused_by_name():
+    """The kernel says who is there; a stranger is named."""
+    near, far = socket.socketpair()
+
+    assert peer_of(near).pid == os.getpid()
+    assert check_peer(near, users=frozenset((os.geteuid(),)), group=None).user == os.geteuid()
+    assert check_peer(near, users=frozenset(), group=os.getegid()).group == os.getegid()
+    with pytest.raises(LinkError, match=f"process {os.getpid()} of user {os.geteuid()}"):
+        check_peer(near, users=frozenset((123_456,)), group=123_457)
+    near.close()
+    far.close()
+
+
+# ---------------------------------------------------------------- death
+
+HOLDER = """
+import os, sys, threading
+from enact_dist import Aspect, Durability, Entity, Lock, Write, connect
+cell = connect(sys.argv[1], actor="holder")
+request = Write(cell.world("online"), Entity("cup"), Aspect("count", int, Durability.VOLATILE))
+with Lock(request) as lock:
+    assert cell._client.carrier.way_to("s0") == sys.argv[2], cell._client.carrier.way_to("s0")
+    exec(sys.argv[3])
+    print("held", flush=True)
+    sys.stdin.readline()
+    lock[request] = 7
+print("done", flush=True)
+"""
+FORKS = """
+child = os.fork()
+if child == 0:
+    os.read(0, 1)
+    os._exit(0)
+print(child, flush=True)
+"""
+FORKS_AND_CHILD_ENDS = """
+child = os.fork()
+if child == 0:
+    os._exit(0)
+os.waitpid(child, 0)
+"""
+CLOSES_ALL_SOCKETS = """
+for name in os.listdir("/proc/self/fd"):
+    try:
+        if "socket" in os.readlink(f"/proc/self/fd/{name}") and int(name) > 2:
+            with open(f"/proc/self/net/unix") as file:
+                inode = os.readlink(f"/proc/self/fd/{name}")[8:-1]
+                if any(line.split()[6] == inode for line in file):
+                    os.close(int(name))
+    except OSError:
+        pass
+"""
+
+
+def next_grant_s(endpoint, before):
+    """Wait for the lock on the cup while `before()` happens; return how long the grant took."""
+    with connect(endpoint, actor="next") as cell:
+        request = Write(cell.world("online"), CUP, COUNT)
+        add_one(cell, Entity("warm"))
+        started = threading.Event()
+        granted_s = []
+
+        def wait():
+            started.set()
+            with Lock(request, wait_s=20.0):
+                granted_s.append(time.monotonic())
+
+        waiting = threading.Thread(target=wait)
+        waiting.start()
+        started.wait()
+        while not any(not lock.granted for lock in cell.locks()):
+            time.sleep(0.002)
+        killed_s = time.monotonic()
+        before()
+        waiting.join()
+        return granted_s[0] - killed_s
+
+
+@pytest.mark.slow
+def test_killed_holder_loses_its_lock_at_once(daemon, endpoint, program):
+    """The kernel says that the process is gone: nobody waits for the lease."""
+    shard = daemon(endpoint)
+    waits_s = []
+    for _ in range(5):
+        process = program(HOLDER, endpoint, "socket", "pass")
+        assert process.stdout.readline() == "held\n", process.stderr.read()
+        waits_s.append(next_grant_s(endpoint, process.kill))
+
+    assert statistics.median(waits_s) < 0.1, waits_s
+    assert counters(shard)["sessions_died"] == 5
+    assert "leases_expired" not in counters(shard)
+
+
+@pytest.mark.slow
+def test_killed_holder_loses_its_lock_though_a_forked_child_lives(daemon, endpoint, program):
+    """A child that has inherited the connections does not keep the session alive."""
+    shard = daemon(endpoint)
+    process = program(HOLDER, endpoint, "socket", FORKS)
+    process.stdout.readline()
+    assert process.stdout.readline() == "held\n"
+
+    assert next_grant_s(endpoint, process.kill) < 0.5
+    assert counters(shard)["sessions_died"] == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("act", [FORKS_AND_CHILD_ENDS, CLOSES_ALL_SOCKETS])
+def test_living_holder_keeps_its_lock_whatever_happens_to_its_sockets(
+    daemon, endpoint, program, act, until
+):
+    """Neither the end of a forked child nor closed connections prove a death."""
+    shard = daemon(endpoint)
+    process = program(HOLDER, endpoint, "socket", act)
+    assert process.stdout.readline() == "held\n", process.stderr.read()
+    time.sleep(1.0)
+
+    output, errors = process.communicate("\n", timeout=20)
+
+    assert output == "done\n", errors
+    assert "sessions_died" not in counters(shard)
+    with connect(endpoint) as cell:
+        request = Write(cell.world("online"), CUP, COUNT)
+        with Lock(request) as lock:
+            assert lock[request] == 7
+
+
+def test_goodbye_before_the_end_is_no_death(daemon, endpoint, until):
+    """A client that closes its cell and lives on is not reported."""
+    shard = daemon(endpoint)
+    with connect(endpoint) as cell:
+        add_one(cell)
+    until(lambda: shard._sockets._count == 0)
+
+    assert "sessions_died" not in counters(shard)
+
+
+def test_process_is_watched_until_it_ends(program, tmp_path, until):
+    """Its end is reported once, a moment after its last connection or before."""
+    listener = socket.socket(socket.AF_UNIX)
+    listener.bind(str(tmp_path / "s"))
+    listener.listen()
+    died = []
+    deaths = Deaths(died.append)
+    text = (
+        "import socket, sys; s = socket.socket(socket.AF_UNIX); s.connect(sys.argv[1]);"
+        "print(flush=True); s.recv(1); s.close(); print(flush=True); sys.stdin.read()"
+    )
+    process = program(text, tmp_path / "s")
+    connected, _ = listener.accept()
+    deaths.connected("a", connected)
+    process.stdout.readline()
+    connected.close()
+    process.stdout.readline()
+    deaths.disconnected("a")
+    assert died == []
+
+    process.kill()
+
+    until(lambda: died == ["a"])
+    deaths.close()
+    listener.close()

@@ -1,0 +1,211 @@
+"""What a shard's socket refuses, and that a client that does not read delays nobody."""
+
+import os
+import queue
+import socket
+import threading
+import time
+
+from socket_parts import ask, counters, over_socket, speak
+
+from enact_dist.core.messages import (
+    AwaitStamp,
+    Committed,
+    Granted,
+    Hello,
+    ListLocks,
+    Locks,
+    Reached,
+    Refused,
+    Waiting,
+)
+from enact_dist.link import socket_connection, socket_service, socket_watcher
+from enact_dist.link.socket_frames import Kind, Stream, prefixed, send_frame
+from enact_dist.terms import Access
+from enact_dist.wire.frames import decode_frame, encode_frame
+
+# ---------------------------------------------------------------- what the shard refuses
+
+
+def test_connection_without_a_greeting_is_refused_and_the_others_served(raw):
+    """Garbage in place of a greeting ends that connection, by name and counted."""
+    stranger = raw(greet=False)
+    stranger.sendall(b"GET / HTTP/1.1\r\n\r\n")
+
+    kind, text, _ = Stream(stranger).receive()
+
+    assert kind == Kind.REFUSED
+    assert b"begins no frame" in text
+    assert counters(raw.shard)["connections_refused"] == 1
+    assert isinstance(ask(raw(), ListLocks()), Locks)
+
+
+def test_answer_that_another_thread_brings_at_once_is_sent_once(raw, monkeypatch):
+    """The connection's thread looks for its answer while another one is sending it."""
+    near = raw()
+    stream = Stream(near)
+    sending, submit, threads = threading.Event(), raw.shard.host.submit, []
+    send_what_fits = socket_connection.SocketConnection._send_what_fits
+
+    def slowly(connection, answer):
+        sending.set()
+        time.sleep(0.1)  # as if the kernel had let the other thread run
+        return send_what_fits(connection, answer)
+
+    def brought_by_another(message, reply):
+        answers = queue.SimpleQueue()
+        submit(message, answers.put)
+        answer = answers.get(timeout=5)
+        threads.append(threading.Thread(target=reply, args=(answer,)))
+        threads[-1].start()
+        assert sending.wait(5)
+
+    monkeypatch.setattr(socket_connection.SocketConnection, "_send_what_fits", slowly)
+    monkeypatch.setattr(raw.shard.host, "submit", brought_by_another)
+    first = ask(near, AwaitStamp(0, 0), stream)
+    sending.clear()
+    threads[0].join()
+    second = ask(near, ListLocks(), stream)
+
+    assert (type(first), type(second)) == (Reached, Locks)
+
+
+def test_frame_that_cannot_be_read_is_refused_and_the_connection_goes_on(raw):
+    """A damaged message is answered with its refusal; the next one is served."""
+    near = raw()
+    stream = Stream(near)
+    send_frame(near, b"\xff\x00garbage")
+    _, header, _ = stream.receive()
+
+    assert isinstance(decode_frame(header), Refused)
+    assert isinstance(ask(near, ListLocks(), stream), Locks)
+    assert counters(raw.shard)["frames_refused"] == 1
+
+
+def test_answer_in_place_of_a_request_is_refused(raw):
+    """Only requests are handled."""
+    answer = ask(raw(), Locks(1, ()))
+
+    assert isinstance(answer, Refused)
+    assert "no request" in answer.text
+
+
+def test_session_with_too_many_connections_is_refused_by_name(raw, monkeypatch):
+    """One process cannot take all threads of a shard; what is refused is counted."""
+    monkeypatch.setattr(socket_service, "SESSION_CONNECTIONS_MAX", 3)
+    kept = [raw("greedy") for _ in range(3)]
+    one_more = raw("greedy", greet=False)
+    send_frame(one_more, b"greedy", kind=Kind.OPEN)
+
+    kind, text, _ = Stream(one_more).receive()
+
+    assert (kind, b"3 connections" in text) == (Kind.REFUSED, True)
+    assert isinstance(ask(raw("modest"), ListLocks()), Locks)
+    assert isinstance(ask(kept[0], ListLocks()), Locks)
+
+
+def test_place_of_a_connection_is_free_again_when_it_ends(raw, monkeypatch, until):
+    """What has left counts no more."""
+    monkeypatch.setattr(socket_service, "CONNECTIONS_MAX", 2)
+    first, _ = raw("a"), raw("b")
+    first.close()
+
+    until(lambda: raw.shard._sockets._count == 1)
+
+    assert isinstance(ask(raw("c"), ListLocks()), Locks)
+
+
+def test_shard_serves_no_stranger(raw):
+    """A peer that is neither the shard's user nor root gets no connection."""
+    raw.shard._sockets._users = frozenset((123_456,))
+    near = raw(greet=False)
+    send_frame(near, b"stranger", kind=Kind.OPEN)
+
+    kind, text, _ = Stream(near).receive()
+
+    assert (kind, b"for user 123456" in text) == (Kind.REFUSED, True)
+
+
+# ---------------------------------------------------------------- slow clients
+
+
+@over_socket
+def test_client_that_reads_no_answers_delays_nobody(raw, carry, make_peer, endpoint, monkeypatch):
+    """It loses its connection after a while, counted; the others never notice."""
+    monkeypatch.setattr(socket_connection, "SEND_S", 0.3)
+    carrier = carry(endpoint, session="good")
+    peer = speak(carrier, make_peer, "good")
+    peer.write("cup", os.urandom(50_000))
+    stopped = raw("stopped")
+    ask(stopped, Hello("stopped", 0, 2_000_000_000, "stopped", "h", 1, False))
+    view = make_peer(lambda _, message: message, session="stopped", epoch=peer.epoch)
+    for _ in range(200):  # each answer has 50 kB, nobody reads them
+        frame = encode_frame(view.acquire_message("cup", access=Access.READ))[0]
+        try:
+            stopped.send(prefixed(frame, 0), socket.MSG_DONTWAIT)
+        except BlockingIOError:
+            break
+    slowest_s, end_s = 0.0, time.monotonic() + 1.0
+    while time.monotonic() < end_s:
+        started_s = time.monotonic()
+        assert isinstance(peer.write("plate", b"1"), Committed)
+        slowest_s = max(slowest_s, time.monotonic() - started_s)
+
+    assert slowest_s < 0.25
+    assert counters(raw.shard)["answers_dropped"] == 1
+
+
+@over_socket
+def test_grant_for_a_waiter_that_does_not_read_delays_nobody(raw, carry, make_peer, endpoint):
+    """Whoever releases a lock sends the next grant only as far as that goes without waiting."""
+    carrier = carry(endpoint, session="good")
+    peer = speak(carrier, make_peer, "good")
+    peer.write("cup", os.urandom(60_000))
+    held = peer.acquire("cup")
+    waiting = []
+    for number in range(5):
+        near = raw(f"waiter{number}")
+        near.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1)
+        ask(near, Hello(f"waiter{number}", 0, 2_000_000_000, "waiter", "h", 1, False))
+        waiter = make_peer(None, session=f"waiter{number}", epoch=peer.epoch)
+        message = waiter.acquire_message("cup", wait_s=0.9, access=Access.READ)
+        send_frame(near, encode_frame(message)[0])
+        waiting.append(near)
+    while len(peer.call("s0", ListLocks()).holders) < 6:
+        time.sleep(0.002)
+    started_s = time.monotonic()
+
+    assert isinstance(peer.commit(held, "cup", os.urandom(60_000)), Committed)
+
+    assert time.monotonic() - started_s < 0.2
+    for near in waiting:
+        _, header, payload = Stream(near).receive()
+        answer = decode_frame(header, payload)
+        assert isinstance(answer, Granted | Waiting)
+
+
+def test_watcher_that_does_not_read_delays_no_commit(raw, make_peer, monkeypatch):
+    """Notices are kept for it up to a number, then dropped and counted; commits go on."""
+    monkeypatch.setattr(socket_watcher, "NOTICES_MAX", 100)
+    watcher, writer = raw("watcher"), raw("writer")
+    send_frame(watcher, b"", kind=Kind.WATCH)
+    stream = Stream(writer)
+    peer = make_peer(lambda _, message: ask(writer, message, stream), session="writer")
+    peer.hello()
+    for number in range(1500):
+        assert isinstance(_write(peer, writer, stream, number), Committed)
+
+    assert counters(raw.shard)["notices_dropped"] > 0
+
+
+def _write(peer, writer, stream, number):
+    granted = peer.acquire("cup")
+    from enact_dist.core.datum import Datum, Slot
+    from enact_dist.core.messages import Commit, WriteItem
+
+    datum = Datum(b"\x01", b"%d" % number, len(b"%d" % number))
+    item = WriteItem(Slot("online", "cup", "count"), datum)
+    header, payload = encode_frame(Commit(granted.lock, granted.token, (item,), 0))
+    send_frame(writer, header, [payload])
+    _, header, payload = stream.receive()
+    return decode_frame(header, payload)
