@@ -11,6 +11,7 @@ is the index (no order-coupled list), data are immutable values, and a lock is a
 
 from __future__ import annotations
 
+import functools
 import threading
 import time
 from dataclasses import dataclass
@@ -33,7 +34,7 @@ from enact_dist.wire.limits import BODY_BYTES_MAX, ITEMS_MAX
 from enact_dist.writable import WritableEach
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
     from types import TracebackType
 
     from enact_dist.core.datum import Position
@@ -66,6 +67,12 @@ def refuse_inside_lock(what: str) -> None:
             f"{what} inside a lock would hold and wait; this thread holds {held!r};"
             " leave its block first"
         )
+
+
+def _refuse_released(requests: Iterable[LockRequest[Any]]) -> None:
+    raise LockReleasedError(
+        f"Lock({', '.join(map(repr, requests))}) is used outside its `with` block"
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,6 +220,17 @@ class Lock:
             # After a commit this is nothing; after an exception, an interrupt too, nothing is held.
             if not client.forked:
                 client.release(lock)
+            self._let_go()
+
+    def _let_go(self) -> None:
+        """Free the data with the block.
+
+        What refers to this lock would form a cycle with it, and data would pile up until the
+        garbage collector looks: 70 images of 0.9 MB were seen to.
+        """
+        self._readings.end(functools.partial(_refuse_released, self._requests))
+        self._each.clear()
+        self._writes.clear()
 
     def _writes_by_shard(self) -> dict[str, list[WriteItem]]:
         assert self._lock is not None

@@ -37,6 +37,9 @@ class Readings:
         lock: The lock or view that pins them.
         readings: The states.
         usable: Raises if the lock is over or lost; called before every access.
+
+    Attributes:
+        decoded: How many data were decoded so far.
     """
 
     def __init__(
@@ -54,11 +57,14 @@ class Readings:
         self._values: dict[Slot, object] = {}
         self._kept: dict[Slot, Datum] = {}
         self.usable = usable
+        self.decoded = 0
 
-    @property
-    def decoded(self) -> int:
-        """How many data were decoded so far."""
-        return len(self._values)
+    def end(self, usable: Callable[[], None]) -> None:
+        """Forget all data: the lock is over, which `usable` says from now on."""
+        self.usable = usable
+        self._readings.clear()
+        self._values.clear()
+        self._kept.clear()
 
     def state(self, slot: Slot) -> SlotState | None:
         """Return the state of a slot, or None if it was not shown (a pattern, and null)."""
@@ -100,6 +106,7 @@ class Readings:
             if state is None or is_null(state):
                 raise null_error(slot, state)
             value = self._values[slot] = decode_datum(self.datum(slot), aspect.datum_type)
+            self.decoded += 1
         return cast("T", value)
 
     def matching(self, request: LockRequest[Any]) -> list[Slot]:
