@@ -97,16 +97,18 @@ class RunningShard:
             if self._sockets is not None:
                 undo.callback(self._sockets.close)
             self._session = open_session(listen=settings.listen, lease_s=settings.link_lease_s)
+            undo.callback(close_session, self._session)
+            self._calls = ShardCalls(
+                settings.cell,
+                shard.name,
+                shard.placement.shards,
+                lease_s=settings.link_lease_s,
+                answered=self.host.called,
+            )
+            undo.callback(self._calls.close)
+            self.host.call_with(self._calls.submit)
+            self._service = ZenohService(self.host, self._session, settings.cell)
             undo.pop_all()
-        self._calls = ShardCalls(
-            settings.cell,
-            shard.name,
-            shard.placement.shards,
-            lease_s=settings.link_lease_s,
-            answered=self.host.called,
-        )
-        self.host.call_with(self._calls.submit)
-        self._service = ZenohService(self.host, self._session, settings.cell)
 
     @property
     def failure(self) -> Exception | None:

@@ -23,6 +23,7 @@ import errno
 import fcntl
 import hmac
 import os
+import re
 import secrets
 import shutil
 import stat
@@ -44,6 +45,8 @@ PART_CHARACTERS_MAX: Final = 60
 """So much of the cell's and the shard's names stands in a folder's name, for people."""
 UNFINISHED_S: Final = 60.0
 """A folder without a nonce is being made; one that stays so for longer was left behind."""
+_MADE_HERE: Final = re.compile(r".+\..+\.[0-9a-f]{16}\Z", re.DOTALL)
+"""Names of folders that `SharedFolder` makes; a root may hold anything else beside them."""
 ADDRESS_BYTES_MAX: Final = 107
 """Longest path of a Unix socket; a longer one is reached through an open descriptor."""
 
@@ -191,7 +194,7 @@ def _make(root: int, name: str, access: Access) -> tuple[Access, int]:
 
 def _sweep(root: int, path: Path) -> None:
     """Remove the folders of this user's shards that live no more."""
-    for entry in os.listdir(root):
+    for entry in filter(_MADE_HERE.match, os.listdir(root)):
         try:
             found = os.stat(entry, dir_fd=root, follow_symlinks=False)
             if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.geteuid():

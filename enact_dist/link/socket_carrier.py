@@ -69,7 +69,7 @@ class SocketCarrier:
     @property
     def fetch_bytes(self) -> int:
         """How large a slice of a datum is asked for in one call, at most."""
-        lines = self._lines.values()
+        lines = list(self._lines.values())
         all_here = len(lines) == len(self._shards) and not any(line.problem for line in lines)
         return FETCH_BYTES if lines and all_here else self._behind.fetch_bytes
 
@@ -141,11 +141,11 @@ class SocketCarrier:
             return None
         try:
             connection.send(message, timeout_s)
-        except (BrokenPipeError, ConnectionResetError):
-            line.lost(connection)  # the shard's end was closed before: it will not read this
-            return None
         except BlockingIOError:
             line.drop(connection)  # it does not read: what it has got of this is no frame
+            return None
+        except OSError:
+            line.lost(connection)  # either end was closed before: nobody reads this whole
             return None
         except BaseException:
             line.drop(connection)

@@ -51,13 +51,15 @@ class SocketConnection:
     """One connection and its thread: a request, its answer, the next request.
 
     Attributes:
-        reading: Whether the thread waits for a request, or has not noticed one yet.
+        session: For whom it speaks; empty until the service has admitted it.
+        step: 3n while it waits for its n-th request, 3n + 1 once it has read that, 3n + 2 once the
+            host has it, too.
         ended: Set once the thread is through.
     """
 
     __slots__ = (
         "_answer", "_answered", "_late", "_rest", "_service", "_stream", "_thread", "connected",
-        "ended", "reading", "session",
+        "ended", "session", "step",
     )  # fmt: skip
 
     def __init__(self, service: SocketService, connected: socket.socket) -> None:
@@ -70,7 +72,7 @@ class SocketConnection:
         self._rest: memoryview | None = None
         self.connected = connected
         self.session = ""
-        self.reading = False
+        self.step = 2
         self.ended = threading.Event()
 
     def run(self) -> None:
@@ -81,18 +83,17 @@ class SocketConnection:
             wait_at_most(self.connected, socket.SO_RCVTIMEO, OPEN_S)
             wait_at_most(self.connected, socket.SO_SNDTIMEO, SEND_S)
             if self._open():
-                try:
-                    self._serve()
-                finally:
-                    self._service.left(self, self.session)
+                self._serve()
         except BlockingIOError:
             self._service.host.count("answers_dropped")
             _log.warning("session %s does not read; its connection is closed", self.session[:8])
-        except (EOFError, OSError):
-            pass
+        except (EOFError, OSError) as error:
+            _log.debug("a connection of session %s ends: %s", self.session[:8], error)
         except ProtocolError as error:
             self._refuse(error)
         finally:
+            if self.session:
+                self._service.left(self, self.session)
             self.connected.close()
             self.ended.set()
 
@@ -105,8 +106,9 @@ class SocketConnection:
         if kind != Kind.OPEN or payload or not 0 < len(header) <= NAME_CHARACTERS_MAX:
             raise ProtocolError("a connection did not say for whom it speaks")
         try:
-            self.session = header.decode("ascii")
-            self._service.admit(self, self.session)
+            session = header.decode("ascii")
+            self._service.admit(self, session)
+            self.session = session
         except (LinkError, UnicodeDecodeError) as error:
             self._refuse(error)
             return False
@@ -124,12 +126,14 @@ class SocketConnection:
 
     def _serve(self) -> None:
         receive, host = self._stream.receive, self._service.host
+        step = -1
         while True:
-            self.reading = True
+            self.step = step = step + 1
             kind, header, payload = receive()
+            self.step = step = step + 1
             if kind != Kind.MESSAGE:
                 if kind == Kind.WATCH:
-                    self.reading = False
+                    self.step = step + 1
                     SocketWatcher(self._service, self.connected).run()
                     return
                 raise ProtocolError(f"a frame of kind {kind} came in place of a request")
@@ -139,10 +143,11 @@ class SocketConnection:
                     raise ProtocolError(f"{type(message).__name__} is no request")
             except ProtocolError as error:
                 host.count("frames_refused")
+                self.step = step = step + 1
                 self._send(Refused("protocol", str(error)))
                 continue
             host.submit(cast("Request", message), self._take)
-            self.reading = False
+            self.step = step = step + 1
             self._send_answer()
 
     def _take(self, answer: Answer) -> None:

@@ -170,10 +170,13 @@ class SocketLine:
 
     def give_back(self, connection: Connection) -> None:
         """Keep a connection whose call was answered for the next one."""
-        if self._closed or len(self._idle) >= IDLE_MAX:
-            self.drop(connection)
-        else:
+        kept = len(self._idle) < IDLE_MAX
+        if kept:
             self._idle.append(connection)
+        if self._closed:  # perhaps just now, by another thread
+            self.lost(connection)
+        elif not kept:
+            self.drop(connection)
 
     def drop(self, connection: Connection) -> None:
         """Throw a connection away: its answer did not come, or made no sense."""

@@ -8,6 +8,7 @@ only that.  Where the kernel gives none, nobody is ever said to be dead.
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import select
 import socket
@@ -27,6 +28,8 @@ GROUPS_MAX: Final = 1024
 LINGER_S: Final = 5.0
 """A process closes its connections a moment before the kernel reports its end."""
 JOIN_S: Final = 0.5
+
+_log = logging.getLogger("enact.link")
 
 
 class Peer(NamedTuple):
@@ -122,10 +125,16 @@ class Deaths:
                 watched.connections += 1
                 return
             process = process_of(connection) if not self._closed else None
-            if process is not None:
-                self._watched[session] = _Watched(process)
-                self._session_of[process] = session
+            if process is None:
+                return
+            try:
                 self._poll.register(process, select.EPOLLIN)
+            except OSError as error:  # the kernel watches no more: its lease ends it
+                os.close(process)
+                _log.warning("the process of session %s is not watched: %s", session[:8], error)
+                return
+            self._watched[session] = _Watched(process)
+            self._session_of[process] = session
 
     def disconnected(self, session: str) -> None:
         """Note that one connection has ended; after the last one it is watched a little longer."""

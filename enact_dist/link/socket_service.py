@@ -13,6 +13,7 @@ import os
 import select
 import socket
 import threading
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -37,9 +38,9 @@ SESSION_CONNECTIONS_MAX: Final = 128
 BACKLOG: Final = 256
 DRAIN_ROUNDS: Final = 20
 DRAIN_STEP_S: Final = 0.001
-"""How often and how long a tick waits for requests that have arrived to be read."""
+"""How often and how long a tick waits for requests that have arrived to be handed in."""
 JOIN_S: Final = 0.5
-"""How long a closing service waits for each of its threads."""
+"""How long a closing service waits for whoever accepts, and then for all connections together."""
 
 _log = logging.getLogger("enact.link")
 
@@ -132,21 +133,23 @@ class SocketService:
             connection.end()
 
     def drain_inbox(self) -> None:
-        """Wait a moment for requests that have arrived but were not read; before a tick."""
+        """Wait a moment for requests that have arrived but that the host has not; before a tick."""
         with self._mutex:
-            reading = [c for mine in self._connections.values() for c in mine if c.reading]
-        if not reading:
-            return
+            steps = {c: c.step for mine in self._connections.values() for c in mine}
+        waiting = {c.connected.fileno(): c for c, step in steps.items() if step % 3 == 0}
+        waiting.pop(-1, None)
         poll = select.poll()
-        of = {connection.connected.fileno(): connection for connection in reading}
-        of.pop(-1, None)
-        for descriptor in of:
+        for descriptor in waiting:
             poll.register(descriptor, select.POLLIN)
-        unread = set(of)
+        arrived = [c for c, step in steps.items() if step % 3 == 1]
+        if waiting:
+            arrived += [waiting[d] for d, event in poll.poll(0) if event & select.POLLIN]
         for _ in range(DRAIN_ROUNDS):
-            ready = {d for d, event in poll.poll(0) if event & select.POLLIN and of[d].reading}
-            unread &= ready
-            if not unread or self._closing.wait(DRAIN_STEP_S):
+            arrived = [
+                c for c in arrived
+                if c.step < steps[c] // 3 * 3 + 2 and not c.ended.is_set()
+            ]  # fmt: skip
+            if not arrived or self._closing.wait(DRAIN_STEP_S):
                 return
 
     # ---------------------------------------------------------------- notices
@@ -185,8 +188,9 @@ class SocketService:
             left = [connection for mine in self._connections.values() for connection in mine]
         for connection in left:
             connection.end()
+        deadline_s = time.monotonic() + JOIN_S
         for connection in left:
-            connection.ended.wait(JOIN_S)
+            connection.ended.wait(max(0.0, deadline_s - time.monotonic()))
         self._deaths.close()
 
 

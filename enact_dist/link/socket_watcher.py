@@ -13,7 +13,7 @@ import threading
 from collections import deque
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.link.socket_frames import Kind, send_frame
+from enact_dist.link.socket_frames import Kind, prefixed
 
 if TYPE_CHECKING:
     from enact_dist.link.socket_service import SocketService
@@ -31,7 +31,8 @@ class SocketWatcher:
         self._service = service
         self._connected = connected
         self._mutex = threading.Lock()
-        self._waiting: deque[memoryview] = deque()
+        # The first that it is sent, whatever is committed at this moment.
+        self._waiting = deque([memoryview(prefixed(b"", 0, Kind.OPENED))])
         self._bell = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
 
     def put(self, frame: bytes) -> None:
@@ -63,7 +64,6 @@ class SocketWatcher:
         poll.register(self._connected, select.POLLIN)
         self._service.watch(self)
         try:
-            send_frame(self._connected, b"", kind=Kind.OPENED)
             while True:
                 poll.modify(
                     self._connected, select.POLLIN | (select.POLLOUT if self._waiting else 0)

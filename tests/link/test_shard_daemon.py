@@ -20,6 +20,7 @@ from enact_dist.core.messages import (
     Waiting,
 )
 from enact_dist.errors import ConfigError, LinkError, StoreError
+from enact_dist.link import shard_daemon
 from enact_dist.link.shard_daemon import DaemonSettings, start_shard
 from enact_dist.link.zenoh_config import close_session, open_session
 from enact_dist.wire.frames import decode_frame, encode_frame
@@ -102,6 +103,23 @@ def test_daemon_refuses_a_folder_that_another_daemon_holds(daemon, endpoint, fre
 
     with pytest.raises(StoreError, match=str(tmp_path)):
         daemon(free(), "s1", folder=tmp_path)
+
+
+def test_daemon_that_fails_at_its_last_step_lets_go_of_everything(
+    daemon, endpoint, tmp_path, monkeypatch, shared_root
+):
+    """Its folder, its endpoint and its socket can be taken by the next one at once."""
+
+    def broken(*_):
+        raise LinkError("no queryable")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(shard_daemon, "ZenohService", broken)
+        with pytest.raises(LinkError, match="no queryable"):
+            daemon(endpoint, folder=tmp_path)
+    assert list(shared_root.iterdir()) == []
+
+    assert daemon(endpoint, folder=tmp_path).host.epoch > 0
 
 
 def test_daemon_refuses_settings_without_an_endpoint(make_settings):

@@ -148,7 +148,7 @@ def test_sweep_leaves_alone_what_is_not_ours(tmp_path):
 
 def test_sweep_takes_a_folder_whose_making_was_broken_off(tmp_path):
     """An empty folder without a nonce that is a minute old was left by a process that died."""
-    old = tmp_path / "cell.s0.1"
+    old = tmp_path / "cell.s0.0123456789abcdef"
     old.mkdir()
     os.utime(old, (time.time() - 100, time.time() - 100))
 
@@ -172,3 +172,17 @@ def test_long_names_of_cell_and_shard_still_make_one_name(tmp_path):
 
     open_shared(folder.name, folder.nonce, root=tmp_path).close()
     folder.close()
+
+
+def test_folders_that_are_none_of_ours_are_left_alone(tmp_path):
+    """A root that somebody names may hold anything: an empty folder, a file that is called nonce."""
+    mine = [tmp_path / "empty", tmp_path / "a.b", tmp_path / "with_nonce"]
+    for path in mine:
+        path.mkdir()
+    (mine[2] / NONCE).write_bytes(b"x" * 16)
+    for path in mine:
+        os.utime(path, (1_000_000, 1_000_000))
+
+    SharedFolder("cell", "s0", root=tmp_path).close()
+
+    assert [path.is_dir() for path in mine] == [True, True, True]

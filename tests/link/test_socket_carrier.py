@@ -249,3 +249,56 @@ def test_folder_of_the_shard_is_the_one_of_its_welcome(daemon, carry, endpoint):
 
     assert opened.path == shard._shared.path
     opened.close()
+
+
+@over_socket
+def test_connection_that_is_given_back_while_the_line_closes_is_closed(daemon, carry, endpoint):
+    """Whoever is through with its call at that very moment leaves no descriptor open."""
+    daemon(endpoint)
+    carrier = carry(endpoint)
+    line = carrier._lines["s0"]
+    connection = line.take()
+
+    class Closing(list):
+        def append(self, given):
+            line.close()
+            super().append(given)
+
+    line._idle = Closing()
+    line.give_back(connection)
+
+    assert connection.socket.fileno() == -1
+
+
+@over_socket
+def test_size_of_slices_is_asked_while_a_shard_is_learned(daemon, carry, endpoint):
+    """A thread that fetches and one that meets a further shard do not meet."""
+    daemon(endpoint)
+    carrier = carry(endpoint)
+
+    class Learning:
+        @property
+        def problem(self):
+            carrier._lines["s9"] = carrier._lines["s0"]
+            return ""
+
+        def close(self):
+            return
+
+    carrier._lines["s8"] = Learning()
+    carrier._shards.add("s8")
+
+    assert carrier.fetch_bytes > 0
+
+
+@over_socket
+def test_call_on_a_connection_that_was_just_closed_takes_the_other_way(daemon, carry, endpoint):
+    """Another thread may close an idle connection while one takes it: nobody is shown EBADF."""
+    daemon(endpoint)
+    carrier = carry(endpoint)
+    carrier._lines["s0"]._idle[-1].socket.close()
+
+    answers = carrier.request_all([("s0", ListLocks())], timeout_s=5)
+    answers.append(carrier.request("s0", ListLocks(), timeout_s=5))
+
+    assert [type(answer) for answer in answers] == [Locks, Locks]

@@ -15,6 +15,7 @@ from enact_dist.core.messages import (
     Hello,
     ListLocks,
     Locks,
+    Notice,
     Reached,
     Refused,
     Waiting,
@@ -115,6 +116,74 @@ def test_place_of_a_connection_is_free_again_when_it_ends(raw, monkeypatch, unti
     assert isinstance(ask(raw("c"), ListLocks()), Locks)
 
 
+def test_place_of_a_client_that_left_before_its_greeting_was_answered_is_free(
+    raw, monkeypatch, until
+):
+    """A busy shard answers late, and a client waits for half a second only: nothing stays counted."""
+    service, admit = raw.shard._sockets, socket_service.SocketService.admit
+    nears = [raw("hasty", greet=False) for _ in range(3)]
+    left = []
+
+    def admit_late(served, connection, session):
+        admit(served, connection, session)
+        for near in nears:
+            near.close()
+        left.append(session)
+
+    monkeypatch.setattr(socket_service.SocketService, "admit", admit_late)
+    for near in nears:
+        send_frame(near, b"hasty", kind=Kind.OPEN)
+
+    until(lambda: len(left) == 3)
+    until(lambda: service._count == 0)
+    assert service._connections == {}
+    assert service._deaths._watched["hasty"].connections == 0
+
+
+def test_kernel_that_watches_no_more_processes_costs_nobody_a_connection(raw, monkeypatch, until):
+    """Then a death is noticed by the end of the lease, as over a network."""
+    service = raw.shard._sockets
+
+    class Full:
+        def register(self, *_):
+            raise OSError(28, "No space left on device")
+
+    real, service._deaths._poll = service._deaths._poll, Full()
+    try:
+        near = raw("unwatched")
+        assert isinstance(ask(near, ListLocks()), Locks)
+    finally:
+        service._deaths._poll = real
+    near.close()
+
+    until(lambda: service._count == 0)
+    assert service._deaths._watched == {}
+
+
+def test_request_that_was_read_is_handled_before_the_tick(raw, monkeypatch):
+    """What a thread has taken from its socket and not handed in yet has arrived, too."""
+    service, host = raw.shard._sockets, raw.shard.host
+    decoding, go_on, decode = threading.Event(), threading.Event(), decode_frame
+
+    def decode_slowly(*frame):
+        decoding.set()
+        assert go_on.wait(5)  # as if the interpreter let others run first
+        return decode(*frame)
+
+    monkeypatch.setattr(socket_connection, "decode_frame", decode_slowly)
+    monkeypatch.setattr(socket_service, "DRAIN_ROUNDS", 5000)
+    send_frame(raw(), encode_frame(ListLocks())[0])
+    assert decoding.wait(5)
+    handed_in, found = host._handles, []
+    drain = threading.Thread(target=lambda: (service.drain_inbox(), found.append(host._handles)))
+    drain.start()
+    time.sleep(0.02)  # an empty drain would be over
+    go_on.set()
+    drain.join()
+
+    assert found == [handed_in + 1]
+
+
 def test_shard_serves_no_stranger(raw):
     """A peer that is neither the shard's user nor root gets no connection."""
     raw.shard._sockets._users = frozenset((123_456,))
@@ -198,6 +267,26 @@ def test_watcher_that_does_not_read_delays_no_commit(raw, make_peer, monkeypatch
     assert counters(raw.shard)["notices_dropped"] > 0
 
 
+def test_watcher_is_welcomed_before_its_first_notice(raw, monkeypatch):
+    """A commit at that very moment does not come in place of the answer to its request."""
+    watch = socket_service.SocketService.watch
+    notice = Notice("s0", raw.shard.host.epoch, 1, ())
+
+    def watch_and_publish(service, watcher):
+        watch(service, watcher)
+        service._publish(notice)
+
+    monkeypatch.setattr(socket_service.SocketService, "watch", watch_and_publish)
+    near = raw("watcher")
+    stream = Stream(near)
+    send_frame(near, b"", kind=Kind.WATCH)
+
+    first, second = stream.receive(), stream.receive()
+
+    assert (first[0], second[0]) == (Kind.OPENED, Kind.MESSAGE)
+    assert decode_frame(*second[1:]) == notice
+
+
 def _write(peer, writer, stream, number):
     granted = peer.acquire("cup")
     from enact_dist.core.datum import Datum, Slot
@@ -209,3 +298,15 @@ def _write(peer, writer, stream, number):
     send_frame(writer, header, [payload])
     _, header, payload = stream.receive()
     return decode_frame(header, payload)
+
+
+def test_service_ends_in_time_though_its_threads_do_not(raw, monkeypatch):
+    """Connections that cannot be ended share one time to end; a signal has to be over in 2 s."""
+    monkeypatch.setattr(socket_connection.SocketConnection, "end", lambda _: None)
+    kept = [raw(f"stubborn{number}") for number in range(6)]
+    started_s = time.monotonic()
+
+    raw.shard._sockets.close()
+
+    assert time.monotonic() - started_s < 1.6
+    assert len(kept) == 6
