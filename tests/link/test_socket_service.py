@@ -122,19 +122,21 @@ def test_place_of_a_client_that_left_before_its_greeting_was_answered_is_free(
     """A busy shard answers late, and a client waits for half a second only: nothing stays counted."""
     service, admit = raw.shard._sockets, socket_service.SocketService.admit
     nears = [raw("hasty", greet=False) for _ in range(3)]
-    left = []
+    left, gone = [], threading.Event()
 
     def admit_late(served, connection, session):
         admit(served, connection, session)
-        for near in nears:
-            near.close()
         left.append(session)
+        assert gone.wait(5)
 
     monkeypatch.setattr(socket_service.SocketService, "admit", admit_late)
     for near in nears:
         send_frame(near, b"hasty", kind=Kind.OPEN)
-
     until(lambda: len(left) == 3)
+    for near in nears:
+        near.close()
+    gone.set()
+
     until(lambda: service._count == 0)
     assert service._connections == {}
     assert service._deaths._watched["hasty"].connections == 0
