@@ -19,6 +19,9 @@ if TYPE_CHECKING:
     from enact_dist.core.messages import AspectEntry, Finish, Item, Prepare, WriteItem
     from enact_dist.core.records import PreparedRecord
 
+NO_PAYLOAD: Final = "no_payload"
+"""The code of a refusal that leaves the lock as it is: named bytes are not here, send them."""
+
 _ACCESSES: Final = frozenset(access.value for access in Access)
 _DURABILITIES: Final = ("", *(durability.value for durability in Durability))
 
@@ -64,6 +67,19 @@ def wrong_writes(writes: Iterable[WriteItem]) -> Refused | None:
         if write.slot in seen:
             return _refused(f"{write.slot} is written twice in one commit")
         seen.add(write.slot)
+    return None
+
+
+def missing_payload(writes: Iterable[WriteItem]) -> Refused | None:
+    """Refuse a write whose bytes lie in a payload that the link has not found."""
+    for write in writes:
+        datum = write.datum
+        if datum is not None and len(datum.body) != datum.size:
+            return Refused(
+                NO_PAYLOAD,
+                f"{write.slot} was written as payload {datum.file} of {datum.size} bytes, which"
+                " this shard does not have; send the bytes",
+            )
     return None
 
 

@@ -28,7 +28,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.core.admission import wrong_name, wrong_parties, wrong_writes
+from enact_dist.core.admission import (
+    NO_PAYLOAD,
+    missing_payload,
+    wrong_name,
+    wrong_parties,
+    wrong_writes,
+)
 from enact_dist.core.datum import Position, Slot
 from enact_dist.core.messages import (
     OUTCOME_COMMITTED,
@@ -179,7 +185,12 @@ class Commits:
             return
         refusal = self.refusal(message, tenure, wall_ns=wall_ns)
         if refusal is not None:
-            if isinstance(refusal, Refused) and tenure is not None and not tenure.bound:
+            if (
+                isinstance(refusal, Refused)
+                and refusal.code != NO_PAYLOAD
+                and tenure is not None
+                and not tenure.bound
+            ):
                 # For good: a late copy must not find the lock again at another time of day.
                 yield from self._tenures.take_away(tenure, refusal.text, now_ns=now_ns)
             yield Reply(reply_to, refusal)
@@ -357,7 +368,7 @@ class Commits:
                 f"the client has seen a commit stamped {ahead_s:.1f} s ahead of the clock of shard"
                 f" {self._shard}; at most 1 s is accepted; set the clocks of both hosts",
             )
-        return None
+        return missing_payload(message.writes)
 
     def _fence(
         self, lock: LockId, token: Token, tenure: Tenure | None

@@ -66,12 +66,16 @@ class Datum:
     Attributes:
         encoding: How `wire` reads the body (msgpack, a few bytes up to some kB).
         body: `size` bytes that nobody changes any more; a memoryview may lie over a mapped file.
+            Empty where only `file` says where they are.
         size: Length of the body in bytes.
         stamp_ns: When the datum was captured, nanoseconds since 1970 by the actor's clock; 0
             where the actor did not say.
+        file: Name of the payload at the slot's shard that holds these bytes, so that they need
+            not travel with a message ("": none).
     """
 
     encoding: bytes
     body: bytes | memoryview
     size: int
     stamp_ns: int = 0
+    file: str = ""

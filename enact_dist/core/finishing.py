@@ -12,7 +12,7 @@ every answer can be had again.  After the commit was sent, only the primary know
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from enact_dist.core.datum import Token
@@ -82,10 +82,30 @@ class Finishing:
             tuple(sorted(self.prepared)),
         )
 
+    def unname(self) -> bool:
+        """Let the bytes travel with the messages from now on; say whether any did not so far."""
+        named = [write for writes in self.writes.values() for write in writes if _is_named(write)]
+        self.writes = {
+            shard: tuple(
+                write._replace(datum=replace(write.datum, file=""))
+                if write.datum is not None and _is_named(write)
+                else write
+                for write in writes
+            )
+            for shard, writes in self.writes.items()
+        }
+        return bool(named)
+
     @property
     def token(self) -> Token:
         """The grant that the commit is compared with."""
         return self.tokens[self.primary]
+
+
+def _is_named(write: WriteItem) -> bool:
+    """Whether a write names a payload whose bytes are here, too."""
+    datum = write.datum
+    return datum is not None and bool(datum.file) and len(datum.body) == datum.size
 
 
 def tokens_of(

@@ -286,6 +286,22 @@ class Commit:
 
 
 @dataclass(frozen=True, slots=True)
+class Stage:
+    """Bring a payload to the shard apart from the commit that will name it.  Answer: `Staged`.
+
+    The first one, at offset 0 and without a body, makes room for `total` bytes: on the same host
+    the client then fills the shard's file by itself.  Where it cannot, slices follow, in order or
+    again.  A total of 0 gives the payload up.  Answered by the shard's link, not by its core.
+    """
+
+    session: str
+    file: str
+    offset: int
+    total: int
+    body: Datum
+
+
+@dataclass(frozen=True, slots=True)
 class Outcome:
     """Ask what became of a commit.  Answer: `OutcomeIs`."""
 
@@ -548,6 +564,18 @@ class Committed:
 
 
 @dataclass(frozen=True, slots=True)
+class Staged:
+    """So much of a payload has come in slices, from its begin on, without a hole.
+
+    `shared` says that it is a file in the shard's folder, to be filled there, too.
+    """
+
+    file: str
+    have: int
+    shared: bool
+
+
+@dataclass(frozen=True, slots=True)
 class Fenced:
     """The lock is no longer held (or never was in this epoch); nothing was written."""
 
@@ -756,6 +784,7 @@ Request = (
     | Break
     | ForceAbort
     | ListAudit
+    | Stage
 )
 Answer = (
     Welcome
@@ -782,6 +811,7 @@ Answer = (
     | Sessions
     | Broken
     | Audited
+    | Staged
     | EpochChanged
     | WrongShard
     | Refused

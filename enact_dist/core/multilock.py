@@ -23,6 +23,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
+from enact_dist.core.admission import NO_PAYLOAD
 from enact_dist.core.cuts import ROUNDS_MAX, Cut
 from enact_dist.core.finishing import Finishing, tokens_of
 from enact_dist.core.lock_parts import Part, Plan, Reading
@@ -193,6 +194,8 @@ class MultiLock:
             self.silent_shard = ""
         self._retry_ns = RETRY_NS_MIN
         if isinstance(answer, Refused):
+            if answer.code == NO_PAYLOAD and self._finishing and self._finishing.unname():
+                return  # asked again, with the bytes
             self._end(Phase.REFUSED)
             self.refusal = answer
         elif isinstance(answer, WrongShard):

@@ -39,9 +39,11 @@ from enact_dist.core.messages import (
     Outcome,
     Prepare,
     Reached,
+    Refused,
     Register,
     Release,
     Resolve,
+    Stage,
     Survey,
     TakeView,
     Validate,
@@ -112,6 +114,7 @@ class Shard:
             ListSessions: self._on_list_sessions,
             Break: self._on_break,
             ListAudit: self._on_list_audit,
+            Stage: self._on_stage,
             Persisted: self._on_persisted,
             Tick: self._on_tick,
             Drain: self._on_drain,
@@ -302,6 +305,9 @@ class Shard:
         kept = self.state.audit.keep(AuditRecord(self.state.wall_ns, text, BROKEN))
         yield Persist(0, (kept,), Durability.OS)
         yield Reply(reply_to, Broken(True, holder))
+
+    def _on_stage(self, _: Stage, reply_to: int) -> Iterator[Effect]:
+        yield Reply(reply_to, Refused("value", "this shard takes no data ahead of their commit"))
 
     def _on_list_audit(self, message: ListAudit, reply_to: int) -> Iterator[Effect]:
         audit = self.state.audit

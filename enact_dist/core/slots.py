@@ -167,7 +167,7 @@ class SlotMap:
                 if content.datum is None and each:
                     continue
                 state = state_of(slot, content, known=item.known, inline_max=left)
-                left -= state.datum.size if state.datum is not None else 0
+                left -= state.size if state.datum is not None and not state.large else 0
                 shown.states.append(state)
                 if content.datum is not None and (state.large or state.same):
                     shown.pins[slot, state.version] = content.datum
@@ -193,7 +193,9 @@ def state_of(
     if same or not with_datum:
         shown = None
     else:
-        shown = replace(datum, body=b"", size=0) if large else datum
+        # A payload's name tells a client of this host where to look; the size belongs to it.
+        size = datum.size if datum.file else 0
+        shown = replace(datum, body=b"", size=size) if large else datum
     return SlotState(
         slot,
         content.version,

@@ -26,7 +26,15 @@ import threading
 from collections import deque
 from typing import TYPE_CHECKING, Final, cast
 
-from enact_dist.core.messages import Acquire, AwaitStamp, Hello, Refused
+from enact_dist.core.messages import (
+    Acquire,
+    AwaitStamp,
+    Commit,
+    Hello,
+    Prepare,
+    Refused,
+    Stage,
+)
 from enact_dist.core.records import (
     Call,
     Called,
@@ -42,6 +50,7 @@ from enact_dist.core.records import (
 from enact_dist.core.shard import Shard
 from enact_dist.errors import StoreError
 from enact_dist.link.clock import Clock, SystemClock
+from enact_dist.link.payload_desk import PayloadDesk
 from enact_dist.link.uninterrupted import Uninterrupted
 
 if TYPE_CHECKING:
@@ -58,6 +67,8 @@ TICK_S_MAX: Final = 0.1
 """The timer wakes at least so often: bounds by how much an expiry may be late."""
 TICK_S_MIN: Final = 0.001
 """The timer rests at least so long; deadlines of many locks then share one tick."""
+PAYLOAD_BYTES_MAX: Final = 2 << 30
+"""Bytes of large data in plain memory that wait for their commits, or came apart from them."""
 PARKED_MAX: Final = 100_000
 """Requests that may wait for their answers at one time."""
 JOIN_S: Final = 0.5
@@ -100,6 +111,7 @@ class ShardHost:
         clock: Read under the mutex, so the shard's time never goes back.
         on_failure: Called once, from whichever thread, when the store or the core has failed;
             the host is dead then and answers nobody.
+        payloads: Takes large data that come apart from their commits.
     """
 
     def __init__(
@@ -109,10 +121,12 @@ class ShardHost:
         store: Store | None = None,
         clock: Clock | None = None,
         on_failure: Callable[[Exception], None] | None = None,
+        payloads: PayloadDesk | None = None,
     ) -> None:
         self._shard = shard
         self._clock: Clock = clock or SystemClock()
         self._on_failure = on_failure
+        self._payloads = payloads or PayloadDesk(None, PAYLOAD_BYTES_MAX)
         self._mutex = threading.RLock()  # reentrant for `count` in reply callbacks only
         self._uninterrupted = Uninterrupted()
         self._replies: dict[int, Callable[[Answer], None]] = {}
@@ -162,6 +176,12 @@ class ShardHost:
 
         It is never called when the host ends or fails first: no answer means *unknown*.
         """
+        kind = type(message)
+        if kind is Commit or kind is Prepare:
+            message = self._payloads.with_bodies(cast("Commit", message))
+        elif kind is Stage:
+            reply(self._payloads.stage(cast("Stage", message)))
+            return
         with self._mutex:
             if self._ended:
                 return
@@ -283,6 +303,8 @@ class ShardHost:
         """Take what has arrived, then let time pass; return when the next tick is due, in ns."""
         for drain in self._inboxes:
             drain()
+        sessions, tenures = self._shard.state.sessions, self._shard.state.tenures
+        self._payloads.sweep(sessions.by_id.__contains__, tenures.by_session.__contains__)
         with self._mutex:
             if not self._ended:
                 self._handle(Tick(), 0)

@@ -211,7 +211,7 @@ def size_of(answer: Answer) -> int:
 
 def _size_of_states(answer: Granted | Viewed) -> int:
     return sum(
-        SURVEYED_BYTES + (state.datum.size if state.datum is not None else 0)
+        SURVEYED_BYTES + (state.size if state.datum is not None and not state.large else 0)
         for state in answer.states
     )
 

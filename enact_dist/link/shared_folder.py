@@ -78,6 +78,11 @@ class Access:
         return 0o600 if self.group is None else 0o660
 
     @property
+    def draft_mode(self) -> int:
+        """Mode of a file that clients fill."""
+        return 0o600 if self.group is None else 0o660
+
+    @property
     def file_mode(self) -> int:
         """Mode of a file that clients read."""
         return 0o400 if self.group is None else 0o440

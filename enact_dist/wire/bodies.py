@@ -17,12 +17,13 @@ from enact_dist.wire.limits import (
     ENCODING_BYTES_MAX,
     INTEGER_MAX,
     PAYLOAD_BYTES_MAX,
+    PAYLOAD_NAME,
     SMALL_BODY_BYTES,
     aligned,
 )
 
 _PADDING: Final = bytes(ALIGNMENT)
-_DATUM: Final = (bytes, int, int, int)
+_DATUM: Final = (bytes, int, int, int, str)
 
 
 class BodyWriter:
@@ -34,19 +35,22 @@ class BodyWriter:
         self.parts: list[bytes | memoryview] = []
         self._end = 0
 
-    def add(self, datum: Datum) -> tuple[bytes, int, int, int]:
+    def add(self, datum: Datum) -> tuple[bytes, int, int, int, str]:
         """Take a datum's body; return what stands for the datum in the header.
 
         Raises:
             ProtocolError: The datum contradicts itself, or the payload is over its limit.
         """
         size = datum.size
+        if datum.file:
+            _check_file(datum.file, size)
+            return datum.encoding, 0, size, datum.stamp_ns, datum.file
         if not 0 <= size <= BODY_BYTES_MAX or len(datum.body) != size:
             raise ProtocolError(
                 f"a datum said to have {size} bytes has {len(datum.body)}; at most {BODY_BYTES_MAX}"
             )
         if not size:
-            return datum.encoding, 0, 0, datum.stamp_ns
+            return datum.encoding, 0, 0, datum.stamp_ns, ""
         start = aligned(self._end)
         if start + size > PAYLOAD_BYTES_MAX:
             raise ProtocolError(
@@ -56,7 +60,7 @@ class BodyWriter:
             self.parts.append(_PADDING[: start - self._end])
         self._end = start + size
         self.parts.append(datum.body)
-        return datum.encoding, start, size, datum.stamp_ns
+        return datum.encoding, start, size, datum.stamp_ns, ""
 
 
 class BodyReader:
@@ -76,11 +80,14 @@ class BodyReader:
         """
         if type(raw) is not tuple or tuple(map(type, raw)) != _DATUM:
             raise ProtocolError(f"a datum came as {reprlib.repr(raw)}")
-        encoding, offset, size, stamp_ns = raw
+        encoding, offset, size, stamp_ns, file = raw
         if len(encoding) > ENCODING_BYTES_MAX + 1 or not 0 <= stamp_ns <= INTEGER_MAX:
             raise ProtocolError(
                 f"a datum has an encoding of {len(encoding)} bytes and the stamp {stamp_ns}"
             )
+        if file:
+            _check_file(file, size, offset)
+            return Datum(encoding, b"", size, stamp_ns, file)
         if size == 0 == offset:
             return Datum(encoding, b"", 0, stamp_ns)
         start, end = aligned(self.end), offset + size
@@ -105,3 +112,11 @@ class BodyReader:
             return payload if type(payload) is bytes else memoryview(payload).toreadonly()
         part = memoryview(payload)[start:end]
         return bytes(part) if end - start < SMALL_BODY_BYTES else part.toreadonly()
+
+
+def _check_file(file: str, size: int, offset: int = 0) -> None:
+    """Raise `ProtocolError` unless this can be a payload that lies at a shard."""
+    if not PAYLOAD_NAME.match(file) or offset or not 0 < size <= BODY_BYTES_MAX:
+        raise ProtocolError(
+            f"a datum of {size} bytes at {offset} names {reprlib.repr(file)} as its payload"
+        )

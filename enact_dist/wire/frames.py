@@ -2,7 +2,8 @@
 
 A frame's header is the array ``[version, code, field, …]`` with the fields of the message in the
 order of its class; a NamedTuple is the array of its fields.  A datum is ``[encoding, offset,
-size, stamp_ns]``, and its body stands in the payload at `offset`.
+size, stamp_ns, file]``, and its body stands in the payload at `offset`; where `file` names a
+payload of the shard, no byte of it stands in the frame.
 
 Rules to keep: a code is never used again for another message; what is received is checked whole
 (every type, every length, nothing left over) before a message exists; only `ProtocolError` leaves,
@@ -52,6 +53,7 @@ CODES: Final[dict[type[Any], int]] = {
     m.Resolve: 19,
     m.ForceAbort: 20,
     m.ListAudit: 21,
+    m.Stage: 22,
     m.Welcome: 33,
     m.Registered: 34,
     m.Granted: 35,
@@ -79,6 +81,7 @@ CODES: Final[dict[type[Any], int]] = {
     m.Finished: 57,
     m.Resolved: 58,
     m.Audited: 59,
+    m.Staged: 60,
     m.Notice: 97,
 }
 

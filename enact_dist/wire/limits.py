@@ -6,13 +6,14 @@ Rule to keep: raising a limit is compatible, lowering one makes stored data unre
 
 from __future__ import annotations
 
+import re
 from typing import Final
 
 from enact_dist.terms import NAME_LENGTH_MAX
 
-FRAME_VERSION: Final = 4
+FRAME_VERSION: Final = 5
 """Version of the frames; both ends must speak the same.  2: commits over shards; 3: a WELCOME
-names shared memory."""
+names shared memory; 5: a datum may name a payload in place of its bytes."""
 DATUM_VERSION: Final = 1
 """Version of the encoding of data; these are stored, so old versions stay readable."""
 
@@ -26,6 +27,9 @@ BODY_BYTES_MAX: Final = 1 << 30
 PAYLOAD_BYTES_MAX: Final = BODY_BYTES_MAX + (16 << 20)
 """Longest frame payload: one largest body, or many small ones with their padding."""
 
+PAYLOAD_NAME: Final = re.compile(r"[0-9A-Za-z_]{1,64}-[0-9a-f]{1,16}\Z")
+"""What a payload is called at its shard: the session that made it and a number, never used again;
+both ends check it, since it becomes the name of a file."""
 NAME_CHARACTERS_MAX: Final = NAME_LENGTH_MAX
 """Longest name of a context, entity, aspect, shard, session, actor or host."""
 TEXT_BYTES_MAX: Final = 64 << 10

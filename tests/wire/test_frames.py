@@ -53,7 +53,7 @@ def test_frame_header_is_an_array_of_version_code_and_fields():
     """The documented layout, byte by byte: another language depends on it."""
     header, payload = encode_frame(m.Validate(LOCK, Token(9, 1)))
 
-    assert header == bytes([0x95, 4, 9, 0x93, 0xA6]) + b"a1b2c3" + bytes([3, 17, 0x92, 9, 1, 0x90])
+    assert header == bytes([0x95, 5, 9, 0x93, 0xA6]) + b"a1b2c3" + bytes([3, 17, 0x92, 9, 1, 0x90])
     assert payload is None
 
 
@@ -70,7 +70,8 @@ def test_frame_codes_stand_still():
         ("Committed", 42), ("Fenced", 43), ("OutcomeIs", 44), ("Valid", 45), ("Released", 46),
         ("Reached", 47), ("Surveyed", 48), ("Locks", 49), ("Sessions", 50), ("Broken", 51),
         ("EpochChanged", 52), ("WrongShard", 53), ("Refused", 54), ("Changed", 55),
-        ("ForceAbort", 20), ("ListAudit", 21), ("Audited", 59), ("Notice", 97),
+        ("ForceAbort", 20), ("ListAudit", 21), ("Stage", 22), ("Audited", 59), ("Staged", 60),
+        ("Notice", 97),
     }  # fmt: skip
 
 
@@ -133,3 +134,13 @@ def test_frame_refuses_to_send_what_cannot_be_read(message):
     """The sender learns of its own mistake, as a ProtocolError."""
     with pytest.raises(ProtocolError):
         encode_frame(message)
+
+
+def test_frame_names_a_payload_in_place_of_its_bytes():
+    """A datum with a file travels by name: its size is told, and none of its bytes."""
+    named = Datum(b"\x01\x00", b"x" * 100, 100, 5, "a1b2c3-1f")
+
+    header, payload = encode_frame(m.Commit(LOCK, Token(1, 1), (m.WriteItem(SLOT, named),), 0))
+
+    assert payload is None
+    assert decode_frame(header).writes[0].datum == Datum(b"\x01\x00", b"", 100, 5, "a1b2c3-1f")

@@ -168,7 +168,7 @@ def test_frame_with_data_that_nobody_claims_is_refused():
 )
 def test_frame_with_a_body_elsewhere_is_refused(offset, size):
     """A body is exactly where the next one must be; claims beyond the payload take no memory."""
-    write = [list(SLOT), [b"\x01\x00", offset, size, 0]]
+    write = [list(SLOT), [b"\x01\x00", offset, size, 0, ""]]
 
     with pytest.raises(ProtocolError):
         decode_frame(header_of(7, list(LOCK), [1, 1], [write], 0, [], []), b"x" * 100)
@@ -176,7 +176,7 @@ def test_frame_with_a_body_elsewhere_is_refused(offset, size):
 
 def test_frame_bodies_cannot_overlap():
     """Two data never share bytes: a small payload cannot stand for a large one."""
-    write = [list(SLOT), [b"\x01\x00", 0, 100, 0]]
+    write = [list(SLOT), [b"\x01\x00", 0, 100, 0, ""]]
 
     with pytest.raises(ProtocolError, match="expected at 128"):
         decode_frame(header_of(7, list(LOCK), [1, 1], [write, write], 0, [], []), b"x" * 100)
@@ -238,3 +238,25 @@ def test_frame_nested_without_end_is_refused():
     for mark in (b"\x91", b"\xdc\x00\x01"):
         with pytest.raises(ProtocolError):
             decode_frame(bytes([0x92, VERSION]) + mark * 100_000)
+
+
+@pytest.mark.parametrize(
+    ("file", "offset", "size"),
+    [
+        ("../a1-1", 0, 100),
+        ("a1-1/x", 0, 100),
+        ("a1-1\n", 0, 100),
+        ("a1-g", 0, 100),
+        ("-1", 0, 100),
+        ("a1-1", 64, 100),
+        ("a1-1", 0, 0),
+        ("a1-1", 0, -1),
+        ("a1-1", 0, (1 << 30) + 1),
+    ],
+)
+def test_frame_with_a_payload_that_cannot_be_is_refused(file, offset, size):
+    """The name becomes the name of a file, and the size the length of a map."""
+    write = [list(SLOT), [b"\x01\x00", offset, size, 0, file]]
+
+    with pytest.raises(ProtocolError, match="payload"):
+        decode_frame(header_of(7, list(LOCK), [1, 1], [write], 0, [], []))

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from enact_dist.core.datum import Datum
 from enact_dist.wire.frames import CODES
+from enact_dist.wire.limits import PAYLOAD_NAME
 
 CLASSES = sorted(CODES, key=CODES.__getitem__)
 INTEGERS = (0, 1, 127, 128, 255, 65_536, 1 << 31, 1_763_000_000_123_456_789, (1 << 63) - 1, -1)
@@ -38,12 +39,21 @@ def messages(kind):
         return st.lists(messages(typing.get_args(kind)[0]), max_size=3).map(tuple)
     if kind is Datum:
         bodies = st.binary(max_size=200) | st.sampled_from([b"", b"x" * 64, b"y" * 65_600])
-        return st.builds(
+        here = st.builds(
             lambda encoding, body, stamp_ns: Datum(encoding, body, len(body), stamp_ns),
             st.binary(max_size=100),
             bodies,
             st.integers(0, 2**63 - 1),
         )
+        named = st.builds(
+            Datum,
+            st.binary(max_size=100),
+            st.just(b""),
+            st.integers(1, 1 << 30),
+            st.integers(0, 2**63 - 1),
+            st.from_regex(PAYLOAD_NAME, fullmatch=True),
+        )
+        return here | named
     if kind is int:
         return st.integers(-(2**63), 2**63 - 1) | st.sampled_from(INTEGERS)
     if kind is str:
@@ -65,6 +75,8 @@ def sample(kind, random):
     if typing.get_origin(kind) is tuple:
         return tuple(sample(typing.get_args(kind)[0], random) for _ in range(random.randint(1, 3)))
     if kind is Datum:
+        if random.random() < 0.2:
+            return Datum(random.randbytes(5), b"", 100_000, 7, f"{'5f' * 16}-1f")
         body = random.randbytes(random.choice((0, 1, 64, 100)))
         return Datum(random.randbytes(5), body, len(body), random.choice(INTEGERS[:-1]))
     if kind is bytes:

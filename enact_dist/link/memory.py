@@ -1,0 +1,185 @@
+"""Files mapped into memory, each for as long as somebody looks at its bytes.
+
+A body over a map is a plain memoryview; when the last view, slice or array over it is gone, the
+pages are given back.  That costs the kernel up to 0.2 ms per MB, so a thread of its own does it
+for large ones.  Python's own `mmap` would keep a descriptor for each map (before 3.13).
+"""
+
+from __future__ import annotations
+
+import ctypes
+import mmap
+import os
+import queue
+import threading
+from functools import cache
+from typing import TYPE_CHECKING, Any, Final
+
+from enact_dist.wire.limits import BODY_BYTES_MAX
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+AT_ONCE_BYTES: Final = 256 << 10
+"""Up to this size a map is given back by whoever drops it: waking a thread costs more."""
+_FAILED: Final = ctypes.c_void_p(-1).value
+_MAP_FIXED: Final = 0x10
+
+
+class Pages(ctypes.Union):
+    """A map of a file; its memory is what a memoryview of this shows.
+
+    Only `map_file` makes them.  The declared length is the longest possible: `body_of` cuts it.
+    """
+
+    _fields_ = (("bytes", ctypes.c_ubyte * BODY_BYTES_MAX),)
+
+    address: int
+    size: int
+    ended: Callable[[], None] | None
+
+    def __del__(self) -> None:
+        if self.size <= AT_ONCE_BYTES:
+            _unmap(self.address, self.size, self.ended)
+        else:
+            _leftovers.later(_unmap, self.address, self.size, self.ended)
+
+
+class Plain(bytearray):
+    """Memory of this process alone, with the same end as `Pages`."""
+
+    size: int
+    ended: Callable[[], None] | None
+
+    def __del__(self) -> None:
+        if self.ended is not None:
+            self.ended()
+
+
+def plain_memory(size: int, *, ended: Callable[[], None] | None = None) -> Plain:
+    """Return `size` bytes of this process; `ended` is called when nobody looks at them any more."""
+    plain = Plain(size)
+    plain.size, plain.ended = size, ended
+    return plain
+
+
+def map_file(
+    descriptor: int, size: int, *, writable: bool, ended: Callable[[], None] | None = None
+) -> Pages:
+    """Map a file of at least `size` bytes, shared with whoever else maps it.
+
+    Args:
+        descriptor: Of the file; may be closed afterwards.
+        size: How many bytes, at least 1.
+        writable: Whether the memory may be changed; that needs a descriptor for writing, too.
+        ended: Called when the pages were given back, from any thread; must not raise.
+
+    Raises:
+        OSError: As the system reports it.
+    """
+    protection = mmap.PROT_READ | (mmap.PROT_WRITE if writable else 0)
+    address = _map(None, size, protection, mmap.MAP_SHARED, descriptor)
+    pages = Pages.from_address(address)
+    pages.address, pages.size, pages.ended = address, size, ended
+    if size > AT_ONCE_BYTES:
+        _leftovers.start()
+    return pages
+
+
+def body_of(pages: Pages | Plain) -> memoryview:
+    """Return the bytes; they last as long as this or any view made of it."""
+    return memoryview(pages).cast("B")[: pages.size]
+
+
+def withdraw(pages: Pages, descriptor: int) -> None:
+    """Cut a writable map off its file: what is written to it from now on stays in this process.
+
+    Arrays over it keep their content; a stray write to one neither changes the file nor crashes.
+
+    Raises:
+        OSError: As the system reports it.
+    """
+    protection = mmap.PROT_READ | mmap.PROT_WRITE
+    flags = mmap.MAP_PRIVATE | _MAP_FIXED
+    _map(pages.address, pages.size, protection, flags, descriptor)
+
+
+@cache
+def _system() -> Any:
+    library = ctypes.CDLL(None, use_errno=True)
+    library.mmap.restype = ctypes.c_void_p
+    library.mmap.argtypes = (
+        ctypes.c_void_p,
+        ctypes.c_size_t,
+        ctypes.c_int,
+        ctypes.c_int,
+        ctypes.c_int,
+        ctypes.c_long,
+    )
+    library.munmap.argtypes = (ctypes.c_void_p, ctypes.c_size_t)
+    return library
+
+
+def _map(address: int | None, size: int, protection: int, flags: int, descriptor: int) -> int:
+    found: int = _system().mmap(address, size, protection, flags, descriptor, 0)
+    if found == _FAILED:
+        code = ctypes.get_errno()
+        raise OSError(code, os.strerror(code))
+    return found
+
+
+def _unmap(address: int, size: int, ended: Callable[[], None] | None) -> None:
+    _system().munmap(address, size)
+    if ended is not None:
+        ended()
+
+
+class Leftovers:
+    """Does in a thread of its own what nobody should wait for."""
+
+    def __init__(self) -> None:
+        self._tasks: queue.SimpleQueue[tuple[Callable[..., None], tuple[Any, ...]]] = (
+            queue.SimpleQueue()
+        )
+        self._mutex = threading.Lock()
+        self._thread: threading.Thread | None = None
+
+    def start(self) -> None:
+        """Make sure that the thread runs."""
+        if self._thread is None:
+            with self._mutex:
+                if self._thread is None:
+                    self._thread = threading.Thread(
+                        target=self._run, name="enact-leftovers", daemon=True
+                    )
+                    self._thread.start()
+
+    def later(self, task: Callable[..., None], *arguments: object) -> None:
+        """Leave a task to the thread; may be called from a destructor."""
+        self._tasks.put((task, arguments))
+
+    def wait(self, timeout_s: float) -> bool:
+        """Wait until all that was left so far is done; False after `timeout_s`."""
+        self.start()
+        done = threading.Event()
+        self.later(done.set)
+        return done.wait(timeout_s)
+
+    def forget(self) -> None:
+        """Begin anew in a forked child: the thread and its tasks are the parent's."""
+        self.__init__()  # type: ignore[misc]  # the same object stays in everybody's hands
+
+    def _run(self) -> None:
+        while True:
+            task, arguments = self._tasks.get()
+            task(*arguments)
+            del task, arguments
+
+
+_leftovers = Leftovers()
+os.register_at_fork(after_in_child=_leftovers.forget)
+
+
+def leftovers() -> Leftovers:
+    """Return what does the leftovers of this process."""
+    return _leftovers

@@ -1,0 +1,301 @@
+"""Payloads at a shard: large data that came, or were made, apart from the commit that names them.
+
+::
+
+    Stage(total) ──> draft ── filled by a client of this host in the shared folder,
+                       │      or by slices that come in Stage messages
+    Commit, Prepare ───┴──> adopted: read-only, its bytes become the body of the datum
+    last datum gone ──────> the file is removed; whoever has it mapped keeps its content
+
+The desk stands in front of the shard: the core sees bodies and never learns where they lie.  A
+payload lasts as long as somebody looks at its bytes, and a draft as long as its client.
+
+Rules that a change must keep:
+
+- A name is used once.  Nobody is told of a payload before its commit stands, so no half-filled one
+  is ever read.
+- What is counted against the cap is counted until the file is gone, and before it is made.
+- A client that still has a draft mapped for writing could change it after the commit.  Ours cuts
+  itself off first; a hostile one runs as the same user or group, who could do worse.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+import time
+import weakref
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING, Final, TypeVar
+
+from enact_dist.core.messages import Refused, Staged
+from enact_dist.link.memory import Pages, Plain, body_of, leftovers, map_file, plain_memory
+from enact_dist.wire.limits import BODY_BYTES_MAX, PAYLOAD_NAME
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from enact_dist.core.datum import Datum
+    from enact_dist.core.messages import Commit, Prepare, Stage, WriteItem
+    from enact_dist.link.shared_folder import SharedFolder
+
+    _Written = TypeVar("_Written", Commit, Prepare)
+
+PAYLOAD_BYTES_MIN: Final = 64 << 10
+"""Smaller data travel with their commit and their grant."""
+NO_ROOM: Final = "no_room"
+"""The code of a refusal because of the cap."""
+DRAFT_S: Final = 30.0
+"""A draft of a session that holds no lock is given up after so long without a slice."""
+ROOM_S: Final = 1.0
+"""How long a new draft waits for files that are on their way out."""
+
+_log = logging.getLogger("enact.shard")
+
+
+@dataclass(slots=True)
+class _Draft:
+    """A payload that no commit has named yet."""
+
+    session: str
+    size: int
+    memory: Pages | Plain
+    shared: bool
+    touched_s: float
+    have: int = 0
+
+    @property
+    def whole(self) -> bool:
+        """Whether all of it is here: from slices, or (none came) from its client in the folder."""
+        return self.have == self.size or (self.shared and not self.have)
+
+
+class PayloadDesk:
+    """The payloads of one shard.  Thread-safe; never waits for the shard.
+
+    Args:
+        folder: Where clients of this host find them; None keeps them in this process.
+        bytes_max: So many bytes of drafts and payloads at most.
+        make_room: Called to let history go, until so many bytes are free.
+        biggest: Names the slots that hold the most, for the text of a refusal.
+
+    Attributes:
+        counters: What happened, by name, for `ListSessions`.
+    """
+
+    def __init__(
+        self,
+        folder: SharedFolder | None,
+        bytes_max: int,
+        *,
+        make_room: Callable[[int], None] = lambda _: None,
+        biggest: Callable[[], str] = lambda: "",
+    ) -> None:
+        self.counters: dict[str, int] = {}
+        self._folder = folder
+        self._bytes_max = bytes_max
+        self._make_room = make_room
+        self._biggest = biggest
+        self._mutex = threading.RLock()  # reentrant: a destructor may run anywhere
+        self._drafts: dict[str, _Draft] = {}
+        self._sizes: dict[str, int] = {}
+        self._adopted: dict[str, weakref.ref[Pages | Plain]] = {}
+        self._bytes = 0
+
+    # ---------------------------------------------------------------- drafts
+
+    def stage(self, message: Stage) -> Staged | Refused:
+        """Open a draft, take a slice of one, or give one up."""
+        file, total = message.file, message.total
+        if not PAYLOAD_NAME.match(file) or not file.startswith(f"{message.session}-"):
+            return Refused("protocol", f"{file[:80]!r} is no payload of session {message.session}")
+        if not total:
+            self.drop(file)
+            return Staged(file, 0, False)
+        if not PAYLOAD_BYTES_MIN < total <= BODY_BYTES_MAX:
+            return Refused(
+                "protocol",
+                f"a payload of {total} bytes; from {PAYLOAD_BYTES_MIN} to {BODY_BYTES_MAX}",
+            )
+        draft = self._drafts.get(file) or self._opened(message.session, file, total)
+        if isinstance(draft, Refused):
+            return draft
+        if draft.size != total:
+            return Refused("protocol", f"payload {file} has {draft.size} bytes, not {total}")
+        return self._take(file, draft, message.offset, message.body)
+
+    def _take(self, file: str, draft: _Draft, offset: int, slice_: Datum) -> Staged | Refused:
+        end = offset + slice_.size
+        if not 0 <= offset <= end <= draft.size:
+            return Refused("protocol", f"a slice to {end} of payload {file}, of {draft.size} bytes")
+        if slice_.size:
+            body_of(draft.memory)[offset:end] = slice_.body
+        with self._mutex:
+            draft.touched_s = time.monotonic()
+            if offset <= draft.have:
+                draft.have = max(draft.have, end)
+            return Staged(file, draft.have, draft.shared)
+
+    def _opened(self, session: str, file: str, total: int) -> _Draft | Refused:
+        if not self._reserved(file, total):
+            # What is let go of takes a moment to leave, and none of it under a mutex.
+            self._make_room(total)
+            leftovers().wait(ROOM_S)
+            if not self._reserved(file, total):
+                return self._refused(session, total)
+        memory, shared = self._memory(file, total)
+        draft = _Draft(session, total, memory, shared, time.monotonic())
+        with self._mutex:
+            self._drafts[file] = draft
+        return draft
+
+    def _reserved(self, file: str, total: int) -> bool:
+        """Count the bytes of a new payload if there is room for them."""
+        with self._mutex:
+            if file in self._sizes or self._bytes + total > self._bytes_max:
+                return False
+            self._sizes[file] = total
+            self._bytes += total
+            return True
+
+    def _refused(self, session: str, total: int) -> Refused:
+        self._count("payloads_refused")
+        return Refused(
+            NO_ROOM,
+            f"session {session[:8]} asked for a payload of {total} bytes; {self._bytes} of at most"
+            f" {self._bytes_max} are in use{self._biggest()}; raise shared_bytes_max, keep fewer"
+            " versions, or let go of arrays and locks that hold old ones",
+        )
+
+    def _memory(self, file: str, total: int) -> tuple[Pages | Plain, bool]:
+        """Return the memory of a new payload, and whether it is a file of the shared folder."""
+        if self._folder is not None:
+            try:
+                return self._file_memory(self._folder, file, total), True
+            except OSError as error:
+                self._count("payload_fallbacks")
+                _log.info("payload %s is no file: %s", file, error)
+        return plain_memory(total, ended=partial(self._ended, file, None)), False
+
+    def _file_memory(self, folder: SharedFolder, file: str, total: int) -> Pages:
+        flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+        made = os.open(file, flags, 0o600, dir_fd=folder.descriptor)
+        try:
+            os.fchmod(made, folder.access.draft_mode)
+            # Never a hole: a page that cannot be had later kills whoever touches it.
+            os.posix_fallocate(made, 0, total)
+            return map_file(made, total, writable=True, ended=partial(self._ended, file, folder))
+        except BaseException:
+            os.unlink(file, dir_fd=folder.descriptor)
+            raise
+        finally:
+            os.close(made)
+
+    def drop(self, file: str) -> None:
+        """Give a draft up; nothing where there is none."""
+        with self._mutex:
+            self._drafts.pop(file, None)
+
+    def drop_session(self, session: str) -> None:
+        """Give up all drafts of a session."""
+        with self._mutex:
+            mine = [file for file, draft in self._drafts.items() if draft.session == session]
+            gone = [self._drafts.pop(file) for file in mine]
+        if gone:
+            self._count("drafts_swept", len(gone))
+
+    # ---------------------------------------------------------------- adoption
+
+    def with_bodies(self, message: _Written) -> _Written:
+        """Return a commit or prepare whose named payloads have become bodies.
+
+        What is not here stays without: the shard then says what that means for this lock.
+        """
+        if not any(write.datum is not None and write.datum.file for write in message.writes):
+            return message
+        session = message.lock.session
+        return replace(message, writes=tuple(self._adopted_by(w, session) for w in message.writes))
+
+    def _adopted_by(self, write: WriteItem, session: str) -> WriteItem:
+        datum = write.datum
+        if datum is None or not datum.file or len(datum.body) == datum.size:
+            return write
+        memory = None
+        if datum.file.startswith(f"{session}-"):
+            memory = self._adopt(datum.file, datum.size)
+        if memory is None:
+            self._count("payloads_missing")
+            return write
+        shared = isinstance(memory, Pages)
+        body = body_of(memory).toreadonly()
+        # Plain memory has a name for its writer alone.
+        file = datum.file if shared else ""
+        return write._replace(datum=replace(datum, body=body, file=file))
+
+    def _adopt(self, file: str, size: int) -> Pages | Plain | None:
+        """Return the bytes of a whole payload, for good; None where there is none."""
+        with self._mutex:
+            known = self._adopted.get(file)
+            if known is not None:
+                memory = known()
+                return memory if memory is not None and memory.size == size else None
+            draft = self._drafts.get(file)
+            if draft is None or draft.size != size or not draft.whole:
+                return None
+            del self._drafts[file]
+            self._adopted[file] = weakref.ref(draft.memory)
+        if draft.shared and self._folder is not None:
+            os.chmod(file, self._folder.access.file_mode, dir_fd=self._folder.descriptor)
+        self._count("payloads_adopted")
+        return draft.memory
+
+    def _ended(self, file: str, folder: SharedFolder | None) -> None:
+        """Nobody looks at a payload any more: remove it, then stop counting it."""
+        if folder is not None and folder.descriptor >= 0:
+            try:
+                os.unlink(file, dir_fd=folder.descriptor)
+            except OSError as error:  # the folder went first
+                _log.info("payload %s: %s", file, error)
+        with self._mutex:
+            self._bytes -= self._sizes.pop(file, 0)
+            self._adopted.pop(file, None)
+
+    # ---------------------------------------------------------------- life
+
+    def sweep(self, lives: Callable[[str], bool], works: Callable[[str], bool]) -> None:
+        """Give up the drafts that nobody will commit any more.
+
+        Args:
+            lives: Whether a session is known.
+            works: Whether a session holds a lock.
+        """
+        if not self._drafts:
+            return
+        late_s = time.monotonic() - DRAFT_S
+        with self._mutex:
+            over = [
+                file
+                for file, draft in self._drafts.items()
+                if not lives(draft.session)
+                or (draft.touched_s < late_s and not works(draft.session))
+            ]
+            gone = [self._drafts.pop(file) for file in over]
+        if gone:
+            self._count("drafts_swept", len(gone))
+
+    def figures(self) -> dict[str, int]:
+        """Return counters, and what there is now: files, bytes, drafts."""
+        with self._mutex:
+            return {
+                **self.counters,
+                "payload_files": len(self._sizes),
+                "payload_bytes": self._bytes,
+                "payload_bytes_max": self._bytes_max,
+                "payload_drafts": len(self._drafts),
+            }
+
+    def _count(self, name: str, count: int = 1) -> None:
+        with self._mutex:
+            self.counters[name] = self.counters.get(name, 0) + count
