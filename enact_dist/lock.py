@@ -185,6 +185,7 @@ class Lock:
             self._readings = Readings(
                 client, self._session.cache, lock.lock, lock.states, self._use
             )
+            self._readings.asked = self._requests
             self._lock = lock
             self._asking = False
         except BaseException:

@@ -6,12 +6,12 @@ read-only views of the received bytes.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any, TypeVar, cast
+from collections.abc import ItemsView, Iterator, Mapping, ValuesView
+from typing import TYPE_CHECKING, Any, Final, TypeVar, cast
 
 from enact_dist.core.datum import Slot
 from enact_dist.errors import MisuseError, NotRequestedError, NullDatumError
-from enact_dist.terms import Aspect, Entity, NullReason, pattern_matches
+from enact_dist.terms import Access, Aspect, Entity, NullReason, pattern_matches
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -20,12 +20,14 @@ if TYPE_CHECKING:
     from enact_dist.core.lock_parts import Reading
     from enact_dist.core.messages import SlotState
     from enact_dist.link.client import CellClient
-    from enact_dist.link.fetching import DatumCache
+    from enact_dist.link.datum_cache import DatumCache
     from enact_dist.terms import LockRequest
 
 T = TypeVar("T")
 
 UNSET: Any = object()
+AHEAD_BYTES_MAX: Final = 64 << 20
+"""So many bytes are fetched before somebody has asked for each of the data."""
 
 
 class Readings:
@@ -40,6 +42,7 @@ class Readings:
 
     Attributes:
         decoded: How many data were decoded so far.
+        asked: The requests they were asked for with, where not all may be read.
     """
 
     def __init__(
@@ -56,6 +59,8 @@ class Readings:
         self._readings = {reading.state.slot: reading for reading in readings}
         self._values: dict[Slot, object] = {}
         self._kept: dict[Slot, Datum] = {}
+        self._fetched_alone = 0
+        self.asked: Iterable[LockRequest[Any]] = ()
         self.usable = usable
         self.decoded = 0
 
@@ -77,19 +82,47 @@ class Readings:
 
     def datum(self, slot: Slot) -> Datum:
         """Return the encoded datum of a slot that is not null, fetching it where needed."""
-        from enact_dist.link.fetching import fetch
-
         kept = self._kept.get(slot)
         if kept is not None:
             return kept
-        reading = self._readings[slot]
-        return fetch(
-            self._client, self._cache, self._lock, reading.shard, reading.epoch, reading.state
-        )
+        if not self._is_to_come(slot):
+            return self._fetched([slot])[slot]
+        self._fetched_alone += 1
+        others = self._asked_alone() if self._fetched_alone > 1 else []
+        # Whoever has read two of them reads the others, too.
+        self.fetch(ahead(slot, others, self.bytes_to_come) if slot in others else [slot])
+        return self._kept[slot]
 
-    def keep(self, slot: Slot) -> None:
-        """Fetch a datum now, so that it can be read after the lock or view is over."""
-        self._kept[slot] = self.datum(slot)
+    def _asked_alone(self) -> list[Slot]:
+        """Return the slots that the lock's requests name one by one, to be read."""
+        reads = (Access.READ, Access.VIEW)
+        return [slot_of(request) for request in self.asked if request.access in reads]
+
+    def fetch(self, slots: Iterable[Slot]) -> None:
+        """Fetch those of these data that are not here, all at once, and keep them."""
+        to_come = [slot for slot in slots if self._is_to_come(slot)]
+        if to_come:
+            self._kept.update(self._fetched(to_come))
+
+    def _fetched(self, slots: Iterable[Slot]) -> dict[Slot, Datum]:
+        from enact_dist.link.fetching import fetch_all
+
+        readings = [self._readings[slot] for slot in slots]
+        return fetch_all(self._client, self._cache, self._lock, readings, self.usable)
+
+    def bytes_to_come(self, slot: Slot) -> int:
+        """Return how long a datum is that would have to be fetched, 0 for all others."""
+        return self._readings[slot].state.size if self._is_to_come(slot) else 0
+
+    def _is_to_come(self, slot: Slot) -> bool:
+        reading = self._readings.get(slot)
+        return reading is not None and reading.state.large and slot not in self._kept
+
+    def keep_all(self) -> None:
+        """Fetch all data now, so that they can be read after the lock or view is over."""
+        states = (reading.state for reading in self._readings.values())
+        named = [state.slot for state in states if state.large or state.same]
+        self._kept.update(self._fetched(named))
 
     def value(self, slot: Slot, aspect: Aspect[T]) -> T:
         """Return the decoded datum of a slot.
@@ -122,6 +155,18 @@ class Readings:
         )
 
 
+def ahead(first: Slot, others: Iterable[Slot], bytes_of: Callable[[Slot], int]) -> list[Slot]:
+    """Return `first` and as many of the others as may be fetched with it."""
+    found, size = [first], bytes_of(first)
+    for slot in others:
+        if slot != first:
+            size += bytes_of(slot)
+            if size > AHEAD_BYTES_MAX:
+                break
+            found.append(slot)
+    return found
+
+
 def is_null(state: SlotState) -> bool:
     """Whether the slot holds no datum."""
     return bool(state.null_reason)
@@ -144,17 +189,45 @@ def slot_of(request: LockRequest[Any]) -> Slot:
 
 
 class EachData(Mapping[Entity, T]):
-    """The data of a pattern request by entity; decoded when they are looked at."""
+    """The data of a pattern request by entity; decoded when they are looked at.
+
+    A single look-up fetches one datum.  Whoever goes through them in order, by `values()` or
+    otherwise, gets those that follow with it.
+    """
 
     def __init__(self, readings: Readings, request: LockRequest[T]) -> None:
         self._data = readings
         self._request = request
         self._slots = {Entity(slot.entity): slot for slot in readings.matching(request)}
+        self._next = -1
 
     def __getitem__(self, entity: Entity) -> T:
-        if entity not in self._slots:
+        slot = self._slots.get(entity)
+        if slot is None:
             raise KeyError(entity)
-        return self._data.value(self._slots[entity], self._request.aspect)
+        if self._data.bytes_to_come(slot):
+            self._data.usable()
+            self._fetch(slot)
+        return self._data.value(slot, self._request.aspect)
+
+    def _fetch(self, slot: Slot) -> None:
+        """Fetch a datum, and those behind it where the one before it was fetched last."""
+        order = list(self._slots.values())
+        at, to_come = order.index(slot), self._data.bytes_to_come
+        in_order = 0 <= self._next <= at and not any(map(to_come, order[self._next : at]))
+        slots = ahead(slot, order[at + 1 :], to_come) if in_order else [slot]
+        self._data.fetch(slots)
+        self._next = at + len(slots)
+
+    def values(self) -> ValuesView[T]:
+        """Return the data in the order of their entities; large ones come together."""
+        self._next = 0
+        return super().values()
+
+    def items(self) -> ItemsView[Entity, T]:
+        """Return the entities with their data; large ones come together."""
+        self._next = 0
+        return super().items()
 
     def __iter__(self) -> Iterator[Entity]:
         return iter(self._slots)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Final
 from enact_dist.core.messages import AspectEntry, Item
 from enact_dist.core.placement import shard_of
 from enact_dist.errors import MisuseError
-from enact_dist.link.fetching import DatumCache
+from enact_dist.link.datum_cache import DatumCache
 from enact_dist.link.session_client import CALL_S, FINISH_S
 from enact_dist.terms import Entity, LockRequest
 from enact_dist.wire.fingerprint import fingerprint

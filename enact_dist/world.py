@@ -260,9 +260,7 @@ def _view(
     lock = client.acquire(items, wait_s=VIEW_WAIT_S, hold_s=VIEW_WAIT_S)
     try:
         readings = Readings(client, session.cache, lock.lock, lock.states, lambda: None)
-        for reading in lock.states:
-            if reading.state.large or reading.state.same:
-                readings.keep(reading.state.slot)
+        readings.keep_all()
         client.finish(lock, {})
     finally:
         client.release(lock)

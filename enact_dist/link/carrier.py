@@ -74,6 +74,24 @@ class NoticeFeed(Protocol):
         """End the feed and wake whoever waits in `get`; twice is harmless."""
 
 
+class Begun(Protocol):
+    """A request that was sent; exactly one of the methods is called, once."""
+
+    def wait(self, into: memoryview | None = None) -> Answer | None:
+        """Return the answer, or None if there was none in time.
+
+        Args:
+            into: Where the answer's data may be put, if they are exactly as long; then they are
+                a view on it, and on a copy otherwise.
+
+        Raises:
+            ProtocolError: As `Carrier.request`.
+        """
+
+    def abandon(self) -> None:
+        """Let nobody wait for the answer."""
+
+
 class Carrier(Protocol):
     """Moves requests to shards and brings back their answers."""
 
@@ -98,6 +116,17 @@ class Carrier(Protocol):
 
         Raises:
             ProtocolError: As `request`.
+            MisuseError: As `request`.
+        """
+
+    def begin(self, shard: str, message: Request, *, timeout_s: float) -> Begun:
+        """Send one request that moves a slice of a large datum; its answer is waited for later.
+
+        These travel so that nothing else waits behind them.  Many may be under way; those of one
+        thread to one shard are best waited for in the order in which they were begun.
+
+        Raises:
+            ProtocolError: The request cannot travel.
             MisuseError: As `request`.
         """
 

@@ -114,7 +114,7 @@ class CellClient(SessionClient):
                     break
                 lock_views = lock.no_cut and not self.core.observer
                 if lock_views:
-                    self._count("views_locked")
+                    self.count("views_locked")
                 lock = begin(lock_views=lock_views)
             waited_s = (self._now_ns() - started_ns) / 1e9
             raise not_granted(lock, waited_s, self.carrier.endpoint_of)
@@ -180,7 +180,7 @@ class CellClient(SessionClient):
             try:
                 self.carrier.request_all(farewells, timeout_s=CALL_S)
             except EnactError as error:
-                self._count("releases_unsent")
+                self.count("releases_unsent")
                 _log.info("lock %s was not released by message: %s", lock.lock, error)
 
     def finish(

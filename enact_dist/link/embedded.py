@@ -29,16 +29,25 @@ FETCH_BYTES: Final = 1 << 40
 class _Call:
     """One answer on its way; most are there before anybody waits."""
 
-    __slots__ = ("answer", "done")
+    __slots__ = ("answer", "done", "timeout_s")
 
     def __init__(self) -> None:
         self.answer: Answer | None = None
+        self.timeout_s = 0.0
         self.done = threading.Lock()  # a bare lock wakes in half the time of an Event
         self.done.acquire()
 
     def __call__(self, answer: Answer) -> None:
         self.answer = answer
         self.done.release()
+
+    def wait(self, into: memoryview | None = None) -> Answer | None:
+        """Return the answer; its data are those that the shard has."""
+        self.done.acquire(timeout=max(0.0, self.timeout_s))
+        return self.answer
+
+    def abandon(self) -> None:
+        """Do nothing: nothing is left to do."""
 
 
 class EmbeddedCarrier:
@@ -86,6 +95,17 @@ class EmbeddedCarrier:
         for call in calls:
             call.done.acquire(timeout=max(0.0, deadline_s - time.monotonic()))
         return [call.answer for call in calls]
+
+    def begin(self, shard: str, message: Request, *, timeout_s: float) -> _Call:
+        """Make a call whose answer is waited for later.
+
+        Raises:
+            ShardUnreachableError: As `request`.
+            MisuseError: As `request`.
+        """
+        call = self._begin(shard, message)
+        call.timeout_s = timeout_s
+        return call
 
     def _begin(self, shard: str, message: Request) -> _Call:
         self._check_usable()

@@ -1,143 +1,142 @@
-"""Data on the way to the client: the cache by version, and large data in slices.
+"""Data on the way to the client: from the cache, or in slices straight to where they will stay.
 
-A datum is known by (shard, epoch, slot, version): versions of volatile slots start again with a
-new epoch of their shard, so a version alone could name two data.  What the cache holds is never
-sent twice; its bytes are capped and the least recently used go first.
+Several data are fetched together, over all shards, through one window (`Transfer`): the slices
+of a pattern's many images follow each other as those of one large cloud do.
 """
 
 from __future__ import annotations
 
-import threading
-from collections import OrderedDict
-from typing import TYPE_CHECKING, Final, NamedTuple
+from functools import partial
+from itertools import chain, zip_longest
+from typing import TYPE_CHECKING
 
 from enact_dist.core.datum import Datum, Slot
-from enact_dist.core.messages import EpochChanged, Fetch, Gone, Refused, Slice, SlotState
+from enact_dist.core.messages import EpochChanged, Fetch, Gone, Refused, Slice
 from enact_dist.errors import LeaseLostError, ProtocolError
 from enact_dist.link.refusals import error_of
-from enact_dist.link.session_client import FINISH_S
+from enact_dist.link.transfer import Piece, Transfer
 from enact_dist.wire.limits import BODY_BYTES_MAX
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator
+
     from enact_dist.core.datum import LockId
+    from enact_dist.core.lock_parts import Reading
+    from enact_dist.core.messages import Answer, SlotState
     from enact_dist.link.client import CellClient
-
-CACHE_BYTES_MAX: Final = 256 << 20
-CACHED_BYTES_MIN: Final = 1024
-"""Smaller data cost less to send again than to look up."""
-IN_FLIGHT: Final = 4
-"""Slices asked for at once: hides the round trip, bounds what a stopped client leaves behind."""
+    from enact_dist.link.datum_cache import DatumCache
 
 
-class _Known(NamedTuple):
-    shard: str
-    epoch: int
-    version: int
-    datum: Datum
-
-
-class DatumCache:
-    """The newest datum of each slot that this process has seen, up to a number of bytes."""
-
-    def __init__(self, bytes_max: int = CACHE_BYTES_MAX) -> None:
-        self._bytes_max = bytes_max
-        self._known: OrderedDict[Slot, _Known] = OrderedDict()
-        self._bytes = 0
-        self._mutex = threading.Lock()
-
-    def version(self, slot: Slot, shard: str, epoch: int) -> int:
-        """Return the version that is known of a slot in this epoch (0: none)."""
-        with self._mutex:
-            known = self._known.get(slot)
-        return known.version if known and (known.shard, known.epoch) == (shard, epoch) else 0
-
-    def get(self, slot: Slot, shard: str, epoch: int, version: int) -> Datum | None:
-        """Return the datum of exactly this version, if it is known."""
-        with self._mutex:
-            known = self._known.get(slot)
-            if known is None or (known.shard, known.epoch, known.version) != (
-                shard,
-                epoch,
-                version,
-            ):
-                return None
-            self._known.move_to_end(slot)
-            return known.datum
-
-    def put(self, slot: Slot, shard: str, epoch: int, version: int, datum: Datum) -> None:
-        """Remember a datum; forget older ones beyond the cap."""
-        if not CACHED_BYTES_MIN <= datum.size <= self._bytes_max:
-            return
-        with self._mutex:
-            old = self._known.pop(slot, None)
-            if old is not None:
-                self._bytes -= old.datum.size
-            self._known[slot] = _Known(shard, epoch, version, datum)
-            self._bytes += datum.size
-            while self._bytes > self._bytes_max:
-                _, dropped = self._known.popitem(last=False)
-                self._bytes -= dropped.datum.size
-
-
-def fetch(
-    client: CellClient, cache: DatumCache, lock: LockId, shard: str, epoch: int, state: SlotState
-) -> Datum:
-    """Return the datum that `state` of a grant or view names, from the cache or in slices.
+def fetch_all(
+    client: CellClient,
+    cache: DatumCache,
+    lock: LockId,
+    readings: Iterable[Reading],
+    alive: Callable[[], None] = lambda: None,
+) -> dict[Slot, Datum]:
+    """Return the data that `readings` name, from the grant, the cache, or in slices.
 
     Args:
         client: The session that took the grant or view.
-        cache: Where to look first and to remember it.
-        lock: The lock that pins the datum.
-        shard: The slot's shard.
-        epoch: The shard's epoch when the grant or view was taken.
-        state: A state with a datum (not null).
+        cache: Where to look first and to remember them.
+        lock: The lock that pins the data.
+        readings: States with a datum (not null), each with its shard and that shard's epoch.
+        alive: Raises when the data are wanted no more; asked whenever an answer was lost.
 
     Raises:
-        LeaseLostError: The shard keeps this version for the lock no more.
-        ShardUnreachableError: The shard does not answer.
+        LeaseLostError: A shard keeps one of these versions for the lock no more.
+        ShardUnreachableError: A shard does not answer.
         ProtocolError: The answers do not fit together.
     """
+    found: dict[Slot, Datum] = {}
+    missing: list[_Incoming] = []
+    for reading in readings:
+        datum = _at_hand(cache, reading)
+        if datum is not None:
+            found[reading.state.slot] = datum
+        else:
+            missing.append(_Incoming(lock, reading, client.carrier.fetch_bytes))
+    if not missing:
+        return found
+    transfer = Transfer(client, alive)
+    try:
+        transfer.run(_shards_in_turn(missing))
+    finally:
+        if transfer.repeated:
+            client.count("slices_repeated", transfer.repeated)
+    for incoming in missing:
+        datum = found[incoming.state.slot] = incoming.datum()
+        reading = incoming.reading
+        cache.put(reading.state.slot, reading.shard, reading.epoch, reading.state.version, datum)
+    return found
+
+
+def _at_hand(cache: DatumCache, reading: Reading) -> Datum | None:
+    shard, epoch, state = reading
     if state.datum is not None and not state.large:
         cache.put(state.slot, shard, epoch, state.version, state.datum)
         return state.datum
-    known = cache.get(state.slot, shard, epoch, state.version)
-    if known is not None:
-        return known
-    datum = _fetch_slices(client, lock, shard, epoch, state)
-    cache.put(state.slot, shard, epoch, state.version, datum)
-    return datum
+    return cache.get(state.slot, shard, epoch, state.version)
 
 
-def _fetch_slices(
-    client: CellClient, lock: LockId, shard: str, epoch: int, state: SlotState
-) -> Datum:
-    length = client.carrier.fetch_bytes
-    if state.size > BODY_BYTES_MAX:
-        raise ProtocolError(f"{state.slot} is said to have {state.size} bytes")
-    offsets = range(0, max(1, state.size), length)
-    body = memoryview(b"") if len(offsets) == 1 else memoryview(bytearray(state.size))
-    encoding, stamp_ns = b"", 0
-    for first in range(0, len(offsets), IN_FLIGHT):
-        calls = [
-            (shard, Fetch(lock, epoch, state.slot, state.version, offset, length))
-            for offset in offsets[first : first + IN_FLIGHT]
-        ]
-        timeout_s = FINISH_S + length * len(calls) / 10e6 if length < 1 << 30 else FINISH_S
-        for (_, call), answer in zip(
-            calls, client.call_all(calls, timeout_s=timeout_s), strict=True
-        ):
-            part = _checked(answer, call, state, lock)
-            encoding, stamp_ns = part.encoding, part.stamp_ns
-            if len(offsets) == 1:
-                body = memoryview(part.body.body)
-            else:
-                body[call.offset : call.offset + part.body.size] = part.body.body
-    if len(body) != state.size:
-        raise ProtocolError(f"{state.slot}: {len(body)} bytes came instead of {state.size}")
-    return Datum(encoding, body.toreadonly(), state.size, stamp_ns)
+def _shards_in_turn(missing: list[_Incoming]) -> Iterator[Piece]:
+    """Yield all slices so that no shard waits until another has sent everything."""
+    by_shard: dict[str, list[Iterator[Piece]]] = {}
+    for incoming in missing:
+        by_shard.setdefault(incoming.reading.shard, []).append(incoming.pieces())
+    rows = zip_longest(*(chain.from_iterable(each) for each in by_shard.values()))
+    return (piece for row in rows for piece in row if piece is not None)
 
 
-def _checked(answer: object, call: Fetch, state: SlotState, lock: LockId) -> Slice:
+class _Incoming:
+    """One datum that comes in slices, and where they go.
+
+    Attributes:
+        reading: What names it.
+        state: Its state.
+        count: How many slices it has.
+    """
+
+    def __init__(self, lock: LockId, reading: Reading, slice_bytes: int) -> None:
+        self.reading = reading
+        self.state = reading.state
+        if self.state.size > BODY_BYTES_MAX:
+            raise ProtocolError(f"{self.state.slot} is said to have {self.state.size} bytes")
+        self._lock = lock
+        self._slice_bytes = slice_bytes
+        self._offsets = range(0, max(1, self.state.size), slice_bytes)
+        self.count = len(self._offsets)
+        self._body: memoryview | None = None
+        self._encoding, self._stamp_ns = b"", 0
+
+    def pieces(self) -> Iterator[Piece]:
+        """Yield its slices; memory for all of them is taken with the first."""
+        shard, epoch, state = self.reading
+        if self.count > 1:
+            # Ordinary memory, which may be recycled: pages of 2 MB were slower (measured).
+            self._body = memoryview(bytearray(state.size))
+        for offset in self._offsets:
+            call = Fetch(self._lock, epoch, state.slot, state.version, offset, self._slice_bytes)
+            size = min(self._slice_bytes, state.size - offset)
+            into = None if self._body is None else self._body[offset : offset + size]
+            yield Piece(shard, call, size, partial(self._take, call, into), into)
+
+    def _take(self, call: Fetch, into: memoryview | None, answer: Answer) -> None:
+        part = _checked(answer, call, self.state, self._lock)
+        self._encoding, self._stamp_ns = part.encoding, part.stamp_ns
+        came = part.body.body
+        if into is None:
+            self._body = memoryview(came)
+        elif not (isinstance(came, memoryview) and came.obj is into.obj):
+            into[:] = came
+
+    def datum(self) -> Datum:
+        """Return the datum, all of whose slices have come."""
+        body = self._body if self._body is not None else memoryview(b"")
+        return Datum(self._encoding, body.toreadonly(), self.state.size, self._stamp_ns)
+
+
+def _checked(answer: Answer, call: Fetch, state: SlotState, lock: LockId) -> Slice:
     """Return the answer if it is the asked slice, else raise what it stands for."""
     if isinstance(answer, Slice):
         wanted = min(call.length, state.size - call.offset)

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
     from enact_dist.core.client import Client
     from enact_dist.core.messages import Request
-    from enact_dist.link.carrier import Carrier, NoticeFeed
+    from enact_dist.link.carrier import Begun, Carrier, NoticeFeed
 
 CALL_S: Final = 1.0
 """How long one call may stay unanswered before it counts as unknown and is made again."""
@@ -186,6 +186,19 @@ class SessionClient:
                 self._take(shard, request, answer)
         return answers
 
+    def begin(self, shard: str, request: Request, *, timeout_s: float) -> Begun:
+        """Send one request of a transfer, whose answer the caller waits for later.
+
+        Raises:
+            MisuseError: This client is closed.
+        """
+        self.check_usable()
+        return self.carrier.begin(shard, request, timeout_s=timeout_s)
+
+    def rest(self, pause_s: float) -> None:
+        """Wait a little before something is asked again, but not once a shard has come back."""
+        self._rest(pause_s, self._returns)
+
     def _send(self, calls: Sequence[tuple[str, Request]]) -> list[Answer | None]:
         if len(calls) == 1:
             shard, request = calls[0]
@@ -293,7 +306,7 @@ class SessionClient:
                     # A shard restarted: the sooner it knows that we know, the sooner it grants.
                     self.renew_once()
             except Exception as error:  # noqa: BLE001 - a bad answer must not end the renewal
-                self._count("keep_alives_failed")
+                self.count("keep_alives_failed")
                 _log.warning("keep-alive of session %s: %s", self.core.session[:8], error)
 
     def _rest(self, pause_s: float, returns: int) -> bool:
@@ -324,7 +337,7 @@ class SessionClient:
             if answer is not None:
                 self._take(shard, request, answer)
             else:
-                self._count("keep_alives_unanswered")
+                self.count("keep_alives_unanswered")
 
     def set_report(self, report: bytes) -> None:
         """Let the next keep-alives carry this actor's statistics (msgpack)."""
@@ -335,9 +348,10 @@ class SessionClient:
         if self._renewer is None:
             self.renew_once()
 
-    def _count(self, name: str) -> None:
+    def count(self, name: str, amount: int = 1) -> None:
+        """Add to one of the counters that `Cell.counters` shows."""
         with self._mutex:
-            self.counters[name] = self.counters.get(name, 0) + 1
+            self.counters[name] = self.counters.get(name, 0) + amount
 
 
 def _patience_s(request: Request) -> float:

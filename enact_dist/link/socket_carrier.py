@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from enact_dist.core.messages import Answer, Request, ShardEntry
+    from enact_dist.link.carrier import Begun
     from enact_dist.link.zenoh_carrier import ZenohCarrier
 
 FETCH_BYTES: Final = 4 << 20
@@ -132,6 +133,22 @@ class SocketCarrier:
             if type(answer) is Welcome:
                 self.learn(answer)
         return answers
+
+    def begin(self, shard: str, message: Request, *, timeout_s: float) -> Begun:
+        """Send one request whose answer is waited for later; each has a connection of its own.
+
+        Raises:
+            ProtocolError: As `request`.
+            MisuseError: As `request`.
+        """
+        self._check_usable()
+        line = self._lines.get(shard)
+        connection = self._sent(line, message, timeout_s) if line is not None else None
+        if line is None or connection is None:
+            self.calls["zenoh"] += 1
+            return self._behind.begin(shard, message, timeout_s=timeout_s)
+        self.calls["socket"] += 1
+        return _Begun(line, connection)
 
     @staticmethod
     def _sent(line: SocketLine, message: Request, timeout_s: float) -> Connection | None:
@@ -264,10 +281,30 @@ class SocketCarrier:
             line.abandon()
 
 
-def _received(line: SocketLine, connection: Connection) -> Answer | None:
+class _Begun:
+    """A request that was sent over a connection."""
+
+    __slots__ = ("_connection", "_line")
+
+    def __init__(self, line: SocketLine, connection: Connection) -> None:
+        self._line = line
+        self._connection = connection
+
+    def wait(self, into: memoryview | None = None) -> Answer | None:
+        """Return the answer, or None where none will come."""
+        return _received(self._line, self._connection, into)
+
+    def abandon(self) -> None:
+        """Throw the connection away, and the answer with it."""
+        self._line.drop(self._connection)
+
+
+def _received(
+    line: SocketLine, connection: Connection, into: memoryview | None = None
+) -> Answer | None:
     """Return the answer on a connection, or None where none will come."""
     try:
-        answer = connection.receive()
+        answer = connection.receive(into)
     except BlockingIOError:  # the time is over
         line.drop(connection)
         return None

@@ -126,8 +126,10 @@ class Stream:
         self._view = memoryview(self._buffer)
         self._filled = 0
 
-    def receive(self) -> tuple[int, bytes, Buffer]:
+    def receive(self, into: memoryview | None = None) -> tuple[int, bytes, Buffer]:
         """Return kind, header and payload of the next frame; blocks until it is there.
+
+        A payload longer than the buffer, and exactly as long as `into`, is put there.
 
         Raises:
             EOFError: The peer has closed the connection.
@@ -141,7 +143,7 @@ class Stream:
         length = PREFIX_BYTES + header_bytes + payload_bytes
         if length > BUFFER_BYTES:
             self._filled = 0
-            return self._receive_long(kind, header_bytes, payload_bytes, filled)
+            return self._receive_long(kind, header_bytes, payload_bytes, filled, into)
         while filled < length:
             filled += self._more(view[filled:])
         end = PREFIX_BYTES + header_bytes
@@ -159,7 +161,12 @@ class Stream:
         return count
 
     def _receive_long(
-        self, kind: int, header_bytes: int, payload_bytes: int, filled: int
+        self,
+        kind: int,
+        header_bytes: int,
+        payload_bytes: int,
+        filled: int,
+        into: memoryview | None,
     ) -> tuple[int, bytes, Buffer]:
         """Read a frame that is longer than the buffer into memory of its own.
 
@@ -167,7 +174,9 @@ class Stream:
         claimed costs nothing.
         """
         header, payload = memoryview(bytearray(header_bytes)), memoryview(bytearray())
-        if payload_bytes:
+        if into is not None and len(into) == payload_bytes:
+            payload = into
+        elif payload_bytes:
             payload = memoryview(mmap.mmap(-1, payload_bytes))  # begins at a page
         at = PREFIX_BYTES
         for part in (header, payload):

@@ -76,15 +76,15 @@ class Connection:
             wait_at_most(self.socket, socket.SO_RCVTIMEO, self._wait_s)
         send_frame(self.socket, header, bodies)
 
-    def receive(self) -> Answer:
-        """Return the answer to the request that was sent.
+    def receive(self, into: memoryview | None = None) -> Answer:
+        """Return the answer to the request that was sent; its data in `into` if they fit.
 
         Raises:
             EOFError: The shard has closed the connection.
             OSError: The connection is broken, or the time is over.
             ProtocolError: What came is no answer.
         """
-        kind, header, payload = self._stream.receive()
+        kind, header, payload = self._stream.receive(into)
         if kind != Kind.MESSAGE:
             raise ProtocolError(
                 f"shard {self.shard} sent a frame of kind {kind} in place of an answer"

@@ -9,9 +9,10 @@ Rules that a change must keep:
 
 - Channels only, no Python callbacks: a library that holds the interpreter lock for half a minute
   would stall Zenoh's receiving thread, and with it the token (measured).
-- Control calls travel at a high priority, data beside them at a lower one, so that a keep-alive
-  never queues behind a mesh; `Fetch` is asked with DROP, which its answer inherits: a slow reader
-  loses an answer instead of its connection.
+- Control calls travel at a high priority, data beside them at a lower one, and what travels in
+  slices on a connection of its own (`zenoh_bulk`), so that a keep-alive never queues behind a
+  mesh.  Until that is connected slices are asked with DROP, which their answers inherit: a slow
+  reader loses an answer instead of the connection that its token lives on.
 - A query without a reply, or with the error "Timeout", is *unknown*.  Two replies to one query
   mean two daemons under one name: that is an alarm.
 """
@@ -29,11 +30,12 @@ from typing import TYPE_CHECKING, Final
 
 import zenoh
 
-from enact_dist.core.messages import Answer, AwaitStamp, Commit, Fetch, Notice, Prepare
+from enact_dist.core.messages import Answer, AwaitStamp, Commit, Notice, Prepare
 from enact_dist.errors import ProtocolError, ShardUnreachableError
 from enact_dist.link.carrier import check_usable, read_answer
 from enact_dist.link.inside import Inside
 from enact_dist.link.notices import NoticeQueue
+from enact_dist.link.zenoh_bulk import BulkWay
 from enact_dist.link.zenoh_config import QUEUED_MAX, close_session, keep_after_fork, open_session
 from enact_dist.link.zenoh_presence import ShardPresence
 from enact_dist.wire.frames import decode_frame, encode_frame
@@ -43,6 +45,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from enact_dist.core.messages import Request, ShardEntry
+    from enact_dist.link.carrier import Begun
 
 _log = logging.getLogger("enact.link")
 CONTROL_BYTES_MAX: Final = 16 << 10
@@ -80,6 +83,7 @@ class _Link:
     session: zenoh.Session
     endpoints: tuple[str, ...]
     token: zenoh.LivelinessToken
+    bulk: BulkWay
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,23 +187,46 @@ class ZenohCarrier:
     ) -> zenoh.Handler[zenoh.Reply] | None:
         link = self._link_of.get(shard) or self._links[0]
         header, payload = encode_frame(message)
-        priority, congestion = _CONTROL, _BLOCK
-        if isinstance(message, Fetch):
-            priority, congestion = _BULK, _DROP
-        elif isinstance(message, Commit | Prepare) and payload and len(payload) > CONTROL_BYTES_MAX:
+        priority = _CONTROL
+        if isinstance(message, Commit | Prepare) and payload and len(payload) > CONTROL_BYTES_MAX:
             priority = _DATA
-        try:
-            return link.session.get(
+        return _asked(
+            link.session,
+            self._key(shard, message),
+            header,
+            payload,
+            timeout_s=timeout_s,
+            priority=priority,
+            congestion=_BLOCK,
+        )
+
+    def begin(self, shard: str, message: Request, *, timeout_s: float) -> Begun:
+        """Send one slice's request, whose answer is waited for later.
+
+        Raises:
+            ProtocolError: The request cannot travel.
+            MisuseError: As `request`.
+        """
+        with self._inside:
+            self._check_usable()
+            link = self._link_of.get(shard) or self._links[0]
+            header, payload = encode_frame(message)
+            session = link.bulk.session()
+            replies = _asked(
+                session or link.session,
                 self._key(shard, message),
-                payload=payload,
-                attachment=header,
-                timeout=max(timeout_s, 0.001),
-                consolidation=_NONE,
-                priority=priority,
-                congestion_control=congestion,
+                header,
+                payload,
+                timeout_s=timeout_s,
+                priority=_BULK,
+                congestion=_DROP if session is None else _BLOCK,
             )
-        except zenoh.ZError:  # closed meanwhile by another thread
-            return None
+            return _Begun(partial(self._wait, shard, replies))
+
+    def _wait(self, shard: str, replies: zenoh.Handler[zenoh.Reply] | None) -> Answer | None:
+        with self._inside:
+            self._check_answered_once()
+            return self._receive(shard, replies)
 
     def _key(self, shard: str, message: Request) -> str:
         known = (shard, type(message))
@@ -275,7 +302,7 @@ class ZenohCarrier:
     def _open_link(self, endpoints: tuple[str, ...]) -> _Link:
         session = open_session(connect=endpoints, lease_s=self._lease_s)
         token = session.liveliness().declare_token(token_key(self._cell, self._session))
-        link = _Link(session, endpoints, token)
+        link = _Link(session, endpoints, token, BulkWay(endpoints, self._lease_s))
         with self._mutex:
             self._links.append(link)
             for feed, pumps in self._feeds.items():
@@ -346,6 +373,7 @@ class ZenohCarrier:
         for feed in list(self._feeds):
             feed.close()
         for link in self._links:
+            link.bulk.close()
             close_session(link.session)
         for pump in pumps:
             pump.thread.join(JOIN_S)
@@ -353,6 +381,46 @@ class ZenohCarrier:
             presence.join(JOIN_S)
         # A thread that comes back from Zenoh while the interpreter ends would abort the process.
         self._inside.wait_empty(JOIN_S)
+
+
+def _asked(
+    session: zenoh.Session,
+    key: str,
+    header: bytes,
+    payload: bytes | None,
+    *,
+    timeout_s: float,
+    priority: zenoh.Priority,
+    congestion: zenoh.CongestionControl,
+) -> zenoh.Handler[zenoh.Reply] | None:
+    try:
+        return session.get(
+            key,
+            payload=payload,
+            attachment=header,
+            timeout=max(timeout_s, 0.001),
+            consolidation=_NONE,
+            priority=priority,
+            congestion_control=congestion,
+        )
+    except zenoh.ZError:  # closed meanwhile by another thread
+        return None
+
+
+class _Begun:
+    """A query that was sent; `wait` brings its answer."""
+
+    __slots__ = ("_wait",)
+
+    def __init__(self, wait: Callable[[], Answer | None]) -> None:
+        self._wait = wait
+
+    def wait(self, into: memoryview | None = None) -> Answer | None:
+        """Return the answer; Zenoh lets nobody choose where it is put."""
+        return self._wait()
+
+    def abandon(self) -> None:
+        """Do nothing: an answer that nobody takes goes with its handler."""
 
 
 def _pump(notices: zenoh.Handler[zenoh.Sample], feed: NoticeQueue) -> None:

@@ -43,8 +43,8 @@ OPEN_S: Final = 5.0
 """How long whoever accepts a connection has to answer in Zenoh's language."""
 CLIENT_BLOCK_S: Final = 3.0
 """How long a client waits for a shard that does not read before it gives up the connection."""
-TRANSPORTS_MAX: Final = 10_000
-"""Connections of one shard; as many as sessions."""
+TRANSPORTS_MAX: Final = 20_000
+"""Connections of one shard: one for the calls and one for the large data of each session."""
 
 
 def session_config(

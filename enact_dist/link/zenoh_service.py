@@ -21,6 +21,7 @@ import zenoh
 
 from enact_dist.core.messages import (
     Answer,
+    Fetch,
     Finish,
     Reached,
     Refused,
@@ -45,6 +46,8 @@ if TYPE_CHECKING:
     from enact_dist.link.host import ShardHost
 
 _log = logging.getLogger("enact.link")
+DATA_SUFFIX: Final = "/data"
+"""Slices of a client count, and wait, apart from its other answers."""
 _NOTICES: Final = "@notices"
 """Stands for all watchers together among the clients of `Senders`."""
 JOIN_S: Final = 0.5
@@ -233,9 +236,16 @@ def _nameless(_: object) -> str:
     return ""
 
 
+def _data_client(request: object) -> str:
+    """Return for whom a slice travels."""
+    return cast("Fetch", request).lock.session + DATA_SUFFIX
+
+
 def _client_getter(kind: type) -> Callable[[object], str]:
     if kind in (Finish, Resolve):
         return _nameless  # it comes from a shard, which must not wait for its lock's client
+    if kind is Fetch:
+        return _data_client
     fields = {field.name for field in dataclasses.fields(kind)}
     path = "lock.session" if "lock" in fields else "session" if "session" in fields else ""
     return attrgetter(path) if path else _nameless

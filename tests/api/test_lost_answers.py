@@ -37,9 +37,23 @@ class LosingCarrier:
     def request(self, shard, message, *, timeout_s):
         return self._maybe(message, self._inner.request(shard, message, timeout_s=timeout_s))
 
+    def begin(self, shard, message, *, timeout_s):
+        return LosingBegun(self, message, self._inner.begin(shard, message, timeout_s=timeout_s))
+
     def request_all(self, requests, *, timeout_s):
         answers = self._inner.request_all(requests, timeout_s=timeout_s)
         return [self._maybe(q, a) for (_, q), a in zip(requests, answers, strict=True)]
+
+
+class LosingBegun:
+    """A call that was begun, and whose answer may get lost."""
+
+    def __init__(self, carrier, message, begun):
+        self._carrier, self._message, self._begun = carrier, message, begun
+        self.abandon = begun.abandon
+
+    def wait(self, into=None):
+        return self._carrier._maybe(self._message, self._begun.wait(into))
 
 
 def lose(cell, *kinds, chance=0.3, seed=1):

@@ -1,6 +1,7 @@
 """What a user of `WorldContext` may rely on: init, views, listings, raw data."""
 
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -132,8 +133,9 @@ def test_view_of_small_data_costs_one_round_trip(cell, online):
     online.init(piece, CLOUD, np.zeros(50_000))
     asked = []
     carrier = cell._client.carrier
-    request, request_all = carrier.request, carrier.request_all
+    request, request_all, begin = carrier.request, carrier.request_all, carrier.begin
     carrier.request = lambda s, m, **k: (asked.append(type(m)), request(s, m, **k))[1]
+    carrier.begin = lambda s, m, **k: (asked.append(type(m)), begin(s, m, **k))[1]
     carrier.request_all = lambda rs, **k: (
         asked.extend(type(m) for _, m in rs),
         request_all(rs, **k),
@@ -151,15 +153,16 @@ def test_view_is_taken_anew_when_its_data_are_gone_before_they_came(cell, online
     """A shard that restarts between a view and its large data costs a second look, no error."""
     online.init(piece, CLOUD, np.arange(50_000))
     view = View(online, piece, CLOUD)
-    request = cell._client.carrier.request
+    begin = cell._client.carrier.begin
     gone = iter([True, True])
 
     def forget(shard, message, **options):
         if isinstance(message, Fetch) and next(gone, False):
-            return Gone(message.slot, message.version)
-        return request(shard, message, **options)
+            answer = Gone(message.slot, message.version)
+            return SimpleNamespace(wait=lambda _into: answer, abandon=lambda: None)
+        return begin(shard, message, **options)
 
-    cell._client.carrier.request = forget
+    cell._client.carrier.begin = forget
     assert online.view(view)[view][-1] == 49_999
     gone = iter([True] * 3)
     online.init(bench, CLOUD, np.arange(50_000))
