@@ -34,6 +34,7 @@ class Finishing:
         primary: The shard whose commit decides; empty where nothing is written.
         left: Shards that have not validated or prepared yet.
         prepared: What the other writing shards have answered.
+        pending: Whether the last word about the commit was that its shard still works on it.
     """
 
     lock: LockId
@@ -45,6 +46,7 @@ class Finishing:
     prepared: dict[str, Prepared] = field(default_factory=dict)
     ask_outcome: bool = False
     sent: bool = False
+    pending: bool = False
 
     def __post_init__(self) -> None:
         self.primary = min(self.writes, default="")

@@ -230,7 +230,7 @@ class MultiLock:
         self.silent_shard = shard
         self._free_calls = 0
         if isinstance(request, Commit | Outcome) and self._finishing is not None:
-            self._finishing.ask_outcome = True
+            self._finishing.ask_outcome, self._finishing.pending = True, False
         self._pause(now_ns)
 
     def _pause(self, now_ns: int) -> None:
@@ -350,6 +350,9 @@ class MultiLock:
     def _gives_up(self) -> None:
         """The deadline has passed: rest in what that means in this phase."""
         if self.phase is Phase.COMMITTING:
+            if self._finishing is not None and self._finishing.pending:
+                primary = self._finishing.primary
+                self.cause = f"shard {primary} still works on it: its disk has not kept it yet"
             self._end(Phase.UNKNOWN if self.sent_commit else Phase.UNREACHABLE)
         elif self.phase is Phase.VALIDATING or self.silent_shard:
             self._end(Phase.UNREACHABLE)
@@ -463,6 +466,7 @@ class MultiLock:
         if answer.kind == OUTCOME_COMMITTED:
             self._committed(answer.position, answer.versions)
         elif answer.kind == OUTCOME_PENDING:
+            finishing.pending = True
             self._pause(now_ns)
         elif answer.kind == OUTCOME_EXPIRED:
             self.cause = "its shard has no record of this session any more"

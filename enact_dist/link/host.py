@@ -23,6 +23,7 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections import deque
 from typing import TYPE_CHECKING, Final, cast
 
@@ -69,6 +70,8 @@ TICK_S_MIN: Final = 0.001
 """The timer rests at least so long; deadlines of many locks then share one tick."""
 PAYLOAD_BYTES_MAX: Final = 2 << 30
 """Bytes of large data in plain memory that wait for their commits, or came apart from them."""
+STALL_S: Final = 1.0
+"""A disk that takes longer than this over one batch is told to the log."""
 PARKED_MAX: Final = 100_000
 """Requests that may wait for their answers at one time."""
 JOIN_S: Final = 0.5
@@ -137,10 +140,13 @@ class ShardHost:
         self._inboxes: tuple[Callable[[], None], ...] = ()
         self._failure: Exception | None = None
         self._ended = False
+        self._draining = False
+        self._rests = threading.Event()
         self._wake = threading.Condition(threading.Lock())
         self._look_again = False
         self._store = store
         self._store_thread = self._start_store(store) if store is not None else None
+        self._stalled_since_s: float | None = None
         self._timer = threading.Thread(target=self._keep_time, name="enact-timer", daemon=True)
         self._timer.start()
 
@@ -237,6 +243,8 @@ class ShardHost:
                 self._perform(self._decide(message, handle))
                 while self._kept_at_once:
                     self._perform(self._decide(Persisted(self._kept_at_once.popleft()), 0))
+                if self._draining and self._shard.idle:
+                    self._rests.set()
             except BaseException as failure:
                 # Half a decision must not be served.
                 _log.exception("the shard failed on %s", type(message).__name__)
@@ -293,6 +301,7 @@ class ShardHost:
         self._failure = failure
         self._ended = True
         self._replies.clear()
+        self._rests.set()
         _log.critical("shard %s stops: %s", self.name, failure)
         if self._on_failure is not None:
             self._on_failure(failure)
@@ -305,10 +314,27 @@ class ShardHost:
             drain()
         sessions, tenures = self._shard.state.sessions, self._shard.state.tenures
         self._payloads.sweep(sessions.by_id.__contains__, tenures.by_session.__contains__)
+        if self._store_thread is not None:
+            self._look_at_disk(self._store_thread.writing_since_s, time.monotonic())
         with self._mutex:
             if not self._ended:
                 self._handle(Tick(), 0)
             return self._shard.next_deadline_ns()
+
+    def _look_at_disk(self, since_s: float | None, now_s: float) -> None:
+        """Tell the log once of a batch that takes long, and once when it is over."""
+        stalled_s = self._stalled_since_s
+        if stalled_s is not None and since_s != stalled_s:
+            self._stalled_since_s = None
+            _log.warning("the disk of shard %s goes on after %.1f s", self.name, now_s - stalled_s)
+        elif stalled_s is None and since_s is not None and now_s - since_s >= STALL_S:
+            self._stalled_since_s = since_s
+            self.count("disk_stalls")
+            _log.warning(
+                "the disk of shard %s has kept nothing for %.1f s; who commits or joins waits",
+                self.name,
+                now_s - since_s,
+            )
 
     def _keep_time(self) -> None:
         while not self._ended:
@@ -339,13 +365,16 @@ class ShardHost:
 
     def drain(self) -> None:
         """Grant nothing new and answer whoever is parked; may be called again."""
+        self._draining = True
         self.event(Drain())
 
-    @property
-    def idle(self) -> bool:
-        """Whether a drained shard may stop without anybody losing a lock or a commit."""
-        with self._mutex:
-            return self._ended or self._shard.idle
+    def wait_idle(self, timeout_s: float) -> bool:
+        """Wait until a drained shard may stop without anybody losing a lock or a commit.
+
+        Returns:
+            Whether it may, or has failed; False after `timeout_s`.
+        """
+        return self._rests.wait(timeout_s)
 
     def close(self) -> None:
         """Keep what is on its way to the store, then end; twice is harmless."""
@@ -354,6 +383,7 @@ class ShardHost:
         with self._mutex:
             self._ended = True
             self._replies.clear()
+            self._rests.set()
         self._wake_timer()
         if threading.current_thread() is not self._timer:
             self._timer.join(JOIN_S)

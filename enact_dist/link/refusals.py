@@ -32,13 +32,17 @@ if TYPE_CHECKING:
 
 
 def unreachable(
-    shard: str, waited_s: float, endpoint_of: Callable[[str], str]
+    shard: str, waited_s: float, endpoint_of: Callable[[str], str], *, runs: bool = False
 ) -> ShardUnreachableError:
-    """Return the error for a shard that does not answer."""
+    """Return the error for a shard that does not answer, though it `runs` perhaps."""
     endpoint = endpoint_of(shard)
+    advice = (
+        f"is it running? (enact shard ls; enact shard run {shard})"
+        if not runs
+        else "it runs, so perhaps its disk stands still: see its log"
+    )
     return ShardUnreachableError(
-        f"shard {shard} at {endpoint} did not answer for {waited_s:.1f} s;"
-        f" is it running? (enact shard ls; enact shard run {shard})",
+        f"shard {shard} at {endpoint} did not answer for {waited_s:.1f} s; {advice}",
         shard=shard,
         endpoint=endpoint,
     )

@@ -21,6 +21,7 @@ from enact_dist.core.messages import (
     Alive,
     Answer,
     AspectEntry,
+    AwaitStamp,
     Commit,
     Goodbye,
     Hello,
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
 
     from enact_dist.core.client import Client
     from enact_dist.core.messages import Request
+    from enact_dist.errors import ShardUnreachableError
     from enact_dist.link.carrier import Begun, Carrier, NoticeFeed
 
 CALL_S: Final = 1.0
@@ -171,9 +173,14 @@ class SessionClient:
                 return [answers[index] for index in range(len(calls))]
             if self._now_ns() >= deadline_ns:
                 missing = next(index for index in left if index not in answers)
-                raise unreachable(calls[missing][0], timeout_s, self.carrier.endpoint_of)
+                raise self._unreachable(calls[missing][0], timeout_s)
             self._rest(pause_s, self._returns)
             pause_s = min(2 * pause_s, 0.3)
+
+    def _unreachable(self, shard: str, waited_s: float) -> ShardUnreachableError:
+        """Return the error for a shard without an answer, after a question that needs no disk."""
+        runs = self.carrier.request(shard, AwaitStamp(0, 0), timeout_s=CALL_S / 4) is not None
+        return unreachable(shard, waited_s, self.carrier.endpoint_of, runs=runs)
 
     def call_once(
         self, calls: Sequence[tuple[str, Request]], *, timeout_s: float = CALL_S

@@ -14,7 +14,6 @@ import queue
 import socket
 import sys
 import threading
-import time
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from logging.handlers import QueueHandler, QueueListener
@@ -130,9 +129,7 @@ class RunningShard:
                 return
             self._stopped = True
             self.host.drain()
-            deadline_s = time.monotonic() + drain_s
-            while not self.host.idle and time.monotonic() < deadline_s:
-                time.sleep(0.005)
+            self.host.wait_idle(drain_s)
             self.host.drain()  # who asked meanwhile is parked: answer them, too
             self.host.close()
             self._calls.close()

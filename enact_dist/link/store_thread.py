@@ -8,6 +8,7 @@ longer queue.
 from __future__ import annotations
 
 import threading
+import time
 from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
@@ -35,6 +36,10 @@ class StoreThread:
             that are 0.
         failed: Called from the thread, once, when the store has failed; nothing is written or
             reported after that.
+
+    Attributes:
+        writing_since_s: When the batch was begun that is being written, on the monotonic clock;
+            None while nothing is.
     """
 
     def __init__(
@@ -49,6 +54,7 @@ class StoreThread:
         self._wake = threading.Condition(threading.Lock())
         self._queue: list[Persist] = []
         self._ending = False
+        self.writing_since_s: float | None = None
         self._thread = threading.Thread(target=self._run, name="enact-store", daemon=True)
         self._thread.start()
 
@@ -84,7 +90,9 @@ class StoreThread:
         """Write what is queued and report it; return False at the end."""
         batch = self._next_batch()
         if batch:
+            self.writing_since_s = time.monotonic()
             self._store.write(batch)
+            self.writing_since_s = None
             tickets = [persist.ticket for persist in batch if persist.ticket]
             if tickets:
                 self._done(tickets)

@@ -60,9 +60,11 @@ def discover(endpoints: Sequence[str], hello: Hello, *, timeout_s: float) -> tup
     """
     deadline_s = time.monotonic() + timeout_s
     session = open_session(connect=endpoints, lease_s=PROBE_LEASE_S, open_s=timeout_s)
+    silent = ""
     try:
         while time.monotonic() < deadline_s:
             for found in _find(session, deadline_s):
+                silent = found.shard
                 answer = _greet(session, found, hello, deadline_s)
                 if isinstance(answer, Welcome):
                     return found.cell, answer
@@ -71,6 +73,13 @@ def discover(endpoints: Sequence[str], hello: Hello, *, timeout_s: float) -> tup
     finally:
         close_session(session)
     where = ", ".join(endpoints)
+    if silent:
+        raise ShardUnreachableError(
+            f"shard {silent} is there at {where}, and did not answer a hello for {timeout_s:g} s;"
+            " perhaps its disk stands still: see its log",
+            shard=silent,
+            endpoint=where,
+        )
     raise ShardUnreachableError(
         f"no shard answers at {where} (waited {timeout_s:g} s); is one running there?"
         " (enact shard run, enact doctor)",

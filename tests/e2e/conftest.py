@@ -161,4 +161,6 @@ def make_cell(tmp_path, carrier):
 
     yield make
     for cell in cells:
+        for name, daemon in cell.daemons.items():  # shown where the test has failed
+            print(f"shard {name}: status {daemon.popen.poll()}, {daemon.story()}")
         cell.end()

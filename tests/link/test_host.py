@@ -237,13 +237,17 @@ def test_host_answers_the_parked_and_grants_nothing_when_it_drains(start, make_p
     host.submit(AwaitStamp(2**62, 50_000_000_000), answers.append)
 
     host.drain()
-    busy = host.idle
+    idle_at_first = host.wait_idle(0.0)
+    ended = threading.Event()
+    stopping = threading.Thread(target=lambda: host.wait_idle(10.0) and ended.set())
+    stopping.start()
     holder.commit(granted, "cup", b"x")
+    stopping.join()
     after = waiter.acquire("tray", wait_s=0.0)
 
     assert [type(answer) for answer in answers] == [Waiting, Reached]
-    assert not busy
-    assert host.idle
+    assert not idle_at_first
+    assert ended.is_set()
     assert isinstance(after, Waiting)
 
 

@@ -1,0 +1,107 @@
+"""A shard whose disk stands still is alive: it says so, and nobody takes it for dead."""
+
+import threading
+
+import pytest
+
+from enact_dist import Aspect, Entity, Lock, Write, connect
+from enact_dist.errors import CommitUnknownError, ShardUnreachableError
+from enact_dist.link import client, host, session_client
+from enact_dist.link.store import Store
+
+COUNT = Aspect("count", int)
+CUP = Entity("cup")
+
+
+@pytest.fixture
+def disk(monkeypatch):
+    """Whether the disks of all shards of this process go on; they do, until it is cleared."""
+    goes_on, write = threading.Event(), Store.write
+    goes_on.set()
+
+    def write_when_it_goes_on(store, batch):
+        assert goes_on.wait(20)
+        write(store, batch)
+
+    monkeypatch.setattr(Store, "write", write_when_it_goes_on)
+    monkeypatch.setattr(host, "STALL_S", 0.1)
+    yield goes_on
+    goes_on.set()
+
+
+def add_one(cell, aspect=COUNT):
+    write = Write(cell.world("online"), CUP, aspect)
+    with Lock(write) as lock:
+        lock[write] = lock.get(write, 0) + 1
+
+
+def disk_lines(caplog):
+    return [record.getMessage() for record in caplog.records if "disk" in record.getMessage()]
+
+
+def test_commit_that_the_disk_still_works_on_says_so(daemon, endpoint, tmp_path, disk, monkeypatch):
+    """The shard answers all the time, only not with the end; its word for it is passed on."""
+    daemon(endpoint, folder=tmp_path, durability="durable")
+    monkeypatch.setattr(client, "FINISH_S", 2.5)
+    with connect(endpoint) as cell:
+        add_one(cell)
+        disk.clear()
+
+        with pytest.raises(CommitUnknownError, match="shard s0 still works on it") as caught:
+            add_one(cell)
+
+        assert "no answer" not in str(caught.value)
+        disk.set()
+        assert cell.outcome(caught.value.lock_id) is not None
+
+
+def test_shard_whose_disk_stands_still_is_not_taken_for_dead(
+    daemon, endpoint, tmp_path, disk, monkeypatch
+):
+    """Neither who connects nor who registers an aspect is asked whether the shard runs."""
+    shard = daemon(endpoint, folder=tmp_path, durability="durable")
+    monkeypatch.setattr(session_client, "FINISH_S", 0.5)
+    with connect(endpoint) as cell:
+        add_one(cell)
+        disk.clear()
+
+        with pytest.raises(ShardUnreachableError, match=r"s0 is there.*its disk"):
+            connect(endpoint, timeout_s=1.0)
+        with pytest.raises(ShardUnreachableError, match=r"it runs.*its disk") as caught:
+            cell._client.greet(timeout_s=0.5)
+            cell._client.register(worlds=("another",), timeout_s=0.5)
+
+        assert caught.value.shard == "s0"
+        disk.set()
+    assert shard.host._shard.counters["disk_stalls"] >= 1
+
+
+def test_disk_that_stands_still_is_told_to_the_log(daemon, endpoint, tmp_path, disk, caplog, until):
+    """Once when it is noticed, and once, with its length, when it is over."""
+    shard = daemon(endpoint, folder=tmp_path, durability="durable")
+    with connect(endpoint) as cell:
+        add_one(cell)
+        disk.clear()
+        waiting = threading.Thread(target=add_one, args=(cell,))
+        waiting.start()
+
+        until(lambda: shard.host._shard.counters.get("disk_stalls"))
+        disk.set()
+        waiting.join()
+        told = until(lambda: len(lines := disk_lines(caplog)) > 1 and lines)
+
+    assert len(told) == 2, told
+    assert "has kept nothing for" in told[0]
+    assert "goes on after" in told[1]
+    assert shard.host._shard.counters["disk_stalls"] == 1
+
+
+def test_idle_disk_stands_not_still(daemon, endpoint, tmp_path, disk):
+    """A shard without work counts nothing."""
+    shard = daemon(endpoint, folder=tmp_path, durability="durable")
+    with connect(endpoint) as cell:
+        add_one(cell)
+        for _ in range(4):
+            shard.host.tick()
+
+    assert "disk_stalls" not in shard.host._shard.counters
