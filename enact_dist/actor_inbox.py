@@ -1,4 +1,4 @@
-"""How changes reach a running actor: one watch per trigger pattern, each on a thread of its own.
+"""How changes reach a running actor: one watch per world context, each on a thread of its own.
 
 A watch blocks, and an update must not wait for one; so each watch has a thread that only fills
 the actor's inbox.  A watch whose shard is away is opened again with growing pauses; its snapshot
@@ -17,10 +17,11 @@ from enact_dist.actor_triggers import BackOff, PendingTriggers, Trigger
 from enact_dist.errors import LinkError
 from enact_dist.link.clock import monotonic_ns
 from enact_dist.session import session_of
+from enact_dist.terms import pattern_matches
 from enact_dist.together import Captured, captured_versions
 
 if TYPE_CHECKING:
-    from collections.abc import Hashable, Iterator, Mapping, Sequence
+    from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 
     from enact_dist.actor_binding import BoundActor, Watched
     from enact_dist.terms import Entity
@@ -140,6 +141,14 @@ class SetInbox(_Box[PendingSets]):
         log.warning("incomplete, outside retention before its update: %s", told)
 
 
+def _by_context(watched: Iterable[Watched]) -> dict[str, list[Watched]]:
+    """Return what one watch can follow together, by the name of the world context."""
+    groups: dict[str, list[Watched]] = {}
+    for each in watched:
+        groups.setdefault(each.context.name, []).append(each)
+    return groups
+
+
 class Watching:
     """All watches of one actor while it runs; a context manager.
 
@@ -155,13 +164,8 @@ class Watching:
         self._guard = threading.Lock()
         self._open: list[Watch] = []
         self._threads = [
-            threading.Thread(
-                target=self._follow,
-                args=(watched,),
-                name=f"watch {watched.context.name}/{watched.entities}",
-                daemon=True,
-            )
-            for watched in bound.watched()
+            threading.Thread(target=self._follow, args=(group,), name=f"watch {name}", daemon=True)
+            for name, group in _by_context(bound.watched()).items()
         ]
 
     def __enter__(self) -> Self:
@@ -178,20 +182,22 @@ class Watching:
         for thread in self._threads:
             thread.join()
 
-    def _follow(self, watched: Watched) -> None:
+    def _follow(self, group: Sequence[Watched]) -> None:
         refused = 0
         while not self._over.is_set():
             try:
-                for change in self._changes(watched):
+                for change in self._changes(group):
                     refused = 0
-                    self._note(watched, change)
+                    for watched in group:
+                        if pattern_matches(str(watched.entities), change.entity.name):
+                            self._note(watched, change)
             except LinkError as error:
                 wait_s = BackOff().wait_s(refused, random.random())  # noqa: S311 (spreads retries)
                 refused += 1
                 log.warning(
                     "watch of %s in %s broke, again in %.2f s: %s",
-                    watched.entities,
-                    watched.context.name,
+                    ", ".join(str(watched.entities) for watched in group),
+                    group[0].context.name,
                     wait_s,
                     error,
                 )
@@ -201,8 +207,10 @@ class Watching:
                     self._inbox.fail(error)
                 return
 
-    def _changes(self, watched: Watched) -> Iterator[Change]:
-        with watched.context.watch(watched.entities, *watched.aspects) as watch:
+    def _changes(self, group: Sequence[Watched]) -> Iterator[Change]:
+        patterns = dict.fromkeys(str(watched.entities) for watched in group)
+        aspects = {aspect.name: aspect for watched in group for aspect in watched.aspects}
+        with group[0].context.watch_all(patterns, aspects.values()) as watch:
             with self._guard:
                 if self._over.is_set():
                     return

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Final
 from enact_dist.core.datum import Position, Slot
 from enact_dist.core.messages import Notice, Survey, Surveyed
 from enact_dist.errors import ShardUnreachableError
+from enact_dist.link.notices import Skipped
 from enact_dist.terms import Entities, Entity, pattern_matches
 
 if TYPE_CHECKING:
@@ -58,29 +59,38 @@ class Change:
 
 @dataclass(slots=True)
 class _Following:
-    """What is known of one shard's notices: all up to `number` of `epoch` are accounted for."""
+    """What is known of one shard's notices: all up to `number` of `epoch` are accounted for.
+
+    `behind` is a later number that a keep-alive has told, and since when that is known.
+    """
 
     epoch: int = -1
     number: int = 0
     listed: bool = False
+    behind: tuple[tuple[int, int], float] | None = None
 
 
 class Watch:
     """An iterator of `Change`; also a context manager.  One thread at a time may iterate."""
 
     def __init__(
-        self, client: CellClient, context: str, pattern: str, aspects: tuple[str, ...]
+        self,
+        client: CellClient,
+        context: str,
+        patterns: tuple[str, ...],
+        aspects: tuple[str, ...],
     ) -> None:
         self._client = client
-        self._context, self._pattern = context, str(Entities(pattern))
-        self._aspects = aspects
+        self._context, self._aspects = context, aspects
+        self._patterns = tuple(str(Entities(pattern)) for pattern in patterns)
+        self._survey = Survey((context,), self._patterns, aspects)
         self._known: dict[Slot, tuple[int, int]] = {}
         self._following: dict[str, _Following] = {}
         self._pending: deque[Change] = deque()
         self._closed = threading.Event()
         self._missed = 0
         # Subscribed before the first listing, so that nothing falls between the two.
-        self._feed = client.subscribe()
+        self._feed = client.subscribe(self._survey)
         try:
             for shard in client.shards():
                 self._following[shard] = _Following()
@@ -110,7 +120,10 @@ class Watch:
             left_s = POLL_S if deadline_s is None else deadline_s - time.monotonic()
             notice = self._feed.get(timeout_s=max(0.0, min(POLL_S, left_s)))
             if notice is not None:
-                self._take(notice)
+                if isinstance(notice, Skipped):
+                    self._pass_over(notice)
+                else:
+                    self._take(notice)
                 continue
             # A closed cell's feed answers None at once: without this the loop would spin.
             self._client.check_usable()
@@ -134,18 +147,32 @@ class Watch:
             if self._covers(slot):
                 self._note(notice.shard, slot, version, stamp_ns, null=null, captured=captured_ns)
 
+    def _pass_over(self, skipped: Skipped) -> None:
+        """Account for notices of other slots; one that is missing before them remains missing."""
+        following = self._following.get(skipped.shard)
+        if (
+            following is not None
+            and skipped.epoch == following.epoch
+            and skipped.after <= following.number < skipped.number
+        ):
+            following.number = skipped.number
+
     def _covers(self, slot: Slot) -> bool:
         return (
             slot.context == self._context
             and (not self._aspects or slot.aspect in self._aspects)
-            and pattern_matches(self._pattern, slot.entity)
+            and any(pattern_matches(pattern, slot.entity) for pattern in self._patterns)
         )
 
     def _look_for_missed_tail(self) -> None:
         """Compare with what the keep-alives know; they come every quarter of a TTL."""
         for shard, following in self._following.items():
-            epoch, number = self._client.notice_numbers.get(shard, (0, 0))
-            if epoch > following.epoch or (epoch == following.epoch and number > following.number):
+            known = (following.epoch, following.number)
+            behind = following.behind
+            if behind is None or behind[0] <= known:
+                told = self._client.notice_numbers.get(shard, (0, 0))
+                behind = following.behind = (told, time.monotonic()) if told > known else None
+            if behind is not None and time.monotonic() - behind[1] >= self._feed.late_s:
                 self._try_list_again(shard)
 
     def _try_list_again(self, shard: str) -> None:
@@ -156,8 +183,7 @@ class Watch:
             self._following[shard].epoch = -1
 
     def _list_again(self, shard: str, *, timeout_s: float) -> None:
-        request = Survey((self._context,), (self._pattern,), self._aspects)
-        answer = self._client.call(shard, request, timeout_s=timeout_s)
+        answer = self._client.call(shard, self._survey, timeout_s=timeout_s)
         if not isinstance(answer, Surveyed):
             return
         states: list[SlotState] = sorted(answer.states, key=lambda state: state.stamp_ns)

@@ -21,7 +21,7 @@ from enact_dist.watch import Watch
 from enact_dist.wire.limits import ITEMS_MAX
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
 
     from enact_dist.core.messages import Item, SlotState
     from enact_dist.session import Session
@@ -115,11 +115,16 @@ class WorldContext(Context):
             LockHeldError: This thread holds a lock.
         """
         refuse_inside_lock("watch")
+        return self.watch_all((str(entities),), aspects)
+
+    def watch_all(self, patterns: Iterable[str], aspects: Iterable[Aspect[Any]]) -> Watch:
+        """Follow several patterns with one watch; as `watch`, for the framework."""
         self.session.client.check_usable()
+        aspects = tuple(aspects)
         if aspects:
             self.session.register_aspects(aspects)
         names = tuple(aspect.name for aspect in aspects)
-        return Watch(self.session.client, self.name, str(entities), names)
+        return Watch(self.session.client, self.name, tuple(patterns), names)
 
     def survey(
         self, entities: Entities | str = "**", aspects: tuple[str, ...] = ()

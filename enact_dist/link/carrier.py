@@ -20,7 +20,8 @@ from enact_dist.wire.frames import decode_frame
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from enact_dist.core.messages import Notice, Request, ShardEntry
+    from enact_dist.core.messages import Notice, Request, ShardEntry, Survey
+    from enact_dist.link.notices import Skipped
 
 
 _ANSWERS: Final = frozenset(get_args(Answer))
@@ -64,10 +65,15 @@ class NoticeFeed(Protocol):
     def dropped(self) -> int:
         """How many notices were thrown away because nobody took them in time."""
 
-    def get(self, timeout_s: float | None) -> Notice | None:
-        """Return the next notice; None after `timeout_s` without one, or once closed.
+    @property
+    def late_s(self) -> float:
+        """How long the number of a notice of no interest may stay out."""
 
-        `timeout_s` None waits until a notice comes or `close` is called.
+    def get(self, timeout_s: float | None) -> Notice | Skipped | None:
+        """Return the next notice of interest, or which numbers were of none.
+
+        `timeout_s` None waits until a notice comes or `close` is called; else None is returned
+        after so long without one, or once closed.
         """
 
     def close(self) -> None:
@@ -130,8 +136,12 @@ class Carrier(Protocol):
             MisuseError: As `request`.
         """
 
-    def subscribe(self) -> NoticeFeed:
-        """Open a feed of the notices of all shards, those of shards added later included."""
+    def subscribe(self, interest: Survey | None = None) -> NoticeFeed:
+        """Open a feed of the notices of all shards, those of shards added later included.
+
+        Args:
+            interest: What is watched; None for everything.
+        """
 
     def add_endpoints(self, entries: Sequence[ShardEntry]) -> None:
         """Connect to further shards; those already in reach stay as they are."""

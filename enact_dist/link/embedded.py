@@ -18,7 +18,7 @@ from enact_dist.link.notices import NoticeQueue
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from enact_dist.core.messages import Answer, Request, ShardEntry
+    from enact_dist.core.messages import Answer, Request, ShardEntry, Survey
     from enact_dist.link.host import ShardHost
 
 
@@ -131,10 +131,10 @@ class EmbeddedCarrier:
         if self._closed:
             raise MisuseError("the connection to this cell is closed; open it again")
 
-    def subscribe(self) -> NoticeQueue:
+    def subscribe(self, interest: Survey | None = None) -> NoticeQueue:
         """Open a feed of the shard's notices."""
         self._check_usable()
-        feed = NoticeQueue()
+        feed = NoticeQueue(interest)
         feed.on_close = self._host.watch(feed.put)
         self._feeds.append(feed)
         return feed

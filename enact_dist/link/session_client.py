@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
     from enact_dist.core.client import Client
-    from enact_dist.core.messages import Request
+    from enact_dist.core.messages import Request, Survey
     from enact_dist.errors import ShardUnreachableError
     from enact_dist.link.carrier import Begun, Carrier, NoticeFeed
 
@@ -294,10 +294,10 @@ class SessionClient:
                 if isinstance(answer, Refused):
                     raise error_of(answer)
 
-    def subscribe(self) -> NoticeFeed:
-        """Open a feed of the notices of all shards."""
+    def subscribe(self, interest: Survey | None = None) -> NoticeFeed:
+        """Open a feed of the notices of all shards that `interest` lists (None: of all slots)."""
         self.check_usable()
-        return self.carrier.subscribe()
+        return self.carrier.subscribe(interest)
 
     # ---------------------------------------------------------------- keep-alive
 

@@ -22,19 +22,22 @@ from typing import TYPE_CHECKING, Final
 from enact_dist.core.messages import Welcome
 from enact_dist.errors import LinkError, ProtocolError
 from enact_dist.link.carrier import check_usable
-from enact_dist.link.notices import NoticeQueue
+from enact_dist.link.notices import NoticeQueue, Skipped
 from enact_dist.link.socket_frames import Kind
 from enact_dist.link.socket_line import Connection, SocketLine
+from enact_dist.wire.frames import encode_frame
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from enact_dist.core.messages import Answer, Request, ShardEntry
+    from enact_dist.core.messages import Answer, Request, ShardEntry, Survey
     from enact_dist.link.carrier import Begun
     from enact_dist.link.zenoh_carrier import ZenohCarrier
 
 FETCH_BYTES: Final = 4 << 20
 """A slice over a socket delays nobody else; more than this no shard sends at once."""
+LATE_S: Final = 1.0
+"""How long the numbers of notices of no interest may stay out: four times as a shard says."""
 JOIN_S: Final = 1.0
 
 _log = logging.getLogger("enact.link")
@@ -237,11 +240,13 @@ class SocketCarrier:
 
     # ---------------------------------------------------------------- notices
 
-    def subscribe(self) -> NoticeQueue:
+    def subscribe(self, interest: Survey | None = None) -> NoticeQueue:
         """Open a feed of the notices of all shards, those of shards added later included."""
         self._check_usable()
-        queue = NoticeQueue()
-        feed = _Feed(self, queue)
+        queue = NoticeQueue(interest)
+        if interest is not None:
+            queue.late_s = LATE_S
+        feed = _Feed(self, queue, interest)
         queue.on_close = lambda: self._unsubscribe(queue)
         self._feeds[queue] = feed
         feed.settle()
@@ -325,9 +330,10 @@ class _Feed:
     is missing is noticed by whoever watches.
     """
 
-    def __init__(self, carrier: SocketCarrier, queue: NoticeQueue) -> None:
+    def __init__(self, carrier: SocketCarrier, queue: NoticeQueue, interest: Survey | None) -> None:
         self._carrier = carrier
         self._queue = queue
+        self._watch = encode_frame(interest)[0] if interest is not None else b""
         self._mutex = threading.Lock()
         self._pumps: dict[str, tuple[Connection, threading.Thread]] = {}
         self._over_zenoh = False
@@ -354,7 +360,7 @@ class _Feed:
         if connection is None:
             return
         try:
-            connection.exchange(Kind.WATCH, b"")
+            connection.exchange(Kind.WATCH, self._watch)
         except (LinkError, ProtocolError, EOFError, OSError) as error:
             _log.info("no notices over the socket to shard %s: %s", shard, error)
             line.drop(connection)
@@ -369,7 +375,10 @@ class _Feed:
         """Move notices from a connection into the queue until it ends."""
         try:
             for notice in connection.notices():
-                self._queue.put(notice)
+                if isinstance(notice, Skipped):
+                    self._queue.skip(notice)
+                else:
+                    self._queue.put(notice)
         except (ProtocolError, EOFError, OSError) as error:
             if not self._closed:
                 _log.info("notices of shard %s end: %s", shard, error)

@@ -12,8 +12,9 @@ import socket
 import threading
 from typing import TYPE_CHECKING, Final, cast, get_args
 
-from enact_dist.core.messages import Answer, Refused, Request
+from enact_dist.core.messages import Answer, Refused, Request, Survey
 from enact_dist.errors import LinkError, ProtocolError
+from enact_dist.link.notices import Interest
 from enact_dist.link.senders import size_of
 from enact_dist.link.socket_frames import (
     BUFFER_BYTES,
@@ -134,7 +135,7 @@ class SocketConnection:
             if kind != Kind.MESSAGE:
                 if kind == Kind.WATCH:
                     self.step = step + 1
-                    SocketWatcher(self._service, self.connected).run()
+                    SocketWatcher(self._service, self.connected, _interest(header)).run()
                     return
                 raise ProtocolError(f"a frame of kind {kind} came in place of a request")
             try:
@@ -209,3 +210,17 @@ class SocketConnection:
             self._answered.release()
         except RuntimeError:  # an answer and the end came at the same moment
             return
+
+
+def _interest(header: bytes) -> Interest | None:
+    """Return what a watcher watches; None for everything.
+
+    Raises:
+        ProtocolError: The header is something else.
+    """
+    if not header:
+        return None
+    wanted = decode_frame(header, b"")
+    if not isinstance(wanted, Survey):
+        raise ProtocolError(f"{type(wanted).__name__} came to say what is watched")
+    return Interest(wanted)

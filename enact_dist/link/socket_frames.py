@@ -29,7 +29,7 @@ from enact_dist.wire.limits import HEADER_BYTES_MAX, PAYLOAD_BYTES_MAX
 
 Buffer = bytes | memoryview
 
-STREAM_VERSION: Final = 1
+STREAM_VERSION: Final = 2
 MAGIC: Final = b"ED"
 BUFFER_BYTES: Final = 32 << 10
 """Kept per connection; frames up to this length are read without taking memory."""
@@ -55,11 +55,34 @@ class Kind(enum.IntEnum):
     MESSAGE = 4
     """A request, its answer, or a notice: the frame of `wire.frames`."""
     WATCH = 5
-    """Client: from now on send notices, I say nothing more."""
+    """Client: from now on send notices, I say nothing more (the header is the `Survey` that lists
+    what I watch, or empty for all)."""
+    SKIPPED = 6
+    """Shard: these notices were of no interest to you (the header is epoch, first and last)."""
 
 
 _MESSAGE: Final = int(Kind.MESSAGE)
 _KINDS: Final = frozenset(int(kind) for kind in Kind)
+
+
+_SKIPPED: Final = struct.Struct("<QQQ")
+
+
+def skipped_frame(epoch: int, after: int, number: int) -> bytes:
+    """Return the frame that says which notices of an epoch were of no interest."""
+    return prefixed(_SKIPPED.pack(epoch, after, number), 0, Kind.SKIPPED)
+
+
+def read_skipped(header: bytes) -> tuple[int, int, int]:
+    """Return the epoch, the number before the first and the last of what was skipped.
+
+    Raises:
+        ProtocolError: The header says something else.
+    """
+    if len(header) != _SKIPPED.size:
+        raise ProtocolError(f"{len(header)} bytes say which notices were skipped")
+    epoch, after, number = _SKIPPED.unpack(header)
+    return epoch, after, number
 
 
 def prefixed(header: bytes, payload_bytes: int, kind: int = _MESSAGE) -> bytes:

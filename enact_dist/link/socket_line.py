@@ -17,10 +17,12 @@ from typing import TYPE_CHECKING, Final
 from enact_dist.core.messages import Answer, Notice
 from enact_dist.errors import EnactError, LinkError, ProtocolError
 from enact_dist.link.carrier import read_answer
+from enact_dist.link.notices import Skipped
 from enact_dist.link.shared_folder import open_shared
 from enact_dist.link.socket_frames import (
     Kind,
     Stream,
+    read_skipped,
     rounded_s,
     send_frame,
     wait_at_most,
@@ -110,8 +112,8 @@ class Connection:
         if kind == Kind.OPEN and text != self.shard.encode():
             raise LinkError(f"shard {text!r} answers at the socket of {self.shard}")
 
-    def notices(self) -> Iterator[Notice]:
-        """Yield the notices that a shard sends since `WATCH`; ends only by an exception.
+    def notices(self) -> Iterator[Notice | Skipped]:
+        """Yield what a shard sends since `WATCH`; ends only by an exception.
 
         Raises:
             EOFError: As `receive`.
@@ -121,6 +123,9 @@ class Connection:
         wait_at_most(self.socket, socket.SO_RCVTIMEO, 0.0)
         while True:
             kind, header, payload = self._stream.receive()
+            if kind == Kind.SKIPPED:
+                yield Skipped(self.shard, *read_skipped(header))
+                continue
             notice = decode_frame(header, payload) if kind == Kind.MESSAGE else None
             if not isinstance(notice, Notice):
                 raise ProtocolError(f"{type(notice).__name__} came in place of a notice")

@@ -69,6 +69,7 @@ class SocketService:
         self._deaths = Deaths(self._died)
         self._unwatch = host.watch(self._publish)
         host.add_inbox(self.drain_inbox)
+        host.add_inbox(self._tell_skipped)
         self._thread = threading.Thread(target=self._accept, name="enact-accept", daemon=True)
         self._thread.start()
 
@@ -171,7 +172,11 @@ class SocketService:
             header, payload = encode_frame(notice)
             frame = prefixed(header, len(payload or b"")) + (payload or b"")
             for watcher in watchers:
-                watcher.put(frame)
+                watcher.put(notice, frame)
+
+    def _tell_skipped(self) -> None:
+        for watcher in self._watchers:
+            watcher.tell_skipped()
 
     # ---------------------------------------------------------------- end
 

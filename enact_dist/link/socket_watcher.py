@@ -2,6 +2,9 @@
 
 What it does not read is kept up to `NOTICES_MAX`, and then notices are dropped and counted: a
 watcher sees the gap in their numbers.
+
+Notices of what it does not watch are not sent: each would wake a process for nothing.  Of a run of
+them it gets the numbers, before the next notice, or when the run is `SKIP_S` old.
 """
 
 from __future__ import annotations
@@ -10,52 +13,88 @@ import os
 import select
 import socket
 import threading
+import time
 from collections import deque
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.link.socket_frames import Kind, prefixed
+from enact_dist.link.notices import Skipped
+from enact_dist.link.socket_frames import Kind, prefixed, skipped_frame
 
 if TYPE_CHECKING:
+    from enact_dist.core.messages import Notice
+    from enact_dist.link.notices import Interest
     from enact_dist.link.socket_service import SocketService
 
 NOTICES_MAX: Final = 65_536
 """Notices kept for a watcher that does not read."""
+SKIP_S: Final = 0.25
+"""After so long the numbers of skipped notices are sent by themselves."""
 
 
 class SocketWatcher:
     """One watching connection; its own thread is in `run`, whoever publishes is in `put`."""
 
-    __slots__ = ("_bell", "_connected", "_mutex", "_service", "_waiting")
+    __slots__ = (
+        "_bell", "_connected", "_interest", "_mutex", "_service", "_skipped", "_skipped_s",
+        "_waiting",
+    )  # fmt: skip
 
-    def __init__(self, service: SocketService, connected: socket.socket) -> None:
+    def __init__(
+        self, service: SocketService, connected: socket.socket, interest: Interest | None
+    ) -> None:
         self._service = service
+        self._interest = interest
+        self._skipped: Skipped | None = None
+        self._skipped_s = 0.0
         self._connected = connected
         self._mutex = threading.Lock()
         # The first that it is sent, whatever is committed at this moment.
         self._waiting = deque([memoryview(prefixed(b"", 0, Kind.OPENED))])
         self._bell = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
 
-    def put(self, frame: bytes) -> None:
-        """Send a frame, or as much as goes without waiting, or keep it, or drop it."""
+    def put(self, notice: Notice, frame: bytes) -> None:
+        """Send the frame of a notice, if it is watched; for one thread at a time."""
         with self._mutex:
-            if self._bell < 0:
+            if self._interest is None or self._interest.covers(notice):
+                self._send(self._taken_skipped() + frame)
+            elif self._skipped is None:
+                number = notice.number
+                self._skipped = Skipped(notice.shard, notice.epoch, number - 1, number)
+                self._skipped_s = time.monotonic()
+            else:
+                self._skipped = self._skipped._replace(number=notice.number)
+
+    def tell_skipped(self) -> None:
+        """Send the numbers of what was skipped a while ago."""
+        if self._skipped is None or time.monotonic() - self._skipped_s < SKIP_S:
+            return
+        with self._mutex:
+            self._send(self._taken_skipped())
+
+    def _taken_skipped(self) -> bytes:
+        skipped, self._skipped = self._skipped, None
+        return skipped_frame(*skipped[1:]) if skipped is not None else b""
+
+    def _send(self, frame: bytes) -> None:
+        """Send a frame, or as much as goes without waiting, or keep it, or drop it."""
+        if self._bell < 0:
+            return
+        rest = memoryview(frame)
+        if not self._waiting:
+            try:
+                sent = self._connected.send(frame, socket.MSG_DONTWAIT)
+            except BlockingIOError:
+                sent = 0
+            except OSError:  # its thread notices, too
                 return
-            rest = memoryview(frame)
-            if not self._waiting:
-                try:
-                    sent = self._connected.send(frame, socket.MSG_DONTWAIT)
-                except BlockingIOError:
-                    sent = 0
-                except OSError:  # its thread notices, too
-                    return
-                if sent == len(frame):
-                    return
-                rest = rest[sent:]
-                os.eventfd_write(self._bell, 1)
-            elif len(self._waiting) >= NOTICES_MAX:
-                self._service.host.count("notices_dropped")
+            if sent == len(frame):
                 return
-            self._waiting.append(rest)
+            rest = rest[sent:]
+            os.eventfd_write(self._bell, 1)
+        elif len(self._waiting) >= NOTICES_MAX:
+            self._service.host.count("notices_dropped")
+            return
+        self._waiting.append(rest)
 
     def run(self) -> None:
         """Send what was kept, until the connection ends."""

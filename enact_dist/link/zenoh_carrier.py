@@ -44,7 +44,7 @@ from enact_dist.wire.keys import notice_key, request_key, token_key, verb_of
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from enact_dist.core.messages import Request, ShardEntry
+    from enact_dist.core.messages import Request, ShardEntry, Survey
     from enact_dist.link.carrier import Begun
 
 _log = logging.getLogger("enact.link")
@@ -328,10 +328,10 @@ class ZenohCarrier:
 
     # ---------------------------------------------------------------- notices
 
-    def subscribe(self) -> NoticeQueue:
+    def subscribe(self, interest: Survey | None = None) -> NoticeQueue:
         """Open a feed of the notices of all shards, those of shards added later included."""
         self._check_usable()
-        feed = NoticeQueue()
+        feed = NoticeQueue(interest)
         feed.on_close = lambda: self.stop_feeding(feed)
         self.feed_into(feed)
         return feed

@@ -262,12 +262,12 @@ class FlakyContext:
         self.context = context
         self.failures = failures
 
-    def watch(self, *args):
+    def watch_all(self, *args):
         """Watch, or fail as long as failures are left."""
         if self.failures:
             self.failures -= 1
             raise ShardUnreachableError("shard left did not answer")
-        return self.context.watch(*args)
+        return self.context.watch_all(*args)
 
 
 def test_watching_opens_a_watch_again_when_its_shard_was_away(cell, caplog):

@@ -2,8 +2,9 @@
 
 import threading
 
-from enact_dist.core.messages import Notice
-from enact_dist.link.notices import NoticeQueue
+from enact_dist.core.datum import Slot
+from enact_dist.core.messages import Notice, Survey
+from enact_dist.link.notices import Interest, NoticeQueue, Skipped
 
 
 def test_queue_gives_notices_in_order_when_they_are_taken():
@@ -64,3 +65,31 @@ def test_queue_wakes_a_waiter_when_it_is_closed():
     assert taken == [None]
     assert queue.get(0.0) is None
     assert closes == [1]
+
+
+def test_queue_with_an_interest_passes_on_only_the_numbers_of_the_rest():
+    """A run of notices of other slots becomes one entry; a number that is missing stays missing."""
+    queue = NoticeQueue(Survey(("online",), ("cup/*",), ("count",)))
+
+    for number, entity in ((1, "cup/1"), (2, "tray"), (3, "tray"), (6, "tray"), (7, "cup/2")):
+        change = (Slot("online", entity, "count"), number, number, False, 0)
+        queue.put(Notice("s0", 1, number, (change,)))
+
+    taken = [queue.get(0.0) for _ in range(5)]
+    assert [getattr(one, "number", one) for one in taken] == [1, 3, 6, 7, None]
+    assert taken[1:3] == [Skipped("s0", 1, 1, 3), Skipped("s0", 1, 5, 6)]
+
+
+def test_interest_is_in_context_aspect_and_pattern():
+    """All three have to fit; of a commit of several slots one is enough."""
+    interest = Interest(Survey(("online",), ("cup/*", "tray"), ("count",)))
+    fits = Slot("online", "cup/1", "count")
+    others = [Slot("other", "cup/1", "count"), Slot("online", "cup", "count"),
+              Slot("online", "tray", "mass")]  # fmt: skip
+
+    def covers(*slots):
+        return interest.covers(Notice("s0", 1, 1, tuple((s, 1, 1, False, 0) for s in slots)))
+
+    assert covers(*others, fits)
+    assert covers(fits._replace(entity="tray"))
+    assert not covers(*others)

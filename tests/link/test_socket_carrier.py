@@ -229,6 +229,28 @@ def test_waiting_threads_do_not_slow_a_fast_one(daemon, endpoint):
     assert beside_s < 1.5 * alone_s + 50e-6
 
 
+def test_watch_lists_nothing_again_while_only_other_slots_change(daemon, endpoint, monkeypatch):
+    """That a number was skipped for it is told before it would be looked for."""
+    daemon(endpoint)
+    with connect(endpoint) as cell:
+        request = add_one(cell)
+        world = cell.world("online")
+        with world.watch("somebody/else") as watch:
+            listed = []
+            monkeypatch.setattr(watch, "_list_again", lambda *_args, **_more: listed.append(1))
+            end_s = time.monotonic() + 3.0
+            while time.monotonic() < end_s:
+                with Lock(request) as lock:
+                    lock[request] += 1
+                assert watch.next(timeout_s=0.01) is None
+            epoch, number = cell._client.notice_numbers["s0"]
+
+            assert listed == []
+            assert number > 10
+            assert watch._following["s0"].epoch == epoch
+            assert watch._following["s0"].number > 10
+
+
 def test_carrier_says_what_went_over_what(daemon, endpoint):
     """The sessions of a shard are those of the clients, whichever way they come."""
     daemon(endpoint)

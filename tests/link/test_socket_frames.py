@@ -12,6 +12,7 @@ from enact_dist.errors import ProtocolError
 from enact_dist.link.socket_frames import (
     BUFFER_BYTES,
     PREFIX_BYTES,
+    STREAM_VERSION,
     Kind,
     Stream,
     prefixed,
@@ -98,11 +99,11 @@ def test_frame_of_many_pieces_is_sent_whole(ends):
     "prefix",
     [
         struct.pack("<2sBBIQ", b"XX", 1, 4, 0, 0),
-        struct.pack("<2sBBIQ", b"ED", 2, 4, 0, 0),
-        struct.pack("<2sBBIQ", b"ED", 1, 0, 0, 0),
-        struct.pack("<2sBBIQ", b"ED", 1, 99, 0, 0),
-        struct.pack("<2sBBIQ", b"ED", 1, 4, HEADER_BYTES_MAX + 1, 0),
-        struct.pack("<2sBBIQ", b"ED", 1, 4, 0, PAYLOAD_BYTES_MAX + 1),
+        struct.pack("<2sBBIQ", b"ED", STREAM_VERSION + 1, 4, 0, 0),
+        struct.pack("<2sBBIQ", b"ED", STREAM_VERSION, 0, 0, 0),
+        struct.pack("<2sBBIQ", b"ED", STREAM_VERSION, 99, 0, 0),
+        struct.pack("<2sBBIQ", b"ED", STREAM_VERSION, 4, HEADER_BYTES_MAX + 1, 0),
+        struct.pack("<2sBBIQ", b"ED", STREAM_VERSION, 4, 0, PAYLOAD_BYTES_MAX + 1),
         b"GET / HTTP/1.1\r\n",
     ],
 )
@@ -118,7 +119,9 @@ def test_prefix_that_is_none_is_refused_before_memory_is_taken(ends, prefix):
 def test_claimed_length_costs_nothing_until_it_comes(ends):
     """A gigabyte that is announced and never sent is not touched: the reader just waits."""
     near, far = ends
-    near.sendall(struct.pack("<2sBBIQ", b"ED", 1, 4, 1, PAYLOAD_BYTES_MAX) + b"h" + b"x" * 1000)
+    near.sendall(
+        struct.pack("<2sBBIQ", b"ED", STREAM_VERSION, 4, 1, PAYLOAD_BYTES_MAX) + b"h" + b"x" * 1000
+    )
     near.close()
     before = _resident_bytes()
 

@@ -8,6 +8,7 @@ import time
 
 from socket_parts import ask, counters, over_socket, speak
 
+from enact_dist.core.datum import Slot
 from enact_dist.core.messages import (
     AwaitStamp,
     Committed,
@@ -18,10 +19,11 @@ from enact_dist.core.messages import (
     Notice,
     Reached,
     Refused,
+    Survey,
     Waiting,
 )
 from enact_dist.link import socket_connection, socket_service, socket_watcher
-from enact_dist.link.socket_frames import Kind, Stream, prefixed, send_frame
+from enact_dist.link.socket_frames import Kind, Stream, prefixed, read_skipped, send_frame
 from enact_dist.terms import Access
 from enact_dist.wire.frames import decode_frame, encode_frame
 
@@ -287,6 +289,41 @@ def test_watcher_is_welcomed_before_its_first_notice(raw, monkeypatch):
 
     assert (first[0], second[0]) == (Kind.OPENED, Kind.MESSAGE)
     assert decode_frame(*second[1:]) == notice
+
+
+def test_watcher_gets_what_it_watches_and_the_numbers_of_the_rest(raw):
+    """Notices of other slots wake nobody; their numbers come before the next one, or late alone."""
+    near = raw("watcher")
+    stream = Stream(near)
+    interest, _ = encode_frame(Survey(("online",), ("cup",), ("count",)))
+    send_frame(near, interest, kind=Kind.WATCH)
+    assert stream.receive()[0] == Kind.OPENED
+    service, epoch = raw.shard._sockets, raw.shard.host.epoch
+
+    def publish(number, entity):
+        change = (Slot("online", entity, "count"), 1, 1, False, 0)
+        service._publish(Notice("s0", epoch, number, (change,)))
+
+    for number, entity in ((11, "tray"), (12, "tray"), (13, "cup"), (14, "tray")):
+        publish(number, entity)
+
+    kinds, headers, _ = zip(*(stream.receive() for _ in range(3)), strict=True)
+    assert kinds == (Kind.SKIPPED, Kind.MESSAGE, Kind.SKIPPED)
+    assert read_skipped(headers[0]) == (epoch, 10, 12)
+    assert decode_frame(headers[1], b"").number == 13
+    assert read_skipped(headers[2]) == (epoch, 13, 14)
+
+
+def test_watcher_that_says_nonsense_is_refused(raw):
+    """What is watched is a Survey and nothing else."""
+    near = raw("watcher")
+    header, _ = encode_frame(ListLocks())
+
+    send_frame(near, header, kind=Kind.WATCH)
+
+    kind, text, _ = Stream(near).receive()
+    assert kind == Kind.REFUSED
+    assert b"ListLocks came to say what is watched" in text
 
 
 def _write(peer, writer, stream, number):
