@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 SECONDS_S: Final = 3.0
 """Measuring time of each line unless given."""
-COLUMNS: Final = ("bench", "variant", "median", "p99", "n", "x floor", "goal", "met")
+COLUMNS: Final = ("bench", "variant", "median", "p99", "n", "x floor", "goal", "met", "note")
 
 
 def run_floor(run: Run) -> None:
@@ -102,6 +102,7 @@ def run(arguments: argparse.Namespace) -> int:
                 target=arguments.connect,
                 shards=arguments.shards or 1,
                 carriers=carriers_of(arguments),
+                shared=memory / "shared",
             )
         )
         floors = stack.enter_context(Floors(folder, memory))
@@ -174,7 +175,7 @@ def _cells(row: Row) -> tuple[str, ...]:
         p99 = shown_us(row.p99_us) if row.p99_us is not None else ""
     met = "" if row.goal is None else {True: "yes", False: "NO", None: "?"}[row.met]
     ratio = "" if row.ratio is None else f"{row.ratio:.2f}"
-    return row.name, row.variant, median, p99, f"{row.n:,}", ratio, row.goal or "", met
+    return row.name, row.variant, median, p99, f"{row.n:,}", ratio, row.goal or "", met, row.note
 
 
 def _print(found: Mapping[str, object], rows: Sequence[Row]) -> None:

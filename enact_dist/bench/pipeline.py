@@ -1,10 +1,10 @@
-"""Bench `pipeline`: 8 cameras at 10 Hz, 8 workers that make masks, one consumer of whole sets.
+"""Bench `pipeline`: 8 cameras at 10 Hz, 8 workers that make masks, one reader of whole sets.
 
-Each of the 17 is a process.  The cameras are triggered at the same moments; a worker is woken by
-its camera's image and writes a mask under the lock that reads the image; the consumer is woken by
-masks and takes all eight under one lock.  A tick counts as missed if no set of its eight masks was
-taken.  The latency is that from the earliest camera's store (before its lock) to the consumer's
-set, all of one tick.
+Each of the 17 is a process.  The cameras are triggered at the same moments; a worker is an actor
+that its camera's image triggers; the reader is an actor that sets of eight masks with one capture
+stamp trigger.  That all eight are of one frame is found in their pixels, not by the stamp.  The
+latency is that from the earliest camera's store (before its lock) to the reader's set.  A tick
+counts as missed if its set was not read within 0.1 s, and the reason is said.
 
 What the framework costs is the processor time of all processes, daemons included where they are
 the bench's own, less that of the same 17 doing the same work on arrays of their own.
@@ -15,28 +15,34 @@ from __future__ import annotations
 import json
 import math
 import time
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from enact_dist.bench.floors import written
+from enact_dist.bench.pipeline_ticks import STAGES, Ticks, ticks_of
 from enact_dist.bench.pipeline_worker import CAMERAS, PERIOD_NS
 from enact_dist.bench.place import PIPELINE_WORKER
-from enact_dist.bench.rows import Case, Row, at_most
+from enact_dist.bench.rows import Case, Row, at_most, value_row
 from enact_dist.bench.timing import sleep_until
+from enact_dist.bench.usage import Usage
 from enact_dist.link.shared_folder import shared_root
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping
 
     from enact_dist.bench.run import Run
+    from enact_dist.verify.daemons import LineProcess
 
+NAME: Final = "pipeline"
 TIMES: Final = 20
 """A pipeline runs this many times as long as a line of another bench: 60 s by default."""
 WARM_TICKS: Final = 15
 HEAD_START_NS: Final = 1_500_000_000
 END_S: Final = 60.0
 CORES_MAX: Final = 0.25
-MEGA: Final = 1e6
+GROWTH_MAX: Final = 50_000.0
+"""Bytes per second that noise may look like; one image that stays per second is 18 times that."""
+KINDS: Final = {"camera": "cameras", "segmenter": "workers", "consumer": "reader"}
+SHARD: Final = "shards"
 
 
 def run_pipeline(run: Run) -> None:
@@ -47,116 +53,143 @@ def run_pipeline(run: Run) -> None:
     bare = _Measured(run, bare_ticks, sharing=False)
     run.told(f"pipeline: {ticks / 10:g} s")
     shared = _Measured(run, ticks, sharing=True)
+    _add_times(run, shared.ticks(), ticks)
+    _add_processors(run, shared.usage, bare.usage, ticks, bare_ticks)
+    _add_memory(run, shared.usage)
+
+
+def _add_times(run: Run, found: Ticks, ticks: int) -> None:
     floor = written("0.9 MB")
     run.measure([run.floors.case(floor[1])])
     goal = at_most(12_000.0, "p50 ≤ 12 ms, p99 ≤ 20 ms", p99_us=20_000.0)
     latency = "image stored to 8 masks read"
-    if shared.latencies_us:
-        case = Case("pipeline", latency, lambda _seconds_s: (), floor, goal)
-        run.add(case, shared.latencies_us)
+    if not found.latencies_us:
+        run.add_row(Row(NAME, latency, None, None, 0, goal=goal.text, met=False))
     else:
-        run.add_row(Row("pipeline", latency, None, None, 0, goal=goal.text, met=False))
-    missed = ticks - len(shared.latencies_us)
-    run.add_row(_row("missed ticks", missed, "ticks", ticks, "0", met=missed == 0))
-    run.add_row(_row("sets of one tick looked for in vain", shared.uneven, "reads", ticks))
-    cores = shared.cores - bare.cores
+        run.add(_case(latency, floor, goal), found.latencies_us)
+        for stage in STAGES:
+            run.add(_case(f"of it: {stage}", floor), found.stages_us[stage])
+    reasons = "; ".join(f"{count}: {reason}" for reason, count in sorted(found.reasons.items()))
+    for variant, value, note in (
+        ("missed ticks", found.missed, reasons),
+        ("sets of more than one frame", found.torn, ""),
+    ):
+        unit = "ticks" if variant.startswith("missed") else "sets"
+        run.add_row(value_row(NAME, variant, value, unit, ticks, "0", met=not value, note=note))
+
+
+def _case(variant: str, floor: tuple[str, str], goal: Any = None) -> Case:
+    return Case(NAME, variant, lambda _seconds_s: (), floor, goal)
+
+
+def _add_processors(run: Run, usage: Usage, bare: Usage, ticks: int, bare_ticks: int) -> None:
+    by_kind = {kind: usage.cores(kind) for kind in usage.kinds}
+    alone = {kind: bare.cores(kind) for kind in bare.kinds}
+    cores = sum(by_kind.values()) - sum(alone.values())
+    note = ", ".join(
+        f"{kind} {cores_ - alone.get(kind, 0.0):.3f}" for kind, cores_ in by_kind.items()
+    )
     over = "" if run.place.own else ", clients alone"
     run.add_row(
-        _row(
+        value_row(
+            NAME,
             f"processor time of the framework{over}",
             round(cores, 3),
             "cores",
             ticks,
             f"≤ {CORES_MAX} core",
             met=cores <= CORES_MAX,
+            note=note,
         )
     )
-    run.add_row(_row("the same work without sharing", round(bare.cores, 3), "cores", bare_ticks))
-    run.add_row(_row("memory growth", round(shared.grown_bytes / MEGA, 2) + 0.0, "MB", ticks))
-    run.add_row(_row("shared files growth", round(shared.files_bytes / MEGA, 2) + 0.0, "MB", ticks))
+    total = round(sum(alone.values()), 3)
+    run.add_row(value_row(NAME, "the same work without sharing", total, "cores", bare_ticks))
 
 
-def _row(
-    variant: str,
-    value: float,
-    unit: str,
-    n: int,
-    goal: str | None = None,
-    *,
-    met: bool | None = None,
-) -> Row:
-    return Row("pipeline", variant, None, None, n, None, goal, met, value, unit)
+def _add_memory(run: Run, usage: Usage) -> None:
+    last = usage.last()
+    for kind, count in usage.kinds.items():
+        note = f"and {last.kinds[kind].shared / 1e6:.1f} MB shared"
+        private = round(last.kinds[kind].private / 1e6, 1)
+        run.add_row(value_row(NAME, f"memory of the {kind}", private, "MB", count, note=note))
+    n = len(usage.samples)
+    figures = {
+        "growth of memory of their own": lambda one: sum(k.private for k in one.kinds.values()),
+        "growth of shared memory": lambda one: sum(k.shared for k in one.kinds.values()),
+        "growth of the shared folder": lambda one: one.files_bytes,
+    }
+    for variant, figure in figures.items():
+        note = "after 10 s"
+        if variant.endswith("folder"):
+            note += f"; {last.files} files, {last.files_bytes / 1e6:.1f} MB at the end"
+        run.add_row(_growth_row(usage, variant, figure, n, note))
+
+
+def _growth_row(usage: Usage, variant: str, figure: Any, n: int, note: str) -> Row:
+    grown = usage.growth(figure)
+    return value_row(
+        NAME,
+        variant,
+        round((grown or 0.0) / 1e3, 1) + 0.0,
+        "kB/s",
+        n,
+        f"none (≤ {GROWTH_MAX / 1e3:g} kB/s)",
+        met=None if grown is None else grown <= GROWTH_MAX,
+        note=note if grown is not None else "too short to tell",
+    )
 
 
 class _Measured:
     """One run of all processes.
 
     Attributes:
-        latencies_us: Of the sets that were taken, one per tick.
-        uneven: How often the consumer held masks of different ticks, and waited for more.
-        cores: Processor time per time.
-        grown_bytes: By how much the private memory of all processes grew after the warm-up.
-        files_bytes: By how much what lies in the shared folder grew meanwhile.
+        usage: What they used after the warm-up.
     """
 
     def __init__(self, run: Run, ticks: int, *, sharing: bool) -> None:
         place = run.place
-        total = WARM_TICKS + ticks
+        self._total = WARM_TICKS + ticks
         roles: list[tuple[str, dict[str, Any]]] = [
             ("consumer", {}),
             *(("segmenter", {"camera": number}) for number in range(CAMERAS)),
             *(("camera", {"camera": number}) for number in range(CAMERAS)),
         ]
-        options = {"ticks": total, "sharing": sharing}
+        options = {"ticks": self._total, "sharing": sharing}
         with place.workers(
             [(role, {**own, **options}) for role, own in roles],
             carrier=place.carrier,
             module=PIPELINE_WORKER,
         ) as workers:
-            start_ns = time.perf_counter_ns() + HEAD_START_NS
+            self._start_ns = time.perf_counter_ns() + HEAD_START_NS
             for worker in workers:
-                worker.tell(str(start_ns))
-            pids = [worker.pid for worker in workers] + (place.daemon_pids() if sharing else [])
-            self._measure(pids, start_ns, total)
-            consumer = workers[0]
-            said = json.loads(consumer.expect("sets:", timeout_s=END_S))
-            for worker in workers[1:]:
-                worker.expect("done:", timeout_s=END_S)
-        self.latencies_us = [ns / 1e3 for tick, ns in said["sets"] if tick >= WARM_TICKS]
-        self.uneven: int = said["uneven"]
+                worker.tell(str(self._start_ns))
+            pids: dict[str, list[int]] = {}
+            for (role, _), worker in zip(roles, workers, strict=True):
+                pids.setdefault(KINDS[role], []).append(worker.pid)
+            if sharing:
+                pids[SHARD] = place.daemon_pids()
+            self.usage = Usage(pids, shared_root())
+            sleep_until(self._start_ns + WARM_TICKS * PERIOD_NS)
+            self.usage.watch(ticks * PERIOD_NS / 1e9)
+            self._said = self._heard(roles, workers)
 
-    def _measure(self, pids: list[int], start_ns: int, total: int) -> None:
-        sleep_until(start_ns + WARM_TICKS * PERIOD_NS)
-        cpu_s, memory, files = _cpu_s(pids), _private_bytes(pids), _files_bytes()
-        began_ns = time.perf_counter_ns()
-        sleep_until(start_ns + total * PERIOD_NS)
-        self.cores = (_cpu_s(pids) - cpu_s) / ((time.perf_counter_ns() - began_ns) / 1e9)
-        self.grown_bytes = _private_bytes(pids) - memory
-        self.files_bytes = _files_bytes() - files
+    @staticmethod
+    def _heard(
+        roles: list[tuple[str, dict[str, Any]]], workers: list[LineProcess]
+    ) -> dict[str, list[Mapping[str, Any]]]:
+        said: dict[str, list[Mapping[str, Any]]] = {}
+        for (role, _), worker in zip(roles, workers, strict=True):
+            said.setdefault(role, []).append(json.loads(worker.expect("did:", timeout_s=END_S)))
+        return said
 
-
-def _cpu_s(pids: Sequence[int]) -> float:
-    """Return the processor time of processes, exact: the kernel has a clock for each."""
-    return sum(time.clock_gettime((~pid << 3) | 2) for pid in pids)
-
-
-def _private_bytes(pids: Sequence[int]) -> int:
-    """Return the memory that processes have for themselves."""
-    total = 0
-    for pid in pids:
-        for line in Path(f"/proc/{pid}/status").read_text().splitlines():
-            if line.startswith("RssAnon:"):
-                total += int(line.split()[1]) * 1024
-    return total
-
-
-def _files_bytes() -> int:
-    """Return the memory under all files of the shared folder."""
-    root = shared_root()
-    total = 0
-    for path in root.rglob("*") if root.is_dir() else ():
-        try:
-            total += path.lstat().st_blocks * 512
-        except FileNotFoundError:
-            continue
-    return total
+    def ticks(self) -> Ticks:
+        """Return what became of each tick after the warm-up."""
+        (consumer,) = self._said["consumer"]
+        return ticks_of(
+            self._said["camera"],
+            self._said["segmenter"],
+            consumer,
+            ticks=range(WARM_TICKS, self._total),
+            start_ns=self._start_ns,
+            period_ns=PERIOD_NS,
+        )

@@ -1,14 +1,15 @@
 """A process of the pipeline: `python -m enact_dist.bench.pipeline_worker CELL ROLE OPTIONS`.
 
 =========  ======================================================================================
-camera     stores an image at each tick
-segmenter  is woken by its camera's image, reads it and writes its mask under one lock
-consumer   is woken by masks, and takes eight of one tick under one lock
+camera     stores an image at each tick, with the tick as its capture stamp
+segmenter  an actor that is triggered by its camera's image and writes its mask, same stamp
+consumer   an actor that is triggered once per set of eight masks with one stamp
 =========  ======================================================================================
 
 A line with the first tick's time starts it.  Without sharing each does the same work at each tick,
 on arrays of its own, and joins no cell.  The first 16 bytes of an image and of its mask are the
-tick's number and the time before the image was stored.
+tick's number and the time before the image was stored; below its first row an image repeats after
+four ticks, and every camera has images of its own, so the reader knows a mask by what is in it.
 """
 
 from __future__ import annotations
@@ -16,23 +17,27 @@ from __future__ import annotations
 import contextlib
 import json
 import sys
+import threading
 import time
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from enact_dist.actor import Actor
+from enact_dist.actor_runner import ActorRun
 from enact_dist.bench.place import WORLD
 from enact_dist.bench.timing import sleep_until
 from enact_dist.connecting import connect
 from enact_dist.lock import Lock
-from enact_dist.terms import Aspect, Durability, Entities, Entity, Read, ReadEach, Write
+from enact_dist.terms import Aspect, Durability, Entity, View, World, Write
+from enact_dist.together import Together
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
-    from enact_dist.world import WorldContext
+    from enact_dist.cell import Cell
 
 CAMERAS: Final = 8
 PERIOD_NS: Final = 100_000_000
@@ -41,9 +46,10 @@ SHAPE: Final = (480, 640, 3)
 WAIT_S: Final = 30.0
 LATE_NS: Final = 2_000_000_000
 """For so long after the last tick its set may still come."""
+FRAMES: Final = 4
 IMAGE: Final[Aspect[Any]] = Aspect("pipeline_image", np.ndarray, Durability.VOLATILE)
-MASK: Final[Aspect[Any]] = Aspect("pipeline_mask", np.ndarray, Durability.VOLATILE)
-NO_TICK: Final = -1
+MASK: Final[Aspect[Any]] = Aspect("pipeline_mask", np.ndarray, Durability.VOLATILE, retention=4)
+ROLE: Final = World(WORLD)
 
 
 def _image_entity(camera: int) -> Entity:
@@ -59,11 +65,10 @@ def head_of(array: NDArray[np.uint8]) -> NDArray[np.int64]:
     return array.reshape(-1)[:16].view(np.int64)
 
 
-def new_image() -> NDArray[np.uint8]:
-    """Return an image of noise whose head names no tick."""
-    image = np.random.default_rng(1).integers(0, 256, SHAPE, np.uint8)
-    head_of(image)[:] = NO_TICK, 0
-    return image
+def frames_of(camera: int) -> list[NDArray[np.uint8]]:
+    """Return the images of noise that a camera shows in turn, of `SHAPE`."""
+    noise = np.random.default_rng(camera)
+    return [noise.integers(0, 256, SHAPE, np.uint8) for _ in range(FRAMES)]
 
 
 def mask_of(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -73,9 +78,24 @@ def mask_of(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return mask
 
 
-def area_of(masks: Mapping[Any, NDArray[np.uint8]]) -> int:
-    """Return how many pixels are set in all masks: what the consumer makes of a set."""
-    return sum(int(np.count_nonzero(mask)) for mask in masks.values())
+def area_of(mask: NDArray[np.uint8]) -> int:
+    """Return how many pixels are set below the first row, where the head lies."""
+    return int(np.count_nonzero(mask[1:]))
+
+
+def areas_of_frames() -> list[list[int]]:
+    """Return the area of the mask of each camera's images."""
+    return [[area_of(mask_of(frame)) for frame in frames_of(camera)] for camera in range(CAMERAS)]
+
+
+def tick_of_set(masks: Sequence[NDArray[np.uint8]], areas: Sequence[Sequence[int]]) -> int | None:
+    """Return the tick that all masks show, by head and by content; None if they differ."""
+    ticks = {int(head_of(mask)[0]) for mask in masks}
+    found = [area_of(mask) for mask in masks]
+    if len(ticks) != 1:
+        return None
+    (tick,) = ticks
+    return tick if found == [area[tick % FRAMES] for area in areas] else None
 
 
 class _Ticks:
@@ -89,106 +109,133 @@ class _Ticks:
         """Sleep until a tick."""
         sleep_until(self._start_ns + tick * PERIOD_NS)
 
-    def left_s(self) -> float:
-        """Return how long a change may still come."""
-        return max(0.0, (self.end_ns - time.perf_counter_ns()) / 1e9)
-
 
 def _started(options: dict[str, Any]) -> _Ticks:
     print("ready:", flush=True)
     return _Ticks(int(sys.stdin.readline()), options["ticks"])
 
 
+def _say(**found: Any) -> None:
+    print("did:", json.dumps(found, separators=(",", ":")), flush=True)
+
+
 # ---------------------------------------------------------------- with sharing
 
 
-def _camera(world: WorldContext, options: dict[str, Any]) -> None:
-    write = Write(world, _image_entity(options["camera"]), IMAGE)
-    image = new_image()
-    with Lock(write, wait_s=WAIT_S) as lock:
-        lock[write] = image
+def _camera(cell: Cell, options: dict[str, Any]) -> None:
+    write = Write(cell.world(WORLD), _image_entity(options["camera"]), IMAGE)
+    frames, image = frames_of(options["camera"]), np.empty(SHAPE, np.uint8)
+    with Lock(write, wait_s=WAIT_S) as lock:  # a null datum: registers the aspect, and connects
+        del lock[write]
     ticks = _started(options)
+    stored: list[tuple[int, int, int]] = []
     for tick in range(ticks.count):
         ticks.wait(tick)
-        head_of(image)[:] = tick, time.perf_counter_ns()
+        np.copyto(image, frames[tick % FRAMES])  # a driver's copy out of its ring
+        begun_ns = time.perf_counter_ns()
+        head_of(image)[:] = tick, begun_ns
         with Lock(write, wait_s=WAIT_S) as lock:
-            lock[write] = image
-    print("done:", flush=True)
+            lock.put(write, image, stamp_ns=tick + 1)
+        stored.append((tick, begun_ns, time.perf_counter_ns()))
+    _say(ticks=stored)
 
 
-def _segmenter(world: WorldContext, options: dict[str, Any]) -> None:
-    entity = _image_entity(options["camera"])
-    read, write = Read(world, entity, IMAGE), Write(world, _mask_entity(options["camera"]), MASK)
-    with Lock(write, wait_s=WAIT_S) as lock:
-        lock[write] = mask_of(new_image())
-    with world.watch(entity, IMAGE) as watch:
+def _segmenter(cell: Cell, options: dict[str, Any]) -> None:
+    class Segmenter(Actor):
+        """Makes the mask of each image."""
+
+        image = View(ROLE, _image_entity(options["camera"]), IMAGE)
+        mask = Write(ROLE, _mask_entity(options["camera"]), MASK)
+        triggers = (image,)
+
+        def update(self, lock: Lock) -> None:
+            """Make the mask of one image."""
+            mask = mask_of(lock[self.image])
+            lock.put(self.mask, mask, stamp_ns=lock.stamp_ns(self.image))
+            done.append((int(head_of(mask)[0]), time.perf_counter_ns()))
+            if done[-1][0] == options["ticks"] - 1:
+                stop.set()
+
+    done: list[tuple[int, int]] = []
+    stop = threading.Event()
+    _run_actor(Segmenter(), cell, options, stop, lambda: {"ticks": done})
+
+
+def _consumer(cell: Cell, options: dict[str, Any]) -> None:
+    class Consumer(Actor):
+        """Looks at each set of masks."""
+
+        masks = Together([View(ROLE, _mask_entity(n), MASK) for n in range(CAMERAS)], by="stamp")
+        triggers = (masks,)
+
+        def update(self, lock: Lock) -> None:
+            """Look at one set."""
+            masks = lock[self.masks]
+            had_ns = time.perf_counter_ns()
+            tick = tick_of_set(masks, areas)
+            if tick is None:
+                torn.append(lock.stamp_ns(self.masks) - 1)
+                return
+            sets.append((tick, had_ns, had_ns - min(int(head_of(mask)[1]) for mask in masks)))
+            if tick == options["ticks"] - 1:
+                stop.set()
+
+    sets: list[tuple[int, int, int]] = []
+    torn: list[int] = []
+    areas = areas_of_frames()
+    stop = threading.Event()
+    _run_actor(Consumer(), cell, options, stop, lambda: {"sets": sets, "torn": torn})
+
+
+def _run_actor(
+    actor: Actor,
+    cell: Cell,
+    options: dict[str, Any],
+    stop: threading.Event,
+    found: Callable[[], dict[str, Any]],
+) -> None:
+    """Run an actor until it stops itself, or the last tick is long over; then say what it did."""
+
+    def stop_late() -> None:
         ticks = _started(options)
-        last = NO_TICK
-        while last < ticks.count - 1 and ticks.left_s():
-            change = watch.next(timeout_s=ticks.left_s())
-            if change is None or change.null:
-                continue
-            with Lock(read, write, wait_s=WAIT_S) as lock:
-                image = lock[read]
-                seen = int(head_of(image)[0])
-                # A start that was seen already, or a change that an earlier lock has shown.
-                if seen > last:
-                    last = seen
-                    lock[write] = mask_of(image)
-    print("done:", flush=True)
+        stop.wait(max(0.0, (ticks.end_ns - time.perf_counter_ns()) / 1e9))
+        stop.set()
 
-
-def _consumer(world: WorldContext, options: dict[str, Any]) -> None:
-    masks = ReadEach(world, Entities("silhouette/*"), MASK)
-    sets: list[tuple[int, int]] = []
-    uneven = 0
-    with world.watch("silhouette/*", MASK) as watch:
-        ticks = _started(options)
-        last, moved = NO_TICK, set[Entity]()
-        while last < ticks.count - 1 and ticks.left_s():
-            change = watch.next(timeout_s=ticks.left_s())
-            if change is not None:
-                moved.add(change.entity)
-            if len(moved) < CAMERAS:
-                continue
-            with Lock(masks, wait_s=WAIT_S) as lock:
-                found = dict(lock[masks])
-                had_ns = time.perf_counter_ns()
-                heads = [head_of(mask) for mask in found.values()]
-                numbers = {int(head[0]) for head in heads}
-                whole = len(found) == CAMERAS and len(numbers) == 1
-                if whole and numbers != {NO_TICK} and max(numbers) > last:
-                    area_of(found)
-                    (last,) = numbers
-                    sets.append((last, had_ns - min(int(head[1]) for head in heads)))
-                    moved.clear()
-                elif whole:
-                    moved.clear()
-                else:
-                    uneven += 1
-    print("sets:", json.dumps({"sets": sets, "uneven": uneven}), flush=True)
+    late = threading.Thread(target=stop_late)
+    late.start()
+    did = ActorRun(actor, cell, stop=stop).run()
+    late.join()
+    _say(
+        **found(),
+        skipped=did.skipped,
+        refused=did.refused,
+        incomplete=did.incomplete,
+        example=did.last_incomplete or did.last_error or "",
+    )
 
 
 # ---------------------------------------------------------------- without
 
 
 def _alone(role: str, options: dict[str, Any]) -> None:
-    image = new_image()
-    masks = {number: mask_of(image) for number in range(CAMERAS)}
+    camera = options.get("camera", 0)
+    frames, image = frames_of(camera), np.empty(SHAPE, np.uint8)
+    areas = areas_of_frames()
+    masks = [mask_of(frames_of(number)[0]) for number in range(CAMERAS)]
     ticks = _started(options)
     for tick in range(ticks.count):
         ticks.wait(tick)
         if role == "camera":
+            np.copyto(image, frames[tick % FRAMES])
             head_of(image)[:] = tick, time.perf_counter_ns()
         elif role == "segmenter":
             mask_of(image)
         else:
-            area_of(masks)
-    print("sets:", json.dumps({"sets": [], "uneven": 0}), flush=True)
-    print("done:", flush=True)
+            tick_of_set(masks, areas)
+    _say()
 
 
-_ROLES: Final[dict[str, Callable[[WorldContext, dict[str, Any]], None]]] = {
+_ROLES: Final[dict[str, Callable[[Cell, dict[str, Any]], None]]] = {
     "camera": _camera,
     "segmenter": _segmenter,
     "consumer": _consumer,
@@ -202,7 +249,8 @@ def main(words: Sequence[str]) -> None:
     with contextlib.ExitStack() as stack:
         if options["sharing"]:
             cell = stack.enter_context(connect(target, actor=f"bench-{role}", timeout_s=60.0))
-            _ROLES[role](cell.create_world(WORLD), options)
+            cell.create_world(WORLD)
+            _ROLES[role](cell, options)
         else:
             _alone(role, options)
         sys.stdin.read()

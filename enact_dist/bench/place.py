@@ -65,10 +65,17 @@ class Place:
         target: A cell that runs; None starts one of its own at the first use.
         shards: How many daemons that one has.
         carriers: How benches that compare them reach the cell, `EMBEDDED` among others.
+        shared: What the shared folder of an own cell is to be; None for that of this user.
     """
 
     def __init__(
-        self, folder: Path, *, target: str | None, shards: int, carriers: tuple[str, ...]
+        self,
+        folder: Path,
+        *,
+        target: str | None,
+        shards: int,
+        carriers: tuple[str, ...],
+        shared: Path | None = None,
     ) -> None:
         self.folder = folder
         self.carriers = carriers
@@ -79,6 +86,10 @@ class Place:
         self._stack = contextlib.ExitStack()
         self._logs = 0
         self._daemons: list[LineProcess] = []
+        if self.own and shared is not None:
+            # Nobody else's files there: what it grows by is ours.
+            shared.mkdir(mode=0o700)
+            self._stack.enter_context(environment(**{SHARED_FOLDER_VARIABLE: str(shared)}))
 
     def __enter__(self) -> Place:
         return self

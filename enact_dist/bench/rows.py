@@ -123,6 +123,7 @@ class Row:
         met: Whether it is kept to; None without one, or where this run cannot tell.
         value: The figure that is no time.
         unit: Of `value`.
+        note: What a reader should know beside it.
     """
 
     name: str
@@ -135,13 +136,31 @@ class Row:
     met: bool | None = None
     value: float | None = None
     unit: str | None = None
+    note: str = ""
 
     def as_json(self) -> dict[str, object]:
-        """Return the row as it stands in JSON: `value` and `unit` only where there is one."""
+        """Return the row as it stands in JSON: `value`, `unit`, `note` only where there is one."""
         found = {name: getattr(self, name) for name in TIME_FIELDS}
         if self.value is not None:
             found |= {"value": self.value, "unit": self.unit}
+        if self.note:
+            found["note"] = self.note
         return found
+
+
+def value_row(
+    name: str,
+    variant: str,
+    value: float,
+    unit: str,
+    n: int,
+    goal: str | None = None,
+    *,
+    met: bool | None = None,
+    note: str = "",
+) -> Row:
+    """Return a row of a figure that is no time."""
+    return Row(name, variant, None, None, n, None, goal, met, value, unit, note)
 
 
 TIME_FIELDS: Final = ("name", "variant", "median_us", "p99_us", "n", "ratio", "goal", "met")

@@ -6,7 +6,15 @@ import pytest
 from enact_dist.bench import pipeline
 from enact_dist.bench.decisions import Decider, granted_of, hand_over_us
 from enact_dist.bench.floors import ECHO, FDATASYNC, PUBLISH, QUERY, Floors
-from enact_dist.bench.pipeline_worker import head_of, mask_of, new_image
+from enact_dist.bench.pipeline_worker import (
+    CAMERAS,
+    FRAMES,
+    areas_of_frames,
+    frames_of,
+    head_of,
+    mask_of,
+    tick_of_set,
+)
 from enact_dist.bench.place import EMBEDDED, Place, environment
 from enact_dist.bench.run import Run
 from enact_dist.bench.updates import slots, update
@@ -101,9 +109,18 @@ def test_environment_is_given_back(monkeypatch):
     assert "ENACT_TEST_ONLY" not in os.environ
 
 
+def masks_at(tick):
+    masks = []
+    for camera in range(CAMERAS):
+        image = frames_of(camera)[tick % FRAMES]
+        head_of(image)[:] = tick, 123
+        masks.append(mask_of(image))
+    return masks
+
+
 def test_mask_bears_the_tick_of_its_image():
     """Sets are told apart by what stands in the pixels, not by what anybody claims."""
-    image = new_image()
+    image = frames_of(3)[1]
     head_of(image)[:] = 7, 123
 
     mask = mask_of(image)
@@ -112,6 +129,20 @@ def test_mask_bears_the_tick_of_its_image():
     assert head_of(mask).tolist() == [7, 123]
     expected = (image[1:, :, 1] > image[1:, :, 0]).astype(np.uint8)
     assert np.array_equal(mask[1:], expected)
+
+
+def test_set_of_one_frame_is_told_by_heads_and_pixels():
+    """A mask of another tick is found by its head, one that only claims the tick by its pixels."""
+    areas = areas_of_frames()
+    whole, other = masks_at(6), masks_at(7)
+    assert tick_of_set(whole, areas) == 6
+
+    by_head = [*whole[:7], other[7]]
+    forged = other[7].copy()
+    head_of(forged)[0] = 6
+
+    assert tick_of_set(by_head, areas) is None
+    assert tick_of_set([*whole[:7], forged], areas) is None
 
 
 @pytest.mark.slow
@@ -123,8 +154,13 @@ def test_pipeline_of_17_processes_takes_sets(new_run, monkeypatch):
     pipeline.run_pipeline(run)
 
     rows = {row.variant: row for row in run.rows() if row.name == "pipeline"}
-    assert rows["image stored to 8 masks read"].n + rows["missed ticks"].value == 15
+    missed = rows["missed ticks"]
+    assert rows["image stored to 8 masks read"].n <= 15
     assert rows["image stored to 8 masks read"].median_us > 0
     assert rows["the same work without sharing"].value > 0
-    assert rows["missed ticks"].met is (rows["missed ticks"].value == 0)
-    assert {"memory growth", "shared files growth"} <= set(rows)
+    assert missed.met is (missed.value == 0) is (not missed.note)
+    assert rows["sets of more than one frame"].value == 0
+    assert {f"memory of the {kind}" for kind in ("cameras", "workers", "reader", "shards")} <= set(
+        rows
+    )
+    assert "growth of the shared folder" in rows
