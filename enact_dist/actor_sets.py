@@ -13,7 +13,7 @@ PURE, as `actor_triggers`.  Rules that a change must keep:
 
 from __future__ import annotations
 
-from collections import OrderedDict, deque
+from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -68,7 +68,7 @@ class PendingSets:
         self._known: dict[int, tuple[int, int]] = {}
         self._newest = [0] * len(self._names)
         self._open: dict[int, set[int]] = {}
-        self._over: OrderedDict[int, None] = OrderedDict()
+        self._over: set[int] = set()
         self._floor_ns = 0
         self._ready: deque[Trigger] = deque()
         self._due_ns = 0
@@ -161,11 +161,13 @@ class PendingSets:
     def _close(self, stamp_ns: int) -> None:
         """Remember that a set is over; of very old ones only that they are."""
         del self._open[stamp_ns]
-        self._over[stamp_ns] = None
+        self._over.add(stamp_ns)
         while len(self._over) > 4 * self._open_max:
-            oldest_ns, _ = self._over.popitem(last=False)
-            lowest_ns = min(self._open, default=oldest_ns + 1)
-            self._floor_ns = max(self._floor_ns, min(oldest_ns, lowest_ns - 1))
+            lowest_ns = min(self._over)
+            if lowest_ns > min(self._open, default=lowest_ns):
+                return  # an older one is open still, and data of this one must stay late
+            self._over.remove(lowest_ns)
+            self._floor_ns = max(self._floor_ns, lowest_ns)
 
     def _give_up(self, stamp_ns: int, missing: Sequence[int]) -> None:
         self._close(stamp_ns)

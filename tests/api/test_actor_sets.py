@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import random
+from collections import Counter
+
 import pytest
 
 from enact_dist import Entity
@@ -197,3 +200,41 @@ def test_every_set_runs_or_is_named_whatever_the_order(seed):
     assert runs == sorted(whole)
     assert feed.sets.incomplete == len(touched - whole)
     assert (feed.sets.late, feed.sets.skipped) == (0, 0)
+
+
+def test_set_that_is_over_is_never_opened_again_by_data_out_of_order():
+    """A second datum of a set that ran is late, however many older sets were closed after it."""
+    feed = Feed(open_max=1)
+    feed.come(50)
+    feed.come(1, LEFT)
+    feed.come(2, LEFT)
+    feed.come(3, LEFT)
+    feed.sets.captured(LEFT, [feed.next(LEFT, 5), feed.next(LEFT, 6)])
+    feed.come(50, LEFT)
+    feed.come(60)
+
+    assert [stamp_ns for stamp_ns, _ in feed.told()] == [1, 2, 3, 5, 6]
+    assert feed.sets.late == 1
+
+
+@pytest.mark.parametrize("open_max", [1, 2, 16])
+def test_every_set_runs_or_is_told_at_most_once_in_any_order(open_max):
+    """Stamps that come mixed, in bunches and with holes: no set twice, none both run and told."""
+    for seed in range(300):
+        draw = random.Random(seed)
+        feed, ran, told = Feed(open_max), Counter(), Counter()
+        queues = [[s for s in range(1, 60) if draw.random() < 0.85] for _ in NAMES]
+        for queue in queues:
+            for _ in range(15):
+                one = draw.randrange(len(queue))
+                other = min(len(queue) - 1, one + draw.randint(0, 5))
+                queue[one], queue[other] = queue[other], queue[one]
+        while any(queues):
+            member = draw.choice([m for m, queue in enumerate(queues) if queue])
+            bunch, queues[member] = queues[member][:3], queues[member][3:]
+            before = feed.sets.incomplete
+            feed.sets.captured(member, [feed.next(member, stamp_ns) for stamp_ns in bunch])
+            told.update(s for s, _ in feed.told()[-(feed.sets.incomplete - before) or 99 :])
+            ran.update(feed.runs())
+
+        assert max((ran + told).values()) == 1, seed
