@@ -7,25 +7,30 @@ import os
 import platform
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.bench.decisions import core_cases
+from enact_dist.bench.faults import run_recovery, run_stopped
 from enact_dist.bench.floors import Floors
+from enact_dist.bench.memory import run_memory
 from enact_dist.bench.payloads import run_fetch, run_publish, run_wakeup
 from enact_dist.bench.pipeline import run_pipeline
 from enact_dist.bench.place import EMBEDDED, Place
+from enact_dist.bench.rows import Row, shown_us
 from enact_dist.bench.run import Run
+from enact_dist.bench.tables import table
 from enact_dist.bench.updates import run_durable, run_multi, run_update, run_waiters
 from enact_dist.cli.output import print_json, print_table
-from enact_dist.errors import MisuseError
+from enact_dist.cli.verbs import DONE, FAILED
+from enact_dist.errors import EnactError, MisuseError
 from enact_dist.link.shared_folder import MEMORY
 
 if TYPE_CHECKING:
     import argparse
 
-    from enact_dist.bench.rows import Row
 
 SECONDS_S: Final = 3.0
 """Measuring time of each line unless given."""
@@ -53,9 +58,16 @@ BENCHES: Final[dict[str, Callable[[Run], None]]] = {
     "publish": run_publish,
     "wakeup": run_wakeup,
     "pipeline": run_pipeline,
+    "stopped": run_stopped,
+    "memory": run_memory,
+    "recovery": run_recovery,
 }
-BETWEEN_PROCESSES: Final = frozenset(("waiters", "wakeup", "pipeline"))
+BETWEEN_PROCESSES: Final = frozenset(
+    ("waiters", "wakeup", "pipeline", "stopped", "memory", "recovery")
+)
 """Benches that mean nothing within one process."""
+OWN_DAEMONS: Final = frozenset(("memory", "recovery"))
+"""Benches that look into daemons or kill them."""
 
 
 def carriers_of(arguments: argparse.Namespace) -> tuple[str, ...]:
@@ -73,21 +85,32 @@ def names_of(arguments: argparse.Namespace) -> list[str]:
     """Return the benches to run, in the order of the table.
 
     Raises:
-        MisuseError: One is named that needs several processes, and there is to be one.
+        MisuseError: One is named that needs several processes, and there is to be one; or daemons
+            of its own, and there are others.
     """
     asked = set(arguments.names or BENCHES)
-    if arguments.embedded:
-        lost = sorted(asked & BETWEEN_PROCESSES) if arguments.names else []
+    for option, given, cannot, why in (
+        ("--embedded", arguments.embedded, BETWEEN_PROCESSES, "needs several processes"),
+        ("--connect", arguments.connect, OWN_DAEMONS, "needs daemons of its own"),
+    ):
+        lost = sorted(asked & cannot) if given and arguments.names else []
         if lost:
             raise MisuseError(
-                f"{', '.join(lost)} between processes cannot run --embedded; leave one of both out"
+                f"{', '.join(lost)} with {option}: {why}; leave out {option} or {lost[0]}"
             )
-        asked -= BETWEEN_PROCESSES
+        if given:
+            asked -= cannot
     return [name for name in BENCHES if name in asked]
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Measure, print, and return the exit status: a goal that is missed is no failure."""
+    """Measure, print, and return the exit status: a goal that is missed is no failure.
+
+    A bench that cannot run is one, after the others have run.
+    """
+    if arguments.table:
+        print(table(arguments.table), end="")
+        return DONE
     names = names_of(arguments)
     found = machine()  # its load is that of others, before this adds its own
     with contextlib.ExitStack() as stack:
@@ -108,14 +131,28 @@ def run(arguments: argparse.Namespace) -> int:
         floors = stack.enter_context(Floors(folder, memory))
         told = stack.enter_context(_progress())
         measured = Run(place, floors, seconds_s=arguments.seconds_s or SECONDS_S, told=told)
-        for name in names:
-            BENCHES[name](measured)
+        failed = [name for name in names if not _ran(name, measured)]
         rows = measured.rows()
     if arguments.json:
         print_json({"machine": found, "rows": [row.as_json() for row in rows]})
     else:
         _print(found, rows)
-    return 0
+    return FAILED if failed else DONE
+
+
+def _ran(name: str, measured: Run) -> bool:
+    """Run one bench; one that fails costs its own rows and not those of the others."""
+    try:
+        BENCHES[name](measured)
+    except EnactError as error:
+        if not measured.place.own:
+            raise
+        print(f"enact: bench {name}: {error}", file=sys.stderr)
+        measured.add_row(
+            Row(name, "failed", None, None, 0, goal="runs", met=False, note=str(error))
+        )
+        return False
+    return True
 
 
 @contextlib.contextmanager
@@ -151,20 +188,11 @@ def machine() -> dict[str, object]:
         "python": platform.python_version(),
         "zenoh": zenoh,
         "load": round(os.getloadavg()[0], 2),
+        "date": time.strftime("%Y-%m-%d"),
     }
 
 
 # ---------------------------------------------------------------- the table
-
-
-def shown_us(value_us: float) -> str:
-    """Return a time with three digits and its unit."""
-    for unit, size_us in (("µs", 1.0), ("ms", 1e3), ("s", 1e6)):
-        value = value_us / size_us
-        if value < 1000.0 or unit == "s":
-            digits = 0 if value >= 100.0 else 1 if value >= 10.0 else 2
-            return f"{value:.{digits}f} {unit}"
-    raise AssertionError
 
 
 def _cells(row: Row) -> tuple[str, ...]:

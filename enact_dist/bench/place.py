@@ -171,13 +171,19 @@ class Place:
     @contextlib.contextmanager
     def far_world(self) -> Iterator[WorldContext]:
         """Give the world context as a client of another host has it: no memory in common."""
-        other = self.folder / "elsewhere"
-        other.mkdir(mode=0o700, exist_ok=True)
         target = self.target
-        with environment(**{CARRIER_VARIABLE: "zenoh", SHARED_FOLDER_VARIABLE: str(other)}):
+        with self._elsewhere():
             cell = connect(target, actor="bench-far", timeout_s=JOIN_S)
         with cell:
             yield cell.create_world(WORLD)
+
+    @contextlib.contextmanager
+    def _elsewhere(self) -> Iterator[None]:
+        """Let what is started meanwhile be on another host, as far as it can see."""
+        other = self.folder / "elsewhere"
+        other.mkdir(mode=0o700, exist_ok=True)
+        with environment(**{CARRIER_VARIABLE: "zenoh", SHARED_FOLDER_VARIABLE: str(other)}):
+            yield
 
     # ---------------------------------------------------------------- workers
 
@@ -209,6 +215,18 @@ class Place:
         """Run `enact_dist.bench.worker` in a role; it has said ``ready:``."""
         with self.workers([(role, options)], carrier=carrier) as (process,):
             yield process
+
+    @contextlib.contextmanager
+    def far_worker(self, role: str, **options: Any) -> Iterator[LineProcess]:
+        """Run a worker as on another host: it has no memory in common with any shard."""
+        target = self.target
+        with self._elsewhere():
+            process = self._process(WORKER, (target, role, json.dumps(options)))
+        try:
+            process.expect("ready:", timeout_s=WORKERS_S)
+            yield process
+        finally:
+            _end(process)
 
     def daemon_pids(self) -> list[int]:
         """Return the process ids of the daemons of an own cell."""

@@ -180,3 +180,13 @@ def row_of(case: Case, figures: Figures) -> Row:
         case.goal.text if case.goal is not None else None,
         case.goal.met(sample, figures) if case.goal is not None else None,
     )
+
+
+def shown_us(value_us: float) -> str:
+    """Return a time with three digits and its unit."""
+    for unit, size_us in (("µs", 1.0), ("ms", 1e3), ("s", 1e6)):
+        value = value_us / size_us
+        if value < 1000.0 or unit == "s":
+            digits = 0 if value >= 100.0 else 1 if value >= 10.0 else 2
+            return f"{value:.{digits}f} {unit}"
+    raise AssertionError

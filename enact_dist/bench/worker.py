@@ -3,6 +3,7 @@
 ========  =======================================================================================
 storer    writes an array anew at each line ``ENTITY BYTES``
 notifier  at a line, writes numbered and stamped arrays with pauses between them
+fetcher   fetches one datum over and over, and says when it begins and when it has it
 waiter    at a line, its threads queue for one slot; says when each had it and began to leave it
 ========  =======================================================================================
 
@@ -23,8 +24,9 @@ from enact_dist.bench.payloads import ARRAY, WAIT_S, said, store
 from enact_dist.bench.place import WORLD
 from enact_dist.bench.updates import slots
 from enact_dist.connecting import connect
+from enact_dist.link.datum_cache import DatumCache
 from enact_dist.lock import Lock
-from enact_dist.terms import Entity, Write
+from enact_dist.terms import Entity, View, Write
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -62,6 +64,16 @@ def _notify(world: WorldContext, options: dict[str, Any]) -> None:
     sys.stdin.read()
 
 
+def _fetch(world: WorldContext, options: dict[str, Any]) -> None:
+    view = View(world, Entity(options["entity"]), ARRAY)
+    print("ready:", flush=True)
+    while True:
+        world.session.cache = DatumCache(0)  # what is known already would not travel
+        print("fetching:", flush=True)
+        world.view(view)
+        print("fetched:", flush=True)
+
+
 def _wait(world: WorldContext, options: dict[str, Any]) -> None:
     (write,) = slots(world, 1, entity="waiters")
     with Lock(write, wait_s=WAIT_S):
@@ -97,6 +109,7 @@ def _wait(world: WorldContext, options: dict[str, Any]) -> None:
 _ROLES: Final[dict[str, Callable[[WorldContext, dict[str, Any]], None]]] = {
     "storer": _store,
     "notifier": _notify,
+    "fetcher": _fetch,
     "waiter": _wait,
 }
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.cli.verbs import add_verb, seconds, whole
@@ -22,6 +23,9 @@ NAMES: Final = (
     "publish",
     "wakeup",
     "pipeline",
+    "stopped",
+    "memory",
+    "recovery",
 )
 """The benches, in the order in which they run and stand in the table."""
 
@@ -37,7 +41,9 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
         "enact bench floor update --json\n"
         "enact bench update --embedded\n"
         "enact bench multi --shards 3\n"
-        "enact bench fetch --connect tcp/tray-pc:7447",
+        "enact bench fetch --connect tcp/tray-pc:7447\n"
+        "for n in 1 2 3; do enact bench --json > run$n.json; done;"
+        " enact bench --table run?.json",
     )
     bench.add_argument(
         "names",
@@ -71,6 +77,13 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
         " 20 times as long",
     )
     bench.add_argument("--json", action="store_true", help="print one JSON object")
+    bench.add_argument(
+        "--table",
+        nargs="+",
+        type=Path,
+        metavar="FILE",
+        help="measure nothing; print what earlier runs wrote with --json, as one Markdown table",
+    )
 
 
 def bench_name(text: str) -> str:

@@ -28,7 +28,7 @@ from enact_dist.verify.daemons import CellProcesses
 
 if TYPE_CHECKING:
     import argparse
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from enact_dist.verify.daemons import LineProcess
 
@@ -36,6 +36,9 @@ TTL_S: Final = 2.0
 ROUNDS: Final = 5
 CLIENT: Final = "enact_dist.verify.recovery_client"
 SHARD: Final = "left"
+RESTARTED: Final = "shard restarted, all clients alive"
+KILLED_FAR: Final = "holder killed, seen over a network"
+KILLED_NEAR: Final = "holder killed on the shard's host"
 PINS: Final = {"left": "left", "right": "right"}
 
 
@@ -79,13 +82,18 @@ class RecoveryFigure:
 
 
 def measure(
-    rounds: int = ROUNDS, *, ttl_s: float = TTL_S, say: Callable[[str], None] = lambda _: None
+    rounds: int = ROUNDS,
+    *,
+    ttl_s: float = TTL_S,
+    only: Sequence[str] = (),
+    say: Callable[[str], None] = lambda _: None,
 ) -> list[RecoveryFigure]:
     """Measure all figures, `rounds` times each.
 
     Args:
         rounds: How often something is killed per figure.
         ttl_s: Session TTL of the cell.
+        only: Names of the figures; none means all.
         say: Takes one line per figure as it begins.
 
     Raises:
@@ -93,12 +101,14 @@ def measure(
     """
     measured = []
     for name, carrier, shards, goal_s, run in (
-        ("shard restarted, all clients alive", "auto", (SHARD,), 0.5, _all_alive),
+        (RESTARTED, "auto", (SHARD,), 0.5, _all_alive),
         ("shard restarted, one client dead", "auto", (SHARD,), ttl_s + 0.1, _one_dead),
-        ("holder killed, seen over a network", "zenoh", (SHARD,), ttl_s + 0.1, _holder_killed),
-        ("holder killed on the shard's host", "auto", (SHARD,), 0.1, _holder_killed),
+        (KILLED_FAR, "zenoh", (SHARD,), ttl_s + 0.1, _holder_killed),
+        (KILLED_NEAR, "auto", (SHARD,), 0.1, _holder_killed),
         ("client killed in doubt", "auto", ("left", "right"), 2 * ttl_s, _in_doubt),
     ):
+        if only and name not in only:
+            continue
         say(f"{name}: {rounds} rounds")
         pins = {entity: shard if shard in shards else SHARD for entity, shard in PINS.items()}
         with (

@@ -6,6 +6,7 @@ import pytest
 
 from enact_dist.bench import command
 from enact_dist.cli import bench
+from enact_dist.errors import LinkError
 
 FIELDS = ["name", "variant", "median_us", "p99_us", "n", "ratio", "goal", "met"]
 SHORT = ("--seconds", "0.03")
@@ -16,7 +17,12 @@ def rows_of(result):
     assert set(result.json) == {"machine", "rows"}
     for row in result.json["rows"]:
         assert list(row)[: len(FIELDS)] == FIELDS
-        assert set(row) - set(FIELDS) in (set(), {"value", "unit"})
+        assert set(row) - set(FIELDS) in (
+            set(),
+            {"value", "unit"},
+            {"note"},
+            {"value", "unit", "note"},
+        )
         assert row["n"] > 0
         assert (row["median_us"] is None) == ("value" in row)
         assert row["median_us"] is None or 0 < row["median_us"] <= row["p99_us"]
@@ -111,7 +117,8 @@ def test_wrong_usage_is_refused(enact, capsys, words, text):
 @pytest.mark.parametrize(
     ("words", "status", "text"),
     [
-        (("bench", "wakeup", "--embedded"), 1, "wakeup between processes"),
+        (("bench", "wakeup", "--embedded"), 1, "wakeup with --embedded: needs several processes"),
+        (("bench", "memory", "--connect", "x"), 1, "memory with --connect: needs daemons of its"),
         (("bench", "multi", "--connect", "no-such-file.toml", *SHORT), 2, "no-such-file.toml"),
     ],
 )
@@ -146,3 +153,49 @@ def test_goal_that_is_missed_is_told_and_is_no_failure(enact, monkeypatch):
 
     row = rows_of(result)["core", "hand-over, 1,000 waiters"]
     assert (row["median_us"], row["met"]) == (5e3, False)
+
+
+def test_bench_that_breaks_costs_no_row_of_the_others(enact, monkeypatch):
+    """Minutes of figures are not lost to the last bench; the status tells that one failed."""
+
+    def broken(_run):
+        raise LinkError("the worker has gone")
+
+    monkeypatch.setitem(command.BENCHES, "multi", broken)
+
+    result = enact("bench", "core", "multi", "--json", *SHORT)
+
+    assert result.status == 1
+    rows = {(row["name"], row["variant"]): row for row in result.json["rows"]}
+    assert rows["core", "acquire + commit, one slot"]["n"] > 0
+    failed = rows["multi", "failed"]
+    assert (failed["goal"], failed["met"], failed["note"]) == ("runs", False, "the worker has gone")
+
+
+def test_runs_side_by_side_measure_nothing(enact, tmp_path):
+    """`--table` reads what `--json` wrote."""
+    result = enact("bench", "core", "--json", *SHORT)
+    path = tmp_path / "run1.json"
+    path.write_text(json.dumps(result.json))
+
+    shown = enact("bench", "--table", str(path), str(path))
+
+    assert shown.status == 0
+    (line,) = (line for line in shown.out.splitlines() if "acquire + commit, one slot" in line)
+    assert line.startswith("| core: acquire + commit, one slot | ≤ 50 µs |")
+
+
+@pytest.mark.slow
+def test_faults_and_memory_are_rows(enact):
+    """A stopped reader, a slot's memory, and deaths; each with its goal."""
+    rows = rows_of(enact("bench", "stopped", "memory", "recovery", "--json", *SHORT))
+
+    assert {key: row["goal"] for key, row in rows.items() if key[0] != "floor"} == {
+        ("stopped", "update beside a stopped reader of 50 MB"): "adds p99 < 50 ms, max < 150 ms",
+        ("memory", "shard, one slot that holds a number"): "≤ 2 kB",
+        ("memory", "shard, growth with commits"): "none (≤ 16 bytes)",
+        ("recovery", "shard restarted, all clients alive"): "p99 ≤ 0.5 s",
+        ("recovery", "holder killed, seen over a network"): "p99 ≤ 2.1 s",
+        ("recovery", "holder killed on the shard's host"): "p99 ≤ 0.1 s",
+    }
+    assert 0 < rows["memory", "shard, one slot that holds a number"]["value"] < 10_000
