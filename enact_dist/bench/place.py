@@ -103,6 +103,11 @@ class Place:
         return self.carriers == (EMBEDDED,)
 
     @property
+    def near(self) -> bool:
+        """Whether the cell is known to be on this host, whose floors are measured."""
+        return self.own or self.way(self.carrier) == "socket"
+
+    @property
     def carrier(self) -> str:
         """The carrier of benches that do not compare them."""
         return self.carriers[0] if len(self.carriers) == 1 else "auto"

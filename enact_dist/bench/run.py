@@ -1,14 +1,19 @@
-"""One run of benches: measures cases in rounds, keeps the best round of each, makes the rows.
+"""One run of benches: measures cases in rounds, and makes the rows.
 
 Two cores of a shared machine swing by a factor of two within seconds.  So all cases of a bench are
-measured in turn, several times over, and of each the round with the lowest median counts: a
-figure and its floor come from the machine's good moments alike.
+measured in turn, several times over, and of each the lowest median of a round counts: a figure and
+its floor come from the machine's good moments alike.  The 99th percentile is that of all rounds
+together, for a tail that only the best round lacks is a tail.
+
+A cell on another host has another disk and other ways than this machine, whose floors say nothing
+of it then: no ratio is given and no goal judged, but for what runs in this process alone.
 """
 
 from __future__ import annotations
 
 import gc
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.bench.floors import Floors
@@ -18,6 +23,8 @@ if TYPE_CHECKING:
     from enact_dist.bench.place import Place
 
 ROUNDS: Final = 3
+HERE: Final = frozenset(("floor", "core"))
+"""What is measured of this machine, wherever the cell is."""
 
 
 def _place_of(key: Key) -> int:
@@ -42,6 +49,7 @@ class Run:
         self.seconds_s = seconds_s
         self.told = told
         self._figures: dict[Key, Sample] = {}
+        self._times_us: dict[Key, list[float]] = {}
         self._cases: dict[Key, Case] = {}
         self._others: list[Row] = []
 
@@ -52,7 +60,7 @@ class Run:
         for number in range(rounds):
             for case in every:
                 self.told(f"{case.name}: {case.variant} ({number + 1} of {rounds})")
-                self._keep(case, sample_of(self._measured(case, self.seconds_s / rounds)))
+                self._keep(case, self._measured(case, self.seconds_s / rounds))
 
     @staticmethod
     def _measured(case: Case, seconds_s: float) -> Sequence[float]:
@@ -61,15 +69,18 @@ class Run:
         gc.collect()
         return case.measure(seconds_s)
 
-    def _keep(self, case: Case, sample: Sample) -> None:
+    def _keep(self, case: Case, times_us: Sequence[float]) -> None:
+        median_us = sample_of(times_us).median_us
         self._cases.setdefault(case.key, case)
-        best = self._figures.get(case.key)
-        if best is None or sample.median_us < best.median_us:
-            self._figures[case.key] = sample
+        if case.key in self._figures:
+            median_us = min(median_us, self._figures[case.key].median_us)
+        every_us = self._times_us.setdefault(case.key, [])
+        every_us += times_us
+        self._figures[case.key] = replace(sample_of(every_us), median_us=median_us)
 
     def add(self, case: Case, times_us: Sequence[float]) -> None:
         """Add a case that was measured elsewhere."""
-        self._keep(case, sample_of(times_us))
+        self._keep(case, times_us)
 
     def add_row(self, row: Row) -> None:
         """Add a figure that is no time."""
@@ -78,6 +89,10 @@ class Run:
     def rows(self) -> list[Row]:
         """Return all lines so far, floors first."""
         found = [row_of(case, self._figures) for case in self._cases.values()]
+        if not self.place.near:
+            found = [
+                row if row.name in HERE else replace(row, ratio=None, met=None) for row in found
+            ]
         names = list(dict.fromkeys(row.name for row in (*found, *self._others)))
         names.sort(key=lambda name: name != "floor")
         ordered = sorted(found, key=lambda row: _place_of((row.name, row.variant)))

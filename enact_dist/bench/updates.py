@@ -257,8 +257,9 @@ def _per_act_us(counts: list[int], seconds_s: float, failed: list[BaseException]
 
 def run_waiters(run: Run) -> None:
     """Hand-over of one slot: how long nobody holds it while several threads wait for it."""
+    floor = floor_of(run.place.way(run.place.carrier))
     cases = [
-        Case("waiters", f"{count} threads in 2 processes, hand-over", _hand_over(run, count), QUERY)
+        Case("waiters", f"{count} threads in 2 processes, hand-over", _hand_over(run, count), floor)
         for count in THREADS
     ]
     run.measure(cases)

@@ -2,7 +2,9 @@
 
 import pytest
 
+from enact_dist.bench.floors import QUERY
 from enact_dist.bench.rows import Case, Goal, Sample, at_most, row_of, sample_of, times
+from enact_dist.bench.run import Run
 from enact_dist.bench.timing import COUNT_MIN, timed
 
 FLOOR, OTHER, MINE = ("floor", "query"), ("floor", "disk"), ("update", "mine")
@@ -87,3 +89,41 @@ def test_act_is_repeated_at_least_three_times():
 def test_goal_is_a_value():
     """Two texts tell two goals apart."""
     assert Goal("a", len) != Goal("b", len)
+
+
+class Place:
+    """Where nothing is started."""
+
+    def __init__(self, *, near):
+        self.near = near
+
+
+def ran(*rounds_us, near=True, name="update"):
+    """Return the row of a case whose rounds took so long, beside a floor of 5 µs and a goal."""
+    run = Run(Place(near=near), None, seconds_s=1.0, told=lambda _text: None)
+    floor = Case(*QUERY, lambda _: ())
+    case = Case(name, "v", lambda _: (), QUERY, times(4.0, QUERY, "≤ 4 x"))
+    run.add(floor, [5.0] * 100)
+    for times_us in rounds_us:
+        run.add(case, times_us)
+    return next(row for row in run.rows() if row.name == name)
+
+
+def test_median_is_of_the_best_round_and_the_tail_of_all():
+    """A round that met with others counts in the 99th percentile and in n."""
+    row = ran([20.0] * 100, [10.0] * 100, [12.0] * 95 + [900.0] * 5)
+
+    assert (row.median_us, row.p99_us, row.n) == (10.0, 900.0, 300)
+
+
+@pytest.mark.parametrize(
+    ("near", "name", "judged"),
+    [(True, "update", True), (False, "update", None), (False, "core", True)],
+)
+def test_cell_on_another_host_is_not_judged_by_the_floors_of_this_one(near, name, judged):
+    """Its disk and its network are others; what runs here is judged all the same."""
+    row = ran([10.0] * 100, near=near, name=name)
+
+    assert row.met is judged
+    assert (row.ratio is None) == (judged is None)
+    assert row.goal == "≤ 4 x"
