@@ -213,23 +213,11 @@ class RepeatingClient(ClientBench):
                 lock.answered(shard, request, None, self.cell.now_ns)
         self.cell.carry_calls()
 
-    def drive(self, lock: MultiLock, *, steps: int = 60) -> MultiLock:
-        """Make the lock's calls until it rests, then send its farewells."""
-        for _ in range(steps):
-            if not lock.phase.busy:
-                break
-            self.step(lock)
-        for shard, farewell in lock.take_farewells():
-            self.call(shard, farewell)
-        return lock
+    def _answer(self, shard: str, request: Request) -> Answer | None:
+        return self.call(shard, request)
 
     def say_goodbye(self) -> None:
         """End the session at every shard."""
         for shard in self.core.shards_in_use():
             self.call(shard, Goodbye(self.core.session))
         self.gone = self.said_goodbye = True
-
-    def keep_alive(self) -> None:
-        """Send one round of keep-alives."""
-        for shard in self.core.shards_in_use():
-            self.call(shard, self.core.keep_alive(shard, self.cell.now_ns))

@@ -15,24 +15,14 @@ import threading
 import time
 from collections import Counter
 from dataclasses import dataclass, field
-from pathlib import Path
 
-from enact_dist import Aspect, Entity, Lock, View, Write, connect
+from accounts import COUNT, LEFT, RIGHT, open_accounts, start_trapped
+
+from enact_dist import Lock, View, Write, connect
 from enact_dist.errors import CommitUnknownError, LeaseLostError, ShardUnreachableError
 from enact_dist.link import client as link_client
 
-LAUNCHER = Path(__file__).with_name("dying_shard.py")
-COUNT = Aspect("count", int)
-LEFT, RIGHT = Entity("account/left"), Entity("account/right")
 PRIMARY, PARTICIPANT = "s0", "s1"
-PINS = """
-[[pins]]
-entities = "account/left"
-shard = "s0"
-[[pins]]
-entities = "account/right"
-shard = "s1"
-"""
 STEP_AT = {
     "all-prepared": PRIMARY,
     "decided": PRIMARY,
@@ -80,11 +70,6 @@ class Tally:
         )
 
 
-def start_trapped(cell, name):
-    """Start a shard's daemon with the trap in it, and wait until it serves."""
-    return cell.start(name, launcher=(str(LAUNCHER),))
-
-
 @dataclass
 class Told:
     """What the client was told about its commit; `outcome` is "" until then."""
@@ -107,8 +92,7 @@ class DecisionRounds:
         with contextlib.ExitStack() as stack:
             self._client = stack.enter_context(connect(cell.file, actor="client"))
             self._prober = stack.enter_context(connect(cell.file, actor="prober"))
-            for entity in (LEFT, RIGHT):
-                self._client.world("online").init(entity, COUNT, 0)
+            open_accounts(self._client)
             assert self._probe(self._prober)[0] == 0
             self._stack = stack.pop_all()
 

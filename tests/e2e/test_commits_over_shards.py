@@ -6,31 +6,20 @@ import random
 import time
 
 import pytest
+from accounts import COUNT, LEFT, RIGHT, open_accounts, two_shards
 
-from enact_dist import Aspect, Entity, Lock, Write, connect
+from enact_dist import Lock, Write, connect
 
 pytestmark = pytest.mark.slow
-COUNT = Aspect("count", int)
-LEFT, RIGHT = Entity("account/left"), Entity("account/right")
 TOTAL = 10_000
-PINS = """
-[[pins]]
-entities = "account/left"
-shard = "s0"
-[[pins]]
-entities = "account/right"
-shard = "s1"
-"""
 
 
 @pytest.fixture
 def cell(make_cell):
     """Two shards with one account on each."""
-    cell = make_cell(shards=("s0", "s1"), pins=PINS, ttl_s=1.0).start_all()
+    cell = two_shards(make_cell, ttl_s=1.0).start_all()
     with connect(cell.file) as joined:
-        world = joined.world("online")
-        world.init(LEFT, COUNT, TOTAL)
-        world.init(RIGHT, COUNT, 0)
+        open_accounts(joined, TOTAL)
     return cell
 
 

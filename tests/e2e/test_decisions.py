@@ -3,7 +3,8 @@
 import os
 
 import pytest
-from decision_rounds import PINS, STEP_AT, DecisionRounds, figures_to
+from accounts import two_shards
+from decision_rounds import STEP_AT, DecisionRounds, figures_to
 
 from enact_dist.link import client as link_client
 
@@ -16,7 +17,7 @@ TTL_S = float(os.environ.get("DECISION_KILLS_TTL_S", "1.0"))
 def test_commit_is_all_or_nothing_when_shards_die_at(step, make_cell, monkeypatch):
     """10 rounds per step, primary or participant or both die: told is true, locks end in 2 TTLs."""
     monkeypatch.setattr(link_client, "FINISH_S", link_client.FINISH_S)  # undoes what rounds set
-    cell = make_cell(shards=("s0", "s1"), pins=PINS, ttl_s=TTL_S)
+    cell = two_shards(make_cell, ttl_s=TTL_S)
     rounds = DecisionRounds(cell, step, ttl_s=TTL_S, seed=len(step))
     try:
         for number in range(ROUNDS):

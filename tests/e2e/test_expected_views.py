@@ -6,7 +6,7 @@ import time
 from dataclasses import dataclass, field
 
 import pytest
-from decision_rounds import COUNT, LEFT, PINS, RIGHT, start_trapped
+from accounts import COUNT, LEFT, RIGHT, open_accounts, start_trapped, two_trapped_shards
 
 from enact_dist import Lock, Read, View, Write, connect, local
 from enact_dist.core.messages import Commit
@@ -24,19 +24,10 @@ pytestmark = pytest.mark.slow
 TTL_S = 1.0
 
 
-def start_accounts(cell):
-    for entity in (LEFT, RIGHT):
-        cell.world("online").init(entity, COUNT, 0)
-    return cell
-
-
 @pytest.fixture
 def daemons(make_cell):
     """Two shards with one account of 0 on each."""
-    cell = make_cell(shards=("s0", "s1"), pins=PINS, ttl_s=TTL_S)
-    for name in cell.ports:
-        start_trapped(cell, name)
-    return cell
+    return two_trapped_shards(make_cell, ttl_s=TTL_S)
 
 
 @pytest.fixture(params=["embedded", "daemons"])
@@ -44,10 +35,10 @@ def joined(request):
     """A connection to both accounts, in this process or over two daemons."""
     if request.param == "embedded":
         with local(worlds=["online"]) as cell:
-            yield start_accounts(cell)
+            yield open_accounts(cell)
     else:
         with connect(request.getfixturevalue("daemons").file) as cell:
-            yield start_accounts(cell)
+            yield open_accounts(cell)
 
 
 def seen(cell, *entities):
@@ -155,7 +146,7 @@ def write_right(cell, value):
 def test_lock_whose_read_shard_restarted_writes_nothing(daemons):
     """Only the reading participant has lost the lock: the write on the other shard fails, too."""
     with connect(daemons.file) as mine, connect(daemons.file) as other:
-        start_accounts(mine)
+        open_accounts(mine)
         world = mine.world("online")
         read, write = Read(world, RIGHT, COUNT), Write(world, LEFT, COUNT)
         with pytest.raises(LeaseLostError, match="nothing was written"), Lock(read, write) as lock:
@@ -172,7 +163,7 @@ def test_lock_whose_read_shard_restarted_writes_nothing(daemons):
 def test_lock_whose_read_lease_expired_writes_nothing(daemons):
     """A client that stood still for 3 TTLs: its read was overwritten, its write is refused."""
     with connect(daemons.file) as other:
-        start_accounts(other)
+        open_accounts(other)
         client = daemons.worker("skew")
         client.expect("holding")
         client.signal(signal.SIGSTOP)
@@ -190,7 +181,7 @@ def test_lock_whose_read_lease_expired_writes_nothing(daemons):
 def test_embedded_lock_that_was_held_too_long_writes_nothing():
     """In one process, too: after the hold limit another wrote what was read."""
     with local(worlds=["online"]) as cell:
-        start_accounts(cell)
+        open_accounts(cell)
         world = cell.world("online")
         read, write = Read(world, RIGHT, COUNT), Write(world, LEFT, COUNT)
         with (

@@ -6,7 +6,7 @@ import threading
 import time
 
 import pytest
-from decision_rounds import COUNT, LEFT, PINS, RIGHT, start_trapped
+from accounts import COUNT, LEFT, RIGHT, open_accounts, start_trapped, two_trapped_shards
 
 from enact_dist import Lock, View, Write, connect
 from enact_dist.errors import CommitUnknownError
@@ -18,12 +18,9 @@ pytestmark = pytest.mark.slow
 @pytest.fixture
 def cell(make_cell):
     """Two shards with one account of 0 on each; s0 decides what is written on both."""
-    cell = make_cell(shards=("s0", "s1"), pins=PINS, ttl_s=1.0)
-    for name in cell.ports:
-        start_trapped(cell, name)
+    cell = two_trapped_shards(make_cell, ttl_s=1.0)
     with connect(cell.file) as joined:
-        for entity in (LEFT, RIGHT):
-            joined.world("online").init(entity, COUNT, 0)
+        open_accounts(joined)
     return cell
 
 
