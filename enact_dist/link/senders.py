@@ -17,6 +17,7 @@ the client, which asks again.
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections import deque
 from collections.abc import Callable
@@ -44,6 +45,8 @@ IDLE_S: Final = 2.0
 """A sender without work ends after so long; the next large answer starts one anew."""
 ANSWER_OVERHEAD_BYTES: Final = 256
 """What an answer is counted with beside its data."""
+
+_log = logging.getLogger("enact.link")
 
 
 class Parcel(Protocol):
@@ -125,8 +128,12 @@ class Senders:
         if account.sender is None:
             if self._senders >= SENDERS_MAX:
                 return False
+            try:
+                account.sender = _Sender(lambda sender: self._idle(account, sender))
+            except RuntimeError as error:  # the system has no more threads
+                _log.warning("an answer is lost: %s", error)
+                return False
             self._senders += 1
-            account.sender = _Sender(lambda sender: self._idle(account, sender))
         return account.sender.put(parcel)
 
     def _idle(self, account: _Account, sender: _Sender) -> bool:

@@ -74,16 +74,25 @@ class ShardCalls:
             if shard not in self._endpoints:
                 self._tell_unknown(shard)
                 return
-            line = self._lines.get(shard)
-            if line is None:
-                line = self._lines[shard] = _Line(
-                    shard,
-                    lambda request: request_key(self._cell, shard, verb_of(request), self._name),
-                    self._endpoints[shard],
-                    self._lease_s,
-                    lambda request, answer: self._answered(shard, request, answer),
-                )
-        line.submit(request)
+            line = self._lines.get(shard) or self._opened(shard)
+        if line is not None:
+            line.submit(request)
+
+    def _opened(self, shard: str) -> _Line | None:
+        """Return a new line to a shard; None where the system has no more threads."""
+        try:
+            line = _Line(
+                shard,
+                lambda request: request_key(self._cell, shard, verb_of(request), self._name),
+                self._endpoints[shard],
+                self._lease_s,
+                lambda request, answer: self._answered(shard, request, answer),
+            )
+        except RuntimeError as error:
+            _log.warning("no call to shard %s now: %s", shard, error)
+            return None
+        self._lines[shard] = line
+        return line
 
     def _tell_unknown(self, shard: str) -> None:
         """Tell the log once of a shard that a lock was prepared with and the cell has no more."""

@@ -165,3 +165,25 @@ def test_senders_drop_what_waits_when_they_are_closed(senders):
 
     assert waiting.dropped
     assert after.dropped
+
+
+def test_senders_drop_a_large_answer_where_no_thread_can_be_started(senders, counts, monkeypatch):
+    """At the system's limit of threads one answer is lost and counted; the shard lives."""
+
+    def refused(_):
+        raise RuntimeError("can't start new thread")
+
+    large, small = FakeParcel(OUTSTANDING_BYTES_MAX), FakeParcel(100)
+    with monkeypatch.context() as patched:
+        patched.setattr(threading.Thread, "start", refused)
+        senders.send("a", large)
+    senders.send("b", small)
+    later = FakeParcel(OUTSTANDING_BYTES_MAX)
+    senders.send("a", later)
+
+    assert large.dropped
+    assert counts["answers_dropped"] == 1
+    assert small.thread == threading.get_ident()
+    assert later.done.wait(5)
+    assert not later.dropped
+    assert senders._senders == 1

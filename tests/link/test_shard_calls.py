@@ -103,6 +103,22 @@ def test_call_that_is_queued_is_not_queued_twice(calling, endpoint, monkeypatch)
     assert asked[1].count(RESOLVE) == 1
 
 
+def test_call_without_a_thread_for_it_is_made_later(daemon, calling, endpoint, until, monkeypatch):
+    """At the system's limit of threads the shard that calls goes on; the core asks again."""
+    daemon(endpoint, "s1")
+    calls = calling(s1=endpoint)
+
+    def refused(_):
+        raise RuntimeError("can't start new thread")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(threading.Thread, "start", refused)
+        calls.submit("s1", RESOLVE)
+
+    assert line_threads() == []
+    until(lambda: calls.answers or calls.submit("s1", RESOLVE))
+
+
 def test_way_that_could_not_be_opened_is_tried_again(
     daemon, calling, endpoint, until, monkeypatch, caplog
 ):
