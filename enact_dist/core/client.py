@@ -172,8 +172,12 @@ class Client:
         self.seen_stamp_ns = max(self.seen_stamp_ns, stamp_ns)
 
     def committed(self, participants: Iterable[str], stamp_ns: int) -> None:
-        """Note that these shards may not show a commit of ours yet."""
-        self._unsettled.update(dict.fromkeys(participants, stamp_ns))
+        """Note that these shards may not show a commit of ours yet.
+
+        Threads are told in another order than that of their commits.
+        """
+        for shard in participants:
+            self._unsettled[shard] = max(self._unsettled.get(shard, 0), stamp_ns)
 
     def unsettled_ns(self, shard: str) -> int:
         """Return the stamp of a commit of ours that a shard may not show yet (0: none)."""

@@ -53,11 +53,13 @@ class State(NamedTuple):
         name: What readers know it by; unique within the slot.
         writer: Id of the lock, or of the event (a restart), that set it.
         version: Counts the committed writes of the slot.
+        captured_ns: The capture stamp of its datum; 0 without one.
     """
 
     name: Name
     writer: Writer
     version: int
+    captured_ns: int = 0
 
 
 class Reading(NamedTuple):
@@ -65,6 +67,14 @@ class Reading(NamedTuple):
 
     slot: Slot
     name: Name
+
+
+class Captured(NamedTuple):
+    """One state that a lock was shown by its capture stamp; `NOTHING` where none was retained."""
+
+    slot: Slot
+    name: Name
+    captured_ns: int
 
 
 @dataclass(slots=True, eq=False)
@@ -80,6 +90,7 @@ class LockStory:
         views: What it saw without protection.
         writes: The slots in which everybody must find it once it has committed.
         outlives_restarts: A promise over shards: held over restarts, which empty volatile slots.
+        captured: What it saw by capture stamp.
     """
 
     id: Writer
@@ -90,6 +101,7 @@ class LockStory:
     views: Sequence[Reading] = ()
     writes: Sequence[Slot] = ()
     outlives_restarts: bool = False
+    captured: Sequence[Captured] = ()
 
 
 class Anomaly(NamedTuple):
@@ -159,6 +171,7 @@ class Checker:
             if story.told is Told.COMMITTED or story.id in visible
         ]
         self.views_checked = 0
+        self.sets_checked = 0
         self._after: dict[Writer, dict[Writer, tuple[str, object]]] = {}
 
     # ---------------------------------------------------------------- all rules
@@ -170,6 +183,7 @@ class Checker:
             *self.told_anomalies(),
             *self.reading_anomalies(),
             *self.view_anomalies(),
+            *self.set_anomalies(),
         ]
         cycle = self.cycle()
         if cycle is not None:
@@ -230,6 +244,48 @@ class Checker:
                 if missed:
                     facts = (f"{story.id} sees {lock}", f"but not in {missed}")
                     yield Anomaly("a view shows half a commit", facts)
+
+    def set_anomalies(self) -> Iterator[Anomaly]:
+        """What is asked by stamp bears it, and a commit that is seen is seen under its stamp.
+
+        A commit may have left retention in one slot and not in another; but a datum that is older
+        than what a visible commit captured at the same stamp is half of that commit.
+        """
+        for story in self.committed:
+            shown = {
+                one.slot: (self._positions.get(one.slot, _ONLY_NOTHING).get(one.name), one)
+                for one in story.captured
+                if one.name is not NOTHING
+            }
+            seen = self._seen_by_views(story)
+            writers = {self._chains[s][i].writer: None for s, i in seen.items() if i >= 0}
+            for slot, (index, one) in shown.items():
+                if index is None:
+                    yield Anomaly("dirty read", (f"{story.id} read {one.name} of {slot}",))
+                    continue
+                state = self._chains[slot][index]
+                if state.captured_ns not in (0, one.captured_ns):
+                    yield Anomaly("another stamp was shown", (f"{story.id}: {one}: {state}",))
+                writers[state.writer] = None
+            self.sets_checked += len(shown) > 1
+            yield from self._halves_of_sets(story, shown, writers)
+
+    def _halves_of_sets(
+        self,
+        story: LockStory,
+        shown: Mapping[Slot, tuple[int | None, Captured]],
+        writers: Iterable[Writer],
+    ) -> Iterator[Anomaly]:
+        for lock in writers:
+            if lock not in self._stories or lock in self._lost:
+                continue
+            for slot, written in self._written[lock].items():
+                index, one = shown.get(slot, (None, None))
+                if index is None or one is None or index >= written:
+                    continue
+                if self._chains[slot][written].captured_ns == one.captured_ns:
+                    facts = (f"{story.id} sees {lock}", f"but something older in {slot}")
+                    yield Anomaly("a set shows half a commit", facts)
 
     def _seen_by_views(self, story: LockStory) -> dict[Slot, int]:
         """Return which state of each viewed slot a lock saw, those set by events left out."""

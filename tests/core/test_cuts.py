@@ -4,12 +4,22 @@ from __future__ import annotations
 
 import pytest
 from client_bench import ANSWER, NOTHING, CellBench, ClientBench
-from shard_bench import MS, TTL_NS, S, item, lock_id, slot
+from shard_bench import MS, TTL_NS, S, datum, item, lock_id, slot
 
 from enact_dist.core.cuts import ROUNDS_MAX, Cut
-from enact_dist.core.messages import Finish, PlacementMap, ShardEntry, TakeView, Viewed
+from enact_dist.core.messages import (
+    Commit,
+    Finish,
+    Outcome,
+    PlacementMap,
+    ShardEntry,
+    TakeView,
+    Viewed,
+    WriteItem,
+)
 from enact_dist.core.multilock import MultiLock
 from enact_dist.core.phase import Phase
+from enact_dist.core.placement import shard_of
 from enact_dist.core.records import Called
 from enact_dist.terms import Access
 
@@ -224,6 +234,40 @@ def test_view_beside_a_deleted_pattern_is_not_older_either(cell):
     reader.drive(lock)
 
     assert (lock.phase, shown(lock)) == (Phase.HELD, ["new"])
+
+
+def test_own_commit_is_shown_though_an_earlier_one_was_told_later(cell):
+    """Two threads of a process commit; the answer to the first one is late."""
+    client = cell.client("ann")
+    names = [(cell.entity_on("a", prefix), cell.entity_on("b", prefix)) for prefix in "ef"]
+    first, second = (
+        client.locked(item(W, x), item(W, y), lane=lane) for lane, (x, y) in enumerate(names)
+    )
+    client.lose = lambda _shard, request: (
+        ANSWER
+        if getattr(request, "lock", None) == first.lock and isinstance(request, Commit | Outcome)
+        else NOTHING
+    )
+    writes = {
+        shard_of(one, cell.placement): [WriteItem(slot(one), datum("first"))] for one in names[0]
+    }
+    first.finish(writes, give_up_ns=cell.now_ns + 10 * S)
+    while not first.sent_commit:
+        client.step(first)
+    client.finish(second, *((slot(one), "second") for one in names[1]))
+    client.lose = lambda _shard, _request: NOTHING
+    client.drive(first)
+    assert (first.phase, second.phase) == (Phase.COMMITTED, Phase.COMMITTED)
+    assert first.position < second.position
+
+    view = client.begin(item(V, names[1][1]), lane=2)
+    for _ in range(3):
+        client.step(view)
+    assert view.phase is Phase.VIEWING
+    tell_decisions(cell)
+    client.drive(view)
+
+    assert (view.phase, shown(view)) == (Phase.HELD, ["second"])
 
 
 def test_view_that_outlived_a_restart_does_not_show_half_a_commit(cell):

@@ -10,12 +10,14 @@ from typing import TYPE_CHECKING, Any
 
 from mutant_parts import forgets_what_ended
 
+from enact_dist.core.client import Client
 from enact_dist.core.commits import Commits
 from enact_dist.core.cuts import Cut
 from enact_dist.core.lock_desk import LockDesk
 from enact_dist.core.messages import Granted
 from enact_dist.core.multilock import MultiLock
 from enact_dist.core.records import Persist, PreparedEnded
+from enact_dist.core.retained import Retained
 from enact_dist.core.sessions import Session, SessionTable
 from enact_dist.core.slots import SlotMap
 from enact_dist.core.tenures import Tenures
@@ -122,6 +124,25 @@ def mixes_past_and_present(patch: Patch) -> None:
     patch(Cut, "settled", wrong)
 
 
+def shows_the_future_by_stamp(patch: Patch) -> None:
+    """A view by stamp shows a version that came after the moment of the view."""
+    captured = Retained.captured
+
+    def wrong(self: Retained, slot: Any, captured_ns: int, **_options: Any) -> Any:
+        return captured(self, slot, captured_ns, version_max=1 << 62)
+
+    patch(Retained, "captured", wrong)
+
+
+def forgets_a_later_commit_of_its_own(patch: Patch) -> None:
+    """A client that is told of two commits in the other order waits for the earlier one only."""
+
+    def wrong(self: Client, participants: Any, stamp_ns: int) -> None:
+        self._unsettled.update(dict.fromkeys(participants, stamp_ns))
+
+    patch(Client, "committed", wrong)
+
+
 DIRECTED = {
     takes_grants_of_an_old_epoch: "test_grant_of_an_epoch_that_is_over_is_not_taken",
     leases_end_late: "test_lease_ends_exactly_with_its_ttl",
@@ -133,6 +154,12 @@ DIRECTED = {
     ),
     shows_the_present_for_the_past: "test_view_as_of_the_past_shows_the_past",
     mixes_past_and_present: "test_one_shard_as_of_a_stamp_may_mix_past_and_present",
+    shows_the_future_by_stamp: (
+        "test_view_as_of_a_commit_stamp_does_not_see_what_was_captured_later"
+    ),
+    forgets_a_later_commit_of_its_own: (
+        "test_own_commit_is_shown_though_an_earlier_one_was_told_later"
+    ),
     views_do_not_renew: "test_everything_that_is_counted_renews",
 }
 """Each with the test of `tests/core` that catches it."""

@@ -89,6 +89,8 @@ class ClientHost(Host):
         self.generation = 0
         self.starves_until_ns = 0
         self.cache: dict[Slot, tuple[str, int, int, Datum]] = {}
+        self.own: dict[Slot, tuple[str, int, int]] = {}
+        """Where and in which epoch it last committed a slot, and with which stamp."""
         self.threads_left = 0
         self._network, self._shards, self._model = network, shards, model
         self._faults = faults

@@ -9,12 +9,15 @@ from enact_dist.terms import Access, Durability
 from enact_dist.verify.simulation.history import TOLD_NOT, Entry, History, conflict
 
 if TYPE_CHECKING:
-    from enact_dist.core.datum import Datum
+    from enact_dist.core.datum import Datum, Slot
     from enact_dist.core.lock_parts import Reading
+    from enact_dist.core.messages import Surveyed
     from enact_dist.core.multilock import MultiLock
     from enact_dist.verify.simulation.client_host import ClientHost
     from enact_dist.verify.simulation.model import Model
     from enact_dist.verify.simulation.world import World
+
+    Own = dict[Slot, tuple[str, int, int]]
 
 
 class ClientJudge:
@@ -61,6 +64,35 @@ class ClientJudge:
         if (state.version, state.stamp_ns) != (0, 0) or datum is not None:
             self._fail("what is read was committed", reading)
 
+    def surveyed(self, host: ClientHost, own: Own, shard: str, answer: Surveyed) -> None:
+        """A process lists versions at a shard that has settled: its own commits are among them.
+
+        Args:
+            host: The process.
+            own: What it had committed when it began to ask.
+            shard: Whom it has asked.
+            answer: What came.
+        """
+        newest = {state.slot: state for state in answer.states}
+        for slot, (at_shard, epoch, stamp_ns) in own.items():
+            durable = self._model.durabilities[slot.aspect] is Durability.DURABLE
+            state = newest.get(slot)
+            if at_shard == shard and state is not None and (durable or epoch == answer.epoch):
+                self._world.tally["own commits found in surveys"] += 1
+                if state.stamp_ns < stamp_ns:
+                    self._fail("a survey names our own commits", host.name, state, stamp_ns)
+
+    def shows_own(self, own: Own, entry: Entry) -> None:
+        """What a process has committed before it asks is shown by all that its locks see."""
+        stamps = entry.stamps()
+        for shard, epoch, state in entry.lock.states:
+            at_shard, at_epoch, stamp_ns = own.get(state.slot, ("", 0, 0))
+            durable = self._model.durabilities[state.slot.aspect] is Durability.DURABLE
+            if at_shard == shard and (durable or epoch == at_epoch) and state.slot not in stamps:
+                self._world.tally["own commits seen"] += 1
+                if state.stamp_ns < stamp_ns:
+                    self._fail("a process sees its own commits", entry.id, state, stamp_ns)
+
     def told(self, host: ClientHost, entry: Entry) -> None:
         """A thread was told how its lock ended: is it true?"""
         self._world.tally[f"told: {entry.told.value if entry.told else '-'}"] += 1
@@ -78,6 +110,11 @@ class ClientJudge:
 
         if entry.told is Phase.COMMITTED:
             self._check_confirmed(entry)
+            epochs = {part.shard: part.token.epoch for part in entry.lock.parts if part.token}
+            for slot, _ in entry.lock.versions:
+                shard, position = entry.lock.shard_of(slot), entry.lock.position
+                if shard in epochs and position is not None:
+                    host.own[slot] = (shard, epochs[shard], position.stamp_ns)
 
     def _check_confirmed(self, entry: Entry) -> None:
         """P3: each part was asked, at its end, whether it had been held all the time."""

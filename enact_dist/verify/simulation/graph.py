@@ -9,8 +9,18 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from enact_dist.core.phase import Phase
-from enact_dist.verify.checker import NOTHING, Checker, LockStory, Reading, State, Told
+from enact_dist.terms import NullReason
+from enact_dist.verify.checker import (
+    NOTHING,
+    Captured,
+    Checker,
+    LockStory,
+    Reading,
+    State,
+    Told,
+)
 from enact_dist.verify.simulation.history import TOLD_NOT
+from enact_dist.verify.simulation.reader_judge import stamp_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -30,7 +40,9 @@ class Graph:
         chains: dict[Slot, list[State]] = {}
         for picture in model.pictures.values():
             for slot, chain in picture.chains.items():
-                chains[slot] = [State(i, s.writer, s.version) for i, s in enumerate(chain)]
+                chains[slot] = [
+                    State(i, s.writer, s.version, stamp_of(s.datum)) for i, s in enumerate(chain)
+                ]
                 positions = self._positions[slot] = {}
                 for index, state in enumerate(chain):
                     positions.setdefault(state.name, []).append((state.epoch, index))
@@ -56,6 +68,7 @@ class Graph:
             reads,
             self._readings(entry.views()),
             outlives_restarts=entry.id in self._model.decided,
+            captured=self._captured(entry),
         )
 
     def _readings(self, found: Iterable[lock_parts.Reading]) -> list[Reading]:
@@ -65,16 +78,29 @@ class Graph:
             readings.append(Reading(state.slot, self._position(state.slot, epoch, name)))
         return readings
 
+    def _captured(self, entry: Entry) -> list[Captured]:
+        stamps, found = entry.stamps(), []
+        for _, epoch, state in entry.lock.states if stamps else ():
+            captured_ns = stamps.get(state.slot)
+            if captured_ns is not None:
+                gone = state.null_reason == NullReason.OUTSIDE_RETENTION.name
+                name = None if gone else self._position(state.slot, epoch, state[1:3])
+                found.append(Captured(state.slot, name, captured_ns))
+        return found
+
     def _position(self, slot: Slot, epoch: int, name: tuple[int, int]) -> int | None:
         """Return which state of the slot a reader of this epoch knew by this name."""
         found = self._positions.get(slot, {}).get(name, ())
         return max((index for since, index in found if since <= epoch), default=NOTHING)
 
     def check_views(self) -> None:
-        """Every view shows all that a commit has written, or nothing of it."""
+        """Every view and every set shows all that a commit has written, or nothing of it."""
         for rule, facts in self._checker.view_anomalies():
             self._model.fail(rule, *facts)
+        for rule, facts in self._checker.set_anomalies():
+            self._model.fail(rule, *facts)
         self._model.count("views over several slots checked", self._checker.views_checked)
+        self._model.count("sets of one stamp checked", self._checker.sets_checked)
 
     def cycle(self) -> list[str] | None:
         """Return a cycle as lines to read, or None if there is an order."""

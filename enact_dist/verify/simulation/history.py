@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from enact_dist.core.datum import Slot
 from enact_dist.core.phase import Phase
 from enact_dist.terms import Access, pattern_matches, patterns_overlap
 
@@ -60,8 +61,22 @@ class Entry:
         ]
 
     def views(self) -> list[Reading]:
-        """Return what the lock saw without protection, at whatever shard."""
-        return [r for r in self.lock.states if not any(_covers(item, r) for item in self.items)]
+        """Return what the lock saw without protection, at whatever shard; not by stamp."""
+        stamps = self.stamps()
+        return [
+            reading
+            for reading in self.lock.states
+            if reading.state.slot not in stamps
+            and not any(_covers(item, reading) for item in self.items)
+        ]
+
+    def stamps(self) -> dict[Slot, int]:
+        """Return which slots it viewed by capture stamp, and by which."""
+        return {
+            Slot(item.context, item.entity, item.aspect): item.captured_ns
+            for item in self.items
+            if item.captured_ns
+        }
 
 
 @dataclass(slots=True)

@@ -16,10 +16,11 @@ from enact_dist.core.messages import (
     Goodbye,
     Granted,
     Hello,
-    Item,
     Notice,
     Prepared,
     SlotVersion,
+    Survey,
+    Surveyed,
     Valid,
     Viewed,
 )
@@ -36,18 +37,21 @@ from enact_dist.core.records import (
     SessionDied,
     SlotRecord,
 )
-from enact_dist.terms import Access, Durability, pattern_matches
+from enact_dist.terms import Durability
 from enact_dist.verify.simulation.client_judge import ClientJudge
 from enact_dist.verify.simulation.history import TOLD_NOT, History
 from enact_dist.verify.simulation.lock_judge import LockJudge
 from enact_dist.verify.simulation.picture import Picture, State
 from enact_dist.verify.simulation.prefixes import judge_prefixes
+from enact_dist.verify.simulation.reader_judge import ReaderJudge, stamp_of
 from enact_dist.verify.simulation.workload import label_of, value_of, writer_of
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
+    from enact_dist.core.messages import AspectEntry
     from enact_dist.core.records import Effect
+    from enact_dist.verify.simulation.history import Entry
     from enact_dist.verify.simulation.shard_host import ShardHost
     from enact_dist.verify.simulation.world import World
 
@@ -55,10 +59,12 @@ if TYPE_CHECKING:
 class Model:
     """The judge of a running simulation."""
 
-    def __init__(self, world: World, history: History, durabilities: dict[str, str]) -> None:
+    def __init__(self, world: World, history: History, aspects: Iterable[AspectEntry]) -> None:
         self._world, self._history = world, history
         self._locks = LockJudge(world)
-        self.durabilities = {name: Durability(text) for name, text in durabilities.items()}
+        aspects = tuple(aspects)
+        self.durabilities = {entry.name: Durability(entry.durability) for entry in aspects}
+        self._readers = ReaderJudge(self, {entry.name: entry.retention or 1 for entry in aspects})
         self.pictures: dict[str, Picture] = {}
         self.of_clients = ClientJudge(world, history, self)
         self.absent: dict[LockId, dict[tuple[str, Slot], tuple[int, tuple[int, int]]]] = {}
@@ -70,6 +76,10 @@ class Model:
     def fail(self, rule: str, *facts: object) -> None:
         """Stop the run: a rule is broken."""
         self._fail(rule, *facts)
+
+    def entry(self, lock: LockId) -> Entry | None:
+        """Return what a client knows of its lock."""
+        return self._history.entries.get(lock)
 
     def clock_was_set(self) -> None:
         """A wall clock was set: commits may be refused for it from now on."""
@@ -159,6 +169,9 @@ class Model:
                 # What is prepared here comes later, however early it was decided elsewhere.
                 by = f"{writer} under {prepared[slot]}" if slot in prepared else writer
                 picture.put(slot, State(*name, by, picture.epoch, content.datum))
+            elif before.version and stamp_of(content.datum) != stamp_of(before.datum):
+                self._fail("a datum keeps its capture stamp", slot, content, before)
+            picture.restarted_at[slot] = len(picture.chains[slot]) - 1
         if len(recovered.outcomes) > len(picture.lanes):
             self._fail("I14 one outcome per lane", len(recovered.outcomes), len(picture.lanes))
         picture.arrivals.clear()
@@ -193,7 +206,9 @@ class Model:
             if not isinstance(effect, Reply):
                 continue
             if isinstance(effect.answer, Granted | Viewed):
-                self._check_snapshot(host, effect.answer, picture)
+                self._readers.check(host, effect.answer, picture)
+            elif isinstance(effect.answer, Surveyed) and isinstance(message, Survey):
+                self._readers.check_survey(message, effect.answer, picture)
             elif isinstance(effect.answer, Valid):
                 lock = effect.answer.lock
                 if lock in picture.granted_ever:  # else it only expected something here
@@ -309,6 +324,10 @@ class Model:
                 self._world.tally["decisions"] += 1
         versions = {change.slot: (change.version, change.stamp_ns) for change in notice.changes}
         datum_of = {slot: host.shard.state.slots[slot].datum for slot in versions}
+        for change in notice.changes:
+            datum = datum_of[change.slot]
+            if (change.null, change.captured_ns) != (datum is None, stamp_of(datum)):
+                self._fail("a notice tells what was committed", change, datum)
         self._put_all(lock, versions, picture, datum_of)
         picture.applied[lock] = persist
         picture.confirmed[lock] = picture.granted_ever[lock]
@@ -387,44 +406,6 @@ class Model:
         emptied = self.durabilities[slot.aspect] is Durability.VOLATILE and before.version == 0
         if value_of(datum) != old + 1 and not (emptied and lock in self.decided):
             self._fail("no lost update", slot, old, datum)
-
-    # ---------------------------------------------------------------- readers
-
-    def _check_snapshot(self, host: ShardHost, answer: Granted | Viewed, picture: Picture) -> None:
-        """I18: an answer shows one committed moment, and all of it."""
-        for state in answer.states:
-            now = picture.now(state.slot)
-            name = (state.version, state.stamp_ns)
-            if name != now.name and isinstance(answer, Viewed):
-                now = picture.at(state.slot, max(answer.from_ns, answer.until_ns))
-                self._world.tally["data shown as of the past"] += 1
-                if name != now.name and answer.from_ns > answer.until_ns:
-                    # Of no one moment, and it says so: some of the past was forgotten.
-                    now = picture.at(state.slot, answer.until_ns)
-                    self._world.tally["views of no moment"] += 1
-            if name != now.name:
-                self._fail("I18 readers see what is committed", state.slot, state, now)
-            if (state.null_reason == "") != (now.datum is not None):
-                self._fail("null is null", state, now)
-        if isinstance(answer, Viewed):
-            return
-        shown = {state.slot for state in answer.states}
-        absent = self.absent.setdefault(answer.lock, {})
-        for known in [known for known in absent if known[0] == host.name]:
-            del absent[known]  # of an earlier grant, before a restart
-        tenure = host.shard.state.tenures.by_lock.get(answer.lock)
-        for item in tenure.items if tenure else ():
-            if Access(item.access).each:
-                for slot in self._not_shown(item, shown, picture):
-                    now = picture.now(slot)
-                    if now.datum is not None:
-                        self._fail("I18 a pattern shows all that match", item, slot)
-                    absent[host.name, slot] = (picture.epoch, now.name)
-
-    @staticmethod
-    def _not_shown(item: Item, shown: set[Slot], picture: Picture) -> list[Slot]:
-        column = picture.columns.get((item.context, item.aspect), {})
-        return [s for s in column if s not in shown and pattern_matches(item.entity, s.entity)]
 
 
 def _names(chain: list[State]) -> set[tuple[int, int]]:

@@ -31,10 +31,14 @@ NEVER_SET = State(0, 0, "nobody", 0, None)
 
 @dataclass(slots=True)
 class Picture:
-    """What the model knows of one shard."""
+    """What the model knows of one shard.
+
+    `restarted_at` is where in its chain a slot stood when the shard last started.
+    """
 
     epoch: int = 0
     chains: dict[Slot, list[State]] = field(default_factory=dict)
+    restarted_at: dict[Slot, int] = field(default_factory=dict)
     columns: dict[tuple[str, str], dict[Slot, None]] = field(default_factory=dict)
     in_flight: dict[LockId, Persist] = field(default_factory=dict)
     preparing: dict[LockId, PreparedRecord] = field(default_factory=dict)

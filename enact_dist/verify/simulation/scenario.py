@@ -85,8 +85,7 @@ class Scenario:
         self._faults_end_ns = min(cells.FAULTS_NS, until_ns + S // 2)
         self._work_ns = min(cell.work_ns, until_ns)
         self.history = History()
-        durabilities = {entry.name: entry.durability for entry in ASPECTS}
-        self.model = Model(world, self.history, durabilities)
+        self.model = Model(world, self.history, ASPECTS)
         self.network = Network(world, cell.faults, through_wire=through_wire)
         self.shards = self._made_shards(cell.shards)
         for host in self.shards.values():

@@ -25,6 +25,7 @@ from enact_dist.core.multilock import MultiLock
 from enact_dist.core.phase import Phase
 from enact_dist.core.placement import shard_of
 from enact_dist.terms import Access
+from enact_dist.verify.simulation.captures import Captures, drawn_stamp_ns
 from enact_dist.verify.simulation.client_host import Calls, ClientHost, Sleep, Steps, Thread
 from enact_dist.verify.simulation.history import Entry, History
 from enact_dist.verify.simulation.world import MS, S
@@ -36,8 +37,8 @@ if TYPE_CHECKING:
 CONTEXTS = ("training", "online")
 ASPECTS = (
     AspectEntry("count", "int", "durable"),
-    AspectEntry("note", "int", "os"),
-    AspectEntry("frame", "int", "volatile"),
+    AspectEntry("note", "int", "os", 3),
+    AspectEntry("frame", "int", "volatile", 4),
     AspectEntry("made", "str", "durable"),
 )
 PLAIN = ("count", "note", "frame")
@@ -50,13 +51,18 @@ KINDS = {
     "derive": 14,
     "across": 12,
     "cross": 8,
-    "read": 8,
+    "read": 6,
     "view": 8,
-    "read each": 8,
+    "read each": 7,
     "write each": 4,
     "create": 12,
+    "capture": 12,
+    "view set": 6,
+    "use set": 8,
 }
 """What threads do, and how often."""
+SETS = ("view set", "use set")
+"""Jobs whose views ask for data of one capture stamp."""
 LARGE = 64 * 1024 + 1
 """Bytes of a datum that does not travel with the grant."""
 
@@ -82,6 +88,7 @@ class Workload:
 
     def __init__(self, world: World, history: History, model: Model, *, entities: int) -> None:
         self._world, self._history, self._model = world, history, model
+        self._captures = Captures(world, model)
         self._entities = ENTITIES[:entities]
         # With one entity nearly all locks want the same few slots.
         one = world.schedule.stream("the one aspect").choice(PLAIN)
@@ -103,7 +110,7 @@ class Workload:
             hold_ns=hold_ns,
             work_ns=random.choice((0, 0, 0, 2 * MS, 20 * MS, 20 * MS, 100 * MS, 500 * MS, 2 * S)),
             abandons=random.random() < 0.08,
-            expects=kind == "cross" or random.random() < 0.7,
+            expects=kind == "cross" or random.random() < (0.1 if kind in SETS else 0.7),
             label=f"package-{random.randrange(LABELS)}",
         )
 
@@ -178,6 +185,24 @@ class Workload:
     def _create(self, random: Random) -> tuple[Item, ...]:
         return (Item(Access.WRITE_EACH, random.choice(CONTEXTS), "made/*", "made"),)
 
+    def _of_one_kind(self, random: Random) -> list[tuple[str, str, str]]:
+        """Return two or three slots of one aspect."""
+        aspect = random.choice(("note", "frame", "frame", "count"))
+        slots = [(c, entity, aspect) for c in CONTEXTS for entity in self._entities]
+        return random.sample(slots, min(len(slots), random.choice((2, 3))))
+
+    def _capture(self, random: Random) -> tuple[Item, ...]:
+        return tuple(Item(Access.WRITE, *slot) for slot in self._of_one_kind(random))
+
+    def _view_set(self, random: Random) -> tuple[Item, ...]:
+        return tuple(Item(Access.VIEW, *slot) for slot in self._of_one_kind(random))
+
+    def _use_set(self, random: Random) -> tuple[Item, ...]:
+        """Write what is made of a set."""
+        made = Item(Access.WRITE, random.choice(CONTEXTS), random.choice(self._entities), "note")
+        views = (view for view in self._view_set(random) if view[1:4] != made[1:4])
+        return (made, *views)
+
     # ---------------------------------------------------------------- doing
 
     def thread(self, host: ClientHost, lane: int) -> Thread:
@@ -196,6 +221,8 @@ class Workload:
     def _do(self, host: ClientHost, lane: int, job: Job, *, lock_views: bool = False) -> Thread:
         client = host.client
         items = tuple(self._with_known(host, item) for item in job.items)
+        if job.kind in SETS:
+            items = yield from self._captures.stamped(host, items, job.luck)
         lock = client.begin(
             lane,
             client.plan(items, lock_views=lock_views),
@@ -203,6 +230,7 @@ class Workload:
             wait_ns=job.wait_ns,
             hold_ns=job.hold_ns,
         )
+        own = dict(host.own)
         entry = Entry(lock, items, job.kind, self._world.now_ns)
         self._history.begin(entry)
         self._world.tell(job.name, "asks for", *map(told_of, items))
@@ -210,6 +238,7 @@ class Workload:
         if lock.phase is Phase.HELD:
             self._world.tell(job.name, "has its lock")
             self._model.of_clients.holds(host, entry)
+            self._model.of_clients.shows_own(own, entry)
             data = yield from self._data(host, lock)
             if lock.phase is Phase.HELD and job.work_ns:
                 yield Sleep(job.work_ns)
@@ -330,7 +359,8 @@ class Workload:
         old = data.get(slot)
         value = 1 if old is None else value_of(old) + 1
         large = slot.aspect == "frame" and random.random() < 0.1
-        return datum_of(f"{lock.lock}|{value}", size=LARGE if large else 0)
+        datum = datum_of(f"{lock.lock}|{value}", size=LARGE if large else 0)
+        return replace(datum, stamp_ns=drawn_stamp_ns(random, self._world.now_ns))
 
 
 def told_of(item: Item) -> str:
