@@ -236,7 +236,7 @@ class Catalogue:
         return entry._replace(durability=durability, retention=retention)
 
     def register(self, entry: AspectEntry) -> tuple[AspectEntry, bool] | str:
-        """Register an aspect; return its entry and whether it is new, or why it is refused."""
+        """Register an aspect; return its entry and whether it changed, or why it is refused."""
         wanted = self._with_configured(entry)
         known = self.aspects.get(entry.name)
         if known is None:
@@ -254,6 +254,7 @@ class Catalogue:
             )
         if known.retention < wanted.retention:
             known = self.aspects[entry.name] = known._replace(retention=wanted.retention)
+            return known, True
         return known, False
 
     def retention(self, aspect: str) -> int:

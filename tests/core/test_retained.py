@@ -115,6 +115,11 @@ def test_view_as_of_a_commit_stamp_does_not_see_what_was_captured_later(cameras)
     assert viewed(cameras, 100, at_ns=first_ns).version == 1
     assert viewed(cameras, 100, seq=2).version == 2
 
+    capture(cameras, 3, 300)
+    capture(cameras, 4, 400)
+    assert viewed(cameras, 300, seq=3).version == 3
+    assert viewed(cameras, 300, seq=4, at_ns=first_ns).null_reason == "OUTSIDE_RETENTION"
+
 
 def test_view_is_current_from_the_newest_commit_on(cameras):
     """An older version belongs to a cut only together with what has replaced it."""
@@ -215,6 +220,16 @@ def test_largest_retention_that_anybody_asks_for_counts(cameras):
         )
         assert isinstance(answer, Registered)
         assert cameras.shard.state.catalogue.retention("mask") == counts
+
+
+def test_larger_retention_outlives_a_restart(cameras):
+    """Whoever asked for more versions does not ask again: the shard has kept it."""
+    cameras.ask(Register("admin", (), (AspectEntry("mask", "int", "volatile", 5),)))
+    cameras.ask(Register("admin", (), (AspectEntry("mask", "int", "volatile", 4),)))
+
+    cameras.restart()
+
+    assert cameras.shard.state.catalogue.retention("mask") == 5
 
 
 @pytest.mark.parametrize("retention", [-1, RETENTION_MAX + 1])
