@@ -19,6 +19,14 @@ def _shown(states):
     return frozenset((state.slot, state.version, _text(state.datum)) for state in states)
 
 
+def _surveyed(states):
+    versions: dict = {}
+    for state in states:
+        if state.version:
+            versions.setdefault(state.slot, []).append((state.version, state.captured_ns))
+    return frozenset((slot, tuple(found)) for slot, found in versions.items())
+
+
 @singledispatch
 def plain(answer: object) -> tuple:
     """Return an answer as a tuple: its kind, then what the reference says too."""
@@ -65,6 +73,7 @@ _ANSWERS = {
     messages.Valid: lambda a: ("valid", a.lock),
     messages.Broken: lambda a: ("broken", a.found),
     messages.Viewed: lambda a: ("viewed", a.lock, _shown(a.states)),
+    messages.Surveyed: lambda a: ("surveyed", _surveyed(a.states)),
     messages.Slice: lambda a: ("slice", a.slot, a.version, _text(a.body)),
     messages.Gone: lambda a: ("gone", a.slot, a.version),
     messages.Locks: lambda a: (

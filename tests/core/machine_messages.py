@@ -6,15 +6,16 @@ no message of the protocol can say (two words of one primary) is left out by the
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import count
 from typing import TYPE_CHECKING
 
 from machine_pair import ENTITIES, SLOTS
+from reference_parts import CAPTURED_NS, captured_of
 from reference_table import lines_of
 from shard_bench import datum
 
-from enact_dist.core.datum import LockId, Position, Token
+from enact_dist.core.datum import LockId, Position, Slot, Token
 from enact_dist.core.messages import (
     Acquire,
     Break,
@@ -114,7 +115,10 @@ class Plans:
         return tuple(WriteItem(slot, self._datum(pick)) for slot in sorted(chosen))
 
     def _datum(self, pick):
-        return None if pick.below(6) == 0 else datum(str(next(self.values)))
+        if pick.below(6) == 0:
+            return None
+        text = str(next(self.values))
+        return replace(datum(text), stamp_ns=captured_of(text))
 
     def seen_ns(self, pick: Pick) -> int:
         """Return a stamp that a client may have seen."""
@@ -191,12 +195,19 @@ class Plans:
         return Fetch(lock, self.pair.shard.epoch, slot, version, 0, 100)
 
     def view(self, lock, pick):
-        """A view of now, or as of the newest stamp that was told."""
+        """A view of now, or as of a stamp that was told; by capture stamp, too."""
         access = pick.one((Access.VIEW, Access.VIEW, Access.VIEW_EACH))
         aspect = pick.one(("count", "note", "frame"))
         entity = "**" if access is Access.VIEW_EACH else pick.one(ENTITIES)
-        items = (Item(access, "online", entity, aspect),)
-        at_ns = self.pair.floor_ns if pick.below(2) else 0
+        at_ns, captured_ns = self.pair.floor_ns if pick.below(2) else 0, 0
+        moved = [slot for slot, versions in self.pair.reference.replaced.items() if versions]
+        if access is Access.VIEW and pick.below(3):
+            if moved and pick.below(4):
+                _, entity, aspect = pick.one(moved)
+            captured_ns = pick.one(CAPTURED_NS)
+            stamps = [ns for ns, *_ in self.pair.history[Slot("online", entity, aspect)]]
+            at_ns = pick.one((at_ns, pick.one(stamps)))
+        items = (Item(access, "online", entity, aspect, 0, captured_ns),)
         n = next(self.counts)
         return TakeView(lock, self.pair.shard.epoch, 1, n, items, self.seen_ns(pick), at_ns)
 
@@ -280,5 +291,8 @@ def _items(pick: Pick) -> list[Item]:
         each = access in (Access.WRITE_EACH, Access.READ_EACH)
         entity = pick.one(("tray/*", "**")) if each else pick.one(ENTITIES)
         aspect = pick.one(("count", "note", "frame", "count"))
-        items.setdefault((entity, aspect), Item(access, "online", entity, aspect))
+        asked = access in (Access.VIEW, Access.READ) and pick.below(2)
+        captured_ns = pick.one(CAPTURED_NS) if asked else 0
+        item = Item(access, "online", entity, aspect, 0, captured_ns)
+        items.setdefault((entity, aspect), item)
     return list(items.values())

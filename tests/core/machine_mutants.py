@@ -14,9 +14,10 @@ from enact_dist.core.lock_desk import LockDesk
 from enact_dist.core.messages import Fenced, Finished, Prepared
 from enact_dist.core.prepares import PrepareDesk
 from enact_dist.core.records import Persist, Reply
+from enact_dist.core.retained import Retained
 from enact_dist.core.session_desk import SessionDesk
 from enact_dist.core.sessions import Session, SessionTable
-from enact_dist.core.slots import Content
+from enact_dist.core.slots import Content, SlotMap
 from enact_dist.core.stamps import Stamps
 from enact_dist.core.tenures import Tenure, Tenures
 from enact_dist.core.view_desk import ViewDesk
@@ -247,7 +248,30 @@ def welcomes_early(patch):
     patch(SessionDesk, "_answer_when_durable", wrong)
 
 
+def retains_one_version_more(patch):
+    """A version stays readable for one commit too long."""
+    keep = Retained.keep
+
+    def wrong(self, slot, old, *, count):
+        keep(self, slot, old, count=count + 1)
+
+    patch(Retained, "keep", wrong)
+
+
+def shows_another_stamp(patch):
+    """Where nothing of a stamp is retained, the newest version is shown."""
+    captured = SlotMap.captured
+
+    def wrong(self, slot, newest, captured_ns):
+        found = captured(self, slot, newest, captured_ns)
+        return found if found.datum is not None else newest
+
+    patch(SlotMap, "captured", wrong)
+
+
 ALL = (
+    retains_one_version_more,
+    shows_another_stamp,
     lease_ends_a_nanosecond_late,
     any_token_of_this_epoch,
     grants_a_seq_again,

@@ -6,15 +6,25 @@ any prefix of what was not reported when the shard dies.
 
 from __future__ import annotations
 
+from collections import Counter
 from itertools import count
 from typing import TYPE_CHECKING
 
 from machine_answers import fact_of, plain
 from reference_commits import ReferenceShard
+from reference_parts import DURABILITY, RETENTION
 from shard_bench import ShardBench
 
 from enact_dist.core.datum import Slot, Token
-from enact_dist.core.messages import AwaitStamp, Reached, Viewed, Waiting
+from enact_dist.core.messages import (
+    AspectEntry,
+    AwaitStamp,
+    Reached,
+    Register,
+    TakeView,
+    Viewed,
+    Waiting,
+)
 from enact_dist.core.records import (
     AspectRecord,
     AuditRecord,
@@ -39,6 +49,7 @@ from enact_dist.core.records import (
 
 if TYPE_CHECKING:
     from enact_dist.core.datum import LockId
+    from enact_dist.core.messages import SlotState
 
 ENTITIES = ("a", "tray/1", "tray/2")
 ASPECTS = ("count", "note", "frame")
@@ -68,6 +79,9 @@ class Pair:
 
     def __init__(self) -> None:
         bench = ShardBench()
+        for name, durability in DURABILITY.items():
+            entry = AspectEntry(name, "int", durability, RETENTION[name])
+            bench.ask(Register("admin", (), (entry,)))
         self._base, self._settings = bench, bench.settings
         self.shard = bench.shard
         self.now_ns, self.wall_ns = bench.now_ns, bench.wall_ns
@@ -81,6 +95,8 @@ class Pair:
         self.history: dict[Slot, list[tuple]] = {slot: [(0, 0, None)] for slot in SLOTS}
         self.promised_ns: dict[Slot, int] = {}
         self.awaited: dict[int, int] = {}
+        self.asked: dict[int, dict[Slot, int]] = {}
+        self.tally: Counter[str] = Counter()
         self.reached_ns = 0
         self.story: list[tuple[int, object]] = []
         self._handles = count(1)
@@ -93,6 +109,9 @@ class Pair:
         self._tell(message)
         if isinstance(message, AwaitStamp):
             self.awaited[handle] = message.stamp_ns
+        if isinstance(message, TakeView):
+            stamps = {Slot(*item[1:4]): item.captured_ns for item in message.items}
+            self.asked[handle] = {slot: ns for slot, ns in stamps.items() if ns}
         expected = self.reference.handle(message, handle, self.now_ns)
         effects = self.shard.handle(
             message, reply_to=handle, now_ns=self.now_ns, wall_ns=self.wall_ns
@@ -196,7 +215,7 @@ class Pair:
                 if gone or many:  # told in the moment of its end, or to nobody in full
                     found[to], expected.answers[to] = found[to][:2], wanted[:2]
             elif isinstance(answer, Viewed) and wanted is not None:
-                self._judge_view(answer)
+                self._judge_view(answer, self.asked[to])
                 if wanted[2] is None:
                     found[to], expected.answers[to] = found[to][:2], wanted[:2]
         self.same("answers", found, expected.answers)
@@ -205,9 +224,12 @@ class Pair:
                 life = self.reference.lives[answer.lock]
                 self.same("the token of a grant", answer.token, life.token)
 
-    def _judge_view(self, answer: Viewed) -> None:
+    def _judge_view(self, answer: Viewed, asked: dict[Slot, int]) -> None:
         """What is shown was current at every stamp of the interval, and stays so."""
         for state in answer.states:
+            if state.slot in asked:
+                self._judge_stamped(answer, state, asked[state.slot])
+                continue
             text = None if state.datum is None else bytes(state.datum.body).decode()
             states = self.history[state.slot]
             entry = next((e for e in states if e[1:] == (state.version, text)), None)
@@ -219,6 +241,24 @@ class Pair:
             elif answer.from_ns <= answer.until_ns:
                 before = self.promised_ns.get(state.slot, 0)
                 self.promised_ns[state.slot] = max(before, answer.until_ns)
+
+    def _judge_stamped(self, answer: Viewed, state: SlotState, captured_ns: int) -> None:
+        """The newest version with a stamp that there was, and still is, at the end of a view."""
+        text = None if state.datum is None else bytes(state.datum.body).decode()
+        states = self.history[state.slot]
+        ends = [entry for entry in states if entry[0] <= answer.until_ns]
+        moments = ends[-1:] if answer.from_ns <= answer.until_ns else [*ends[-1:], states[-1]]
+        right = [self.reference.by_stamp(state.slot, m[1:], captured_ns) for m in moments]
+        self.same(
+            f"{state.slot} by stamp {captured_ns}",
+            (state.version, text) if (state.version, text) not in right else right,
+            right,
+        )
+        past = moments[0] is not states[-1]
+        newest = state.version == states[-1][1]
+        self.tally["by stamp: newest" if text and newest else "by stamp: replaced"] += bool(text)
+        self.tally["by stamp: outside retention"] += not (text or state.version)
+        self.tally["by stamp: as of the past"] += past
 
     def _judge_reached(self, effect: Reply) -> None:
         stamp_ns = self.awaited.pop(effect.reply_to)

@@ -18,7 +18,7 @@ from machine_pair import Pair
 from machine_staging import Staging
 
 from enact_dist.core.datum import LockId
-from enact_dist.core.messages import AwaitStamp, Finish, ListLocks
+from enact_dist.core.messages import AwaitStamp, Finish, ListLocks, Survey
 from enact_dist.core.records import Called, Drain, SessionSeen, Tick
 
 STATES = (
@@ -230,8 +230,9 @@ class ShardMachine(Staging, RuleBasedStateMachine):
 
     @rule(pick=PICK)
     def look(self, pick):
-        """Somebody lists the locks, and somebody waits for a stamp."""
+        """Somebody lists the locks and what is retained, and somebody waits for a stamp."""
         self.pair.give(ListLocks())
+        self.pair.give(Survey((), (), (), retained=True))
         self.pair.give(AwaitStamp(self.pair.floor_ns + Pick(pick).below(3) - 1, 90 * MS))
 
     @precondition(lambda self: self.reference.draining)
@@ -249,6 +250,7 @@ class ShardMachine(Staging, RuleBasedStateMachine):
     def teardown(self):
         """The example is over."""
         self.coverage.count_run(self.steps)
+        self.coverage.tally.update(self.pair.tally)
 
     # ---------------------------------------------------------------- choosing
 

@@ -141,6 +141,8 @@ class ReferenceShard(ReferenceSessions):
         """Make the writes visible."""
         texts = dict(life.writes)
         for slot, version in life.versions:
+            if slot in self.slots and self.slots[slot][0]:
+                self.replaced.setdefault(slot, []).append(self.slots[slot])
             self.slots[slot] = (version, texts[slot])
             self.out.changes.append((slot, version, texts[slot]))
 

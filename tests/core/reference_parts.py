@@ -14,8 +14,19 @@ if TYPE_CHECKING:
 DURABILITY = {"count": "durable", "note": "os", "frame": "volatile"}
 """What a commit of each aspect survives."""
 
+RETENTION = {"count": 1, "note": 3, "frame": 2}
+"""How many versions of a slot of each aspect stay readable by capture stamp."""
+
+CAPTURED_NS = (0, 100, 200, 300)
+"""Capture stamps of data: each value says by itself which is its own."""
+
 BOUND = ("committing", "deciding", "preparing", "prepared", "finishing", "aborting")
 """Phases that neither a client nor time can end."""
+
+
+def captured_of(text: str | None) -> int:
+    """Return when a value was captured; 0 where it does not say, or for null."""
+    return 0 if text is None else CAPTURED_NS[int(text) % len(CAPTURED_NS)]
 
 
 @dataclass

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from reference_parts import Decision, Expected, Lane, Life, Person
+from reference_parts import RETENTION, Decision, Expected, Lane, Life, Person, captured_of
 from reference_table import ReferenceTable
 
 from enact_dist.core.datum import Slot
@@ -42,6 +42,7 @@ class ReferenceSessions:
         self.lives: dict[LockId, Life] = {}
         self.table = ReferenceTable()
         self.slots: dict[Slot, tuple[int, str | None]] = {}
+        self.replaced: dict[Slot, list[tuple[int, str | None]]] = {}
         self.decisions: dict[LockId, Decision] = {}
         self.forced: dict[LockId, int] = {}
         self.tokens_elsewhere: set[str] = set()
@@ -280,13 +281,34 @@ class ReferenceSessions:
         for item in items:
             if item.access not in EACH:
                 slot = Slot(item.context, item.entity, item.aspect)
-                found.add((slot, *self.slots.get(slot, (0, None))))
+                newest = self.slots.get(slot, (0, None))
+                found.add((slot, *self.by_stamp(slot, newest, item.captured_ns)))
                 continue
             for slot, (version, text) in self.slots.items():
                 same = (slot.context, slot.aspect) == (item.context, item.aspect)
                 if same and text is not None and pattern_matches(item.entity, slot.entity):
                     found.add((slot, version, text))
         return found
+
+    def by_stamp(self, slot, newest, captured_ns) -> tuple[int, str | None]:
+        """Return the newest version up to `newest` of a capture stamp, if there is one still."""
+        if not captured_ns:
+            return newest
+        kept = self.replaced.get(slot, [])[::-1] if RETENTION[slot.aspect] > 1 else []
+        for version, text in (newest, *kept[: RETENTION[slot.aspect] - 1]):
+            if version <= newest[0] and captured_of(text) == captured_ns:
+                return version, text
+        return newest if newest[1] is None else (0, None)
+
+    def on_survey(self, m, handle):
+        found = set()
+        for slot, newest in self.slots.items():
+            kept = RETENTION[slot.aspect] - 1
+            versions = [*self.replaced.get(slot, [])[-kept:], newest] if kept else [newest]
+            told = tuple((version, captured_of(text)) for version, text in versions if version)
+            if told:
+                found.add((slot, told))
+        self.answer(handle, "surveyed", frozenset(found))
 
     def waiting(self, life: Life) -> tuple:
         """Return the answer to whom waits: place and who is in the way."""

@@ -4,7 +4,16 @@ import random
 
 import pytest
 
-from enact_dist.verify.checker import NOTHING, Checker, LockStory, Reading, State, Told, name_of
+from enact_dist.verify.checker import (
+    NOTHING,
+    Captured,
+    Checker,
+    LockStory,
+    Reading,
+    State,
+    Told,
+    name_of,
+)
 
 
 class HandMade:
@@ -239,3 +248,36 @@ def test_serial_histories_pass_and_swapped_ones_do_not(seed):
 def test_names_of_cycles_cover_every_kind():
     """A cycle without any edge has no name to go by but the common one."""
     assert name_of([]) == "circular dependency"
+
+
+def test_set_that_shows_half_of_a_commit_is_told(told):
+    """One commit captured both; the set has its datum in one slot and an older one in the other."""
+    told.lock("a", writes=["x", "y"]).lock("b", writes=["x", "y"])
+    told.chains["x"] = [State("a", "a", 1, 7), State("b", "b", 2, 7)]
+    told.chains["y"] = [State("a", "a", 1, 7), State("b", "b", 2, 7)]
+    told.lock("whole", captured=[Captured("x", "b", 7), Captured("y", "b", 7)])
+    assert told.rules() == []
+
+    told.lock("half", captured=[Captured("x", "b", 7), Captured("y", "a", 7)])
+    assert told.rules() == ["a set shows half a commit"]
+
+
+def test_set_beside_a_view_of_the_same_commit_is_told(told):
+    """What a view shows is there, so its other half is not older either."""
+    told.lock("a", writes=["y"]).lock("b", writes=["x", "y"])
+    told.chain("x", "b")
+    told.chains["y"] = [State("a", "a", 1, 7), State("b", "b", 2, 7)]
+    told.lock("half", views=["x@b"], captured=[Captured("y", "a", 7)])
+
+    assert told.rules() == ["a set shows half a commit"]
+
+
+def test_datum_of_another_stamp_is_told(told):
+    """A set has nothing in it but its own stamp; what is not retained is no fault."""
+    told.lock("a", writes=["x"])
+    told.chains["x"] = [State("a", "a", 1, 7)]
+    told.lock("gone", captured=[Captured("x", NOTHING, 8)])
+    assert told.rules() == []
+
+    told.lock("wrong", captured=[Captured("x", "a", 8)])
+    assert told.rules() == ["another stamp was shown"]
