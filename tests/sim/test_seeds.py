@@ -26,7 +26,7 @@ Leases that end early (10), views that are expected beside writers (21), half a 
 
 SECONDS = float(os.environ.get("ENACT_SIM_SECONDS", "10"))
 HALVES = 2
-SEEDS_MIN = 60
+SEEDS_MIN = 150
 """Even on a slow machine so many seeds run; fewer would prove nothing about rare events."""
 SHRINK_S = 20.0
 
