@@ -52,6 +52,7 @@ from enact_dist.core.shard import Shard
 from enact_dist.errors import StoreError
 from enact_dist.link.clock import Clock, SystemClock
 from enact_dist.link.payload_desk import PayloadDesk
+from enact_dist.link.stalls import Stalls
 from enact_dist.link.uninterrupted import Uninterrupted
 
 if TYPE_CHECKING:
@@ -70,8 +71,6 @@ TICK_S_MIN: Final = 0.001
 """The timer rests at least so long; deadlines of many locks then share one tick."""
 PAYLOAD_BYTES_MAX: Final = 2 << 30
 """Bytes of large data in plain memory that wait for their commits, or came apart from them."""
-STALL_S: Final = 1.0
-"""A disk that takes longer than this over one batch is told to the log."""
 PARKED_MAX: Final = 100_000
 """Requests that may wait for their answers at one time."""
 JOIN_S: Final = 0.5
@@ -146,7 +145,7 @@ class ShardHost:
         self._look_again = False
         self._store = store
         self._store_thread = self._start_store(store) if store is not None else None
-        self._stalled_since_s: float | None = None
+        self._stalls = Stalls(self.name, self.count)
         self._timer = threading.Thread(target=self._keep_time, name="enact-timer", daemon=True)
         self._timer.start()
 
@@ -314,27 +313,13 @@ class ShardHost:
             drain()
         sessions, tenures = self._shard.state.sessions, self._shard.state.tenures
         self._payloads.sweep(sessions.by_id.__contains__, tenures.by_session.__contains__)
-        if self._store_thread is not None:
-            self._look_at_disk(self._store_thread.writing_since_s, time.monotonic())
+        store_thread = self._store_thread
+        writing_since_s = store_thread.writing_since_s if store_thread is not None else None
+        self._stalls.look(writing_since_s, time.monotonic())
         with self._mutex:
             if not self._ended:
                 self._handle(Tick(), 0)
             return self._shard.next_deadline_ns()
-
-    def _look_at_disk(self, since_s: float | None, now_s: float) -> None:
-        """Tell the log once of a batch that takes long, and once when it is over."""
-        stalled_s = self._stalled_since_s
-        if stalled_s is not None and since_s != stalled_s:
-            self._stalled_since_s = None
-            _log.warning("the disk of shard %s goes on after %.1f s", self.name, now_s - stalled_s)
-        elif stalled_s is None and since_s is not None and now_s - since_s >= STALL_S:
-            self._stalled_since_s = since_s
-            self.count("disk_stalls")
-            _log.warning(
-                "the disk of shard %s has kept nothing for %.1f s; who commits or joins waits",
-                self.name,
-                now_s - since_s,
-            )
 
     def _keep_time(self) -> None:
         while not self._ended:

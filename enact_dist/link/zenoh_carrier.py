@@ -55,7 +55,9 @@ FETCH_BYTES: Final = 1 << 20
 CONNECT_S: Final = 5.0
 """How long opening a carrier waits for a first connection."""
 POLL_S: Final = 0.005
-"""How often a carrier being opened looks for a connection."""
+"""How often a carrier being opened looks for a connection.  A session opens connected where its
+shard is up, so the first look is the last one; and no channel of Zenoh's Python binding, which
+would tell of a later connection, can be waited on for a limited time."""
 REACH_S: Final = 0.3
 """How long a shard has to show that it is already in reach."""
 NAMELESS: Final = "client"

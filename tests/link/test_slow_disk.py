@@ -6,7 +6,7 @@ import pytest
 
 from enact_dist import Aspect, Entity, Lock, Write, connect
 from enact_dist.errors import CommitUnknownError, ShardUnreachableError
-from enact_dist.link import client, host, session_client
+from enact_dist.link import client, session_client, stalls
 from enact_dist.link.store import Store
 
 COUNT = Aspect("count", int)
@@ -24,7 +24,7 @@ def disk(monkeypatch):
         write(store, batch)
 
     monkeypatch.setattr(Store, "write", write_when_it_goes_on)
-    monkeypatch.setattr(host, "STALL_S", 0.1)
+    monkeypatch.setattr(stalls, "STALL_S", 0.1)
     yield goes_on
     goes_on.set()
 
@@ -105,3 +105,15 @@ def test_idle_disk_stands_not_still(daemon, endpoint, tmp_path, disk):
             shard.host.tick()
 
     assert "disk_stalls" not in shard.host._shard.counters
+
+
+def test_shard_without_a_turn_is_told_to_the_log(caplog):
+    """A stopped process, or a machine with too much to do, is named once; short rests are not."""
+    counted = []
+    watch = stalls.Stalls("s0", counted.append)
+    for now_s in (100.0, 100.1, 100.9, 112.7, 112.8):
+        watch.look(None, now_s)
+
+    (told,) = (record.getMessage() for record in caplog.records)
+    assert "shard s0 had no turn for 11.8 s" in told
+    assert counted == []
