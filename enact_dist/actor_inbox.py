@@ -1,8 +1,9 @@
-"""How changes reach a running actor: one watch per world context, each on a thread of its own.
+"""How changes reach a running actor: one watch per world context.
 
-A watch blocks, and an update must not wait for one; so each watch has a thread that only fills
-the actor's inbox.  A watch whose shard is away is opened again with growing pauses; its snapshot
-then repeats what is known, which `PendingTriggers` passes over.
+An actor with one watch follows it by its own thread while it has nothing else to do.  Of several
+watches each has a thread that only fills the actor's inbox, since a watch blocks.  A watch whose
+shard is away is opened again with growing pauses; its snapshot then repeats what is known, which
+`PendingTriggers` passes over.
 """
 
 from __future__ import annotations
@@ -10,7 +11,8 @@ from __future__ import annotations
 import logging
 import random
 import threading
-from typing import TYPE_CHECKING, Generic, Self, TypeVar
+import time
+from typing import TYPE_CHECKING, Final, Generic, Self, TypeVar
 
 from enact_dist.actor_sets import PendingSets
 from enact_dist.actor_triggers import BackOff, PendingTriggers, Trigger
@@ -29,6 +31,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("enact.actor")
 
+AT_ONCE_MAX: Final = 1000
+"""Changes that an idle actor notes before it looks for a run again."""
 
 P = TypeVar("P", PendingTriggers, PendingSets)
 
@@ -50,6 +54,11 @@ class _Box(Generic[P]):
         """Put a refused run back until `due_ns`."""
         with self._filled:
             self._pending.postpone(trigger, due_ns)
+
+    def due_ns(self) -> int | None:
+        """Return when `take` will have something; None for not before a change."""
+        with self._filled:
+            return self._pending.due_ns()
 
     def fail(self, error: Exception) -> None:
         """Let the actor's thread raise what ended a watch for good."""
@@ -149,6 +158,31 @@ def _by_context(watched: Iterable[Watched]) -> dict[str, list[Watched]]:
     return groups
 
 
+def _watch_of(group: Sequence[Watched]) -> Watch:
+    patterns = dict.fromkeys(str(watched.entities) for watched in group)
+    aspects = {aspect.name: aspect for watched in group for aspect in watched.aspects}
+    return group[0].context.watch_all(patterns, aspects.values())
+
+
+def _broke_s(group: Sequence[Watched], error: Exception, refused: int) -> float:
+    """Say that a watch broke, and return how long to wait before it is opened again."""
+    wait_s = BackOff().wait_s(refused, random.random())  # noqa: S311 (spreads retries)
+    log.warning(
+        "watch of %s in %s broke, again in %.2f s: %s",
+        ", ".join(str(watched.entities) for watched in group),
+        group[0].context.name,
+        wait_s,
+        error,
+    )
+    return wait_s
+
+
+def watching(bound: BoundActor, inbox: Inbox | SetInbox) -> Watching | OwnWatch:
+    """Return what follows an actor's triggers: by its own thread where one watch sees them all."""
+    one = len(_by_context(bound.watched())) == 1
+    return OwnWatch(bound, inbox) if one else Watching(bound, inbox)
+
+
 class Watching:
     """All watches of one actor while it runs; a context manager.
 
@@ -188,29 +222,17 @@ class Watching:
             try:
                 for change in self._changes(group):
                     refused = 0
-                    for watched in group:
-                        if pattern_matches(str(watched.entities), change.entity.name):
-                            self._note(watched, change)
+                    self._note_in_all(group, change)
             except LinkError as error:
-                wait_s = BackOff().wait_s(refused, random.random())  # noqa: S311 (spreads retries)
+                self._over.wait(_broke_s(group, error, refused))
                 refused += 1
-                log.warning(
-                    "watch of %s in %s broke, again in %.2f s: %s",
-                    ", ".join(str(watched.entities) for watched in group),
-                    group[0].context.name,
-                    wait_s,
-                    error,
-                )
-                self._over.wait(wait_s)
             except Exception as error:  # noqa: BLE001 (raised again in the actor's thread)
                 if not self._over.is_set():
                     self._inbox.fail(error)
                 return
 
     def _changes(self, group: Sequence[Watched]) -> Iterator[Change]:
-        patterns = dict.fromkeys(str(watched.entities) for watched in group)
-        aspects = {aspect.name: aspect for watched in group for aspect in watched.aspects}
-        with group[0].context.watch_all(patterns, aspects.values()) as watch:
+        with _watch_of(group) as watch:
             with self._guard:
                 if self._over.is_set():
                     return
@@ -220,6 +242,19 @@ class Watching:
             finally:
                 with self._guard:
                     self._open.remove(watch)
+
+    def take(self, wait_s: float) -> Trigger | None:
+        """Return the next run that is due, waiting at most `wait_s` for one; else None.
+
+        Raises:
+            Exception: What ended a watch for good.
+        """
+        return self._inbox.take(wait_s)
+
+    def _note_in_all(self, group: Sequence[Watched], change: Change) -> None:
+        for watched in group:
+            if pattern_matches(str(watched.entities), change.entity.name):
+                self._note(watched, change)
 
     def _note(self, watched: Watched, change: Change) -> None:
         declaration = self._bound.declaration
@@ -246,3 +281,64 @@ class Watching:
             view = self._bound.set_views()[member]
             versions = captured_versions(session_of((view,)), (view,))[0]
         inbox.captured(member, versions)
+
+
+class OwnWatch(Watching):
+    """The only watch of an actor, followed by the actor's thread itself while it is idle.
+
+    No other thread has to be woken first.  What comes during an update waits in the watch's feed.
+    """
+
+    def __init__(self, bound: BoundActor, inbox: Inbox | SetInbox) -> None:
+        super().__init__(bound, inbox)
+        self._threads = []
+        (self._group,) = _by_context(bound.watched()).values()
+        self._watch: Watch | None = None
+        self._again_ns = 0
+        self._refused = 0
+
+    def __exit__(self, *_: object) -> None:
+        self._end()
+
+    def _end(self) -> None:
+        watch, self._watch = self._watch, None
+        if watch is not None:
+            watch.close()
+
+    def take(self, wait_s: float) -> Trigger | None:
+        """Return the next run that is due, following the watch for at most `wait_s`; else None."""
+        until_ns = monotonic_ns() + round(wait_s * 1e9)
+        self._follow_for(0.0)
+        while True:
+            trigger = self._inbox.take(0.0)
+            now_ns = monotonic_ns()
+            if trigger is not None or now_ns >= until_ns:
+                return trigger
+            due_ns = self._inbox.due_ns()
+            wake_ns = until_ns if due_ns is None else min(due_ns, until_ns)
+            self._follow_for(max(0, wake_ns - now_ns) / 1e9)
+
+    def _follow_for(self, wait_s: float) -> None:
+        """Wait so long for a change, and note all that have arrived by then."""
+        try:
+            if self._watch is None:
+                left_s = (self._again_ns - monotonic_ns()) / 1e9
+                if left_s > 0:
+                    time.sleep(min(left_s, wait_s))
+                    return
+                self._watch = _watch_of(self._group)
+            change = self._watch.next(timeout_s=wait_s)
+            for _ in range(AT_ONCE_MAX):
+                if change is None:
+                    return
+                self._refused = 0
+                self._note_in_all(self._group, change)
+                change = self._watch.next(timeout_s=0.0)
+            if change is not None:
+                self._note_in_all(self._group, change)
+        except LinkError as error:
+            self._end()
+            self._again_ns = monotonic_ns() + round(
+                _broke_s(self._group, error, self._refused) * 1e9
+            )
+            self._refused += 1

@@ -30,7 +30,7 @@ from weakref import WeakKeyDictionary
 
 from enact_dist.actor import Actor, check_period
 from enact_dist.actor_binding import BoundActor
-from enact_dist.actor_inbox import Inbox, SetInbox, Watching
+from enact_dist.actor_inbox import Inbox, SetInbox, watching
 from enact_dist.actor_report import (
     ERROR_LENGTH_MAX,
     ActorRecord,
@@ -182,9 +182,9 @@ class ActorRun:
         return self.statistics()
 
     def _run_triggered(self) -> None:
-        with Watching(self._bound, self._inbox):
+        with watching(self._bound, self._inbox) as changes:
             while not self._stop.is_set():
-                trigger = self._inbox.take(STOP_LOOK_S)
+                trigger = changes.take(STOP_LOOK_S)
                 if trigger is not None:
                     error = self._attempt(trigger.entity)
                     if isinstance(error, REFUSALS):
@@ -204,9 +204,9 @@ class ActorRun:
                 self._report()
                 self._stop.wait(self._pause_s(refused))
                 refused += 1
-        with Watching(self._bound, inbox):
+        with watching(self._bound, inbox) as changes:
             while not self._stop.is_set():
-                trigger = inbox.take(STOP_LOOK_S)
+                trigger = changes.take(STOP_LOOK_S)
                 if trigger is not None:
                     error_ = self._attempt(None, captured_ns=trigger.captured_ns)
                     if isinstance(error_, REFUSALS):

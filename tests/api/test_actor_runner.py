@@ -11,7 +11,7 @@ import pytest
 from enact_dist import testing
 from enact_dist.actor import Actor
 from enact_dist.actor_binding import BoundActor
-from enact_dist.actor_inbox import Inbox, Watching
+from enact_dist.actor_inbox import Inbox, OwnWatch, Watching, watching
 from enact_dist.actor_process import ActorThread, actor_command
 from enact_dist.actor_report import decode_reports
 from enact_dist.actor_runner import run_actor
@@ -270,7 +270,8 @@ class FlakyContext:
         return self.context.watch_all(*args)
 
 
-def test_watching_opens_a_watch_again_when_its_shard_was_away(cell, caplog):
+@pytest.mark.parametrize("kind", [Watching, OwnWatch])
+def test_watching_opens_a_watch_again_when_its_shard_was_away(cell, caplog, kind):
     """No change is lost: the watch that opens at last begins with what is there."""
     caplog.set_level(logging.CRITICAL, logger="enact.actor")
     write(cell, A, 1)
@@ -278,11 +279,37 @@ def test_watching_opens_a_watch_again_when_its_shard_was_away(cell, caplog):
     bound.contexts["online"] = FlakyContext(cell.world("online"), failures=2)
     inbox = Inbox(per_entity=True)
 
-    with Watching(bound, inbox):
-        trigger = inbox.take(PATIENCE_S)
+    with kind(bound, inbox) as changes:
+        trigger = changes.take(PATIENCE_S)
 
     assert trigger is not None
     assert trigger.entity == A
+
+
+def test_watch_of_an_actor_that_breaks_is_opened_again_without_a_loss(cell, caplog, monkeypatch):
+    """What changed meanwhile is found at the new beginning, what was seen runs no second time."""
+    caplog.set_level(logging.CRITICAL, logger="enact.actor")
+    bound = BoundActor(Reconstruction(), cell)
+    with OwnWatch(bound, Inbox(per_entity=True)) as changes:
+        write(cell, A, 1)
+        assert changes.take(PATIENCE_S).entity == A
+
+        def away(**_):
+            raise ShardUnreachableError("shard left did not answer")
+
+        monkeypatch.setattr(changes._watch, "next", away)
+        assert changes.take(0.0) is None
+        write(cell, B, 2)
+
+        assert changes.take(PATIENCE_S).entity == B
+        assert changes.take(0.0) is None
+
+
+def test_actor_of_one_world_follows_it_by_its_own_thread(cell):
+    """Nobody is woken to wake somebody else; two world contexts are two watches."""
+    bound = BoundActor(Reconstruction(), cell)
+
+    assert type(watching(bound, Inbox(per_entity=True))) is OwnWatch
 
 
 def test_inbox_returns_nothing_when_nothing_changes_in_time():
