@@ -33,7 +33,9 @@ from enact_dist.link.session_client import (
     CALLS_S_MAX,
     FINISH_S,
     SessionClient,
+    bytes_with,
 )
+from enact_dist.link.staging import drop_staged, stage
 
 if TYPE_CHECKING:
     import threading
@@ -198,14 +200,18 @@ class CellClient(SessionClient):
             ShardUnreachableError: A shard does not answer; nothing was written.
         """
         started_ns = self._now_ns()
+        named = writes
         try:
+            if writes and lock.phase is Phase.HELD:
+                self._check_open(lock)
+                named = stage(self, writes, lambda: self._check_held(lock))
+                started_ns = self._now_ns()
             with self._mutex:
                 if lock.phase is Phase.HELD:
                     self._check_open(lock)
-                    size = sum(w.datum.size for ws in writes.values() for w in ws if w.datum)
-                    finish_s = FINISH_S + size / BYTES_PER_S_MIN
+                    finish_s = FINISH_S + bytes_with(named.values()) / BYTES_PER_S_MIN
                     give_up_ns = started_ns + int(finish_s * 1e9)
-                    lock.finish(writes, give_up_ns=give_up_ns, expects=expects)
+                    lock.finish(named, give_up_ns=give_up_ns, expects=expects)
             try:
                 self._drive(lock)
             except EnactError as error:
@@ -215,9 +221,18 @@ class CellClient(SessionClient):
                 lock.phase, lock.cause = Phase.UNKNOWN, f"then: {error}"
                 raise self._not_committed(lock, writes, started_ns) from error
             if lock.phase is not Phase.COMMITTED:
+                if lock.phase is not Phase.UNKNOWN:
+                    drop_staged(self, named)
                 raise self._not_committed(lock, writes, started_ns)
         finally:
             self.release(lock)  # only the lane, unless something broke in between
+
+    def _check_held(self, lock: MultiLock) -> None:
+        """Raise if a lock was lost while its data were on their way."""
+        self.check_usable()
+        if lock.phase is not Phase.HELD:
+            self._ask_cause(lock)
+            raise not_committed(lock, FINISH_S, self.carrier.endpoint_of)
 
     def _check_open(self, lock: MultiLock) -> None:
         try:

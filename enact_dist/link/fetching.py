@@ -7,14 +7,13 @@ of a pattern's many images follow each other as those of one large cloud do.
 from __future__ import annotations
 
 from functools import partial
-from itertools import chain, zip_longest
 from typing import TYPE_CHECKING
 
 from enact_dist.core.datum import Datum, Slot
 from enact_dist.core.messages import EpochChanged, Fetch, Gone, Refused, Slice
 from enact_dist.errors import LeaseLostError, ProtocolError
 from enact_dist.link.refusals import error_of
-from enact_dist.link.transfer import Piece, Transfer
+from enact_dist.link.transfer import Piece, Transfer, in_turn
 from enact_dist.wire.limits import BODY_BYTES_MAX
 
 if TYPE_CHECKING:
@@ -58,9 +57,12 @@ def fetch_all(
             missing.append(_Incoming(lock, reading, client.carrier.fetch_bytes))
     if not missing:
         return found
+    by_shard: dict[str, list[Iterator[Piece]]] = {}
+    for incoming in missing:
+        by_shard.setdefault(incoming.reading.shard, []).append(incoming.pieces())
     transfer = Transfer(client, alive)
     try:
-        transfer.run(_shards_in_turn(missing))
+        transfer.run(in_turn(by_shard))
     finally:
         if transfer.repeated:
             client.count("slices_repeated", transfer.repeated)
@@ -77,15 +79,6 @@ def _at_hand(cache: DatumCache, reading: Reading) -> Datum | None:
         cache.put(state.slot, shard, epoch, state.version, state.datum)
         return state.datum
     return cache.get(state.slot, shard, epoch, state.version)
-
-
-def _shards_in_turn(missing: list[_Incoming]) -> Iterator[Piece]:
-    """Yield all slices so that no shard waits until another has sent everything."""
-    by_shard: dict[str, list[Iterator[Piece]]] = {}
-    for incoming in missing:
-        by_shard.setdefault(incoming.reading.shard, []).append(incoming.pieces())
-    rows = zip_longest(*(chain.from_iterable(each) for each in by_shard.values()))
-    return (piece for row in rows for piece in row if piece is not None)
 
 
 class _Incoming:

@@ -31,6 +31,7 @@ from enact_dist.core.messages import (
     Acquire,
     AwaitStamp,
     Commit,
+    EpochChanged,
     Hello,
     Prepare,
     Refused,
@@ -185,7 +186,7 @@ class ShardHost:
         if kind is Commit or kind is Prepare:
             message = self._payloads.with_bodies(cast("Commit", message))
         elif kind is Stage:
-            reply(self._payloads.stage(cast("Stage", message)))
+            self._stage(cast("Stage", message), reply)
             return
         with self._mutex:
             if self._ended:
@@ -198,6 +199,14 @@ class ShardHost:
             self._replies[self._handles] = reply
             self._handle(message, self._handles)
             self._look_at_clock_for(message)
+
+    def _stage(self, message: Stage, reply: Callable[[Answer], None]) -> None:
+        if self._ended:
+            return
+        if message.total and message.session not in self._shard.state.sessions.by_id:
+            reply(EpochChanged(self.epoch))
+        else:
+            reply(self._payloads.stage(message))
 
     def event(self, event: Event) -> None:
         """Hand an event to the shard (a session's token appeared, for example)."""

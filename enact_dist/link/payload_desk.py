@@ -26,7 +26,7 @@ import os
 import threading
 import time
 import weakref
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Final, TypeVar
 
@@ -45,6 +45,8 @@ if TYPE_CHECKING:
 
 PAYLOAD_BYTES_MIN: Final = 64 << 10
 """Smaller data travel with their commit and their grant."""
+GAPS_MAX: Final = 1024
+"""Slices of one draft that may be here while one before them is not."""
 NO_ROOM: Final = "no_room"
 """The code of a refusal because of the cap."""
 DRAFT_S: Final = 30.0
@@ -65,6 +67,14 @@ class _Draft:
     shared: bool
     touched_s: float
     have: int = 0
+    beyond: list[tuple[int, int]] = field(default_factory=list)
+
+    def add(self, begin: int, end: int) -> None:
+        """Note that a slice is here, perhaps again, or before one that belongs in front of it."""
+        self.beyond.append((begin, end))
+        self.beyond.sort()
+        while self.beyond and self.beyond[0][0] <= self.have:
+            self.have = max(self.have, self.beyond.pop(0)[1])
 
     @property
     def whole(self) -> bool:
@@ -99,6 +109,7 @@ class PayloadDesk:
         self._make_room = make_room
         self._biggest = biggest
         self._mutex = threading.RLock()  # reentrant: a destructor may run anywhere
+        self._opening = tuple(threading.Lock() for _ in range(16))
         self._drafts: dict[str, _Draft] = {}
         self._sizes: dict[str, int] = {}
         self._adopted: dict[str, weakref.ref[Pages | Plain]] = {}
@@ -119,7 +130,13 @@ class PayloadDesk:
                 "protocol",
                 f"a payload of {total} bytes; from {PAYLOAD_BYTES_MIN} to {BODY_BYTES_MAX}",
             )
-        draft = self._drafts.get(file) or self._opened(message.session, file, total)
+        if file in self._adopted:
+            return Staged(file, total, False)  # a late copy of a slice
+        draft: _Draft | Refused | None = self._drafts.get(file)
+        if draft is None:
+            # Slices of one draft may come by several threads.
+            with self._opening[hash(file) % len(self._opening)]:
+                draft = self._drafts.get(file) or self._opened(message.session, file, total)
         if isinstance(draft, Refused):
             return draft
         if draft.size != total:
@@ -130,12 +147,14 @@ class PayloadDesk:
         end = offset + slice_.size
         if not 0 <= offset <= end <= draft.size:
             return Refused("protocol", f"a slice to {end} of payload {file}, of {draft.size} bytes")
+        if len(draft.beyond) >= GAPS_MAX:
+            return Refused("protocol", f"{GAPS_MAX} slices of payload {file} came before others")
         if slice_.size:
             body_of(draft.memory)[offset:end] = slice_.body
         with self._mutex:
             draft.touched_s = time.monotonic()
-            if offset <= draft.have:
-                draft.have = max(draft.have, end)
+            if slice_.size:
+                draft.add(offset, end)
             return Staged(file, draft.have, draft.shared)
 
     def _opened(self, session: str, file: str, total: int) -> _Draft | Refused:

@@ -10,6 +10,7 @@ Python thread alone would starve for as long as a library holds the interpreter 
 
 from __future__ import annotations
 
+import itertools
 import logging
 import os
 import threading
@@ -42,7 +43,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
     from enact_dist.core.client import Client
-    from enact_dist.core.messages import Request, Survey
+    from enact_dist.core.messages import Request, Survey, WriteItem
     from enact_dist.errors import ShardUnreachableError
     from enact_dist.link.carrier import Begun, Carrier, NoticeFeed
 
@@ -52,6 +53,9 @@ BYTES_PER_S_MIN: Final = 10e6
 """A call that carries data gets this much more time per byte."""
 FINISH_S: Final = 10.0
 """How long calls are made again before their shard counts as unreachable."""
+
+FIRST_STAGED: Final = 1 << 60
+"""Numbers of payloads that travel in slices; files that a client fills itself begin at 1."""
 
 CALLS_S_MAX: Final = 1e8
 """Three years; whoever waits longer means for ever."""
@@ -86,6 +90,7 @@ class SessionClient:
         self.closed = False
         self.notice_numbers: dict[str, tuple[int, int]] = {}
         self.counters: dict[str, int] = {}
+        self.staged_numbers = itertools.count(FIRST_STAGED)
         self._now_ns = now_ns
         self._mutex = threading.RLock()
         self._stopping = threading.Event()
@@ -361,13 +366,17 @@ class SessionClient:
             self.counters[name] = self.counters.get(name, 0) + amount
 
 
+def bytes_with(writes: Iterable[Sequence[WriteItem]]) -> int:
+    """Return how many bytes of data travel with the messages that write these."""
+    return sum(w.datum.size for each in writes for w in each if w.datum and not w.datum.file)
+
+
 def _patience_s(request: Request) -> float:
     """Return how long to wait for the answer to one call."""
     if isinstance(request, Acquire):
         return request.wait_ns / 1e9 + CALL_S
     if isinstance(request, Commit | Prepare):
-        size = sum(write.datum.size for write in request.writes if write.datum is not None)
-        return CALL_S + size / BYTES_PER_S_MIN
+        return CALL_S + bytes_with([request.writes]) / BYTES_PER_S_MIN
     if isinstance(request, Hello | KeepAlive):
         return CALL_S / 2
     return CALL_S

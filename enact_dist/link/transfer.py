@@ -13,7 +13,8 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from itertools import chain, zip_longest
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from enact_dist.link.refusals import unreachable
@@ -46,6 +47,12 @@ class Piece(NamedTuple):
     size: int
     take: Callable[[Answer], None]
     into: memoryview | None = None
+
+
+def in_turn(by_shard: Mapping[str, Iterable[Iterator[Piece]]]) -> Iterator[Piece]:
+    """Yield all slices so that no shard waits until another has had all of its own."""
+    rows = zip_longest(*(chain.from_iterable(each) for each in by_shard.values()))
+    return (piece for row in rows for piece in row if piece is not None)
 
 
 class Transfer:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import queue
 import threading
 from collections.abc import Callable
 from operator import attrgetter
@@ -27,6 +28,7 @@ from enact_dist.core.messages import (
     Refused,
     Request,
     Resolve,
+    Stage,
 )
 from enact_dist.core.records import SessionSeen
 from enact_dist.errors import ProtocolError
@@ -80,9 +82,14 @@ class ZenohService:
         # The handlers, not their owners: these cannot be undeclared while a thread waits on them.
         self._inbox: zenoh.Handler[zenoh.Query] = self._queryable.handler
         host.add_inbox(self.drain_inbox)
+        self._staged: queue.SimpleQueue[tuple[Stage, _Call] | None] = queue.SimpleQueue()
         self._threads = [
             threading.Thread(target=run, name=name, daemon=True)
-            for name, run in (("enact-dispatch", self._dispatch), ("enact-tokens", self._see))
+            for name, run in (
+                ("enact-dispatch", self._dispatch),
+                ("enact-stage", self._stage),
+                ("enact-tokens", self._see),
+            )
         ]
         for thread in self._threads:
             thread.start()
@@ -130,7 +137,20 @@ class ZenohService:
             return
         client = client_of(message) or str(query.key_expr)
         self.senders.heard(client)
-        self._host.submit(cast("Request", message), _Call(self, query, client))
+        if type(message) is Stage:
+            self._staged.put((message, _Call(self, query, client)))
+        else:
+            self._host.submit(cast("Request", message), _Call(self, query, client))
+
+    def _stage(self) -> None:
+        """Take the slices of large data to where they belong: making room for them takes time."""
+        while (staged := self._staged.get()) is not None:
+            message, call = staged
+            try:
+                self._host.submit(message, call)
+            except Exception:  # noqa: BLE001 - the thread serves all clients
+                _log.exception("a slice of payload %s was not taken", message.file)
+                call.drop()
 
     def reply_key(self, query: zenoh.Query, answer: Answer) -> zenoh.KeyExpr | str:
         """Return the key to answer under: the query's own, unless that asked every shard."""
@@ -174,6 +194,7 @@ class ZenohService:
         self._queryable.undeclare()  # type: ignore[no-untyped-call]  # as Zenoh's stub has it
         self._tokens.undeclare()  # type: ignore[no-untyped-call]  # as Zenoh's stub has it
         self.senders.close()
+        self._staged.put(None)
         for thread in self._threads:
             thread.join(JOIN_S)
 
@@ -238,13 +259,14 @@ def _nameless(_: object) -> str:
 
 def _data_client(request: object) -> str:
     """Return for whom a slice travels."""
-    return cast("Fetch", request).lock.session + DATA_SUFFIX
+    session = request.session if isinstance(request, Stage) else cast("Fetch", request).lock.session
+    return session + DATA_SUFFIX
 
 
 def _client_getter(kind: type) -> Callable[[object], str]:
     if kind in (Finish, Resolve):
         return _nameless  # it comes from a shard, which must not wait for its lock's client
-    if kind is Fetch:
+    if kind in (Fetch, Stage):
         return _data_client
     fields = {field.name for field in dataclasses.fields(kind)}
     path = "lock.session" if "lock" in fields else "session" if "session" in fields else ""

@@ -40,11 +40,15 @@ def far(request, make_settings, endpoint, monkeypatch):
             cells.append(connect(endpoint if direct else proxy.endpoint))
             return cells[-1]
 
-        open_cell.proxy = proxy
+        def restart():
+            open_cell.shard.stop(drain_s=0.0)
+            open_cell.shard = start_shard(DaemonSettings("cell", shard, (endpoint,), None))
+
+        open_cell.proxy, open_cell.shard, open_cell.restart = proxy, started, restart
         yield open_cell
         for cell in cells:
             cell.close()
-        started.stop(drain_s=0.0)
+        open_cell.shard.stop(drain_s=0.0)
 
 
 def recorded(cell):
@@ -197,3 +201,121 @@ def test_views_are_fetched_together_and_never_twice(images):
     assert first.count("begun") == 6
     assert len(seen) == len(first)
     assert np.array_equal(again[views[1]], snapshot[views[1]])
+
+
+# ---------------------------------------------------------------- publishing
+
+
+def publish(cell, entity, data):
+    write = Write(cell.world("online"), entity, CLOUD)
+    with Lock(write, wait_s=30.0) as lock:
+        lock[write] = data
+
+
+def found(cell, entity):
+    view = View(cell.world("online"), entity, CLOUD)
+    return cell.world("online").view(view)[view]
+
+
+def drafts(far):
+    return far.shard.host._payloads.figures()["payload_drafts"]
+
+
+def test_publication_goes_on_after_the_network_was_cut(far):
+    """What the shard had before the cut stays there, and the commit is a short message."""
+    sent = np.random.default_rng(1).integers(0, 255, 60_000_000, np.uint8)
+    cell = far()
+    cell.world("online").init(tray, CLOUD, sent[:10])
+    seen = recorded(cell)
+    far.proxy.cut_after(25_000_000)
+
+    publish(cell, tray, sent)
+
+    assert far.proxy.cuts == 1
+    assert np.array_equal(found(far(direct=True), tray), sent)
+    begun = [message.offset for what, message in seen if what == "begun"]
+    repeated = len(begun) - len(set(begun))
+    assert 0 < repeated <= 8
+    assert cell.statistics()["slices_repeated"] == repeated
+    assert drafts(far) == 0
+
+
+def test_threads_of_one_process_publish_at_once(far):
+    """Each has a window of its own; names are never taken twice, nothing gets mixed."""
+    cell = far()
+    data = {camera: np.full(9_000_000, n, np.uint8) for n, camera in enumerate(CAMERAS)}
+    threads = [
+        threading.Thread(target=publish, args=(cell, camera, each)) for camera, each in data.items()
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+
+    reader = far(direct=True)
+    for camera, each in data.items():
+        assert np.array_equal(found(reader, camera), each)
+    assert drafts(far) == 0
+
+
+def test_publication_fails_by_name_when_the_shard_restarts_meanwhile(far):
+    """The lock is lost with the restart; the datum is what it was, and a second try succeeds."""
+    cell = far()
+    begin, restarts = cell._client.carrier.begin, iter([True])
+
+    def begin_and_restart(shard, message, *, timeout_s):
+        if message.offset == 20 << 20 and next(restarts, False):
+            far.restart()
+        return begin(shard, message, timeout_s=timeout_s)
+
+    cell._client.carrier.begin = begin_and_restart
+    with pytest.raises(LeaseLostError, match=r"restarted|lost"):
+        publish(cell, tray, np.ones(40_000_000, np.uint8))
+    publish(cell, tray, np.full(5_000_000, 2, np.uint8))
+
+    assert int(found(cell, tray).sum()) == 10_000_000
+    assert drafts(far) == 0
+
+
+def test_publication_whose_lock_is_lost_leaves_nothing_behind(far):
+    """A lock that is broken while its data travel commits nothing, and its drafts are dropped."""
+    direct, cell = far(direct=True), far()
+    publish(direct, tray, np.zeros(10, np.uint8))
+    begin = cell._client.carrier.begin
+
+    def lose():
+        (held,) = direct.locks()
+        direct.break_lock(held.number, shard="s0")
+
+    def begin_and_lose(shard, message, *, timeout_s):
+        if message.offset == 20 << 20:
+            in_thread(lose)
+        return begin(shard, message, timeout_s=timeout_s)
+
+    cell._client.carrier.begin = begin_and_lose
+    with pytest.raises(LeaseLostError, match="nothing was written"):
+        publish(cell, tray, np.ones(40_000_000, np.uint8))
+
+    assert found(direct, tray).size == 10
+    assert drafts(far) == 0
+
+
+def test_shard_that_lost_what_was_staged_gets_the_bytes_with_the_commit(far):
+    """The caller does not notice that a shard has given up the drafts of its session."""
+    cell = far()
+    begin = cell._client.carrier.begin
+    data = np.arange(3_000_000, dtype=np.uint8)
+
+    class Dropping:
+        def __init__(self, begun):
+            self._begun, self.abandon = begun, begun.abandon
+
+        def wait(self, into=None):
+            answer = self._begun.wait(into)
+            far.shard.host._payloads.drop(answer.file)
+            return answer
+
+    cell._client.carrier.begin = lambda *a, **k: Dropping(begin(*a, **k))
+    publish(cell, tray, data)
+
+    assert np.array_equal(found(far(direct=True), tray), data)

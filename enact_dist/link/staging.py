@@ -1,0 +1,139 @@
+"""Large data on their way to a shard: in slices ahead of the commit, which then only names them.
+
+A commit over a network is a short message whatever it writes, so the urgent ones of this process,
+and those of others, never wait behind it.  Slices go through one window (`Transfer`), to all
+shards of the commit at once; each is told its place, so that it may come twice, late, or out of
+order, and a transfer goes on where a network was cut.
+
+What was staged ends with its session at the shard, or when the shard is told to drop it.  A shard
+that has lost it all the same asks for the bytes with the commit itself (`no_payload`).
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.core.datum import Datum
+from enact_dist.core.messages import EpochChanged, Refused, Stage, Staged
+from enact_dist.errors import EnactError, LeaseLostError, ProtocolError, ShardUnreachableError
+from enact_dist.link.payload_desk import PAYLOAD_BYTES_MIN
+from enact_dist.link.refusals import error_of
+from enact_dist.link.session_client import CALL_S, FIRST_STAGED
+from enact_dist.link.transfer import Piece, Transfer, in_turn
+from enact_dist.wire.limits import BODY_BYTES_MAX
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping, Sequence
+
+    from enact_dist.core.messages import Answer, WriteItem
+    from enact_dist.link.session_client import SessionClient
+
+INLINE_BYTES_MAX: Final = 1 << 20
+"""Data that have no more than this together travel with their commit: one slice costs as much."""
+_NOTHING: Final = Datum(b"", b"", 0)
+
+_log = logging.getLogger("enact.link")
+
+
+def stage(
+    client: SessionClient,
+    writes: Mapping[str, Sequence[WriteItem]],
+    alive: Callable[[], None],
+) -> Mapping[str, Sequence[WriteItem]]:
+    """Bring the large data of these writes to their shards; return writes that name them.
+
+    Args:
+        client: The session that will commit them.
+        writes: By shard; data that name a payload already are left as they are.
+        alive: Raises once the lock that they are for is lost.
+
+    Raises:
+        LeaseLostError: A shard has restarted, so that the lock is lost.
+        LinkError: A shard has no room for them; the text says how much it has and what to do.
+        ShardUnreachableError: A shard does not answer.
+        EnactError: What `alive` raises.
+    """
+    named = {shard: _named(client, each) for shard, each in writes.items()}
+    by_shard = {
+        shard: [_pieces(client, shard, w.datum) for w in each if w.datum and _is_staged(w.datum)]
+        for shard, each in named.items()
+        if each is not writes[shard]
+    }
+    if by_shard:
+        transfer = Transfer(client, alive)
+        try:
+            transfer.run(in_turn(by_shard))
+        except ShardUnreachableError:
+            raise  # nobody is there to be told
+        except BaseException:
+            drop_staged(client, named)
+            raise
+        finally:
+            if transfer.repeated:
+                client.count("slices_repeated", transfer.repeated)
+    return named
+
+
+def _named(client: SessionClient, writes: Sequence[WriteItem]) -> Sequence[WriteItem]:
+    """Give each large datum of one shard's writes a name; return `writes` where none travels so."""
+    inline = sum(w.datum.size for w in writes if w.datum is not None and not w.datum.file)
+    slice_bytes = client.carrier.fetch_bytes
+    if inline <= INLINE_BYTES_MAX or slice_bytes > BODY_BYTES_MAX:
+        return writes
+    session = client.core.session
+    return [
+        write._replace(
+            datum=replace(write.datum, file=f"{session}-{next(client.staged_numbers):x}")
+        )
+        if write.datum is not None and not write.datum.file and write.datum.size > PAYLOAD_BYTES_MIN
+        else write
+        for write in writes
+    ]
+
+
+def drop_staged(client: SessionClient, writes: Mapping[str, Sequence[WriteItem]]) -> None:
+    """Tell the shards that what was staged for these writes will not be committed."""
+    drops = [
+        (shard, Stage(client.core.session, write.datum.file, 0, 0, _NOTHING))
+        for shard, each in writes.items()
+        for write in each
+        if write.datum is not None and _is_staged(write.datum)
+    ]
+    if drops:
+        try:
+            client.carrier.request_all(drops, timeout_s=CALL_S)
+        except EnactError as error:  # the shard finds out by itself
+            _log.info("staged data were not given up by message: %s", error)
+
+
+def _is_staged(datum: Datum) -> bool:
+    number = datum.file.rpartition("-")[2]
+    return bool(number) and int(number, 16) >= FIRST_STAGED
+
+
+def _pieces(client: SessionClient, shard: str, datum: Datum) -> Iterator[Piece]:
+    """Yield the slices of one datum."""
+    session, slice_bytes = client.core.session, client.carrier.fetch_bytes
+    body = memoryview(datum.body)
+    for offset in range(0, datum.size, slice_bytes):
+        part = body[offset : offset + slice_bytes]
+        request = Stage(session, datum.file, offset, datum.size, Datum(b"", part, len(part)))
+        yield Piece(shard, request, len(part), partial(_check_staged, shard, datum.file))
+
+
+def _check_staged(shard: str, file: str, answer: Answer) -> None:
+    """Return if a slice has arrived, else raise what the answer stands for."""
+    if isinstance(answer, Staged) and answer.file == file:
+        return
+    if isinstance(answer, EpochChanged):
+        raise LeaseLostError(
+            f"shard {shard} has restarted, or ended this session, while data were on their way to"
+            " it: the lock is lost and nothing was written; take it again and redo the work",
+            cause="its shard restarted",
+        )
+    if isinstance(answer, Refused):
+        raise error_of(answer)
+    raise ProtocolError(f"{type(answer).__name__} came as the answer to a slice of {file}")
