@@ -302,6 +302,14 @@ def _shard(shard: ShardInfo) -> Iterator[Finding]:
         return
     yield _connection(subject, shard)
     yield clock_skew(f"clock of {shard.name}", shard.clock_ahead_s)
+    stalls = shard.counters.get("disk_stalls", 0)
+    if stalls:
+        yield Finding(
+            Level.WARN,
+            f"disk of {shard.name}",
+            f"stood still for more than a second {stalls} times since the shard started",
+            "see the shard's log for when; move its folder to another disk, or what else uses this",
+        )
     alarms = shard.counters.get("alarms", 0)
     if alarms:
         yield Finding(

@@ -1,10 +1,12 @@
 """The doctor: each check, good and bad, with its remedy."""
 
 import socket
+from dataclasses import replace
 
 import pytest
 
 from enact_dist import doctor
+from enact_dist.cell_info import ShardInfo
 from enact_dist.doctor import Level
 
 
@@ -67,6 +69,18 @@ def test_clock_skew_is_judged_by_what_a_shard_refuses(ahead_s, level, text):
     found = doctor.clock_skew("clock", ahead_s)
 
     assert (found.level, found.text) == (level, text)
+
+
+def test_disk_that_stood_still_is_a_warning():
+    """The shard counts it; one that never did says nothing of its disk."""
+    shard = ShardInfo("s0", "tcp/host:1", reachable=True, counters={"disk_stalls": 3})
+
+    found = [one for one in doctor._shard(shard) if one.subject == "disk of s0"]
+    quiet = [one.subject for one in doctor._shard(replace(shard, counters={}))]
+
+    assert [one.level for one in found] == [Level.WARN]
+    assert "3 times" in found[0].text
+    assert "disk of s0" not in quiet
 
 
 def test_knock_tells_why_nobody_answers():
