@@ -18,7 +18,7 @@ WARM_UP_S: Final = 10.0
 """Samples of the first so many seconds say nothing about growth."""
 SAMPLES: Final = 60
 SAMPLES_MIN: Final = 5
-"""From fewer samples after the warm-up no growth is told."""
+"""From fewer samples after the warm-up, or in a shorter time than it, no growth is told."""
 KINDS_OF_MEMORY: Final = {"RssAnon:": "private", "RssShmem:": "shared"}
 
 
@@ -84,9 +84,8 @@ class Usage:
     def growth(self, figure: Callable[[Sampled], float]) -> float | None:
         """Return by how much a figure grows per second after the warm-up; None if too short."""
         first_s, last_s = self.samples[0].at_s, self.samples[-1].at_s
-        warm_s = min(WARM_UP_S, (last_s - first_s) / 3)
-        left = [one for one in self.samples if one.at_s >= first_s + warm_s]
-        if len(left) < SAMPLES_MIN:
+        left = [one for one in self.samples if one.at_s >= first_s + WARM_UP_S]
+        if last_s - first_s < 2 * WARM_UP_S or len(left) < SAMPLES_MIN:
             return None
         return slope([(one.at_s, figure(one)) for one in left])
 

@@ -73,8 +73,8 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
         dest="seconds_s",
         type=seconds,
         metavar="S",
-        help="measuring time of each line, all rounds together (default: 3); a pipeline runs"
-        " 20 times as long",
+        help="measuring time of each line, all rounds together (default: 3, with which all benches"
+        " take about 10 minutes on a quiet machine); a pipeline runs 20 times as long",
     )
     bench.add_argument("--json", action="store_true", help="print one JSON object")
     bench.add_argument(

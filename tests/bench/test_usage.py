@@ -29,9 +29,9 @@ def test_growth_leaves_the_warm_up_out(tmp_path):
 
 
 def test_growth_of_a_short_run_is_not_told(tmp_path):
-    """Too few samples are no proof that nothing grows."""
+    """Less than as long again as the warm-up is no proof that nothing grows."""
     usage = Usage({}, tmp_path)
-    usage.samples += [Sampled(float(second), {}, 0, 0) for second in range(4)]
+    usage.samples += [Sampled(float(second), {}, 0, 0) for second in range(19)]
 
     assert usage.growth(lambda one: one.files) is None
 
