@@ -84,6 +84,8 @@ class ActorLock(Lock):
 
     def __getitem__(self, request: Any) -> Any:
         if isinstance(request, Together) and request == self._together:
+            self._use()
+            self._readings.fetch(slot_of(view) for view in self._in_set)  # all are asked for
             return tuple(super(ActorLock, self).__getitem__(view) for view in self._in_set)
         return super().__getitem__(self._own(request))
 

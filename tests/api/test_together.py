@@ -350,6 +350,35 @@ def test_versions_whose_notices_were_lost_are_asked_for(cell):
     assert inbox.sets.incomplete == 0
 
 
+def test_set_of_large_data_is_fetched_at_once(cell, monkeypatch):
+    """The update asks for all of them, so none waits for the one before."""
+    online = cell.world("online")
+    cloud = Aspect("cloud", np.ndarray, Durability.VOLATILE, retention=2)
+
+    class Look(Actor):
+        clouds = Together([View(role, entity, cloud) for entity in (LEFT, RIGHT)])
+        triggers = (clouds,)
+
+        def update(self, lock): ...
+
+    for entity in (LEFT, RIGHT):
+        with Lock(write := Write(online, entity, cloud)) as lock:
+            lock.put(write, np.full(100_000, 7, np.uint8), stamp_ns=5)
+    actor = Look()
+    with BoundActor(actor, cell).lock(None, captured_ns=5) as lock:
+        fetched, fetch = [], lock._readings._fetched
+
+        def counted(slots):
+            fetched.append(len(slots := list(slots)))
+            return fetch(slots)
+
+        monkeypatch.setattr(lock._readings, "_fetched", counted)
+        data = lock[actor.clouds]
+
+    assert fetched == [2]
+    assert [int(one[-1]) for one in data] == [7, 7]
+
+
 # ---------------------------------------------------------------- the paper's first application
 
 TICKS = 12
