@@ -10,13 +10,14 @@ from __future__ import annotations
 import gc
 import json
 import logging
+import os
 import queue
 import socket
 import sys
 import threading
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
-from logging.handlers import QueueHandler, QueueListener
+from logging.handlers import QueueHandler
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.errors import ConfigError, EnactError, LinkError
@@ -43,6 +44,9 @@ SWITCH_INTERVAL_S: Final = 0.0002
 """With Python's 5 ms a busy store thread would add 7 to 11 ms to a call (p90), measured."""
 GC_THRESHOLDS: Final = (5_000, 20, 1_000_000)
 """Objects made between two looks at the youngest, and how rarely the older ones are looked at."""
+STDERR: Final = 2
+LOG_S: Final = 0.3
+"""How long an ending daemon waits until its last lines are written."""
 LOG_LINES_MAX: Final = 10_000
 """Log lines that wait for whoever reads the log; beyond, lines are lost, never time."""
 
@@ -261,29 +265,42 @@ def _stay_responsive() -> None:
 class _Log:
     """Sends the log of a daemon to stderr from a thread of its own.
 
-    A reader of the log that stops reading must not stop the shard: lines beyond
-    `LOG_LINES_MAX` are lost and counted.
+    A reader of the log that stops reading must not stop the shard, nor keep it from ending: lines
+    beyond `LOG_LINES_MAX` are lost and counted, and the last ones are waited for `LOG_S` only.
     """
 
     def __init__(self, log_format: str) -> None:
-        output = logging.StreamHandler(sys.stderr)
-        output.setFormatter(_JsonLines() if log_format == "json" else logging.Formatter(_TEXT))
-        self._handler = _BoundedHandler(queue.Queue(LOG_LINES_MAX))
-        self._listener = QueueListener(self._handler.queue, output)
+        self._format = (_JsonLines() if log_format == "json" else logging.Formatter(_TEXT)).format
+        self._lines: queue.Queue[logging.LogRecord | None] = queue.Queue(LOG_LINES_MAX)
+        self._handler = _BoundedHandler(self._lines)
+        self._thread = threading.Thread(target=self._write, name="enact-log", daemon=True)
         self._logger = logging.getLogger("enact")
 
     def __enter__(self) -> None:
         self._level = self._logger.level
         self._logger.setLevel(logging.INFO)
         self._logger.addHandler(self._handler)
-        self._listener.start()
+        self._thread.start()
+
+    def _write(self) -> None:
+        # To the descriptor itself: the locks of Python's streams and handlers, held while a full
+        # pipe blocks a line, would keep the interpreter from ending.
+        while (record := self._lines.get()) is not None:
+            left = f"{self._format(record)}\n".encode("utf-8", "backslashreplace")
+            try:
+                while left:
+                    left = left[os.write(STDERR, left) :]
+            except OSError:  # its reader is gone for good, or its disk is full
+                self._handler.lost += 1
 
     def __exit__(self, *_: object) -> None:
         if self._handler.lost:
             _log.warning("%d lines of this log were lost", self._handler.lost)
         self._logger.removeHandler(self._handler)
         self._logger.setLevel(self._level)
-        self._listener.stop()
+        with suppress(queue.Full):
+            self._lines.put_nowait(None)
+        self._thread.join(LOG_S)
 
 
 _TEXT: Final = "%(asctime)s %(levelname)s %(name)s %(message)s"

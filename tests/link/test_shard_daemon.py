@@ -220,6 +220,21 @@ def test_daemon_ends_with_status_0_in_two_seconds_on_a_signal(
 
 
 @pytest.mark.slow
+def test_daemon_ends_in_time_though_nobody_reads_its_log(process, endpoint, shared_root):
+    """Its log's pipe is full, as beside a supervisor that hangs: lines are lost, not the shard."""
+    running = process(endpoint)
+    (folder,) = shared_root.iterdir()
+    for _ in range(1000):  # each is worth a warning
+        with socket.socket(socket.AF_UNIX) as stranger:
+            stranger.connect(str(folder / "socket"))
+            stranger.sendall(b"GET / HTTP/1.1\r\n\r\n")
+            stranger.recv(1)
+    running.send_signal(signal.SIGTERM)
+
+    assert running.wait(5) == 0
+
+
+@pytest.mark.slow
 def test_daemon_says_one_line_and_status_1_when_its_endpoint_is_in_use(process):
     """No traceback: who must act reads one line."""
     with socket.socket() as other:
