@@ -7,11 +7,14 @@ of a pattern's many images follow each other as those of one large cloud do.
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
 
 from enact_dist.core.datum import Datum, Slot
 from enact_dist.core.messages import EpochChanged, Fetch, Gone, Refused, Slice
 from enact_dist.errors import LeaseLostError, ProtocolError
+from enact_dist.link.memory import body_of, plain_memory
 from enact_dist.link.refusals import error_of
 from enact_dist.link.transfer import Piece, Transfer, in_turn
 from enact_dist.wire.limits import BODY_BYTES_MAX
@@ -24,6 +27,10 @@ if TYPE_CHECKING:
     from enact_dist.core.messages import Answer, SlotState
     from enact_dist.link.client import CellClient
     from enact_dist.link.datum_cache import DatumCache
+
+
+RECYCLED_BYTES_MAX: Final = 32 << 20
+"""The C library gives longer memory back to the system each time."""
 
 
 def fetch_all(
@@ -106,8 +113,7 @@ class _Incoming:
         """Yield its slices; memory for all of them is taken with the first."""
         shard, epoch, state = self.reading
         if self.count > 1:
-            # Ordinary memory, which may be recycled: pages of 2 MB were slower (measured).
-            self._body = memoryview(bytearray(state.size))
+            self._body = _room(state.size)
         for offset in self._offsets:
             call = Fetch(self._lock, epoch, state.slot, state.version, offset, self._slice_bytes)
             size = min(self._slice_bytes, state.size - offset)
@@ -127,6 +133,17 @@ class _Incoming:
         """Return the datum, all of whose slices have come."""
         body = self._body if self._body is not None else memoryview(b"")
         return Datum(self._encoding, body.toreadonly(), self.state.size, self._stamp_ns)
+
+
+def _room(size: int) -> memoryview:
+    """Return memory for a datum that comes in slices, not set to zero first.
+
+    Ordinary memory may be recycled, and touches no page for the first time then.  What is too long
+    for that is given back by a thread of its own.  Pages of 2 MB were slower than either.
+    """
+    if size > RECYCLED_BYTES_MAX:
+        return body_of(plain_memory(size))
+    return np.empty(size, np.uint8).data
 
 
 def _checked(answer: Answer, call: Fetch, state: SlotState, lock: LockId) -> Slice:

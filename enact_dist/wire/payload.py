@@ -6,9 +6,10 @@ arrays come back as read-only views of the body; a datum is a copy of its value,
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any, Final
 
 import msgpack
+import numpy as np
 
 from enact_dist.core.datum import Datum
 from enact_dist.errors import DatumTypeError, ProtocolError
@@ -22,6 +23,12 @@ from enact_dist.wire.limits import (
 from enact_dist.wire.shapes import shape_of
 from enact_dist.wire.tree_reader import TreeReader, build, untyped
 from enact_dist.wire.tree_writer import INT_MAX, INT_MIN, TREE, MisfitError, TreeWriter, reference
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+JOINED_BYTES_MIN: Final = 1 << 20
+"""From here on data are copied while other threads run."""
 
 _VERSION = bytes([DATUM_VERSION])
 
@@ -47,8 +54,21 @@ def encode_datum(value: object, datum_type: Any, *, stamp_ns: int = 0) -> Datum:
         return Datum(_VERSION + msgpack.packb(value), b"", 0, stamp_ns)
     writer = TreeWriter()
     encoding = _write(writer, value, datum_type)
-    body = b"".join(writer.parts)
-    return Datum(encoding, body, len(body), stamp_ns)
+    return Datum(encoding, joined(writer.parts, writer.length), writer.length, stamp_ns)
+
+
+def joined(parts: Sequence[bytes | memoryview], size: int) -> bytes | memoryview:
+    """Return a copy of the parts, one after another, which nobody can change.
+
+    `bytes.join` would let all other threads of the process wait: 0.1 s and more for 100 MB.
+    """
+    if size < JOINED_BYTES_MIN:
+        return b"".join(parts)
+    body, offset = np.empty(size, np.uint8), 0
+    for part in parts:
+        body[offset : offset + len(part)] = np.frombuffer(part, np.uint8)
+        offset += len(part)
+    return body.data.toreadonly()
 
 
 def check_datum(value: object, datum_type: Any) -> None:

@@ -25,37 +25,6 @@ from enact_dist.link.shard_daemon import DaemonSettings, start_shard
 from enact_dist.link.zenoh_config import close_session, open_session
 from enact_dist.wire.frames import decode_frame, encode_frame
 
-DAEMON = """
-import sys
-from pathlib import Path
-from enact_dist.core.messages import AspectEntry, PlacementMap, ShardEntry
-from enact_dist.core.shard_state import ShardSettings
-from enact_dist.link.shard_daemon import DaemonSettings, run_shard
-endpoint, folder, log_format, durability = sys.argv[1:]
-shard = ShardSettings(
-    "s0",
-    PlacementMap(1, (ShardEntry("s0", (endpoint,)),), ()),
-    worlds=("online",),
-    aspects=(AspectEntry("count", "", durability),),
-)
-path = Path(folder) if folder else None
-sys.exit(run_shard(DaemonSettings("cell", shard, (endpoint,), path, log_format)))
-"""
-
-
-@pytest.fixture
-def process(program):
-    """Start a daemon as a process; returns it once it said that it is ready."""
-
-    def start(endpoint, folder="", *, log_format="text", durability="volatile", ready=True):
-        started = program(DAEMON, endpoint, folder, log_format, durability)
-        if ready:
-            line = started.stdout.readline()
-            assert line.startswith("ready: shard s0 of cell cell at "), line + started.stderr.read()
-        return started
-
-    return start
-
 
 def speak(carrier, make_peer, **options):
     """Return a session that has said hello over `carrier`."""
@@ -279,11 +248,10 @@ resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, 1_000_000))
 
 @pytest.mark.slow
 def test_daemon_acknowledges_nothing_and_ends_with_status_1_when_its_disk_is_full(
-    program, carry, make_peer, endpoint, tmp_path
+    process, carry, make_peer, endpoint, tmp_path
 ):
     """A commit that could not be written is never answered, and the daemon does not go on."""
-    started = program(FULL_DISK + DAEMON, endpoint, tmp_path, "json", "durable")
-    assert started.stdout.readline().startswith("ready")
+    started = process(endpoint, tmp_path, first=FULL_DISK, log_format="json", durability="durable")
     peer = speak(carry(endpoint), make_peer, durability="durable")
 
     answer = peer.write("cup", bytes(3_000_000))
