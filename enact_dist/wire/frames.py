@@ -29,6 +29,7 @@ from enact_dist.wire.limits import (
     TEXT_BYTES_MAX,
 )
 from enact_dist.wire.message_parts import reader_of, values_of, writers_of
+from enact_dist.wire.quick_readers import quick_reader_of
 
 CODES: Final[dict[type[Any], int]] = {
     # Requests from 1, answers from 33, notices from 97: all fit into one byte of msgpack.
@@ -183,7 +184,26 @@ def _check_version(header: bytes) -> None:
 
 
 _writers: Final = {cls: (code, values_of(cls), writers_of(cls)) for cls, code in CODES.items()}
-_readers: Final = {code: reader_of(cls) for cls, code in CODES.items()}
+_OF_EVERY_LOCK: Final = frozenset(
+    (
+        m.Acquire,
+        m.Granted,
+        m.Commit,
+        m.Committed,
+        m.Validate,
+        m.Valid,
+        m.Release,
+        m.Released,
+        m.TakeView,
+        m.Viewed,
+        m.Fetch,
+        m.Notice,
+    )
+)
+_readers: Final = {
+    code: (quick_reader_of if cls in _OF_EVERY_LOCK else reader_of)(cls)
+    for cls, code in CODES.items()
+}
 _uncoded = set(get_args(m.Message)) ^ set(CODES)
 assert not _uncoded, f"no message, or one without a code: {_uncoded}"
 assert len(_readers) == len(CODES), "a code is used twice"

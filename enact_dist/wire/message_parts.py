@@ -61,7 +61,7 @@ LONGEST: Final[dict[type[Any], int]] = {
     tuple: ENTRIES_MAX,
 }
 """Longest content of all other fields by their type."""
-_SCALARS: Final = frozenset({int, str, bytes, bool})
+SCALARS: Final = frozenset({int, str, bytes, bool})
 
 
 # ---------------------------------------------------------------- writers
@@ -93,7 +93,7 @@ def _writer_of(kind: Any) -> Write | None:
         if write_one is None:
             return None
         return lambda values, bodies: [write_one(value, bodies) for value in values]
-    writers = [] if kind in _SCALARS else writers_of(kind)
+    writers = [] if kind in SCALARS else writers_of(kind)
     return _writer_of_part(writers) if writers else None
 
 
@@ -115,7 +115,7 @@ def reader_of(cls: type[Any]) -> Read:
     fields = annotated(cls)
     signatures = frozenset(product(*(_raw_types(kind) for _, kind in fields)))
     integers = tuple(index for index, (_, kind) in enumerate(fields) if kind is int)
-    lengths = _lengths(fields)
+    lengths = lengths_of(fields)
     found = [(index, _reader_of_field(kind)) for index, (_, kind) in enumerate(fields)]
     readers = [(index, read_part) for index, read_part in found if read_part is not None]
     build: Callable[[Sequence[Any]], Any] = partial(tuple.__new__, cls)
@@ -145,13 +145,13 @@ def reader_of(cls: type[Any]) -> Read:
 def _reader_of_field(kind: Any) -> Read | None:
     """Return what reads a field further; None where its type says all."""
     inner = without_none(kind)
-    if inner in _SCALARS:
+    if inner in SCALARS:
         assert inner is kind, "numbers and texts of a message are never None"
         return None
     if inner is Datum:
         read_inner: Read = _read_datum
     elif get_origin(inner) is tuple:
-        read_inner = _reader_of_each(get_args(inner)[0])
+        read_inner = reader_of_each(get_args(inner)[0])
     else:
         read_inner = reader_of(inner)
     if inner is kind:
@@ -163,8 +163,9 @@ def _read_datum(raw: Any, bodies: BodyReader) -> Datum:
     return bodies.take(raw)
 
 
-def _reader_of_each(kind: Any) -> Read:
-    if kind not in _SCALARS:
+def reader_of_each(kind: Any) -> Read:
+    """Return what reads a list of scalars or parts whose length was checked."""
+    if kind not in SCALARS:
         read_one = reader_of(kind)
         return lambda raw, bodies: tuple([read_one(one, bodies) for one in raw])
     allowed: tuple[set[type[Any]], ...] = (set(), {kind})
@@ -200,11 +201,11 @@ def without_none(kind: Any) -> Any:
 def _raw_types(kind: Any) -> tuple[type[Any], ...]:
     """Return the Python types that msgpack may give for an annotation, the usual one first."""
     inner = without_none(kind)
-    raw = inner if inner in _SCALARS else tuple
+    raw = inner if inner in SCALARS else tuple
     return (raw,) if inner is kind else (raw, type(None))
 
 
-def _lengths(fields: list[tuple[str, Any]]) -> list[tuple[int, int]]:
+def lengths_of(fields: list[tuple[str, Any]]) -> list[tuple[int, int]]:
     """Return the places and greatest lengths of fields that msgpack's own limits leave open."""
     lengths = []
     for index, (name, kind) in enumerate(fields):
@@ -235,4 +236,4 @@ def _mismatch(cls: type[Any], raw: Any) -> str:
 
 def _shown(raw: Any) -> str:
     name = type(raw).__name__
-    return f"{name} {str(raw)[:60]!r}" if type(raw) in _SCALARS else name
+    return f"{name} {str(raw)[:60]!r}" if type(raw) in SCALARS else name
