@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Final
 from enact_dist.bench.decisions import core_cases
 from enact_dist.bench.faults import run_recovery, run_stopped
 from enact_dist.bench.floors import Floors
+from enact_dist.bench.layers import run_layers
 from enact_dist.bench.memory import run_memory
 from enact_dist.bench.payloads import run_fetch, run_publish, run_wakeup
 from enact_dist.bench.pipeline import run_pipeline
@@ -51,6 +52,7 @@ BENCHES: Final[dict[str, Callable[[Run], None]]] = {
     "floor": run_floor,
     "core": run_core,
     "update": run_update,
+    "layers": run_layers,
     "multi": run_multi,
     "durable": run_durable,
     "waiters": run_waiters,

@@ -16,6 +16,7 @@ NAMES: Final = (
     "floor",
     "core",
     "update",
+    "layers",
     "multi",
     "durable",
     "waiters",
