@@ -26,11 +26,12 @@ from enact_dist.errors import (
     MisuseError,
     ReadonlyError,
 )
-from enact_dist.reading import EachData, Readings, check_requested, slot_of
+from enact_dist.reading import EachData, Readings, check_requested, null_error, slot_of
 from enact_dist.session import session_of
 from enact_dist.terms import Access, Entity, refuse_duplicates
 from enact_dist.together import Together
 from enact_dist.wire.limits import BODY_BYTES_MAX, ITEMS_MAX
+from enact_dist.wire.payload import decode_datum, encode_datum
 from enact_dist.writable import WritableEach
 
 if TYPE_CHECKING:
@@ -269,7 +270,9 @@ class Lock:
         self._check(request)
         if request.access.each:
             return self._each_data(request)
-        slot = slot_of(request)
+        return self._value(slot_of(request), request)
+
+    def _value(self, slot: Slot, request: Any) -> Any:
         if slot in self._writes:
             return self._written(slot, request.aspect)
         return self._readings.value(slot, request.aspect)
@@ -299,7 +302,8 @@ class Lock:
         slot = slot_of(request)
         if self._is_null(slot):
             return default
-        return self[request]
+        value: T = self._value(slot, request)
+        return value
 
     def is_null(self, request: LockRequestOne[Any]) -> bool:
         """Whether the datum is null; fetches nothing."""
@@ -313,9 +317,6 @@ class Lock:
         return state is None or bool(state.null_reason)
 
     def _written(self, slot: Slot, aspect: Aspect[T]) -> T:
-        from enact_dist.reading import null_error
-        from enact_dist.wire.payload import decode_datum
-
         datum = self._writes[slot]
         if datum is None:
             raise null_error(slot, None)
@@ -342,8 +343,6 @@ class Lock:
         self._put(slot_of(request), request.aspect, datum, stamp_ns=stamp_ns)
 
     def _put(self, slot: Slot, aspect: Aspect[T], datum: T, *, stamp_ns: int = 0) -> None:
-        from enact_dist.wire.payload import encode_datum
-
         self._note_write(slot, encode_datum(datum, aspect.datum_type, stamp_ns=stamp_ns))
 
     def _note_write(self, slot: Slot, datum: Datum | None) -> None:

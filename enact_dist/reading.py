@@ -7,11 +7,14 @@ read-only views of the received bytes.
 from __future__ import annotations
 
 from collections.abc import ItemsView, Iterator, Mapping, ValuesView
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final, TypeVar, cast
 
 from enact_dist.core.datum import Slot
 from enact_dist.errors import MisuseError, NotRequestedError, NullDatumError
-from enact_dist.terms import Access, Aspect, Entity, NullReason, pattern_matches
+from enact_dist.link.fetching import fetch_all
+from enact_dist.terms import Access, Aspect, Entity, LockRequest, NullReason, pattern_matches
+from enact_dist.wire.payload import decode_datum
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -21,11 +24,12 @@ if TYPE_CHECKING:
     from enact_dist.core.messages import SlotState
     from enact_dist.link.client import CellClient
     from enact_dist.link.datum_cache import DatumCache
-    from enact_dist.terms import LockRequest
 
 T = TypeVar("T")
 
 UNSET: Any = object()
+_slot_at: Final = partial(tuple.__new__, Slot)
+"""Makes a slot of an address without looking at it again: in a third of the time."""
 AHEAD_BYTES_MAX: Final = 64 << 20
 """So many bytes are fetched before somebody has asked for each of the data."""
 
@@ -85,6 +89,10 @@ class Readings:
         kept = self._kept.get(slot)
         if kept is not None:
             return kept
+        shard, epoch, state = self._readings[slot]
+        if state.datum is not None and not state.large:
+            self._cache.put(slot, shard, epoch, state.version, state.datum)
+            return state.datum
         if not self._is_to_come(slot):
             return self._fetched([slot])[slot]
         self._fetched_alone += 1
@@ -105,8 +113,6 @@ class Readings:
             self._kept.update(self._fetched(to_come))
 
     def _fetched(self, slots: Iterable[Slot]) -> dict[Slot, Datum]:
-        from enact_dist.link.fetching import fetch_all
-
         readings = [self._readings[slot] for slot in slots]
         return fetch_all(self._client, self._cache, self._lock, readings, self.usable)
 
@@ -130,8 +136,6 @@ class Readings:
         Raises:
             NullDatumError: The slot is null.
         """
-        from enact_dist.wire.payload import decode_datum
-
         self.usable()
         value = self._values.get(slot, UNSET)
         if value is UNSET:
@@ -184,8 +188,7 @@ def null_error(slot: Slot, state: SlotState | None) -> NullDatumError:
 
 def slot_of(request: LockRequest[Any]) -> Slot:
     """Return the slot that a request for one entity names."""
-    context, entity, aspect = request.address
-    return Slot(context, entity, aspect)
+    return _slot_at(request.address)
 
 
 class EachData(Mapping[Entity, T]):
@@ -248,8 +251,6 @@ def check_requested(
         NotRequestedError: It is another request.
         MisuseError: It is no request at all.
     """
-    from enact_dist.terms import LockRequest
-
     if not isinstance(request, LockRequest):
         raise MisuseError(
             f"a {what} is indexed by the request it was made with, not by {request!r}"

@@ -9,6 +9,7 @@ from enact_dist.core.placement import shard_of
 from enact_dist.errors import MisuseError
 from enact_dist.link.datum_cache import DatumCache
 from enact_dist.link.session_client import CALL_S, FINISH_S
+from enact_dist.reading import slot_of
 from enact_dist.terms import Entity, LockRequest
 from enact_dist.wire.fingerprint import fingerprint
 
@@ -51,6 +52,8 @@ class Session:
             ShardUnreachableError: A shard that is asked does not answer.
         """
         entries = [self._entry(aspect) for aspect in aspects]
+        if self.client.knows(entries):
+            return
         timeout_s = min(FINISH_S, max(wait_s, CALL_S))
         if requests is None:
             self.client.register(aspects=entries)
@@ -96,11 +99,10 @@ class Session:
         context, entity, aspect = request.address
         if request.access.each:
             return Item(int(request.access), context, entity, aspect)
-        from enact_dist.core.datum import Slot
-
-        slot = Slot(context, entity, aspect)
-        shard = self.shard_of(slot)
-        known = self.cache.version(slot, shard, self.client.core.epoch(shard))
+        slot, known = slot_of(request), 0
+        if slot in self.cache:
+            shard = self.shard_of(slot)
+            known = self.cache.version(slot, shard, self.client.core.epoch(shard))
         return Item(int(request.access), context, entity, aspect, known, captured_ns)
 
 
@@ -110,12 +112,12 @@ def session_of(requests: tuple[LockRequest[Any], ...]) -> Session:
     Raises:
         MisuseError: A request names an unbound role, or two cells are mixed.
     """
-    sessions: list[Session] = []
+    session: Session | None = None
     for request in requests:
         if not isinstance(request, LockRequest):
             raise MisuseError(f"{request!r} is no lock request; use Read, Write, View or …Each")
-        session = getattr(request.world, "session", None)
-        if session is None:
+        found: Session | None = getattr(request.world, "session", None)
+        if found is None:
             raise MisuseError(
                 f"{request!r} names {request.world!r}, which is a role and not a world context of"
                 " a cell; use cell.world(name), or run the actor with its roles bound"
@@ -124,7 +126,8 @@ def session_of(requests: tuple[LockRequest[Any], ...]) -> Session:
             raise MisuseError(
                 f"{request!r} names a pattern; outside an actor use {type(request).__name__}Each"
             )
-        sessions.append(session)
-    if any(session is not sessions[0] for session in sessions):
-        raise MisuseError("one lock names world contexts of two connections; connect once")
-    return sessions[0]
+        if session is not None and found is not session:
+            raise MisuseError("one lock names world contexts of two connections; connect once")
+        session = found
+    assert session is not None, "called with at least one request"
+    return session

@@ -20,7 +20,7 @@ from __future__ import annotations
 import enum
 import re
 import secrets
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, Self, TypeVar
 
 if TYPE_CHECKING:
@@ -290,20 +290,22 @@ class Access(enum.IntEnum):
     WRITE_EACH = 5
     VIEW_EACH = 6
 
-    @property
-    def each(self) -> bool:
-        """Whether the request names a pattern of entities."""
-        return self >= Access.READ_EACH
+    # Plain attributes and no properties: every request of every lock is looked at for them.
+    each: bool
+    """Whether the request names a pattern of entities."""
+    locks: bool
+    """Whether the request holds a lock until the block ends."""
+    writes: bool
+    """Whether the request allows to set a datum."""
 
-    @property
-    def locks(self) -> bool:
-        """Whether the request holds a lock until the block ends."""
-        return self not in (Access.VIEW, Access.VIEW_EACH)
+    def __init__(self, number: int) -> None:
+        self.each = number >= 4
+        self.locks = number not in (3, 6)
+        self.writes = number in (2, 5)
 
-    @property
-    def writes(self) -> bool:
-        """Whether the request allows to set a datum."""
-        return self in (Access.WRITE, Access.WRITE_EACH)
+
+ACCESSES: Final = {access.value: access for access in Access}
+"""The accesses by their number: a third of the time of `Access(number)`."""
 
 
 class Context:
@@ -333,6 +335,9 @@ class LockRequest(Generic[T_co]):
         entity: The entity; in an actor class also a pattern, standing for the triggering entity.
         aspect: The aspect.
 
+    Attributes:
+        address: Names of the context, of the entity (or pattern) and of the aspect.
+
     Raises:
         TypeError: The arguments are not in that order or not of these types.
     """
@@ -341,6 +346,8 @@ class LockRequest(Generic[T_co]):
     entity: Entity | Entities
     aspect: Aspect[T_co]
     access: ClassVar[Access]
+    address: tuple[str, str, str] = field(init=False)
+    _hash: int = field(init=False)
 
     def __post_init__(self) -> None:
         allowed = Entities if self.access.each else (Entity, Entities)
@@ -351,11 +358,10 @@ class LockRequest(Generic[T_co]):
                     f"{type(self).__name__}(world, entity, aspect): {name} is {found!r}, which is"
                     f" no {getattr(wanted, '__name__', 'Entity or Entities')}"
                 )
-
-    @property
-    def address(self) -> tuple[str, str, str]:
-        """Names of the context, of the entity (or pattern) and of the aspect."""
-        return self.world.name, str(self.entity), self.aspect.name
+        # Every lock asks for both several times, and a request never changes.
+        address = self.world.name, str(self.entity), self.aspect.name
+        object.__setattr__(self, "address", address)
+        object.__setattr__(self, "_hash", hash((self.access, address)))
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, LockRequest):
@@ -363,7 +369,7 @@ class LockRequest(Generic[T_co]):
         return self.access == other.access and self.address == other.address
 
     def __hash__(self) -> int:
-        return hash((self.access, self.address))
+        return self._hash
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({'/'.join(self.address[:2])} {self.address[2]})"

@@ -23,13 +23,14 @@ NO_PAYLOAD: Final = "no_payload"
 """The code of a refusal that leaves the lock as it is: named bytes are not here, send them."""
 
 _ACCESSES: Final = frozenset(access.value for access in Access)
+_ACCESSES_BY_STAMP: Final = (Access.VIEW, Access.READ)
 _DURABILITIES: Final = ("", *(durability.value for durability in Durability))
 
 
 def wrong_access(items: Iterable[Item]) -> Refused | None:
     """Refuse an access that there is not, and a write or a pattern of what was captured when."""
     for item in items:
-        if item.captured_ns and item.access not in (Access.VIEW, Access.READ):
+        if item.captured_ns and item.access not in _ACCESSES_BY_STAMP:
             return _refused(f"{item.entity}/{item.aspect} was asked by stamp; only a View can be")
         if item.access not in _ACCESSES:
             return _refused(f"access {item.access} was asked; there are {sorted(_ACCESSES)}")
@@ -60,8 +61,10 @@ def wrong_aspect(entry: AspectEntry) -> Refused | None:
     return wrong_name("aspect", entry.name, slashes=False)
 
 
-def wrong_writes(writes: Iterable[WriteItem]) -> Refused | None:
+def wrong_writes(writes: Collection[WriteItem]) -> Refused | None:
     """Refuse two writes of one slot."""
+    if len(writes) == 1:
+        return None
     seen: set[Slot] = set()
     for write in writes:
         if write.slot in seen:

@@ -32,11 +32,11 @@ class Sendings:
 
     def next(self, now_ns: int) -> int:
         """Return the counter for a message that is sent now."""
-        self.count += 1
-        self._sent[self.count] = now_ns
-        if len(self._sent) > SENDINGS_KEPT:
-            del self._sent[self.count - SENDINGS_KEPT]
-        return self.count
+        self.count = count = self.count + 1
+        self._sent[count] = now_ns
+        if count > SENDINGS_KEPT:
+            del self._sent[count - SENDINGS_KEPT]
+        return count
 
     def believe_until_ns(self, count_seen: int, duration_ns: int) -> int:
         """Return until when something granted for `duration_ns` may be believed in (0: not)."""

@@ -12,7 +12,7 @@ One `Client` per process, one lane per thread.  Rules a change must keep:
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.beliefs import Sendings
 from enact_dist.core.datum import LockId
@@ -30,12 +30,17 @@ from enact_dist.core.messages import (
 from enact_dist.core.multilock import MultiLock
 from enact_dist.core.phase import Phase
 from enact_dist.core.placement import shard_of
-from enact_dist.terms import Access
+from enact_dist.terms import ACCESSES, Access
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from enact_dist.core.messages import Item, Request
+
+
+PLANNED_MAX: Final = 32
+PLANS_MAX: Final = 256
+"""Sets of so few requested items, at most so many, whose split by shard is remembered."""
 
 
 @dataclass(slots=True)
@@ -55,6 +60,7 @@ class Client:
     __slots__ = (
         "_locks",
         "_peers",
+        "_plans",
         "_seqs",
         "_unsettled",
         "actor",
@@ -90,6 +96,7 @@ class Client:
         self._locks: dict[LockId, MultiLock] = {}
         self._seqs: dict[int, int] = {}
         self._unsettled: dict[str, int] = {}
+        self._plans: dict[tuple[Item, ...], Plan] = {}
 
     # ---------------------------------------------------------------- shards
 
@@ -101,12 +108,13 @@ class Client:
 
     def epoch(self, shard: str) -> int:
         """Return the epoch that the shard was last known in (0: none)."""
-        return self._peer(shard).epoch
+        peer = self._peers.get(shard)
+        return peer.epoch if peer is not None else 0
 
     def needs_hello(self, shard: str) -> bool:
         """Whether the shard does not know yet that we are in its epoch."""
-        peer = self._peer(shard)
-        return peer.epoch == 0 or peer.acknowledged != peer.epoch
+        peer = self._peers.get(shard)
+        return peer is None or peer.epoch == 0 or peer.acknowledged != peer.epoch
 
     def hello(self, shard: str) -> Hello:
         """Return the greeting, which acknowledges the epoch that we know."""
@@ -165,6 +173,7 @@ class Client:
 
     def learn_placement(self, placement: PlacementMap) -> None:
         """Take over the shard's placement map; where shards differ, the newest answer counts."""
+        self._plans.clear()
         self.placement = placement
 
     def saw_stamp(self, stamp_ns: int) -> None:
@@ -255,11 +264,23 @@ class Client:
         A pattern goes to every shard.  Views ride with the locks where one shard has them all,
         unless it may not show a commit of ours yet.  With `lock_views` they become reads.
         """
+        items = tuple(items)
+        usual = not lock_views and not self._unsettled and len(items) <= PLANNED_MAX
+        plan = self._plans.get(items) if usual else None
+        if plan is None:
+            plan = self._planned(items, lock_views=lock_views)
+            if usual:
+                if len(self._plans) >= PLANS_MAX:
+                    self._plans.clear()
+                self._plans[items] = plan
+        return plan
+
+    def _planned(self, items: Iterable[Item], *, lock_views: bool) -> Plan:
         locks: dict[str, list[Item]] = {}
         views: dict[str, list[Item]] = {}
         every = [shard.name for shard in self.placement.shards]
         for item in items:
-            access = Access(item.access)
+            access = ACCESSES[item.access]
             if lock_views and not access.locks:
                 access = Access.READ_EACH if access.each else Access.READ
                 item = item._replace(access=access)  # noqa: PLW2901 - the same, but locked

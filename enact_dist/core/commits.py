@@ -82,6 +82,7 @@ if TYPE_CHECKING:
 
 NOT_HELD: Final = "it is not held here (never granted, released, or forgotten)"
 
+_DELETED: Final = NullReason.DELETED
 _STRICTNESS: Final = (Durability.VOLATILE, Durability.OS, Durability.DURABLE)
 
 
@@ -196,19 +197,14 @@ class Commits:
             yield Reply(reply_to, refusal)
             return
         assert tenure is not None
-        moved = self.moved_on(message.expects, message.lock)
+        moved = self.moved_on(message.expects, message.lock) if message.expects else None
         if moved is not None:
             yield from self.changed(tenure, moved, reply_to=reply_to, now_ns=now_ns)
             return
         stamp_ns = self._stamps.next(seen_ns=message.seen_stamp_ns, wall_ns=wall_ns)
-        outcome = OutcomeRecord(
-            message.lock,
-            Position(stamp_ns, self._shard),
-            tuple(
-                SlotVersion(write.slot, self._slots[write.slot].version + 1)
-                for write in message.writes
-            ),
-        )
+        slots = self._slots
+        versions = tuple([SlotVersion(slot, slots[slot].version + 1) for slot, _ in message.writes])
+        outcome = OutcomeRecord(message.lock, Position(stamp_ns, self._shard), versions)
         commit = _InFlight(tenure, message.writes, outcome, [reply_to])
         if message.participants:
             commit.decision = DecisionRecord(message.lock, outcome.position, message.participants)
@@ -273,8 +269,12 @@ class Commits:
         """
         if commit.decision is not None:
             return Durability.DURABLE
-        durabilities = [self._catalogue.durability(write.slot.aspect) for write in commit.writes]
-        return max(durabilities, key=_STRICTNESS.index, default=Durability.VOLATILE)
+        strictest = Durability.VOLATILE
+        for slot, _ in commit.writes:
+            durability = self._catalogue.durability(slot.aspect)
+            if durability is not strictest:
+                strictest = max(strictest, durability, key=_STRICTNESS.index)
+        return strictest
 
     def persisted(self, ticket: int, *, now_ns: int) -> Iterator[Effect]:
         """The store is done: apply, release and answer."""
@@ -291,7 +291,9 @@ class Commits:
         changes = self.apply_writes(commit.writes, outcome.versions, outcome.position.stamp_ns)
         lanes = self._sessions.lanes_of(lock.session)
         if lanes is not None:
-            lane = lanes.setdefault(lock.lane, Lane())
+            lane = lanes.get(lock.lane)
+            if lane is None:
+                lane = lanes[lock.lane] = Lane()
             # A commit whose client gave up may end after a newer one of its lane.
             if lane.outcome is None or lane.outcome.lock.seq < lock.seq:
                 lane.outcome = outcome
@@ -307,13 +309,15 @@ class Commits:
         self, writes: tuple[WriteItem, ...], versions: tuple[SlotVersion, ...], stamp_ns: int
     ) -> list[Change]:
         """Make writes visible; return what a notice tells of them."""
-        changes = []
-        for write, (slot, version) in zip(writes, versions, strict=True):
-            content = Content(version, stamp_ns, write.datum, NullReason.DELETED)
+        changes, size = [], 0
+        for (_, datum), (slot, version) in zip(writes, versions, strict=True):
+            content = Content(version, stamp_ns, datum, _DELETED)
             self._slots.replace(slot, content, retention=self._catalogue.retention(slot.aspect))
-            captured_ns = write.datum.stamp_ns if write.datum is not None else 0
-            changes.append(Change(slot, version, stamp_ns, write.datum is None, captured_ns))
-        self._count("bytes_written", sum(w.datum.size for w in writes if w.datum))
+            captured_ns = 0
+            if datum is not None:
+                captured_ns, size = datum.stamp_ns, size + datum.size
+            changes.append(Change(slot, version, stamp_ns, datum is None, captured_ns))
+        self._count("bytes_written", size)
         return changes
 
     def publish(self, changes: list[Change]) -> Iterator[Effect]:
@@ -352,9 +356,9 @@ class Commits:
             return wrong
         if tenure.bound:
             return Refused("protocol", f"{message.lock} is being committed in another way")
-        uncovered = [write.slot for write in message.writes if not tenure.covers(write.slot)]
-        if uncovered:
-            return Refused("protocol", f"{message.lock} does not hold {uncovered[0]} for writing")
+        for slot, _ in message.writes:
+            if not tenure.covers(slot):
+                return Refused("protocol", f"{message.lock} does not hold {slot} for writing")
         for slot, _ in message.writes:
             # Everybody whose pattern covers it must be able to read its name.
             if not self._slots.exists(slot):

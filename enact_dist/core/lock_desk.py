@@ -44,41 +44,43 @@ class LockDesk:
 
     def on_acquire(self, message: Acquire, reply_to: int) -> Iterator[Effect]:
         """Queue a lock, or return to one that is queued or granted already."""
-        session = self._state.session_in_epoch(message.lock.session, message.epoch)
+        state, lock = self._state, message.lock
+        session = state.session_in_epoch(lock.session, message.epoch)
         refusal = self.refused(session, message.map_version, message.items)
         if refusal is not None or session is None:
-            yield Reply(reply_to, refusal or EpochChanged(self._state.epoch))
+            yield Reply(reply_to, refusal or EpochChanged(state.epoch))
             return
         if session.observer:
             text = "this session only observes and cannot lock; connect without observer=True"
             yield Reply(reply_to, Refused("value", text))
             return
-        session.renewed_ns = max(session.renewed_ns, self._state.now_ns)
+        session.renewed_ns = max(session.renewed_ns, state.now_ns)
         session.count_seen = max(session.count_seen, message.count)
-        tenure = self._state.tenures.by_lock.get(message.lock)
+        tenure = state.tenures.by_lock.get(lock)
         if tenure is None:
-            lane = session.lanes.get(message.lock.lane)
+            lane = session.lanes.get(lock.lane)
             if lane is None and len(session.lanes) >= LANES_MAX:
                 yield Reply(reply_to, Refused("overload", f"{LANES_MAX} lanes in one session"))
                 return
-            lane = lane or session.lane(message.lock.lane)
-            if message.lock.seq <= lane.top:
-                self._state.count("stale")
-                yield Reply(reply_to, Stale(message.lock, self._state.epoch))
+            lane = lane or session.lane(lock.lane)
+            if lock.seq <= lane.top:
+                state.count("stale")
+                yield Reply(reply_to, Stale(lock, state.epoch))
                 return
-            yield from self._supersede(message.lock)
-            lane.top = message.lock.seq
-            tenure = self._state.tenures.enqueue(message, now_ns=self._state.now_ns)
-            yield from self._state.grant_ready()
+            if state.pins or lock.session in state.tenures.by_session:
+                yield from self._supersede(lock)
+            lane.top = lock.seq
+            tenure = state.tenures.enqueue(message, now_ns=state.now_ns)
+            if state.tenures.table.any_ready:
+                yield from state.grant_ready()
         if tenure.token is not None:
-            granted = self._state.tenures.granted(
-                tenure, now_ns=self._state.now_ns, stamp_ns=self._state.stamp(message.seen_stamp_ns)
-            )
+            stamp_ns = state.stamp(message.seen_stamp_ns)
+            granted = state.tenures.granted(tenure, now_ns=state.now_ns, stamp_ns=stamp_ns)
             yield Reply(reply_to, granted)
         else:
-            self._state.count("lock_waits")
-            yield from self._state.tenures.park(
-                tenure, reply_to=reply_to, wait_ns=message.wait_ns, now_ns=self._state.now_ns
+            state.count("lock_waits")
+            yield from state.tenures.park(
+                tenure, reply_to=reply_to, wait_ns=message.wait_ns, now_ns=state.now_ns
             )
 
     def _supersede(self, lock: LockId) -> Iterator[Effect]:
@@ -110,13 +112,14 @@ class LockDesk:
         wrong = wrong_access(items)
         if wrong is not None:
             return wrong
+        worlds, aspects = self._state.catalogue.worlds, self._state.catalogue.aspects
         for item in items:
-            if item.context not in self._state.catalogue.worlds:
-                known = ", ".join(sorted(self._state.catalogue.worlds)) or "none"
+            if item.context not in worlds:
+                known = ", ".join(sorted(worlds)) or "none"
                 return Refused(
                     "unknown_world", f"no world context {item.context!r} here; known: {known}"
                 )
-            if item.aspect not in self._state.catalogue.aspects:
+            if item.aspect not in aspects:
                 return Refused("unknown_aspect", f"aspect {item.aspect!r} is not registered here")
         return None
 

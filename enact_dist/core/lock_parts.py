@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from enact_dist.core.messages import Alive, EpochChanged, Welcome
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from enact_dist.core.beliefs import Sendings
     from enact_dist.core.datum import Token
     from enact_dist.core.messages import Granted, Item, PlacementMap, SlotState
+
+OF_SESSIONS: Final = (Welcome, Alive, EpochChanged)
+"""The answers that tell something about a session and not only about one lock."""
 
 
 @dataclass(slots=True, eq=False)
@@ -35,6 +42,14 @@ class Part:
         self.token, self.granted_count = answer.token, sendings.count
         self.until_ns = sendings.believe_until_ns(answer.count_seen, ttl_ns)
         self.hold_until_ns = sendings.believe_until_ns(answer.count_seen, answer.hold_left_ns)
+
+
+def first_asking(parts: Iterable[Part]) -> Part | None:
+    """Return the part that is asked for now: one at a time, in the order of the plan."""
+    for part in parts:
+        if part.token is None:
+            return part
+    return None
 
 
 class Reading(NamedTuple):

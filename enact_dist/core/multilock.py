@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Final
 from enact_dist.core.admission import NO_PAYLOAD
 from enact_dist.core.cuts import ROUNDS_MAX, Cut
 from enact_dist.core.finishing import Finishing, tokens_of
-from enact_dist.core.lock_parts import Part, Plan, Reading
+from enact_dist.core.lock_parts import OF_SESSIONS, Part, Plan, Reading, first_asking
 from enact_dist.core.messages import (
     OUTCOME_COMMITTED,
     OUTCOME_EXPIRED,
@@ -70,6 +70,10 @@ RETRY_NS_MAX: Final = 300_000_000
 """Pause after a call without an answer; doubles up to the second figure."""
 OVERLOAD: Final = "overload"
 """The code of refusals by a shard that has not looked at the request."""
+# Tuples: a union would be made anew for each answer.
+_TO_ANY_REQUEST: Final = (Refused, WrongShard, EpochChanged)
+_DECIDERS: Final = (Commit, Outcome)
+
 FREE_CALLS: Final = 3
 """Calls after a step forward that are made though the time to wait is over: a lock that does not
 want to wait asks each shard once, and again where a shard has restarted."""
@@ -128,10 +132,10 @@ class MultiLock:
         if now_ns < self._retry_at_ns:
             return [], min(self._retry_at_ns, self.give_up_ns)
         calls = self._calls(now_ns)
-        hellos = {
-            shard: self.client.hello(shard) for shard, _ in calls if self.client.needs_hello(shard)
-        }
-        return (list(hellos.items()) if hellos else calls), 0
+        strangers = [shard for shard, _ in calls if self.client.needs_hello(shard)]
+        if strangers:
+            calls = [(shard, self.client.hello(shard)) for shard in dict.fromkeys(strangers)]
+        return calls, 0
 
     def _calls(self, now_ns: int) -> list[tuple[str, Request]]:
         if self.phase is Phase.ACQUIRING:
@@ -148,7 +152,8 @@ class MultiLock:
         return [(finishing.primary, finishing.commit(self.client.seen_stamp_ns))]
 
     def _acquire(self, now_ns: int) -> tuple[str, Request]:
-        part = next(part for part in self.parts if part.token is None)
+        part = first_asking(self.parts)
+        assert part is not None
         left_ns = max(0, self.give_up_ns - now_ns)
         last = part is self.parts[-1]
         # The hold limit counts from the last grant; earlier ones must outlast the waiting too.
@@ -188,11 +193,28 @@ class MultiLock:
         if answer is None or self._tells_nothing(request, answer):
             self._silent(shard, request, now_ns)
             return
-        if self.client.answered(shard, request, answer, now_ns):
+        if isinstance(answer, OF_SESSIONS) and self.client.answered(shard, request, answer, now_ns):
             return  # it was about the session, not about this lock
         if self.silent_shard == shard:
             self.silent_shard = ""
         self._retry_ns = RETRY_NS_MIN
+        if isinstance(answer, _TO_ANY_REQUEST):
+            self._on_refusal(shard, request, answer)
+        elif getattr(answer, "lock", None) != self.lock:
+            return
+        elif self.phase is Phase.ACQUIRING:
+            self._on_acquiring(shard, answer, now_ns)
+        elif self.phase is Phase.COMMITTING:
+            if isinstance(request, _DECIDERS):
+                self._on_committing(answer, now_ns)
+        elif isinstance(answer, Viewed) and isinstance(request, TakeView):
+            self._on_viewed(shard, request, answer, now_ns)
+        elif self.phase is Phase.VALIDATING and isinstance(request, Validate | Prepare):
+            self._on_vote(shard, answer)
+
+    def _on_refusal(
+        self, shard: str, request: Request, answer: Refused | WrongShard | EpochChanged
+    ) -> None:
         if isinstance(answer, Refused):
             if answer.code == NO_PAYLOAD and self._finishing and self._finishing.unname():
                 return  # asked again, with the bytes
@@ -201,18 +223,8 @@ class MultiLock:
         elif isinstance(answer, WrongShard):
             self.client.learn_placement(answer.placement)
             self._end(Phase.MISPLACED)
-        elif isinstance(answer, EpochChanged):
+        else:
             self._epoch_changed(shard, request)
-        elif getattr(answer, "lock", None) != self.lock:
-            return
-        elif self.phase is Phase.ACQUIRING:
-            self._on_acquiring(shard, answer, now_ns)
-        elif isinstance(answer, Viewed) and isinstance(request, TakeView):
-            self._on_viewed(shard, request, answer, now_ns)
-        elif self.phase is Phase.VALIDATING and isinstance(request, Validate | Prepare):
-            self._on_vote(shard, answer)
-        elif self.phase is Phase.COMMITTING and isinstance(request, Commit | Outcome):
-            self._on_committing(answer, now_ns)
 
     def _tells_nothing(self, request: Request, answer: Answer) -> bool:
         """Whether it is a refusal that leaves open what became of a commit that was sent.
@@ -229,7 +241,7 @@ class MultiLock:
     def _silent(self, shard: str, request: Request, now_ns: int) -> None:
         self.silent_shard = shard
         self._free_calls = 0
-        if isinstance(request, Commit | Outcome) and self._finishing is not None:
+        if isinstance(request, _DECIDERS) and self._finishing is not None:
             self._finishing.ask_outcome, self._finishing.pending = True, False
         self._pause(now_ns)
 
@@ -245,7 +257,7 @@ class MultiLock:
         """The shard restarted or forgot the session; `client` has dropped our grants there."""
         self._free_calls = max(0, self._free_calls - 1)
         finishing = self._finishing
-        if isinstance(request, Commit | Outcome) and finishing is not None:
+        if isinstance(request, _DECIDERS) and finishing is not None:
             finishing.ask_outcome = True
         elif isinstance(request, Validate | Prepare) and finishing and shard in finishing.left:
             self.lose(f"shard {shard} restarted or forgot this session")
@@ -253,7 +265,7 @@ class MultiLock:
         # grant has already ended this lock through `lose_at`.
 
     def _on_acquiring(self, shard: str, answer: Answer, now_ns: int) -> None:
-        part = next((part for part in self.parts if part.token is None), None)
+        part = first_asking(self.parts)
         if part is None or part.shard != shard:
             return
         if isinstance(answer, Granted):
@@ -261,7 +273,8 @@ class MultiLock:
                 return  # a grant of an epoch that is over
             part.granted(answer, self.client.sendings, ttl_ns=self.client.ttl_ns)
             self.client.saw_stamp(answer.stamp_ns)
-            self.states += [Reading(shard, answer.epoch, state) for state in answer.states]
+            epoch = answer.epoch
+            self.states += [Reading(shard, epoch, state) for state in answer.states]
             if self.cut is not None:
                 self.cut.not_before(answer.from_ns)
             self._advance()
@@ -294,7 +307,7 @@ class MultiLock:
     def _advance(self) -> None:
         """Go on when everything of this phase has arrived."""
         self._free_calls = FREE_CALLS
-        if self.phase is Phase.ACQUIRING and all(part.token is not None for part in self.parts):
+        if self.phase is Phase.ACQUIRING and first_asking(self.parts) is None:
             self.phase = Phase.VIEWING
         if self.phase is Phase.VIEWING and (self.cut is None or not self.cut.left):
             self.phase = Phase.HELD

@@ -34,7 +34,10 @@ class Past:
 
     def keep(self, slot: Slot, old: Content, *, until_ns: int) -> None:
         """Keep a state that another one, stamped `until_ns`, has replaced."""
-        self._by_slot.setdefault(slot, deque()).append(old)
+        states = self._by_slot.get(slot)
+        if states is None:
+            states = self._by_slot[slot] = deque()
+        states.append(old)
         self._order.append((until_ns, slot))
         self.bytes += old.datum.size if old.datum is not None else 0
         self.forget(until_ns - PAST_NS)

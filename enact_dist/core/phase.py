@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import enum
-from typing import Final
 
 
 class Phase(enum.Enum):
@@ -24,10 +23,8 @@ class Phase(enum.Enum):
     MISPLACED = "misplaced"
     UNKNOWN = "unknown"
 
-    @property
-    def busy(self) -> bool:
-        """Whether the lock has calls to make before it rests."""
-        return self in _BUSY
+    busy: bool
+    """Whether the lock has calls to make before it rests."""
 
-
-_BUSY: Final = frozenset((Phase.ACQUIRING, Phase.VIEWING, Phase.VALIDATING, Phase.COMMITTING))
+    def __init__(self, text: str) -> None:
+        self.busy = text in ("acquiring", "viewing", "validating", "committing")

@@ -135,19 +135,23 @@ class Shard:
         """
         self._advance(now_ns, wall_ns)
         effects = list(self._handlers[type(message)](message, reply_to))
-        effects += self._views.answer_parked()
-        effects += self.state.grant_ready()
+        if self._views.waits:
+            effects += self._views.answer_parked()
+        if self.state.tenures.table.any_ready:
+            effects += self.state.grant_ready()
         return effects
 
     def _advance(self, now_ns: int, wall_ns: int) -> None:
         """Move the time; if this host itself stood still, nobody's lease pays for it."""
-        gap_ns = now_ns - self.state.now_ns
-        if gap_ns > self.state.shortest_ttl_ns // 4:
-            self.state.sessions.stalled(gap_ns)
-            self.state.tenures.stalled(gap_ns)
-            self.state.count("stalls")
-        self.state.now_ns = max(self.state.now_ns, now_ns)
-        self.state.wall_ns = wall_ns
+        state = self.state
+        gap_ns = now_ns - state.now_ns
+        if gap_ns > state.shortest_ttl_ns // 4:
+            state.sessions.stalled(gap_ns)
+            state.tenures.stalled(gap_ns)
+            state.count("stalls")
+        if gap_ns > 0:
+            state.now_ns = now_ns
+        state.wall_ns = wall_ns
 
     def next_deadline_ns(self) -> int:
         """Return the monotonic time at which a `Tick` is due at the latest."""

@@ -15,7 +15,7 @@ from enact_dist.core.datum import Column, Datum, Slot
 from enact_dist.core.messages import AspectEntry, SlotState
 from enact_dist.core.past import Past
 from enact_dist.core.retained import Retained
-from enact_dist.terms import Access, Durability, NullReason, pattern_matches
+from enact_dist.terms import ACCESSES, Durability, NullReason, pattern_matches
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -83,13 +83,13 @@ class SlotMap:
                 )
 
     def __getitem__(self, slot: Slot) -> Content:
-        column = self._columns.get(Column(slot.context, slot.aspect))
-        return NOTHING if column is None else column.get(slot.entity, NOTHING)
+        context, entity, aspect = slot
+        column = self._columns.get((context, aspect))  # type: ignore[call-overload]
+        return NOTHING if column is None else column.get(entity, NOTHING)
 
     def exists(self, slot: Slot) -> bool:
         """Whether the slot was ever written or is known to have been."""
-        column = self._columns.get(Column(slot.context, slot.aspect))
-        return column is not None and slot.entity in column
+        return self[slot] is not NOTHING
 
     def replace(self, slot: Slot, content: Content, *, retention: int = 1) -> None:
         """Put a newly committed state in place of the old one, which stays known for a while.
@@ -99,11 +99,10 @@ class SlotMap:
             content: Its new state.
             retention: How many versions stay readable, the new one included.
         """
-        old = self[slot]
+        old = self.set(slot, content)
         self.past.keep(slot, old, until_ns=content.stamp_ns)
         if retention > 1:
             self.retained.keep(slot, old, count=retention - 1)
-        self.set(slot, content)
 
     def at(self, slot: Slot, content: Content, at_ns: int) -> Content:
         """Return the state of a slot as of a stamp (0: now), or `content` where that is gone."""
@@ -120,17 +119,21 @@ class SlotMap:
             return found
         return newest if newest.datum is None else _OUTSIDE
 
-    def set(self, slot: Slot, content: Content) -> None:
-        """Put a new committed state in place of the old one."""
-        column = self._columns.setdefault(Column(slot.context, slot.aspect), {})
-        old = column.get(slot.entity)
-        if old is None:
+    def set(self, slot: Slot, content: Content) -> Content:
+        """Put a new committed state in place of the old one, which is returned."""
+        context, entity, aspect = slot
+        column = self._columns.get((context, aspect))  # type: ignore[call-overload]
+        if column is None:
+            column = self._columns[Column(context, aspect)] = {}
+        old: Content = column.get(entity, NOTHING)
+        if old is NOTHING:
             self.count += 1
         elif old.datum is not None:
             self.bytes -= old.datum.size
         if content.datum is not None:
             self.bytes += content.datum.size
-        column[slot.entity] = content
+        column[entity] = content
+        return old
 
     def matching(self, column: Column, pattern: str) -> Iterator[tuple[Slot, Content]]:
         """Yield the slots of a column whose entity the pattern covers, null ones too."""
@@ -147,10 +150,11 @@ class SlotMap:
 
         Slots stand in order, patterns expanded to those that are not null.
         """
-        shown = Shown([], {}, 0)
+        states: list[SlotState] = []
+        pins: dict[tuple[Slot, int], Datum] = {}
         from_ns, left = 0, self._answer_bytes_max
         for item in items:
-            each = Access(item.access).each
+            each = ACCESSES[item.access].each
             if each:
                 column = Column(item.context, item.aspect)
                 found = list(self.matching(column, item.entity))
@@ -158,7 +162,7 @@ class SlotMap:
                 slot = Slot(item.context, item.entity, item.aspect)
                 found = [(slot, self[slot])]
             for slot, newest in found:
-                content = self.at(slot, newest, at_ns)
+                content = self.at(slot, newest, at_ns) if at_ns else newest
                 # Of the newest one as of then, too, where an older version is asked: what was
                 # captured when is certain only from its commit on.
                 from_ns = max(from_ns, content.stamp_ns)
@@ -168,10 +172,10 @@ class SlotMap:
                     continue
                 state = state_of(slot, content, known=item.known, inline_max=left)
                 left -= state.size if state.datum is not None and not state.large else 0
-                shown.states.append(state)
+                states.append(state)
                 if content.datum is not None and (state.large or state.same):
-                    shown.pins[slot, state.version] = content.datum
-        return shown._replace(from_ns=from_ns)
+                    pins[slot, state.version] = content.datum
+        return Shown(states, pins, from_ns)
 
 
 def state_of(
@@ -264,4 +268,7 @@ class Catalogue:
 
     def durability(self, aspect: str) -> Durability:
         """Return what a commit of this (registered) aspect survives."""
-        return Durability(self.aspects[aspect].durability)
+        return _DURABILITIES[self.aspects[aspect].durability]
+
+
+_DURABILITIES: Final = {durability.value: durability for durability in Durability}

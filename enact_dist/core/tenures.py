@@ -27,7 +27,7 @@ from enact_dist.core.lock_table import Claim, LockTable, Mode, Resource, join
 from enact_dist.core.messages import Acquire, Granted, Item, Waiting
 from enact_dist.core.records import Effect, Reply, Story
 from enact_dist.core.slots import SlotMap
-from enact_dist.terms import Access, pattern_matches
+from enact_dist.terms import ACCESSES, Access, pattern_matches
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -77,7 +77,7 @@ class Tenure:
 
     def covers(self, slot: Slot) -> bool:
         """Whether this lock may write `slot`."""
-        if self.claim.wants.get(slot) is Mode.X:
+        if self.claim.wants.get(slot) is _X:
             return True
         return any(
             item.access == Access.WRITE_EACH
@@ -87,20 +87,23 @@ class Tenure:
         )
 
 
+_IS, _IX, _S, _X = Mode.IS, Mode.IX, Mode.S, Mode.X
+
+
 def wants_of(items: Iterable[Item]) -> dict[Resource, Mode]:
     """Return which resources a set of requested items uses, and how."""
     wants: dict[Resource, Mode] = {}
     for item in items:
-        access = Access(item.access)
+        access = ACCESSES[item.access]
         if not access.locks:
             continue
         column = Column(item.context, item.aspect)
         if access.each:
-            wants[column] = join(wants.get(column), Mode.X if access.writes else Mode.S)
+            wants[column] = join(wants.get(column), _X if access.writes else _S)
         else:
             slot = Slot(item.context, item.entity, item.aspect)
-            wants[slot] = join(wants.get(slot), Mode.X if access.writes else Mode.S)
-            wants[column] = join(wants.get(column), Mode.IX if access.writes else Mode.IS)
+            wants[slot] = join(wants.get(slot), _X if access.writes else _S)
+            wants[column] = join(wants.get(column), _IX if access.writes else _IS)
     return wants
 
 
@@ -220,8 +223,9 @@ class Tenures:
         """Return the grant with its data as of now."""
         assert tenure.token is not None
         states, pins, from_ns = self._slots.shown(tenure.items)
-        # Added to: the client may have taken an earlier answer, whose views have moved on since.
-        tenure.pins.update(pins)
+        if pins:
+            # Added to: the client may have taken an earlier answer, whose views have moved on.
+            tenure.pins.update(pins)
         session = self._sessions.by_id[tenure.lock.session]
         return Granted(
             tenure.lock,

@@ -16,7 +16,7 @@ from enact_dist.core.datum import Column, Slot
 from enact_dist.core.messages import EpochChanged, TakeView, Viewed
 from enact_dist.core.past import PAST_NS
 from enact_dist.core.records import Reply
-from enact_dist.terms import Access, pattern_matches
+from enact_dist.terms import ACCESSES, pattern_matches
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -39,6 +39,11 @@ class ViewDesk:
         self._locks = locks
         self._prepares = prepares
         self._parked: dict[int, tuple[TakeView, int]] = {}
+
+    @property
+    def waits(self) -> bool:
+        """Whether a view waits for undecided commits."""
+        return bool(self._parked)
 
     def on_take_view(self, message: TakeView, reply_to: int) -> Iterator[Effect]:
         """Show committed data without a lock."""
@@ -64,8 +69,8 @@ class ViewDesk:
         undecided += [(record.stamp_ns, record.writes) for record in self._prepares.undecided()]
         if not undecided:
             return _NEVER_NS
-        slots = {Slot(i.context, i.entity, i.aspect) for i in items if not Access(i.access).each}
-        each = [(Column(i.context, i.aspect), i.entity) for i in items if Access(i.access).each]
+        slots = {Slot(i.context, i.entity, i.aspect) for i in items if not ACCESSES[i.access].each}
+        each = [(Column(i.context, i.aspect), i.entity) for i in items if ACCESSES[i.access].each]
         return min(
             (
                 stamp_ns

@@ -6,14 +6,17 @@ client register anew what it needs there.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.messages import AspectEntry, Registered, Welcome
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from enact_dist.core.messages import Answer
+    from enact_dist.core.messages import PlacementMap
+
+CATALOGUES: Final = (Welcome, Registered)
+"""The answers that carry a catalogue."""
 
 
 class KnownCatalogue:
@@ -22,16 +25,34 @@ class KnownCatalogue:
     def __init__(self) -> None:
         self._aspects: dict[str, dict[str, AspectEntry]] = {}
         self._worlds: dict[str, tuple[str, ...]] = {}
+        self._settled: set[AspectEntry] = set()
+        self._settled_for: PlacementMap | None = None
 
-    def learn(self, shard: str, answer: Answer) -> None:
-        """Take a catalogue from an answer that carries one."""
-        if isinstance(answer, Welcome | Registered):
-            self._worlds[shard] = answer.worlds
-            self._aspects[shard] = {entry.name: entry for entry in answer.aspects}
+    def learn(self, shard: str, answer: Welcome | Registered) -> None:
+        """Take the catalogue that an answer carries."""
+        self._settled = set()
+        self._worlds[shard] = answer.worlds
+        self._aspects[shard] = {entry.name: entry for entry in answer.aspects}
 
     def forget(self, shard: str) -> None:
         """Forget the aspects of a shard, which does not know what it was said to know."""
+        self._settled = set()
         self._aspects.pop(shard, None)
+
+    def settled(self, aspects: Iterable[AspectEntry], placement: PlacementMap) -> bool:
+        """Whether no shard of a placement must be asked before these aspects can be used.
+
+        Found out once for each, until some catalogue changes: every lock asks.
+        """
+        if placement is not self._settled_for:
+            self._settled, self._settled_for = set(), placement
+        settled = self._settled
+        for entry in aspects:
+            if entry not in settled:
+                if any(self.lacks(shard.name, (), (entry,)) for shard in placement.shards):
+                    return False
+                settled.add(entry)
+        return True
 
     def worlds(self) -> tuple[str, ...]:
         """Return the world contexts that every greeted shard knows."""

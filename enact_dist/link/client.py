@@ -150,14 +150,14 @@ class CellClient(SessionClient):
     def _drive(self, lock: MultiLock, *, interrupt: threading.Event | None = None) -> None:
         """Make the lock's calls until it rests."""
         try:
-            while True:
+            while lock.phase.busy or interrupt is not None:
                 with self._mutex:
                     if interrupt is not None and interrupt.is_set():
                         lock.release()
                     calls, wait_until_ns = lock.next_calls(self._now_ns())
-                    if not calls and not lock.phase.busy:
-                        return
                 if not calls:
+                    if not lock.phase.busy:
+                        return
                     pause_s = (wait_until_ns - self._now_ns()) / 1e9
                     self._pause(max(0.001, min(pause_s, lock.slice_ns / 1e9)))
                     continue

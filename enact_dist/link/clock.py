@@ -14,6 +14,7 @@ Times of two hosts are never compared; only durations travel.
 from __future__ import annotations
 
 import time
+from functools import partial
 from typing import Protocol
 
 
@@ -22,17 +23,11 @@ def monotonic_ns() -> int:
     return time.monotonic_ns()
 
 
-def boottime_ns() -> int:
+if hasattr(time, "CLOCK_BOOTTIME"):
+    boottime_ns = partial(time.clock_gettime_ns, time.CLOCK_BOOTTIME)
     """Return the time since boot, suspend included (Linux; elsewhere `monotonic_ns`)."""
-    return _boottime_ns()
-
-
-def _boottime_ns() -> int:
-    return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
-
-
-if not hasattr(time, "CLOCK_BOOTTIME"):
-    _boottime_ns = time.monotonic_ns
+else:
+    boottime_ns = partial(time.monotonic_ns)
 
 
 def wall_ns() -> int:

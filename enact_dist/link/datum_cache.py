@@ -35,6 +35,9 @@ class DatumCache:
         self._bytes = 0
         self._mutex = threading.Lock()
 
+    def __contains__(self, slot: Slot) -> bool:
+        return slot in self._known
+
     def version(self, slot: Slot, shard: str, epoch: int) -> int:
         """Return the version that is known of a slot in this epoch (0: none)."""
         with self._mutex:

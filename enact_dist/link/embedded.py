@@ -78,7 +78,8 @@ class EmbeddedCarrier:
             MisuseError: The carrier is closed or was opened before a fork.
         """
         call = self._begin(shard, message)
-        call.done.acquire(timeout=max(0.0, timeout_s))
+        if call.answer is None:
+            call.done.acquire(timeout=max(0.0, timeout_s))
         return call.answer
 
     def request_all(

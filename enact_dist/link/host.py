@@ -38,7 +38,6 @@ from enact_dist.core.messages import (
     Stage,
 )
 from enact_dist.core.records import (
-    Call,
     Called,
     Drain,
     Persist,
@@ -72,6 +71,10 @@ TICK_S_MIN: Final = 0.001
 """The timer rests at least so long; deadlines of many locks then share one tick."""
 PAYLOAD_BYTES_MAX: Final = 2 << 30
 """Bytes of large data in plain memory that wait for their commits, or came apart from them."""
+_SOON_NS: Final = TICK_S_MAX * 1e9
+# Tuples: a union would be made anew for each message.
+_TOLD_LATER: Final = (Publish, Story)
+_THAT_MAY_WAIT: Final = (Acquire, AwaitStamp)
 PARKED_MAX: Final = 100_000
 """Requests that may wait for their answers at one time."""
 JOIN_S: Final = 0.5
@@ -268,20 +271,23 @@ class ShardHost:
 
     def _perform(self, effects: list[Effect]) -> None:
         """Do what the shard says: answers first, since somebody waits for them."""
+        later: list[Publish | Story] = []
         for effect in effects:
             if isinstance(effect, Reply):
                 reply = self._replies.pop(effect.reply_to, None)
                 if reply is not None:
-                    reply(cast("Answer", effect.answer))
+                    reply(effect.answer)  # type: ignore[arg-type]  # of the core: an `Answer`
+            elif isinstance(effect, _TOLD_LATER):
+                later.append(effect)
             elif isinstance(effect, Persist):
                 self._persist(effect)
-            elif isinstance(effect, Call) and self._call is not None:
+            elif self._call is not None:
                 self._call(effect.shard, cast("Request", effect.request))
-        for effect in effects:
+        for effect in later:
             if isinstance(effect, Publish):
                 for watcher in self._watchers:
                     watcher(cast("Notice", effect.notice))
-            elif isinstance(effect, Story):
+            else:
                 level = logging.CRITICAL if effect.grave else logging.INFO
                 _log.log(level, "%s: %s", effect.event, effect.text, extra={"event": effect.event})
 
@@ -340,13 +346,10 @@ class ShardHost:
 
     def _look_at_clock_for(self, message: Request) -> None:
         """Wake the timer if this request, not answered yet, ends before the timer looks again."""
-        soon_ns = TICK_S_MAX * 1e9
-        if isinstance(message, Hello):
-            begins_soon = message.ttl_ns // 8 < soon_ns
-        elif isinstance(message, Acquire | AwaitStamp):
-            begins_soon = message.wait_ns < soon_ns and self._handles in self._replies
+        if isinstance(message, _THAT_MAY_WAIT):
+            begins_soon = self._handles in self._replies and message.wait_ns < _SOON_NS
         else:
-            begins_soon = False
+            begins_soon = isinstance(message, Hello) and message.ttl_ns // 8 < _SOON_NS
         if begins_soon:
             self._wake_timer()
 

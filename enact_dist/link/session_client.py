@@ -34,7 +34,7 @@ from enact_dist.core.messages import (
 )
 from enact_dist.core.placement import shard_of
 from enact_dist.errors import EnactError, MisuseError
-from enact_dist.link.catalogue import KnownCatalogue
+from enact_dist.link.catalogue import CATALOGUES, KnownCatalogue
 from enact_dist.link.clock import boottime_ns
 from enact_dist.link.lanes import Lanes
 from enact_dist.link.refusals import error_of, unreachable
@@ -56,6 +56,10 @@ FINISH_S: Final = 10.0
 
 FIRST_STAGED: Final = 1 << 60
 """Numbers of payloads that travel in slices; files that a client fills itself begin at 1."""
+# Tuples: a union would be made anew for each call.
+_GREETINGS: Final = (Welcome, Alive)
+_WITH_DATA: Final = (Commit, Prepare)
+_SIGNS_OF_LIFE: Final = (Hello, KeepAlive)
 
 CALLS_S_MAX: Final = 1e8
 """Three years; whoever waits longer means for ever."""
@@ -226,8 +230,9 @@ class SessionClient:
         self._follow_placement()
 
     def _learn(self, shard: str, answer: Answer) -> None:
-        self._catalogue.learn(shard, answer)
-        if isinstance(answer, Welcome | Alive):
+        if isinstance(answer, CATALOGUES):
+            self._catalogue.learn(shard, answer)
+        if isinstance(answer, _GREETINGS):
             self.notice_numbers[shard] = (answer.epoch, answer.notice_number)
 
     def _follow_placement(self) -> None:
@@ -261,6 +266,10 @@ class SessionClient:
     def aspect_entries(self) -> dict[str, AspectEntry]:
         """Return the registered aspects of all greeted shards by name."""
         return self._catalogue.aspects()
+
+    def knows(self, aspects: Sequence[AspectEntry]) -> bool:
+        """Whether every shard of the cell is known to know these aspects: the usual case."""
+        return self._catalogue.settled(aspects, self.core.placement)
 
     def register(
         self,
@@ -375,8 +384,8 @@ def _patience_s(request: Request) -> float:
     """Return how long to wait for the answer to one call."""
     if isinstance(request, Acquire):
         return request.wait_ns / 1e9 + CALL_S
-    if isinstance(request, Commit | Prepare):
+    if isinstance(request, _WITH_DATA):
         return CALL_S + bytes_with([request.writes]) / BYTES_PER_S_MIN
-    if isinstance(request, Hello | KeepAlive):
+    if isinstance(request, _SIGNS_OF_LIFE):
         return CALL_S / 2
     return CALL_S

@@ -11,6 +11,7 @@ import importlib
 import signal
 import sys
 import threading
+from threading import get_ident
 from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
@@ -29,18 +30,16 @@ class Uninterrupted:
     Elsewhere, and where SIGINT raises nothing, it does nothing.  May be used again, not nested.
     """
 
-    __slots__ = ("_before", "_pending")
+    __slots__ = ("_before", "_main", "_pending")
 
     def __init__(self) -> None:
+        self._main = threading.main_thread().ident
         self._before: Any = None
         self._pending: tuple[int, FrameType | None] | None = None
 
     def __enter__(self) -> None:
-        if threading.get_ident() == threading.main_thread().ident:
-            before = _plain.getsignal(_SIGINT)
-            if callable(before):
-                _plain.signal(_SIGINT, self._defer)
-                self._before = before
+        if get_ident() == self._main and callable(_plain.getsignal(_SIGINT)):
+            self._before = _plain.signal(_SIGINT, self._defer)
 
     def _defer(self, number: int, frame: FrameType | None) -> None:
         self._pending = (number, frame)
