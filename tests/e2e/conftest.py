@@ -26,13 +26,13 @@ def free_port():
 class Process:
     """A child process whose lines of output can be waited for."""
 
-    def __init__(self, arguments, log, **variables):
+    def __init__(self, arguments, log, *, before=(), **variables):
         self.log = log
         self.lines = queue.Queue()
         self.seen = []
         with log.open("ab") as errors:
             self.popen = subprocess.Popen(
-                [sys.executable, *arguments],
+                [*before, sys.executable, *map(str, arguments)],
                 stdout=subprocess.PIPE,
                 stderr=errors,
                 stdin=subprocess.PIPE,
@@ -164,3 +164,18 @@ def make_cell(tmp_path, carrier):
         for name, daemon in cell.daemons.items():  # shown where the test has failed
             print(f"shard {name}: status {daemon.popen.poll()}, {daemon.story()}")
         cell.end()
+
+
+@pytest.fixture
+def make_process(tmp_path):
+    """Start Python processes: `make_process(*arguments, before=…)`, killed after the test."""
+    processes = []
+
+    def make(*arguments, **options):
+        log = tmp_path / f"process.{len(processes)}.log"
+        processes.append(Process(arguments, log, **options))
+        return processes[-1]
+
+    yield make
+    for process in reversed(processes):
+        process.end()

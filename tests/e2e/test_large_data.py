@@ -1,0 +1,96 @@
+"""Large data between hosts without common memory: the same program, the same results."""
+
+import time
+from pathlib import Path
+
+import pytest
+
+from enact_dist.errors import LinkError
+from enact_dist.verify.chaos.hosts import open_hosts
+
+pytestmark = pytest.mark.slow
+PROGRAM = str(Path(__file__).with_name("large_data_program.py"))
+OWN_MEMORY = (
+    "unshare", "--mount", "sh", "-c",
+    'mount -t tmpfs none /dev/shm && exec "$@"', "own-memory",
+)  # fmt: skip
+"""Runs what follows with a /dev/shm of its own, as on another host."""
+TTL_S = 8.0
+CUT_S = 5.0
+"""Longer than the lease of a link, shorter than that of a lock."""
+
+
+@pytest.fixture
+def hosts():
+    """Two hosts with a shard each, the second with a client's program, and one far from both."""
+    try:
+        opened = open_hosts(("s0", "s1", "far"), other_clock="far", required=True)
+    except LinkError as error:
+        pytest.skip(str(error))
+    yield opened
+    opened.close()
+
+
+@pytest.fixture
+def run(hosts, tmp_path, make_process):
+    """Start a program on one of the hosts, `run(host, *arguments)`; the shards run already."""
+    cell = tmp_path / "cell.toml"
+    shards = "".join(
+        f'[shards.{name}]\nlisten = "{hosts.endpoint(name)}"\n' for name in ("s0", "s1")
+    )
+    pins = "".join(
+        f'[[pins]]\nentities = "{side}/**"\nshard = "{shard}"\n'
+        for side, shard in (("left", "s0"), ("right", "s1"))
+    )
+    cell.write_text(
+        f'name = "far"\nworlds = ["online"]\nsession_ttl_s = {TTL_S}\n'
+        f'data_folder = "{tmp_path}/data"\n{shards}{pins}'
+    )
+
+    def start(host, *arguments):
+        own = OWN_MEMORY if host == "far" else ()
+        return make_process(*arguments, before=(*hosts.before(host), *own))
+
+    for name in ("s0", "s1"):
+        start(name, "-m", "enact_dist.cli.main", "shard", "run", name, "--cell", cell).expect(
+            "ready:"
+        )
+    return lambda host, *arguments: start(host, PROGRAM, cell, *arguments)
+
+
+def told(process):
+    """Return what a program said of its data, and how its calls travelled."""
+    way = process.expect("done:", timeout_s=90.0)
+    assert process.finish() == 0, process.story()
+    return [line for line in process.seen if ": " in line and "done" not in line], way
+
+
+def test_program_far_from_its_shards_finds_what_one_beside_them_finds(run):
+    """With the shard's memory in common and without, over both shards: not a bit differs."""
+    near, near_way = told(run("s0"))
+    far, far_way = told(run("far"))
+
+    assert len(near) == 11
+    assert far == near
+    assert "socket" in near_way
+    assert far_way == "zenoh zenoh"
+
+
+def test_program_that_is_cut_off_in_mid_transfer_goes_on_when_the_network_is_back(run, hosts):
+    """Links end in the midst of a publication and of a fetch; the lock lives, nothing is lost."""
+    calm, _ = told(run("far"))
+    program = run("far", "pause")
+    for kind in ("Stage", "Fetch"):
+        assert program.expect("midst:", timeout_s=60.0) == kind
+        hosts.cut("s0", "far")
+        hosts.cut("far", "s0")
+        program.tell("")
+        time.sleep(CUT_S)  # the cut itself, not something to be waited for
+        hosts.heal("s0", "far")
+        hosts.heal("far", "s0")
+    cut, _ = told(program)
+
+    assert [line for line in cut if line[:5] not in ("midst", "repea")] == [
+        line for line in calm if not line.startswith("repea")
+    ]
+    assert int(cut[-1].removeprefix("repeated:")) > 0
