@@ -53,6 +53,7 @@ class RawZenoh:
             raise
 
     def _wait_matching(self) -> None:
+        # Zenoh would tell over a channel, which cannot be waited on for a limited time.
         deadline_s = time.monotonic() + START_S
         while not (
             self._querier.matching_status.matching and self._publisher.matching_status.matching
