@@ -1,6 +1,7 @@
 """Sockets between client and shard on one host: when they are taken, lost and found again."""
 
 import os
+import signal
 import statistics
 import threading
 import time
@@ -324,3 +325,24 @@ def test_call_on_a_connection_that_was_just_closed_takes_the_other_way(daemon, c
     answers.append(carrier.request("s0", ListLocks(), timeout_s=5))
 
     assert [type(answer) for answer in answers] == [Locks, Locks]
+
+
+@over_socket
+def test_signals_do_not_lengthen_a_call(daemon, carry, endpoint):
+    """A program with an interval timer interrupts each wait; together they last no longer."""
+    daemon(endpoint)
+    carrier = carry(endpoint)
+    came = []
+    before = signal.signal(signal.SIGALRM, lambda *_: came.append(time.monotonic()))
+    signal.setitimer(signal.ITIMER_REAL, 0.05, 0.05)
+    try:
+        began_s = time.monotonic()
+        answer = carrier.request("s0", AwaitStamp(2**62, 900_000_000), timeout_s=0.2)
+        took_s = time.monotonic() - began_s
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+
+    assert answer is None
+    assert len(came) > 1
+    assert took_s < 0.7
