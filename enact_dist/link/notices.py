@@ -9,15 +9,20 @@ the numbers are passed on (`Skipped`), so that a gap remains a gap.
 
 from __future__ import annotations
 
+import contextlib
+import os
+import select
 import threading
+import time
 from collections import deque
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 
 from enact_dist.core.messages import Notice
+from enact_dist.errors import EnactError
 from enact_dist.terms import pattern_matches
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable
 
     from enact_dist.core.datum import Slot
     from enact_dist.core.messages import Survey
@@ -74,8 +79,48 @@ class Interest:
         return known
 
 
+class Source(Protocol):
+    """Where notices can be read by whoever waits for them."""
+
+    def fileno(self) -> int:
+        """Return the descriptor that becomes readable when something has come."""
+
+    def take_notices(self) -> list[Notice | Skipped]:
+        """Return what has come.
+
+        Raises:
+            EnactError: It made no sense.
+            EOFError: It has ended.
+            OSError: It is broken.
+        """
+
+
+class _Bell:
+    """Wakes a thread that polls; rings on until it is heard."""
+
+    __slots__ = ("_descriptor",)
+
+    def __init__(self) -> None:
+        self._descriptor = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+
+    def fileno(self) -> int:
+        return self._descriptor
+
+    def ring(self) -> None:
+        os.eventfd_write(self._descriptor, 1)
+
+    def heard(self) -> None:
+        with contextlib.suppress(BlockingIOError):
+            os.eventfd_read(self._descriptor)
+
+    def __del__(self) -> None:
+        os.close(self._descriptor)
+
+
 class NoticeQueue:
     """A feed filled from another thread.  `put` never blocks, `get` wakes at once.
+
+    It may have one source that `get` itself reads, so that no thread has to be woken by another.
 
     Args:
         interest: What is watched; None for everything.
@@ -96,6 +141,10 @@ class NoticeQueue:
         self._changed = threading.Condition(threading.Lock())
         self._closed = False
         self._dropped = 0
+        self._source: Source | None = None
+        self._on_end: Callable[[Exception], None] | None = None
+        self._bell: _Bell | None = None
+        self._polling = False
 
     @property
     def dropped(self) -> int:
@@ -116,7 +165,36 @@ class NoticeQueue:
                 self._notices.popleft()
                 self._dropped += 1
             self._notices.append(notice)
-            self._changed.notify()
+            self._wake()
+
+    def _wake(self) -> None:
+        """Wake whoever waits in `get`.  The mutex is held."""
+        self._changed.notify_all()
+        if self._bell is not None and self._polling:
+            self._bell.ring()
+
+    def read_from(self, source: Source, on_end: Callable[[Exception], None]) -> bool:
+        """Let `get` read this source, too; say no if there is one, or the feed is closed.
+
+        Args:
+            source: What is read while somebody waits; what comes at other times waits there.
+            on_end: Called once by `get`, with the reason, when the source has ended.
+        """
+        with self._changed:
+            if self._closed or self._source is not None:
+                return False
+            self._source, self._on_end = source, on_end
+            self._bell = self._bell or _Bell()
+            self._wake()
+            return True
+
+    def take(self, found: Iterable[Notice | Skipped]) -> None:
+        """Add what came from a shard."""
+        for one in found:
+            if isinstance(one, Skipped):
+                self.skip(one)
+            else:
+                self.put(one)
 
     def skip(self, skipped: Skipped) -> None:
         """Add the numbers of notices that were of no interest; wakes nobody."""
@@ -136,9 +214,48 @@ class NoticeQueue:
 
         None after `timeout_s` without one, or once closed.
         """
+        deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
+        while True:
+            left_s = None if deadline_s is None else max(0.0, deadline_s - time.monotonic())
+            with self._changed:
+                self._changed.wait_for(
+                    lambda: self._notices or self._closed or self._source is not None, left_s
+                )
+                if self._notices and not self._closed:
+                    return self._notices.popleft()
+                source, bell = self._source, self._bell
+                if self._closed or source is None or bell is None:
+                    return None
+                self._polling = True
+            if not self._read(source, bell, left_s):
+                return None
+
+    def _read(self, source: Source, bell: _Bell, wait_s: float | None) -> bool:
+        """Wait for the source or the bell, and take what has come; False: nothing did."""
+        try:
+            poll = select.poll()
+            poll.register(bell, select.POLLIN)
+            poll.register(source, select.POLLIN)
+            ready = [one for one, _ in poll.poll(None if wait_s is None else wait_s * 1e3)]
+            with self._changed:
+                self._polling = False
+                bell.heard()
+            if self._closed or not [one for one in ready if one != bell.fileno()]:
+                return bool(ready)
+            found = source.take_notices()
+        except (EnactError, EOFError, OSError, ValueError) as error:
+            self._ended(source, error)
+            return True
+        self.take(found)
+        return True
+
+    def _ended(self, source: Source, error: Exception) -> None:
         with self._changed:
-            self._changed.wait_for(lambda: self._notices or self._closed, timeout_s)
-            return self._notices.popleft() if self._notices and not self._closed else None
+            if self._source is not source:
+                return
+            self._source, on_end, self._on_end = None, self._on_end, None
+        if on_end is not None:
+            on_end(error)
 
     def close(self) -> None:
         """End the feed and wake whoever waits in `get`; twice is harmless."""
@@ -146,6 +263,6 @@ class NoticeQueue:
             if self._closed:
                 return
             self._closed = True
-            self._changed.notify_all()
+            self._wake()
         if self.on_close is not None:
             self.on_close()

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import logging
 import os
+import socket
 import threading
 import weakref
 from typing import TYPE_CHECKING, Final
@@ -22,8 +23,8 @@ from typing import TYPE_CHECKING, Final
 from enact_dist.core.messages import Welcome
 from enact_dist.errors import LinkError, ProtocolError
 from enact_dist.link.carrier import check_usable
-from enact_dist.link.notices import NoticeQueue, Skipped
-from enact_dist.link.socket_frames import Kind
+from enact_dist.link.notices import NoticeQueue
+from enact_dist.link.socket_frames import Kind, wait_at_most
 from enact_dist.link.socket_line import Connection, SocketLine
 from enact_dist.wire.frames import encode_frame
 
@@ -327,7 +328,8 @@ class _Feed:
     """One feed of notices: a connection to each shard with a socket, Zenoh where one has none.
 
     Both may bring the same notice for a while; the queue takes each number once, and a number that
-    is missing is noticed by whoever watches.
+    is missing is noticed by whoever watches.  Whoever waits reads the first of the connections
+    itself, and each further one has a thread.
     """
 
     def __init__(self, carrier: SocketCarrier, queue: NoticeQueue, interest: Survey | None) -> None:
@@ -335,7 +337,7 @@ class _Feed:
         self._queue = queue
         self._watch = encode_frame(interest)[0] if interest is not None else b""
         self._mutex = threading.Lock()
-        self._pumps: dict[str, tuple[Connection, threading.Thread]] = {}
+        self._pumps: dict[str, tuple[SocketLine, Connection, threading.Thread | None]] = {}
         self._over_zenoh = False
         self._closed = False
 
@@ -365,23 +367,31 @@ class _Feed:
             _log.info("no notices over the socket to shard %s: %s", shard, error)
             line.drop(connection)
             return
+        wait_at_most(connection.socket, socket.SO_RCVTIMEO, 0.0)
+        if self._queue.read_from(
+            connection, lambda error: self._ended(shard, line, connection, error)
+        ):
+            self._pumps[shard] = line, connection, None
+            return
         thread = threading.Thread(
             target=self._pump, args=(shard, line, connection), name="enact-notices", daemon=True
         )
-        self._pumps[shard] = connection, thread
+        self._pumps[shard] = line, connection, thread
         thread.start()
 
     def _pump(self, shard: str, line: SocketLine, connection: Connection) -> None:
         """Move notices from a connection into the queue until it ends."""
         try:
-            for notice in connection.notices():
-                if isinstance(notice, Skipped):
-                    self._queue.skip(notice)
-                else:
-                    self._queue.put(notice)
+            while True:
+                self._queue.take(connection.take_notices())
         except (ProtocolError, EOFError, OSError) as error:
-            if not self._closed:
-                _log.info("notices of shard %s end: %s", shard, error)
+            self._ended(shard, line, connection, error)
+
+    def _ended(
+        self, shard: str, line: SocketLine, connection: Connection, error: Exception
+    ) -> None:
+        if not self._closed:
+            _log.info("notices of shard %s end: %s", shard, error)
         line.drop(connection)
         with self._mutex:
             self._pumps.pop(shard, None)
@@ -395,10 +405,12 @@ class _Feed:
             pumps = list(self._pumps.values())
             if self._over_zenoh:
                 self._carrier.behind.stop_feeding(self._queue)
-        for connection, _ in pumps:
+        for _, connection, _ in pumps:
             connection.wake()
-        for _, thread in pumps:
-            if thread is not threading.current_thread():
+        for line, connection, thread in pumps:
+            if thread is None:
+                line.drop(connection)
+            elif thread is not threading.current_thread():
                 thread.join(JOIN_S)
 
 

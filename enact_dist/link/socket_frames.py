@@ -149,6 +149,11 @@ class Stream:
         self._view = memoryview(self._buffer)
         self._filled = 0
 
+    @property
+    def begun(self) -> bool:
+        """Whether something of the next frame is here already."""
+        return bool(self._filled)
+
     def receive(self, into: memoryview | None = None) -> tuple[int, bytes, Buffer]:
         """Return kind, header and payload of the next frame; blocks until it is there.
 

@@ -33,8 +33,6 @@ from enact_dist.link.socket_peers import check_peer
 from enact_dist.wire.frames import decode_frame, encode_parts
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from enact_dist.core.messages import Request
 
 SOCKET_NAME: Final = "socket"
@@ -122,24 +120,31 @@ class Connection:
         if kind == Kind.OPEN and text != self.shard.encode():
             raise LinkError(f"shard {text!r} answers at the socket of {self.shard}")
 
-    def notices(self) -> Iterator[Notice | Skipped]:
-        """Yield what a shard sends since `WATCH`; ends only by an exception.
+    def fileno(self) -> int:
+        """Return the descriptor that becomes readable when something has come."""
+        return self.socket.fileno()
+
+    def take_notices(self) -> list[Notice | Skipped]:
+        """Return what a shard has sent since `WATCH`; waits if that is nothing.
 
         Raises:
             EOFError: As `receive`.
             OSError: As `receive`.
             ProtocolError: What came is no notice.
         """
-        wait_at_most(self.socket, socket.SO_RCVTIMEO, 0.0)
-        while True:
-            kind, header, payload = self._stream.receive()
-            if kind == Kind.SKIPPED:
-                yield Skipped(self.shard, *read_skipped(header))
-                continue
-            notice = decode_frame(header, payload) if kind == Kind.MESSAGE else None
-            if not isinstance(notice, Notice):
-                raise ProtocolError(f"{type(notice).__name__} came in place of a notice")
-            yield notice
+        found = [self._notice()]
+        while self._stream.begun:
+            found.append(self._notice())
+        return found
+
+    def _notice(self) -> Notice | Skipped:
+        kind, header, payload = self._stream.receive()
+        if kind == Kind.SKIPPED:
+            return Skipped(self.shard, *read_skipped(header))
+        notice = decode_frame(header, payload) if kind == Kind.MESSAGE else None
+        if not isinstance(notice, Notice):
+            raise ProtocolError(f"{type(notice).__name__} came in place of a notice")
+        return notice
 
     def wake(self) -> None:
         """End the call that waits on it, from another thread."""

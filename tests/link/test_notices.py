@@ -1,6 +1,10 @@
 """The queue of notices: newest win, losses are counted, a waiter always wakes."""
 
+import socket
 import threading
+import time
+
+import pytest
 
 from enact_dist.core.datum import Slot
 from enact_dist.core.messages import Notice, Survey
@@ -93,3 +97,98 @@ def test_interest_is_in_context_aspect_and_pattern():
     assert covers(*others, fits)
     assert covers(fits._replace(entity="tray"))
     assert not covers(*others)
+
+
+class Piped:
+    """A source that a test feeds through a socket."""
+
+    def __init__(self, near, number=0):
+        self.near = near
+        self.number = number
+
+    def fileno(self):
+        """Return what becomes readable."""
+        return self.near.fileno()
+
+    def take_notices(self):
+        """Return one notice per byte."""
+        some = self.near.recv(100)
+        if not some:
+            raise EOFError("it has ended")
+        self.number += len(some)
+        first = self.number - len(some) + 1
+        return [Notice("s0", 1, number, ()) for number in range(first, self.number + 1)]
+
+
+@pytest.fixture
+def piped():
+    """Return a queue that reads a source, the source's far end, and the reasons of its end."""
+    near, far = socket.socketpair()
+    queue, ends = NoticeQueue(), []
+    with near, far:
+        assert queue.read_from(Piped(near), ends.append)
+        yield queue, far, ends
+        queue.close()
+
+
+def got_meanwhile(queue, act):
+    """Return what a thread that waits without limit gets after `act`."""
+    found = []
+    waiter = threading.Thread(target=lambda: found.append(queue.get(None)))
+    waiter.start()
+    while not queue._polling:
+        time.sleep(0.001)
+    act()
+    waiter.join(10)
+    return found[0]
+
+
+def test_whoever_waits_reads_the_source_itself(piped):
+    """No thread stands between; what comes together is taken together and in order."""
+    queue, far, _ = piped
+    assert queue.get(0.0) is None
+
+    found = got_meanwhile(queue, lambda: far.sendall(b"x"))
+    far.sendall(b"xx")
+
+    assert [found.number, queue.get(0.0).number, queue.get(0.0).number] == [1, 2, 3]
+    assert queue.get(0.01) is None
+
+
+def test_notice_of_another_thread_wakes_whoever_reads_the_source(piped):
+    """A second shard has a thread of its own that fills the same queue."""
+    queue, far, _ = piped
+
+    found = got_meanwhile(queue, lambda: queue.put(Notice("s1", 1, 9, ())))
+    far.sendall(b"x")
+
+    assert found == Notice("s1", 1, 9, ())
+    assert queue.get(1.0).shard == "s0"
+
+
+def test_close_wakes_whoever_reads_the_source(piped):
+    """At once, and nothing is read after it."""
+    queue, far, ends = piped
+
+    assert got_meanwhile(queue, queue.close) is None
+    far.sendall(b"x")
+
+    assert queue.get(None) is None
+    assert ends == []
+
+
+def test_source_that_ends_is_told_of_once_and_may_be_followed_by_another(piped):
+    """Waiting goes on with what there is then."""
+    queue, far, ends = piped
+    near, other_far = socket.socketpair()
+    with near, other_far:
+        assert not queue.read_from(Piped(near), ends.append)
+        far.close()
+
+        assert queue.get(0.01) is None
+        assert [str(error) for error in ends] == ["it has ended"]
+        assert queue.read_from(Piped(near, number=5), ends.append)
+        other_far.sendall(b"x")
+
+        assert queue.get(1.0).number == 6
+        assert len(ends) == 1
