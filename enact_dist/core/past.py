@@ -7,9 +7,12 @@ all that is kept of the same slot.  What is not here any more is answered with t
 from __future__ import annotations
 
 from collections import deque
+from itertools import chain
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from enact_dist.core.datum import Slot
     from enact_dist.core.slots import Content
 
@@ -49,12 +52,24 @@ class Past:
             or self.bytes > PAST_BYTES_MAX
             or len(self._order) > PAST_STATES_MAX
         ):
-            _, slot = self._order.popleft()
-            states = self._by_slot[slot]
-            old = states.popleft()
-            self.bytes -= old.datum.size if old.datum is not None else 0
-            if not states:
-                del self._by_slot[slot]
+            self.forget_oldest()
+
+    def __len__(self) -> int:
+        return len(self._order)
+
+    def states(self) -> Iterator[Content]:
+        """Yield all of them."""
+        return chain.from_iterable(self._by_slot.values())
+
+    def forget_oldest(self) -> tuple[Slot, Content]:
+        """Forget the state that was replaced first, and return it."""
+        _, slot = self._order.popleft()
+        states = self._by_slot[slot]
+        old = states.popleft()
+        self.bytes -= old.datum.size if old.datum is not None else 0
+        if not states:
+            del self._by_slot[slot]
+        return slot, old
 
     def at(self, slot: Slot, at_ns: int) -> Content | None:
         """Return the replaced state that was current at a stamp, None if it is forgotten."""

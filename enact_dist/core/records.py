@@ -264,4 +264,11 @@ class Drain:
     """The shard is about to stop: grant nothing new, answer parked requests."""
 
 
-Event = Persisted | Called | SessionSeen | SessionDied | Tick | Drain
+@dataclass(frozen=True, slots=True)
+class MakeRoom:
+    """The cap of shared memory is reached: let go of so many bytes of history, the oldest first."""
+
+    bytes: int
+
+
+Event = Persisted | Called | SessionSeen | SessionDied | Tick | Drain | MakeRoom

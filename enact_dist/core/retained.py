@@ -11,16 +11,18 @@ newest version only.
 from __future__ import annotations
 
 from collections import OrderedDict, deque
+from itertools import chain
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Iterator
 
     from enact_dist.core.datum import Slot
     from enact_dist.core.slots import Content
 
 RETAINED_BYTES_MAX: Final = 256 << 20
-"""Bytes of replaced data that are retained at most, over all slots of a shard."""
+"""Bytes of replaced data that are retained at most, over all slots of a shard; those of payloads
+have a cap of their own, which the link keeps."""
 RETAINED_STATES_MAX: Final = 100_000
 """Replaced states that are retained at most, over all slots of a shard."""
 
@@ -29,7 +31,7 @@ class Retained:
     """The retained replaced versions of one shard's slots.
 
     Attributes:
-        bytes: How many bytes of data they hold.
+        bytes: How many bytes of data they hold, payloads left out.
         dropped: Versions that had to go before their time, because of the limits above.
     """
 
@@ -52,21 +54,36 @@ class Retained:
         states = self._by_slot.setdefault(slot, deque())
         states.append(old)
         self._order[slot, old.version] = None
-        self.bytes += old.datum.size if old.datum is not None else 0
+        self.bytes += _own_bytes(old)
         while len(states) > count:
             self._forget(slot)
         while self.bytes > self._bytes_max or len(self._order) > RETAINED_STATES_MAX:
-            self._forget(next(iter(self._order))[0])
-            self.dropped += 1
+            self.forget_oldest()
 
-    def _forget(self, slot: Slot) -> None:
+    def __len__(self) -> int:
+        return len(self._order)
+
+    def __contains__(self, version: tuple[Slot, int]) -> bool:
+        return version in self._order
+
+    def states(self) -> Iterator[Content]:
+        """Yield all of them."""
+        return chain.from_iterable(self._by_slot.values())
+
+    def forget_oldest(self) -> Content:
+        """Forget the version that was replaced first, before its time, and return it."""
+        self.dropped += 1
+        return self._forget(next(iter(self._order))[0])
+
+    def _forget(self, slot: Slot) -> Content:
         """Forget the oldest version of a slot."""
         states = self._by_slot[slot]
         old = states.popleft()
         del self._order[slot, old.version]
-        self.bytes -= old.datum.size if old.datum is not None else 0
+        self.bytes -= _own_bytes(old)
         if not states:
             del self._by_slot[slot]
+        return old
 
     def of(self, slot: Slot) -> Iterable[Content]:
         """Return the replaced versions of a slot, oldest first."""
@@ -84,7 +101,12 @@ class Retained:
         """Assert the bookkeeping.  For tests and simulation."""
         kept = [(slot, old) for slot, states in self._by_slot.items() for old in states]
         assert {(slot, old.version) for slot, old in kept} == set(self._order)
-        assert self.bytes == sum(old.datum.size for _, old in kept if old.datum is not None)
+        assert self.bytes == sum(_own_bytes(old) for _, old in kept)
         for states in self._by_slot.values():
             versions = [old.version for old in states]
             assert versions == sorted(versions), versions
+
+
+def _own_bytes(old: Content) -> int:
+    """Return the bytes that a state holds in the memory of the shard alone."""
+    return old.datum.size if old.datum is not None and not old.datum.file else 0

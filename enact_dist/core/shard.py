@@ -54,12 +54,14 @@ from enact_dist.core.records import (
     Called,
     Drain,
     Effect,
+    MakeRoom,
     Persist,
     Persisted,
     Recovered,
     Reply,
     SessionDied,
     SessionSeen,
+    Story,
     Tick,
 )
 from enact_dist.core.session_desk import SessionDesk
@@ -118,6 +120,7 @@ class Shard:
             Persisted: self._on_persisted,
             Tick: self._on_tick,
             Drain: self._on_drain,
+            MakeRoom: self._on_make_room,
         }
 
     # ---------------------------------------------------------------- the one mutator
@@ -282,6 +285,12 @@ class Shard:
             self._parked_stamp_ends[reply_to] = self.state.now_ns
         yield from self._answer_reached()
 
+    def _on_make_room(self, message: MakeRoom, _: int) -> Iterator[Effect]:
+        gone, size = self.state.slots.make_room(message.bytes)
+        if gone:
+            self.state.count("history_dropped", gone)
+            yield Story("history.dropped", f"{gone} replaced versions of {size} bytes at the cap")
+
     # ---------------------------------------------------------------- people
 
     def _on_survey(self, message: Survey, reply_to: int) -> Iterator[Effect]:
@@ -319,6 +328,10 @@ class Shard:
             kept = audit.keep(AuditRecord(self.state.wall_ns, message.settle, SETTLED))
             yield Persist(0, (kept,), Durability.OS)
         yield Reply(reply_to, Audited(audit.alarms, audit.entries()))
+
+    def biggest(self, count: int) -> list[tuple[str, int]]:
+        """Return the slots whose newest data are the largest, with their bytes; for messages."""
+        return self.state.slots.biggest(count)
 
     def assert_invariants(self) -> None:
         """Assert I1, I8, I10, I11 and the bookkeeping of all parts.  For tests and simulation."""

@@ -8,6 +8,7 @@ comparable within one epoch of the shard.
 
 from __future__ import annotations
 
+import heapq
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -119,6 +120,42 @@ class SlotMap:
             return found
         return newest if newest.datum is None else _OUTSIDE
 
+    def make_room(self, size: int) -> tuple[int, int]:
+        """Forget the oldest replaced states until so many bytes of payloads are named no more.
+
+        What is kept to answer as of a recent stamp goes first: the present stands in for it.
+        Where all of them would not do, they stay.
+
+        Returns:
+            How many versions went, and the bytes of payloads that only they named.
+        """
+        named = {
+            old.datum.file: old.datum.size
+            for old in (*self.past.states(), *self.retained.states())
+            if old.datum is not None and old.datum.file
+        }
+        gone = freed = 0
+        if sum(named.values()) < size:
+            return 0, 0
+        while self.past:
+            slot, old = self.past.forget_oldest()
+            freed_now = 0 if (slot, old.version) in self.retained else _payload_bytes(old)
+            freed, gone = freed + freed_now, gone + bool(freed_now)
+        while self.retained and freed < size:
+            freed += _payload_bytes(self.retained.forget_oldest())
+            gone += 1
+        return gone, freed
+
+    def biggest(self, count: int) -> list[tuple[str, int]]:
+        """Return the slots whose newest data are the largest, with their bytes."""
+        sizes = (
+            (content.datum.size, str(Slot(column.context, entity, column.aspect)))
+            for column, contents in self._columns.items()
+            for entity, content in contents.items()
+            if content.datum is not None
+        )
+        return [(name, size) for size, name in heapq.nlargest(count, sizes)]
+
     def set(self, slot: Slot, content: Content) -> Content:
         """Put a new committed state in place of the old one, which is returned."""
         context, entity, aspect = slot
@@ -176,6 +213,11 @@ class SlotMap:
                 if content.datum is not None and (state.large or state.same):
                     pins[slot, state.version] = content.datum
         return Shown(states, pins, from_ns)
+
+
+def _payload_bytes(content: Content) -> int:
+    datum = content.datum
+    return datum.size if datum is not None and datum.file else 0
 
 
 def state_of(

@@ -1,0 +1,64 @@
+"""At the cap of shared memory: which history goes, in what order, and when none does."""
+
+import pytest
+from shard_bench import slot
+
+from enact_dist.core.datum import Datum
+from enact_dist.core.slots import Content, SlotMap
+from enact_dist.terms import NullReason
+
+MB = 1_000_000
+
+
+def content(version, *, size=MB, file=True):
+    name = f"s-{version:x}" if file else ""
+    return Content(version, version * 10, Datum(b"e", bytes(1), size, 0, name), NullReason.DELETED)
+
+
+@pytest.fixture
+def slots():
+    """A slot whose versions 1 to 5 are payloads, all retained; 6 is the newest."""
+    found = SlotMap(())
+    for version in range(1, 7):
+        found.replace(slot("cam", "frame"), content(version), retention=10)
+    return found
+
+
+def kept(slots, name="cam"):
+    return [old.version for old in slots.retained.of(slot(name, "frame"))]
+
+
+@pytest.mark.parametrize(("size", "left"), [(1, 4), (MB, 4), (MB + 1, 3), (5 * MB, 0)])
+def test_oldest_history_goes_and_no_more_than_needed(slots, size, left):
+    """The newest version is no history."""
+    gone, freed = slots.make_room(size)
+
+    assert kept(slots) == [2, 3, 4, 5][4 - left :]
+    assert (gone, freed) == (5 - left, (5 - left) * MB)
+    assert slots[slot("cam", "frame")].version == 6
+    slots.retained.assert_invariants()
+
+
+def test_history_that_would_not_do_stays(slots):
+    """A write that is refused costs nobody anything."""
+    assert slots.make_room(5 * MB + 1) == (0, 0)
+    assert kept(slots) == [1, 2, 3, 4, 5]
+
+
+def test_history_that_is_not_retained_makes_room_too():
+    """What is kept for a moment to answer as of a stamp holds its payload as well."""
+    slots = SlotMap(())
+    for version in (1, 2, 3):
+        slots.replace(slot("cam", "frame"), content(version))
+
+    assert slots.make_room(2 * MB) == (2, 2 * MB)
+
+
+def test_history_outside_shared_memory_counts_for_nothing(slots):
+    """It goes by its age with the rest, and frees no file."""
+    for version in (7, 8):
+        slots.replace(slot("arm", "frame"), content(version, file=False), retention=10)
+
+    assert slots.retained.bytes == MB
+    assert slots.make_room(5 * MB) == (5, 5 * MB)
+    assert kept(slots, "arm") == [7]
