@@ -14,6 +14,7 @@
     ├─ NullDatumError          the world context does not know this datum      .reason
     ├─ ChangedError            an expected view moved on; nothing written
     ├─ LockTimeoutError        not granted within wait_s; nothing held         .holders .waited_s
+    ├─ NoRoomError             a shard's cap of shared memory is reached; nothing written
     ├─ LeaseLostError          granted, then lost; nothing written             .cause
     ├─ CommitUnknownError      sent, not answered; may stand                   .lock_id
     ├─ StoreError              a shard's folder is in use, unreadable or corrupt   .path
@@ -110,6 +111,10 @@ class LockTimeoutError(EnactError):
         super().__init__(message)
         self.holders = holders
         self.waited_s = waited_s
+
+
+class NoRoomError(EnactError):
+    """A shard has no room for a large datum: its cap is reached, and no history is left to go."""
 
 
 class LeaseLostError(EnactError):

@@ -6,6 +6,7 @@ arrays come back as read-only views of the body; a datum is a copy of its value,
 
 from __future__ import annotations
 
+from dataclasses import dataclass, fields, is_dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 import msgpack
@@ -25,12 +26,45 @@ from enact_dist.wire.tree_reader import TreeReader, build, untyped
 from enact_dist.wire.tree_writer import INT_MAX, INT_MIN, TREE, MisfitError, TreeWriter, reference
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
 JOINED_BYTES_MIN: Final = 1 << 20
 """From here on data are copied while other threads run."""
 
 _VERSION = bytes([DATUM_VERSION])
+
+
+@dataclass(frozen=True, slots=True)
+class Encoded:
+    """A value on its way into a datum: its bytes still lie where they were.
+
+    Attributes:
+        encoding: Of the datum.
+        parts: Buffers, which make up the body one after another.
+        size: Length of the body in bytes.
+        stamp_ns: Of the datum.
+    """
+
+    encoding: bytes
+    parts: list[Any]
+    size: int
+    stamp_ns: int
+
+    def datum(self) -> Datum:
+        """Return the datum, with a copy of the bytes."""
+        return Datum(self.encoding, joined(self.parts, self.size), self.size, self.stamp_ns)
+
+    def over(self, body: memoryview, file: str) -> Datum:
+        """Return the datum whose bytes were copied, or will be made, elsewhere."""
+        return Datum(self.encoding, body, self.size, self.stamp_ns, file)
+
+    def put_texts(self, memory: memoryview) -> None:
+        """Copy all but the arrays to where they belong in the body."""
+        offset = 0
+        for part in self.parts:
+            if type(part) is bytes:
+                memory[offset : offset + len(part)] = part
+            offset += len(part)
 
 
 def encode_datum(value: object, datum_type: Any, *, stamp_ns: int = 0) -> Datum:
@@ -45,16 +79,30 @@ def encode_datum(value: object, datum_type: Any, *, stamp_ns: int = 0) -> Datum:
         DatumTypeError: The value is not of the type, or the type is none of a datum; the message
             names the part.
     """
+    return encode_parts(value, datum_type, stamp_ns=stamp_ns).datum()
+
+
+def encode_parts(value: object, datum_type: Any, *, stamp_ns: int = 0) -> Encoded:
+    """Return what the datum that stands for `value` is made of, without a copy.
+
+    Args:
+        value: A value of `datum_type`, not to be changed before its bytes are copied.
+        datum_type: The aspect's type.
+        stamp_ns: As in `encode_datum`.
+
+    Raises:
+        DatumTypeError: As `encode_datum`.
+    """
     if type(stamp_ns) is not int or not 0 <= stamp_ns <= INTEGER_MAX:
         raise DatumTypeError(
             f"stamp_ns: asked nanoseconds since 1970 as an int, found {stamp_ns!r:.40}"
         )
     if datum_type is int and type(value) is int and INT_MIN <= value <= INT_MAX:
         # The commonest datum: a third of the time of the general way.
-        return Datum(_VERSION + msgpack.packb(value), b"", 0, stamp_ns)
+        return Encoded(_VERSION + msgpack.packb(value), [], 0, stamp_ns)
     writer = TreeWriter()
     encoding = _write(writer, value, datum_type)
-    return Datum(encoding, joined(writer.parts, writer.length), writer.length, stamp_ns)
+    return Encoded(encoding, writer.parts, writer.length, stamp_ns)
 
 
 def joined(parts: Sequence[bytes | memoryview], size: int) -> bytes | memoryview:
@@ -114,6 +162,36 @@ def decode_datum(datum: Datum, datum_type: Any) -> Any:
         return build(node, shape, _name(datum_type))
     except RecursionError as error:
         raise ProtocolError("a datum is nested too deeply") from error
+
+
+def decode_to_fill(
+    encoding: bytes, memory: memoryview, datum_type: Any
+) -> tuple[Any, tuple[np.ndarray[Any, Any], ...]]:
+    """Return a value whose arrays lie over writable memory, and these arrays, to be filled.
+
+    Raises:
+        DatumTypeError: It is a value of another type.
+    """
+    datum = Datum(encoding, memory, len(memory))
+    node = TreeReader(datum, writable=True).tree()
+    value = build(node, shape_of(datum_type), _name(datum_type))
+    arrays = tuple(_arrays_in(value))
+    for array in arrays:
+        array.flags.writeable = True
+    return value, arrays
+
+
+def _arrays_in(value: object) -> Iterator[np.ndarray[Any, Any]]:
+    """Yield the arrays of a value, those of nested dataclasses and containers, too."""
+    if isinstance(value, np.ndarray):
+        yield value
+    elif isinstance(value, list | tuple):
+        for each in value:
+            yield from _arrays_in(each)
+    elif isinstance(value, dict):
+        yield from _arrays_in(list(value.values()))
+    elif is_dataclass(value):
+        yield from _arrays_in([getattr(value, field.name) for field in fields(value)])
 
 
 def decode_untyped(datum: Datum) -> object:

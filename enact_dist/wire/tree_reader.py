@@ -73,9 +73,10 @@ class TreeReader:
 
     __slots__ = ("_body", "_copied_left", "_datum", "_depth")
 
-    def __init__(self, datum: Datum) -> None:
+    def __init__(self, datum: Datum, *, writable: bool = False) -> None:
         self._datum = datum
-        self._body = memoryview(datum.body).toreadonly()
+        body = memoryview(datum.body)
+        self._body = body if writable else body.toreadonly()
         self._copied_left = len(self._body)
         self._depth = 0
 
