@@ -39,6 +39,10 @@ data_folder            none           parent of the shards' folders; without one
 carrier                "auto"         how messages travel between processes: "zenoh"; "socket"
                                       (of this host, an error elsewhere); "auto" takes sockets
                                       where it can
+shared_bytes_max       none           cap of each shard's large data in the memory that is
+                                      shared on its host, bytes: beyond, history goes, then
+                                      writes are refused; without one, half of that memory is
+                                      used and what is beyond travels; 0: none is shared
 [shards.NAME]          at least one   a shard daemon
   listen               required       endpoint or endpoints it opens, ``tcp/host:port``
   advertise            listen         endpoint or endpoints at which others reach it; required
@@ -167,7 +171,7 @@ def parse_config(
 
 def _cell(root: Table, file: Path) -> CellConfig:
     root.refuse_unknown(
-        "name", "worlds", "session_ttl_s", "data_folder", "carrier",
+        "name", "worlds", "session_ttl_s", "data_folder", "carrier", "shared_bytes_max",
         "shards", "pins", "aspects", "actors",
     )  # fmt: skip
     name = root.take_str("name")
@@ -180,6 +184,7 @@ def _cell(root: Table, file: Path) -> CellConfig:
         name=name,
         ttl_s=root.take_float("session_ttl_s", TTL_S_DEFAULT, low=TTL_S_MIN, high=TTL_S_MAX),
         carrier=_carrier(root),
+        shared_bytes_max=_shared_bytes_max(root),
         data_folder=data_folder,
         worlds=worlds,
         shards=shards,
@@ -198,6 +203,13 @@ def _carrier(root: Table) -> str:
     if carrier not in CARRIERS:
         root.refuse("carrier", f"unknown carrier {carrier!r} (known: {', '.join(CARRIERS)})")
     return carrier
+
+
+def _shared_bytes_max(root: Table) -> int | None:
+    found = root.values.get("shared_bytes_max")
+    if found is not None and (type(found) is not int or found < 0):
+        root.refuse("shared_bytes_max", f"'shared_bytes_max' is a number of bytes, not {found!r}")
+    return found
 
 
 def _worlds(root: Table) -> tuple[str, ...]:

@@ -6,6 +6,7 @@ variable                      replaces
 ENACT_SESSION_TTL_S           session_ttl_s
 ENACT_DATA_FOLDER             data_folder, of shards without a `folder` of their own
 ENACT_CARRIER                 carrier
+ENACT_SHARED_BYTES_MAX        shared_bytes_max
 ENACT_SHARD_<NAME>_LISTEN     shards.NAME.listen, comma separated
 ENACT_SHARD_<NAME>_ADVERTISE  shards.NAME.advertise, comma separated
 ENACT_SHARD_<NAME>_FOLDER     shards.NAME.folder
@@ -47,6 +48,7 @@ _CELL_NAMES: Final = (
     "ENACT_SESSION_TTL_S",
     "ENACT_DATA_FOLDER",
     "ENACT_CARRIER",
+    "ENACT_SHARED_BYTES_MAX",
     "ENACT_SHARED_FOLDER",
 )
 _SHARD_PREFIX: Final = "ENACT_SHARD_"
@@ -67,6 +69,9 @@ def with_environment(config: CellConfig, environment: Mapping[str, str]) -> Cell
         config = dataclasses.replace(config, ttl_s=_ttl_s(ours["ENACT_SESSION_TTL_S"]))
     if "ENACT_CARRIER" in ours:
         config = dataclasses.replace(config, carrier=_carrier(ours["ENACT_CARRIER"]))
+    if "ENACT_SHARED_BYTES_MAX" in ours:
+        bytes_max = _bytes_max(ours["ENACT_SHARED_BYTES_MAX"])
+        config = dataclasses.replace(config, shared_bytes_max=bytes_max)
     if "ENACT_DATA_FOLDER" in ours:
         config = _moved(config, Path(ours["ENACT_DATA_FOLDER"]).expanduser().absolute())
     shards = tuple(_with_overrides(shard, ours) for shard in config.shards)
@@ -104,6 +109,12 @@ def _ttl_s(text: str) -> float:
             f" {TTL_S_MAX:g}"
         )
     return ttl_s
+
+
+def _bytes_max(text: str) -> int:
+    if not text.isdecimal():
+        raise ConfigError(f"ENACT_SHARED_BYTES_MAX={text!r} is no number of bytes, 0 or more")
+    return int(text)
 
 
 def _carrier(text: str) -> str:

@@ -90,6 +90,7 @@ class CellConfig:
         name: Name of the cell; part of every key on the network.
         ttl_s: Session TTL in seconds.
         carrier: How messages travel between processes.
+        shared_bytes_max: Cap of each shard's large data in shared memory, bytes.
         data_folder: Where shards without a `folder` of their own keep theirs, or ``None``.
         worlds: World contexts that exist from the start.
         shards: At least one, in the order of the file.
@@ -102,6 +103,7 @@ class CellConfig:
     name: str
     ttl_s: float
     carrier: str
+    shared_bytes_max: int | None
     data_folder: Path | None
     worlds: tuple[str, ...]
     shards: tuple[ShardConfig, ...]

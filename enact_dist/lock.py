@@ -14,8 +14,7 @@ from __future__ import annotations
 import functools
 import threading
 import time
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeVar, overload
+from typing import TYPE_CHECKING, Any, TypeVar, cast, overload
 
 from enact_dist.core.datum import Datum, Slot
 from enact_dist.core.messages import SlotVersion, WriteItem
@@ -26,17 +25,21 @@ from enact_dist.errors import (
     MisuseError,
     ReadonlyError,
 )
+from enact_dist.lock_statistics import LockStatistics
 from enact_dist.reading import EachData, Readings, check_requested, null_error, slot_of
 from enact_dist.session import session_of
 from enact_dist.terms import Access, Entity, refuse_duplicates
 from enact_dist.together import Together
-from enact_dist.wire.limits import BODY_BYTES_MAX, ITEMS_MAX
-from enact_dist.wire.payload import decode_datum, encode_datum
+from enact_dist.wire.limits import BODY_BYTES_MAX, ITEMS_MAX, PAYLOAD_BYTES_MIN
+from enact_dist.wire.payload import decode_datum, encode_parts
 from enact_dist.writable import WritableEach
+from enact_dist.writing import Writing, template
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterable, Mapping, Sequence
     from types import TracebackType
+
+    from numpy.typing import DTypeLike
 
     from enact_dist.core.datum import Position
     from enact_dist.core.messages import Item
@@ -74,25 +77,6 @@ def _refuse_released(requests: Iterable[LockRequest[Any]]) -> None:
     raise LockReleasedError(
         f"Lock({', '.join(map(repr, requests))}) is used outside its `with` block"
     )
-
-
-@dataclass(frozen=True, slots=True)
-class LockStatistics:
-    """What a lock went through.
-
-    Attributes:
-        granted: Whether it was granted.
-        waited_s: From asking to the grant.
-        held_s: From the grant to the end of the block, or until now.
-        shards: The shards that it locked.
-        fetched: How many data were decoded.
-    """
-
-    granted: bool
-    waited_s: float
-    held_s: float
-    shards: tuple[str, ...]
-    fetched: int
 
 
 class Lock:
@@ -146,6 +130,7 @@ class Lock:
         self._readings: Readings
         self._each: dict[LockRequest[Any], EachData[Any]] = {}
         self._writes: dict[Slot, Datum | None] = {}
+        self._writing: Writing | None = None
         self._edits = self._bytes = 0
         self._expects: dict[Slot, SlotVersion] = {}
         self._entity: Entity | None = None
@@ -216,12 +201,16 @@ class Lock:
                 _thread.lock = None
             if kind is None:
                 client.check_usable()
+                if self._writing is not None:
+                    self._writing.fix()
                 client.finish(lock, self._writes_by_shard(), tuple(self._expects.values()))
                 self.position = lock.position
         finally:
             # After a commit this is nothing; after an exception, an interrupt too, nothing is held.
             if not client.forked:
                 client.release(lock)
+                if self._writing is not None:
+                    self._writing.end(committed=lock.phase in (Phase.COMMITTED, Phase.UNKNOWN))
             self._let_go()
 
     def _let_go(self) -> None:
@@ -343,7 +332,61 @@ class Lock:
         self._put(slot_of(request), request.aspect, datum, stamp_ns=stamp_ns)
 
     def _put(self, slot: Slot, aspect: Aspect[T], datum: T, *, stamp_ns: int = 0) -> None:
-        self._note_write(slot, encode_datum(datum, aspect.datum_type, stamp_ns=stamp_ns))
+        encoded = encode_parts(datum, aspect.datum_type, stamp_ns=stamp_ns)
+        if encoded.size > PAYLOAD_BYTES_MIN:
+            self._note_write(slot, self._large().put(slot, self._shard(slot), encoded))
+        else:
+            if self._writing is not None:
+                self._writing.forget(slot)
+            self._note_write(slot, encoded.datum())
+
+    def _large(self) -> Writing:
+        if self._writing is None:
+            self._writing = Writing(self._session.client.payloads)
+        return self._writing
+
+    def _shard(self, slot: Slot) -> str:
+        assert self._lock is not None
+        return self._lock.shard_of(slot)
+
+    @overload
+    def new(
+        self, request: Write[T], shape: int | Sequence[int], dtype: DTypeLike, *, stamp_ns: int = 0
+    ) -> T: ...
+    @overload
+    def new(self, request: Write[T], *, like: T, stamp_ns: int = 0) -> T: ...
+    def new(
+        self,
+        request: Write[T],
+        shape: int | Sequence[int] | None = None,
+        dtype: DTypeLike | None = None,
+        *,
+        like: T | None = None,
+        stamp_ns: int = 0,
+    ) -> T:
+        """Return a datum whose arrays are to be filled in place; committing it copies nothing.
+
+        It counts as written at once.  After the block its arrays are read-only.
+
+        Args:
+            request: A `Write` of this lock.
+            shape: Of an array, where the aspect's datum is one.
+            dtype: Of that array.
+            like: In place of both, a datum of the aspect's type, such as a dataclass of arrays.
+                They give shapes, dtypes and orders; all else in it is taken over.
+            stamp_ns: As in `put`.
+
+        Raises:
+            ReadonlyError: The request does not allow writing.
+            DatumTypeError: The array or `like` is not of the aspect's type, or has no array.
+            NoRoomError: The shard's cap of shared memory is reached.
+        """
+        self._check_writable(request)
+        slot, asked = slot_of(request), request.aspect.datum_type
+        wanted = template(like, shape, dtype)
+        value, datum = self._large().blank(slot, self._shard(slot), wanted, asked, stamp_ns)
+        self._note_write(slot, datum)
+        return cast("T", value)
 
     def _note_write(self, slot: Slot, datum: Datum | None) -> None:
         old = self._writes.get(slot)
@@ -365,6 +408,8 @@ class Lock:
         self._delete(slot_of(request))
 
     def _delete(self, slot: Slot) -> None:
+        if self._writing is not None:
+            self._writing.forget(slot)
         self._note_write(slot, None)
 
     def expect(self, view: View[Any]) -> None:

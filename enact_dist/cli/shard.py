@@ -89,6 +89,7 @@ def run_shard(arguments: argparse.Namespace) -> int:
             log_format=arguments.log_format,
             link_lease_s=config.ttl_s / 2,
             carrier=config.carrier,
+            shared_bytes_max=config.shared_bytes_max,
         )
     )
 

@@ -6,6 +6,7 @@ of a pattern's many images follow each other as those of one large cloud do.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
@@ -57,7 +58,7 @@ def fetch_all(
     found: dict[Slot, Datum] = {}
     missing: list[_Incoming] = []
     for reading in readings:
-        datum = _at_hand(cache, reading)
+        datum = _at_hand(client, cache, reading)
         if datum is not None:
             found[reading.state.slot] = datum
         else:
@@ -80,11 +81,16 @@ def fetch_all(
     return found
 
 
-def _at_hand(cache: DatumCache, reading: Reading) -> Datum | None:
+def _at_hand(client: CellClient, cache: DatumCache, reading: Reading) -> Datum | None:
     shard, epoch, state = reading
     if state.datum is not None and not state.large:
         cache.put(state.slot, shard, epoch, state.version, state.datum)
         return state.datum
+    named = state.datum
+    if named is not None and named.file:
+        body = client.payloads.mapped(shard, epoch, named.file, state.size)
+        if body is not None:
+            return replace(named, body=body)
     return cache.get(state.slot, shard, epoch, state.version)
 
 

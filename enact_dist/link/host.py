@@ -33,6 +33,7 @@ from enact_dist.core.messages import (
     Commit,
     EpochChanged,
     Hello,
+    ListSessions,
     Prepare,
     Refused,
     Stage,
@@ -40,6 +41,7 @@ from enact_dist.core.messages import (
 from enact_dist.core.records import (
     Called,
     Drain,
+    MakeRoom,
     Persist,
     Persisted,
     Publish,
@@ -51,7 +53,7 @@ from enact_dist.core.records import (
 from enact_dist.core.shard import Shard
 from enact_dist.errors import StoreError
 from enact_dist.link.clock import Clock, SystemClock
-from enact_dist.link.payload_desk import PayloadDesk
+from enact_dist.link.payload_desk import PayloadDesk, half_of
 from enact_dist.link.stalls import Stalls
 from enact_dist.link.uninterrupted import Uninterrupted
 
@@ -62,6 +64,7 @@ if TYPE_CHECKING:
     from enact_dist.core.messages import Answer, Notice, Request
     from enact_dist.core.records import Effect, Event
     from enact_dist.core.shard_state import ShardSettings
+    from enact_dist.link.shared_folder import SharedFolder
     from enact_dist.link.store import Store
     from enact_dist.link.store_thread import StoreThread
 
@@ -69,8 +72,6 @@ TICK_S_MAX: Final = 0.1
 """The timer wakes at least so often: bounds by how much an expiry may be late."""
 TICK_S_MIN: Final = 0.001
 """The timer rests at least so long; deadlines of many locks then share one tick."""
-PAYLOAD_BYTES_MAX: Final = 2 << 30
-"""Bytes of large data in plain memory that wait for their commits, or came apart from them."""
 _SOON_NS: Final = TICK_S_MAX * 1e9
 # Tuples: a union would be made anew for each message.
 _TOLD_LATER: Final = (Publish, Story)
@@ -89,6 +90,8 @@ def open_host(
     *,
     clock: Clock | None = None,
     on_failure: Callable[[Exception], None] | None = None,
+    shared: SharedFolder | None = None,
+    payload_bytes_max: int | None = None,
 ) -> ShardHost:
     """Open a shard's folder and run the shard; without a folder nothing outlives the process.
 
@@ -105,7 +108,14 @@ def open_host(
 
         store, recovered = open_store(folder, unix_s=wall_ns // 1_000_000_000)
     shard = Shard(settings, recovered, now_ns=clock.monotonic_ns(), wall_ns=wall_ns)
-    return ShardHost(shard, store=store, clock=clock, on_failure=on_failure)
+    return ShardHost(
+        shard,
+        store=store,
+        clock=clock,
+        on_failure=on_failure,
+        shared=shared,
+        payload_bytes_max=payload_bytes_max,
+    )
 
 
 class ShardHost:
@@ -117,7 +127,9 @@ class ShardHost:
         clock: Read under the mutex, so the shard's time never goes back.
         on_failure: Called once, from whichever thread, when the store or the core has failed;
             the host is dead then and answers nobody.
-        payloads: Takes large data that come apart from their commits.
+        shared: Where large data lie that clients of this host map; None keeps them in memory.
+        payload_bytes_max: How many bytes may lie there; None: half of what the file system has,
+            and what is beyond in plain memory.
     """
 
     def __init__(
@@ -127,12 +139,19 @@ class ShardHost:
         store: Store | None = None,
         clock: Clock | None = None,
         on_failure: Callable[[Exception], None] | None = None,
-        payloads: PayloadDesk | None = None,
+        shared: SharedFolder | None = None,
+        payload_bytes_max: int | None = None,
     ) -> None:
         self._shard = shard
         self._clock: Clock = clock or SystemClock()
         self._on_failure = on_failure
-        self._payloads = payloads or PayloadDesk(None, PAYLOAD_BYTES_MAX)
+        self._payloads = PayloadDesk(
+            shared,
+            payload_bytes_max if payload_bytes_max is not None else half_of(shared),
+            firm=payload_bytes_max is not None,
+            make_room=lambda size: self.event(MakeRoom(size)),
+            biggest=self._biggest,
+        )
         self._mutex = threading.RLock()  # reentrant for `count` in reply callbacks only
         self._uninterrupted = Uninterrupted()
         self._replies: dict[int, Callable[[Answer], None]] = {}
@@ -191,6 +210,8 @@ class ShardHost:
         elif kind is Stage:
             self._stage(cast("Stage", message), reply)
             return
+        elif kind is ListSessions:
+            self._shard.counters.update(self._payloads.figures())
         with self._mutex:
             if self._ended:
                 return
@@ -222,6 +243,12 @@ class ShardHost:
         with self._mutex:
             counters = self._shard.counters
             counters[name] = counters.get(name, 0) + amount
+
+    def _biggest(self) -> str:
+        """Name the slots with the largest data, for people."""
+        with self._mutex:
+            found = self._shard.biggest(3)
+        return "; the largest: " + ", ".join(f"{name} {size}" for name, size in found)
 
     def call_with(self, call: Callable[[str, Request], None]) -> None:
         """Let `call(shard, request)` carry requests to other shards; it must not wait."""

@@ -22,6 +22,10 @@ if TYPE_CHECKING:
 
 AT_ONCE_BYTES: Final = 256 << 10
 """Up to this size a map is given back by whoever drops it: waking a thread costs more."""
+STEP_BYTES: Final = 4 << 20
+"""So much is given back at a time: until it is, no other thread of the process gets memory."""
+GATHER_S: Final = 0.02
+"""How long leftovers are gathered: a thread that wakes for each would be in everybody's way."""
 _FAILED: Final = ctypes.c_void_p(-1).value
 _MAP_FIXED: Final = 0x10
 
@@ -119,6 +123,10 @@ def withdraw(pages: Pages, descriptor: int) -> None:
     Raises:
         OSError: As the system reports it.
     """
+    for offset in range(0, pages.size, STEP_BYTES):
+        length = min(STEP_BYTES, pages.size - offset)
+        _system().madvise(pages.address + offset, length, mmap.MADV_DONTNEED)
+    # Nothing is left to be torn down while all other threads of the process stand still.
     protection = mmap.PROT_READ | mmap.PROT_WRITE
     flags = mmap.MAP_PRIVATE | _MAP_FIXED
     _map(pages.address, pages.size, protection, flags, descriptor)
@@ -137,6 +145,7 @@ def _system() -> Any:
         ctypes.c_long,
     )
     library.munmap.argtypes = (ctypes.c_void_p, ctypes.c_size_t)
+    library.madvise.argtypes = (ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int)
     return library
 
 
@@ -149,7 +158,8 @@ def _map(address: int | None, size: int, protection: int, flags: int, descriptor
 
 
 def _unmap(address: int, size: int, ended: Callable[[], None] | None) -> None:
-    _system().munmap(address, size)
+    for offset in range(0, size, STEP_BYTES):
+        _system().munmap(address + offset, min(STEP_BYTES, size - offset))
     if ended is not None:
         ended()
 
@@ -162,6 +172,7 @@ class Leftovers:
             queue.SimpleQueue()
         )
         self._mutex = threading.Lock()
+        self._hurry = threading.Event()
         self._thread: threading.Thread | None = None
 
     def start(self) -> None:
@@ -183,6 +194,7 @@ class Leftovers:
         self.start()
         done = threading.Event()
         self.later(done.set)
+        self._hurry.set()
         return done.wait(timeout_s)
 
     def forget(self) -> None:
@@ -192,8 +204,15 @@ class Leftovers:
     def _run(self) -> None:
         while True:
             task, arguments = self._tasks.get()
-            task(*arguments)
-            del task, arguments
+            if self._hurry.wait(GATHER_S):
+                self._hurry.clear()
+            while True:
+                task(*arguments)
+                del task, arguments
+                try:
+                    task, arguments = self._tasks.get_nowait()
+                except queue.Empty:
+                    break
 
 
 _leftovers = Leftovers()

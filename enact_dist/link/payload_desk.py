@@ -32,7 +32,7 @@ from typing import TYPE_CHECKING, Final, TypeVar
 
 from enact_dist.core.messages import Refused, Staged
 from enact_dist.link.memory import Pages, Plain, body_of, leftovers, map_file, plain_memory
-from enact_dist.wire.limits import BODY_BYTES_MAX, PAYLOAD_NAME
+from enact_dist.wire.limits import BODY_BYTES_MAX, PAYLOAD_BYTES_MIN, PAYLOAD_NAME
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -43,14 +43,14 @@ if TYPE_CHECKING:
 
     _Written = TypeVar("_Written", Commit, Prepare)
 
-PAYLOAD_BYTES_MIN: Final = 64 << 10
-"""Smaller data travel with their commit and their grant."""
 GAPS_MAX: Final = 1024
 """Slices of one draft that may be here while one before them is not."""
 NO_ROOM: Final = "no_room"
 """The code of a refusal because of the cap."""
 DRAFT_S: Final = 30.0
 """A draft of a session that holds no lock is given up after so long without a slice."""
+DRAFT_BYTES_MAX: Final = 2 << 30
+"""Bytes of drafts that wait in plain memory for their commits."""
 ROOM_S: Final = 1.0
 """How long a new draft waits for files that are on their way out."""
 
@@ -87,7 +87,8 @@ class PayloadDesk:
 
     Args:
         folder: Where clients of this host find them; None keeps them in this process.
-        bytes_max: So many bytes of drafts and payloads at most.
+        bytes_max: So many bytes of files at most, drafts included.
+        firm: Whether a payload beyond that is refused; else it lies in plain memory.
         make_room: Called to let history go, until so many bytes are free.
         biggest: Names the slots that hold the most, for the text of a refusal.
 
@@ -100,18 +101,21 @@ class PayloadDesk:
         folder: SharedFolder | None,
         bytes_max: int,
         *,
+        firm: bool = True,
         make_room: Callable[[int], None] = lambda _: None,
         biggest: Callable[[], str] = lambda: "",
     ) -> None:
         self.counters: dict[str, int] = {}
         self._folder = folder
         self._bytes_max = bytes_max
+        self._firm = firm
         self._make_room = make_room
         self._biggest = biggest
         self._mutex = threading.RLock()  # reentrant: a destructor may run anywhere
         self._opening = tuple(threading.Lock() for _ in range(16))
         self._drafts: dict[str, _Draft] = {}
-        self._sizes: dict[str, int] = {}
+        self._used: dict[str, None] = {}
+        self._files: dict[str, int] = {}
         self._adopted: dict[str, weakref.ref[Pages | Plain]] = {}
         self._bytes = 0
 
@@ -158,26 +162,46 @@ class PayloadDesk:
             return Staged(file, draft.have, draft.shared)
 
     def _opened(self, session: str, file: str, total: int) -> _Draft | Refused:
-        if not self._reserved(file, total):
-            # What is let go of takes a moment to leave, and none of it under a mutex.
-            self._make_room(total)
-            leftovers().wait(ROOM_S)
-            if not self._reserved(file, total):
+        with self._mutex:
+            if file in self._used:
+                return Refused("overload", f"payload {file} is being made, or was made before")
+            self._used[file] = None
+        try:
+            shared = self._folder is not None and self._has_room(total)
+            if self._folder is not None and not shared and self._firm:
                 return self._refused(session, total)
-        memory, shared = self._memory(file, total)
-        draft = _Draft(session, total, memory, shared, time.monotonic())
+            memory = self._in_folder(self._folder, file, total) if shared else None
+            if memory is None and self._drafted() + total > DRAFT_BYTES_MAX:
+                return self._refused(session, total)
+        finally:
+            with self._mutex:
+                del self._used[file]
+        found = memory or plain_memory(total, ended=partial(self._ended, file, None))
+        draft = _Draft(session, total, found, memory is not None, time.monotonic())
         with self._mutex:
             self._drafts[file] = draft
         return draft
 
-    def _reserved(self, file: str, total: int) -> bool:
-        """Count the bytes of a new payload if there is room for them."""
+    def _has_room(self, total: int) -> bool:
+        """Count the bytes of a new file if they fit under the cap, history gone if need be."""
+        if self._reserved(total):
+            return True
+        self._make_room(self._bytes + total - self._bytes_max)
+        # What is let go of takes a moment to leave.
+        leftovers().wait(ROOM_S)
+        return self._reserved(total)
+
+    def _reserved(self, total: int) -> bool:
         with self._mutex:
-            if file in self._sizes or self._bytes + total > self._bytes_max:
+            if self._bytes + total > self._bytes_max:
                 return False
-            self._sizes[file] = total
             self._bytes += total
             return True
+
+    def _drafted(self) -> int:
+        """Return the bytes of drafts in plain memory."""
+        with self._mutex:
+            return sum(draft.size for draft in self._drafts.values() if not draft.shared)
 
     def _refused(self, session: str, total: int) -> Refused:
         self._count("payloads_refused")
@@ -188,15 +212,20 @@ class PayloadDesk:
             " versions, or let go of arrays and locks that hold old ones",
         )
 
-    def _memory(self, file: str, total: int) -> tuple[Pages | Plain, bool]:
-        """Return the memory of a new payload, and whether it is a file of the shared folder."""
-        if self._folder is not None:
-            try:
-                return self._file_memory(self._folder, file, total), True
-            except OSError as error:
-                self._count("payload_fallbacks")
-                _log.info("payload %s is no file: %s", file, error)
-        return plain_memory(total, ended=partial(self._ended, file, None)), False
+    def _in_folder(self, folder: SharedFolder | None, file: str, total: int) -> Pages | None:
+        """Return the memory of a new file whose bytes are counted; None where it cannot be."""
+        assert folder is not None
+        try:
+            memory = self._file_memory(folder, file, total)
+        except OSError as error:
+            with self._mutex:
+                self._bytes -= total
+            self._count("payload_fallbacks")
+            _log.info("payload %s is no file: %s", file, error)
+            return None
+        with self._mutex:
+            self._files[file] = total
+        return memory
 
     def _file_memory(self, folder: SharedFolder, file: str, total: int) -> Pages:
         flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
@@ -278,7 +307,7 @@ class PayloadDesk:
             except OSError as error:  # the folder went first
                 _log.info("payload %s: %s", file, error)
         with self._mutex:
-            self._bytes -= self._sizes.pop(file, 0)
+            self._bytes -= self._files.pop(file, 0)
             self._adopted.pop(file, None)
 
     # ---------------------------------------------------------------- life
@@ -309,7 +338,7 @@ class PayloadDesk:
         with self._mutex:
             return {
                 **self.counters,
-                "payload_files": len(self._sizes),
+                "payload_files": len(self._files),
                 "payload_bytes": self._bytes,
                 "payload_bytes_max": self._bytes_max,
                 "payload_drafts": len(self._drafts),
@@ -318,3 +347,11 @@ class PayloadDesk:
     def _count(self, name: str, count: int = 1) -> None:
         with self._mutex:
             self.counters[name] = self.counters.get(name, 0) + count
+
+
+def half_of(folder: SharedFolder | None) -> int:
+    """Return half of the bytes that the file system of a folder has."""
+    if folder is None:
+        return 0
+    system = os.fstatvfs(folder.descriptor)
+    return system.f_blocks * system.f_frsize // 2

@@ -20,6 +20,7 @@ from enact_dist.errors import (
     LinkError,
     LockTimeoutError,
     MisuseError,
+    NoRoomError,
     ProtocolError,
     ShardUnreachableError,
     UnknownWorldError,
@@ -142,5 +143,6 @@ def error_of(refused: Refused) -> EnactError:
         "value": MisuseError,
         "protocol": ProtocolError,
         "overload": LinkError,
+        "no_room": NoRoomError,
     }
     return classes.get(refused.code, LinkError)(refused.text)

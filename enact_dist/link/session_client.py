@@ -37,6 +37,7 @@ from enact_dist.errors import EnactError, MisuseError
 from enact_dist.link.catalogue import CATALOGUES, KnownCatalogue
 from enact_dist.link.clock import boottime_ns
 from enact_dist.link.lanes import Lanes
+from enact_dist.link.payload_client import SharedPayloads
 from enact_dist.link.refusals import error_of, unreachable
 
 if TYPE_CHECKING:
@@ -102,6 +103,7 @@ class SessionClient:
         self._returns = 0
         self._lanes = Lanes()
         self._catalogue = KnownCatalogue()
+        self.payloads = SharedPayloads(client.session, self._staged, self.count)
         self._registered: dict[str, AspectEntry] = {}
         self._linked = client.placement
         self._renewer: threading.Thread | None = None
@@ -136,6 +138,7 @@ class SessionClient:
         except EnactError as error:
             _log.info("session %s ends without goodbye: %s", self.core.session[:8], error)
         finally:
+            self.payloads.close()
             self.carrier.close()
             _alive.discard(self)
 
@@ -215,6 +218,9 @@ class SessionClient:
         """Wait a little before something is asked again, but not once a shard has come back."""
         self._rest(pause_s, self._returns)
 
+    def _staged(self, shard: str, request: Request) -> Answer | None:
+        return self.call_once([(shard, request)])[0]
+
     def _send(self, calls: Sequence[tuple[str, Request]]) -> list[Answer | None]:
         if len(calls) == 1:
             shard, request = calls[0]
@@ -233,6 +239,8 @@ class SessionClient:
         if isinstance(answer, CATALOGUES):
             self._catalogue.learn(shard, answer)
         if isinstance(answer, _GREETINGS):
+            if isinstance(answer, Welcome):
+                self.payloads.learn(answer)
             self.notice_numbers[shard] = (answer.epoch, answer.notice_number)
 
     def _follow_placement(self) -> None:

@@ -66,6 +66,9 @@ class DaemonSettings:
         link_lease_s: A connection counts as lost after so long without a sign of life.
         carrier: How clients of this host may reach it: "auto" by a socket too, if there can be
             one; "socket" makes it an error if there cannot; "zenoh" makes none.
+        shared_bytes_max: So many bytes of large data lie in memory that is shared on this host;
+            beyond, history goes, then writes are refused.  None stands for half of what the file
+            system there has, and plain memory beyond; 0 shares none.
     """
 
     cell: str
@@ -75,6 +78,7 @@ class DaemonSettings:
     log_format: str = "text"
     link_lease_s: float = 1.0
     carrier: str = "auto"
+    shared_bytes_max: int | None = None
 
 
 class RunningShard:
@@ -93,11 +97,16 @@ class RunningShard:
             if self._shared is not None:
                 undo.callback(self._shared.close)
             self.host: ShardHost = open_host(
-                shard, settings.folder, on_failure=lambda _: self._ended.set()
+                shard,
+                settings.folder,
+                on_failure=lambda _: self._ended.set(),
+                shared=self._shared if settings.shared_bytes_max != 0 else None,
+                payload_bytes_max=settings.shared_bytes_max,
             )
             undo.callback(self.host.close)
-            self._sockets = self._shared and SocketService(self.host, self._shared)
-            if self._sockets is not None:
+            self._sockets: SocketService | None = None
+            if self._shared is not None and settings.carrier != "zenoh":
+                self._sockets = SocketService(self.host, self._shared)
                 undo.callback(self._sockets.close)
             self._session = open_session(listen=settings.listen, lease_s=settings.link_lease_s)
             undo.callback(close_session, self._session)
@@ -152,7 +161,7 @@ def _shared_folder(settings: DaemonSettings) -> SharedFolder | None:
     Raises:
         LinkError: It is asked for and cannot be made.
     """
-    if settings.carrier == "zenoh":
+    if settings.carrier == "zenoh" and settings.shared_bytes_max == 0:
         return None
     try:
         return SharedFolder(settings.cell, settings.shard.name)

@@ -219,7 +219,8 @@ class SocketLine:
         try:
             connection = self._connected()
         except (EnactError, EOFError, OSError) as error:
-            self.problem = str(error) or type(error).__name__
+            none = isinstance(error, FileNotFoundError)
+            self.problem = "it offers none" if none else str(error) or type(error).__name__
             with self._mutex:
                 self._retry_at_s = time.monotonic() + self._retry_s
                 self._retry_s = min(2 * self._retry_s, RETRY_S_MAX)

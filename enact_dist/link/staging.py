@@ -19,11 +19,10 @@ from typing import TYPE_CHECKING, Final
 from enact_dist.core.datum import Datum
 from enact_dist.core.messages import EpochChanged, Refused, Stage, Staged
 from enact_dist.errors import EnactError, LeaseLostError, ProtocolError, ShardUnreachableError
-from enact_dist.link.payload_desk import PAYLOAD_BYTES_MIN
 from enact_dist.link.refusals import error_of
 from enact_dist.link.session_client import CALL_S, FIRST_STAGED
 from enact_dist.link.transfer import Piece, Transfer, in_turn
-from enact_dist.wire.limits import BODY_BYTES_MAX
+from enact_dist.wire.limits import BODY_BYTES_MAX, PAYLOAD_BYTES_MIN
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence

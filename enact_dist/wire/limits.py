@@ -30,6 +30,8 @@ PAYLOAD_BYTES_MAX: Final = BODY_BYTES_MAX + (16 << 20)
 PAYLOAD_NAME: Final = re.compile(r"[0-9A-Za-z_]{1,64}-[0-9a-f]{1,16}\Z")
 """What a payload is called at its shard: the session that made it and a number, never used again;
 both ends check it, since it becomes the name of a file."""
+PAYLOAD_BYTES_MIN: Final = 64 << 10
+"""Data up to this size travel with their commit and their grant, never as a payload."""
 NAME_CHARACTERS_MAX: Final = NAME_LENGTH_MAX
 """Longest name of a context, entity, aspect, shard, session, actor or host."""
 TEXT_BYTES_MAX: Final = 64 << 10

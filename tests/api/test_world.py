@@ -146,7 +146,8 @@ def test_view_of_small_data_costs_one_round_trip(cell, online):
     asked.clear()
     for _ in range(2):
         online.view(View(online, piece, CLOUD))
-    assert asked == [TakeView, Fetch, Release, TakeView, Release]
+    shared = carrier.way_to("local") == "socket"  # then the view names a file
+    assert asked == [TakeView, *([] if shared else [Fetch]), Release, TakeView, Release]
 
 
 def test_view_is_taken_anew_when_its_data_are_gone_before_they_came(cell, online):
@@ -163,6 +164,7 @@ def test_view_is_taken_anew_when_its_data_are_gone_before_they_came(cell, online
         return begin(shard, message, **options)
 
     cell._client.carrier.begin = forget
+    cell._client.payloads.mapped = lambda *_: None
     assert online.view(view)[view][-1] == 49_999
     gone = iter([True] * 3)
     online.init(bench, CLOUD, np.arange(50_000))

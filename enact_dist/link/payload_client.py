@@ -1,0 +1,272 @@
+"""Large data on the client's side: written into the shard's folder, read by mapping its files.
+
+Both need that client and shard share memory, which the nonce of the shard's WELCOME proves for one
+start of it (see `shared_folder`).  Where they do not, or whatever fails here, the same bytes travel
+with the messages: every failure is counted, none is the caller's.
+"""
+
+from __future__ import annotations
+
+import itertools
+import logging
+import os
+import stat
+import threading
+import weakref
+from typing import TYPE_CHECKING, Any, Final
+
+from enact_dist.core.datum import Datum
+from enact_dist.core.messages import Refused, Stage, Staged
+from enact_dist.errors import EnactError
+from enact_dist.link.memory import Pages, body_of, leftovers, map_file, withdraw
+from enact_dist.link.payload_desk import NO_ROOM
+from enact_dist.link.refusals import error_of
+from enact_dist.link.shared_folder import OpenedFolder, open_shared
+from enact_dist.wire.limits import PAYLOAD_BYTES_MIN
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from enact_dist.core.messages import Answer, Request, Welcome
+
+    Call = Callable[[str, Request], Answer | None]
+
+PARTS_MAX: Final = 512
+"""Buffers in one system call; the kernel takes 1024."""
+NOTHING: Final = Datum(b"", b"", 0)
+
+_log = logging.getLogger("enact.link")
+
+
+class Draft:
+    """A payload that this process fills; to be committed by its name, or dropped.
+
+    Attributes:
+        shard: Where it lies.
+        file: Its name there.
+        size: Its length in bytes.
+    """
+
+    __slots__ = ("_descriptor", "_pages", "file", "shard", "size")
+
+    def __init__(self, shard: str, file: str, size: int, descriptor: int) -> None:
+        self.shard, self.file, self.size = shard, file, size
+        self._descriptor = descriptor
+        self._pages: Pages | None = None
+
+    def fill(self, parts: Sequence[Any]) -> memoryview:
+        """Write the parts one after another, which fill it whole; return the bytes, read-only.
+
+        A write costs half of what filling a fresh map does: no page is touched for the first time
+        by this process.
+
+        Raises:
+            OSError: As the system reports it.
+        """
+        offset = 0
+        left = [memoryview(part).cast("B") for part in parts]
+        while left:
+            written = os.pwritev(self._descriptor, left[:PARTS_MAX], offset)
+            offset += written
+            while left and written >= len(left[0]):
+                written -= len(left.pop(0))
+            if written:
+                left[0] = left[0][written:]
+        return body_of(map_file(self._descriptor, self.size, writable=False)).toreadonly()
+
+    def memory(self) -> memoryview:
+        """Return the bytes to be filled in place.
+
+        Raises:
+            OSError: As the system reports it.
+        """
+        self._pages = map_file(self._descriptor, self.size, writable=True)
+        return body_of(self._pages)
+
+    def close(self) -> None:
+        """Let nothing that this process does reach the file any more; twice is harmless.
+
+        Memory that was filled in place stays readable, and is cut off the file in a moment: its
+        pages are too many to be waited for.
+        """
+        descriptor, self._descriptor = self._descriptor, -1
+        if descriptor < 0:
+            return
+        pages, self._pages = self._pages, None
+        if pages is None:
+            os.close(descriptor)
+        else:
+            leftovers().start()
+            leftovers().later(_cut_off, pages, descriptor)
+
+
+def _cut_off(pages: Pages, descriptor: int) -> None:
+    try:
+        withdraw(pages, descriptor)
+    except OSError as error:
+        _log.warning("a committed array could not be cut off its file: %s", error)
+    finally:
+        os.close(descriptor)
+
+
+class _Shared:
+    """What one start of a shard shares with this process, if anything."""
+
+    __slots__ = ("epoch", "folder", "name", "nonce")
+
+    def __init__(self, welcome: Welcome) -> None:
+        self.name, self.nonce, self.epoch = welcome.shared, welcome.shared_nonce, welcome.epoch
+        self.folder: OpenedFolder | None = None
+
+    def __del__(self) -> None:
+        if self.folder is not None:
+            self.folder.close()
+
+
+class SharedPayloads:
+    """The payloads of all shards as one process sees them.  Thread-safe.
+
+    Args:
+        session: The session of this process; its payloads bear its name.
+        call: Makes one call to a shard; None stands for no answer.
+        count: Adds to a counter of the session.
+    """
+
+    def __init__(self, session: str, call: Call, count: Callable[[str], None]) -> None:
+        self._session = session
+        self._call = call
+        self._count = count
+        self._numbers = itertools.count(1)
+        self._mutex = threading.Lock()
+        self._shards: dict[str, _Shared] = {}
+        self._mapped: weakref.WeakValueDictionary[tuple[str, int, str], Pages] = (
+            weakref.WeakValueDictionary()
+        )
+
+    def learn(self, welcome: Welcome) -> None:
+        """Take from a WELCOME what the shard shares; looked at when it is first needed."""
+        with self._mutex:
+            known = self._shards.get(welcome.shard)
+            if known is not None and (known.epoch, known.name) == (welcome.epoch, welcome.shared):
+                return
+            self._shards[welcome.shard] = shared = _Shared(welcome)
+            if shared.name:
+                try:
+                    shared.folder = open_shared(shared.name, shared.nonce)
+                except EnactError as error:
+                    self._count("payload_folders_elsewhere")
+                    _log.info("shard %s: %s", welcome.shard, error)
+
+    def _folder(self, shard: str) -> _Shared | None:
+        shared = self._shards.get(shard)
+        return shared if shared is not None and shared.folder is not None else None
+
+    # ---------------------------------------------------------------- writing
+
+    def draft(self, shard: str, size: int) -> Draft | None:
+        """Make a payload to be filled; None where the bytes have to travel.
+
+        Raises:
+            NoRoomError: The shard's cap is reached, and no history is left to go.
+        """
+        shared = self._folder(shard)
+        if shared is None or size <= PAYLOAD_BYTES_MIN:
+            return None
+        file = f"{self._session}-{next(self._numbers):x}"
+        answer = self._call(shard, Stage(self._session, file, 0, size, NOTHING))
+        if isinstance(answer, Refused) and answer.code == NO_ROOM:
+            raise error_of(answer)
+        if not isinstance(answer, Staged) or not answer.shared:
+            self._count("payload_fallbacks")
+            if isinstance(answer, Staged):
+                self.drop(shard, file)
+            return None
+        try:
+            return Draft(shard, file, size, self._opened(shared, file, size, os.O_RDWR))
+        except OSError as error:
+            # A folder that can be read only, most likely.
+            self._count("payload_fallbacks")
+            _log.info("payload %s of shard %s: %s", file, shard, error)
+            self.drop(shard, file)
+            return None
+
+    def filled(self, draft: Draft, parts: Sequence[Any]) -> memoryview | None:
+        """Fill a payload; return its bytes, or None where that fails and they have to travel."""
+        try:
+            return draft.fill(parts)
+        except OSError as error:
+            self._failed(draft, error)
+            return None
+        finally:
+            draft.close()
+
+    def memory(self, draft: Draft) -> memoryview | None:
+        """Return the memory of a payload to be filled in place; None where there is none."""
+        try:
+            return draft.memory()
+        except OSError as error:
+            draft.close()
+            self._failed(draft, error)
+            return None
+
+    def _failed(self, draft: Draft, error: OSError) -> None:
+        self._count("payload_fallbacks")
+        _log.info("payload %s of shard %s: %s", draft.file, draft.shard, error)
+        self.drop(draft.shard, draft.file)
+
+    def drop(self, shard: str, file: str) -> None:
+        """Tell a shard that a payload will not be committed; it finds out by itself, too."""
+        try:
+            self._call(shard, Stage(self._session, file, 0, 0, NOTHING))
+        except EnactError as error:
+            _log.info("payload %s of shard %s is not given up: %s", file, shard, error)
+
+    # ---------------------------------------------------------------- reading
+
+    def mapped(self, shard: str, epoch: int, file: str, size: int) -> memoryview | None:
+        """Return the bytes of a payload without a copy; None where they have to be fetched.
+
+        A map lasts as long as somebody looks at it: what is replaced leaves the memory with its
+        last reader, so none is kept here for the next one.
+        """
+        shared = self._folder(shard)
+        if shared is None or shared.epoch != epoch:
+            return None
+        key = shard, epoch, file
+        pages = self._mapped.get(key)
+        if pages is None or pages.size != size:
+            try:
+                descriptor = self._opened(shared, file, size, os.O_RDONLY)
+                try:
+                    pages = map_file(descriptor, size, writable=False)
+                finally:
+                    os.close(descriptor)
+            except OSError as error:
+                self._count("maps_failed")
+                _log.info("payload %s of shard %s cannot be mapped: %s", file, shard, error)
+                return None
+            self._mapped[key] = pages
+        return body_of(pages).toreadonly()
+
+    @staticmethod
+    def _opened(shared: _Shared, file: str, size: int, access: int) -> int:
+        """Open a payload, sure to be what the shard has made.
+
+        Raises:
+            OSError: It is not.
+        """
+        assert shared.folder is not None
+        flags = access | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+        descriptor = os.open(file, flags, dir_fd=shared.folder.descriptor)
+        found = os.fstat(descriptor)
+        # Shorter than it is said to be, it would kill whoever touches what is missing.
+        fits = stat.S_ISREG(found.st_mode) and found.st_size == size
+        if not fits or found.st_uid != shared.folder.owner:
+            os.close(descriptor)
+            raise OSError(f"user {found.st_uid}, {stat.filemode(found.st_mode)}, {found.st_size}")
+        return descriptor
+
+    def close(self) -> None:
+        """Let go of all folders; what is mapped stays."""
+        with self._mutex:
+            self._shards.clear()

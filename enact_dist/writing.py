@@ -1,0 +1,142 @@
+"""What a lock writes: data on their way into their shards' memory, until the lock ends.
+
+Large data are written there at once (see `link.payload_client`), small ones, and those of shards
+that share no memory with this process, travel with the commit.  `blank` hands out memory to be
+filled in place; once the block ends nobody can change it any more.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from enact_dist.core.datum import Datum, Slot
+from enact_dist.errors import DatumTypeError, MisuseError
+from enact_dist.wire.payload import decode_to_fill, encode_parts
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import DTypeLike, NDArray
+
+    from enact_dist.link.payload_client import Draft, SharedPayloads
+    from enact_dist.wire.payload import Encoded
+
+
+class _Written(NamedTuple):
+    """One datum of a lock, where it lies, and the arrays that were handed out to be filled."""
+
+    datum: Datum
+    draft: Draft | None
+    arrays: tuple[NDArray[Any], ...] = ()
+
+
+class Writing:
+    """The data that one lock writes, by slot.
+
+    Args:
+        payloads: The memory that shards share with this process.
+    """
+
+    __slots__ = ("_by_slot", "_payloads")
+
+    def __init__(self, payloads: SharedPayloads) -> None:
+        self._payloads = payloads
+        self._by_slot: dict[Slot, _Written] = {}
+
+    def put(self, slot: Slot, shard: str, encoded: Encoded) -> Datum:
+        """Return the datum that stands for a value, its bytes copied once.
+
+        Raises:
+            NoRoomError: The shard's cap is reached.
+        """
+        draft = self._payloads.draft(shard, encoded.size)
+        body = self._payloads.filled(draft, encoded.parts) if draft is not None else None
+        if draft is None or body is None:
+            return self._keep(slot, _Written(encoded.datum(), None))
+        return self._keep(slot, _Written(encoded.over(body, draft.file), draft))
+
+    def blank(
+        self, slot: Slot, shard: str, like: object, datum_type: Any, stamp_ns: int
+    ) -> tuple[Any, Datum]:
+        """Return a value like `like` whose arrays are to be filled, and its datum.
+
+        Raises:
+            DatumTypeError: `like` is not of the type, or has no array.
+            NoRoomError: The shard's cap is reached.
+        """
+        encoded = encode_parts(like, datum_type, stamp_ns=stamp_ns)
+        draft = self._payloads.draft(shard, encoded.size)
+        memory = self._payloads.memory(draft) if draft is not None else None
+        if memory is None:
+            draft, memory = None, _plain(encoded)
+        encoded.put_texts(memory)
+        value, arrays = decode_to_fill(encoded.encoding, memory, datum_type)
+        if not arrays:
+            raise DatumTypeError(
+                f"new() hands out arrays to be filled, and {type(like).__name__} has none; put()"
+                " takes any datum"
+            )
+        datum = encoded.over(memory.toreadonly(), draft.file if draft is not None else "")
+        self._keep(slot, _Written(datum, draft, arrays))
+        return value, datum
+
+    def forget(self, slot: Slot) -> None:
+        """Drop what was written to a slot: something else takes its place."""
+        old = self._by_slot.pop(slot, None)
+        if old is not None:
+            _fix(old)
+            if old.draft is not None:
+                self._payloads.drop(old.draft.shard, old.draft.file)
+
+    def _keep(self, slot: Slot, written: _Written) -> Datum:
+        self.forget(slot)
+        if written.draft is not None or written.arrays:
+            self._by_slot[slot] = written
+        return written.datum
+
+    def fix(self) -> None:
+        """Let nobody change any of it: it is about to be committed."""
+        for written in self._by_slot.values():
+            for array in written.arrays:
+                array.flags.writeable = False
+
+    def end(self, *, committed: bool) -> None:
+        """Let go of it after the lock has ended."""
+        for slot in list(self._by_slot):
+            if committed:
+                _fix(self._by_slot.pop(slot))
+            else:
+                self.forget(slot)
+
+
+def _fix(written: _Written) -> None:
+    for array in written.arrays:
+        array.flags.writeable = False
+    if written.draft is not None:
+        written.draft.close()
+
+
+def _plain(encoded: Encoded) -> memoryview:
+    """Return memory of this process that starts as arrays of any type may."""
+    import numpy as np
+
+    from enact_dist.wire.limits import ALIGNMENT
+
+    raw = np.empty(encoded.size + ALIGNMENT, np.uint8)
+    start = -raw.ctypes.data % ALIGNMENT
+    return memoryview(raw.data)[start : start + encoded.size]
+
+
+def template(like: object, shape: int | Sequence[int] | None, dtype: DTypeLike | None) -> object:
+    """Return what an array that is to be filled looks like, without memory of its own.
+
+    Raises:
+        MisuseError: Both ways to say it were taken, or none.
+    """
+    if (like is None) == (shape is None):
+        raise MisuseError("new() takes either shape and dtype, or like=…")
+    if shape is None:
+        return like
+    import numpy as np
+
+    return np.empty(shape, dtype)

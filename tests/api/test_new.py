@@ -1,0 +1,193 @@
+"""`lock.new`: arrays that are filled in place and committed without a copy."""
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from enact_dist import Aspect, Durability, Entity, Lock, Read, View, Write
+from enact_dist.errors import DatumTypeError, LockReleasedError, MisuseError, ReadonlyError
+
+piece = Entity("work_piece")
+CARRIERS = pytest.mark.parametrize("cell", ["local", "socket", "zenoh"], indirect=True)
+ROWS = pytest.mark.parametrize("rows", [0, 4, 50_000, 1_000_000])
+"""Of 12 bytes: nothing, with the commit, and two payloads."""
+
+
+@dataclass(frozen=True)
+class Pose:
+    matrix: np.ndarray
+
+
+@dataclass(frozen=True)
+class Surface:
+    vertices_m: np.ndarray
+    triangles: np.ndarray
+    pose: Pose
+    name: str
+    note: str
+
+
+CLOUD = Aspect("cloud", np.ndarray, Durability.VOLATILE)
+SURFACE = Aspect("surface", Surface, Durability.VOLATILE)
+TEXT = Aspect("text", str, Durability.VOLATILE)
+
+
+def payloads():
+    """Return the names of all payloads in this test's shared folders."""
+    root = Path(os.environ.get("ENACT_SHARED_FOLDER", "/nonexistent"))
+    return [path.name for path in root.glob("*/*-*")]
+
+
+@CARRIERS
+@ROWS
+def test_array_is_filled_in_place(online, rows):
+    """What is in it at the end of the block is what everybody reads, stamp and all."""
+    write, read = Write(online, piece, CLOUD), Read(online, piece, CLOUD)
+    with Lock(write) as lock:
+        cloud = lock.new(write, (rows, 3), np.float32, stamp_ns=5)
+        assert (cloud.shape, cloud.dtype, cloud.flags.writeable) == ((rows, 3), np.float32, True)
+        cloud[:] = np.arange(3 * rows).reshape(rows, 3)
+        assert lock[write].shape == (rows, 3)
+
+    with Lock(read) as lock:
+        found, stamp_ns = lock[read], lock.stamp_ns(read)
+    assert np.array_equal(found, np.arange(3 * rows).reshape(rows, 3))
+    assert (found.dtype, stamp_ns) == (np.float32, 5)
+
+
+@CARRIERS
+def test_dataclass_is_filled_in_place(online):
+    """Its arrays look like those of `like`, order included; everything else is taken over."""
+    write, read = Write(online, piece, SURFACE), Read(online, piece, SURFACE)
+    like = Surface(
+        np.empty((30_000, 3), np.float64),
+        np.empty((50, 3), np.int32, order="F"),
+        Pose(np.empty((4, 4))),
+        "tray",
+        "n" * 500,
+    )
+    with Lock(write) as lock:
+        surface = lock.new(write, like=like)
+        surface.vertices_m[:] = 1.5
+        surface.triangles[:] = 7
+        surface.pose.matrix[:] = np.eye(4)
+
+    assert not surface.vertices_m.flags.writeable
+    with Lock(read) as lock:
+        found = lock[read]
+    assert (found.name, found.note) == ("tray", "n" * 500)
+    assert found.triangles.flags.f_contiguous
+    assert (found.vertices_m == 1.5).all()
+    assert (found.triangles == 7).all()
+    assert np.array_equal(found.pose.matrix, np.eye(4))
+
+
+@CARRIERS
+@ROWS
+def test_array_is_read_only_after_the_block(online, rows):
+    """Its writer cannot change what was committed by accident."""
+    write = Write(online, piece, CLOUD)
+    with Lock(write) as lock:
+        cloud = lock.new(write, (rows, 3), np.float32)
+        cloud[:] = 1.0
+
+    with pytest.raises(ValueError, match="read-only"):
+        cloud[...] = 2.0
+    assert (cloud == 1.0).all()
+
+
+@pytest.mark.parametrize("cell", ["socket", "zenoh"], indirect=True)
+def test_view_made_before_the_commit_reaches_nobody_after_it(online):
+    """A stray write through it stays in its process; the array itself stays as it was read."""
+    from enact_dist.link.memory import leftovers
+
+    write, view = Write(online, piece, CLOUD), View(online, piece, CLOUD)
+    with Lock(write) as lock:
+        cloud = lock.new(write, (1_000_000,), np.uint8)
+        cloud[:] = 1
+        kept = cloud[10:20]
+    assert leftovers().wait(5.0)
+
+    kept[:] = 99
+
+    with Lock(view) as lock:
+        assert (lock[view] == 1).all()
+
+
+@CARRIERS
+def test_block_that_raises_leaves_nothing(online):
+    """No datum, no file."""
+    from enact_dist.link.memory import leftovers
+
+    write = Write(online, piece, CLOUD)
+
+    def fail():
+        with Lock(write) as lock:
+            lock.new(write, (1_000_000,), np.uint8)[:] = 1
+            raise KeyError("on purpose")
+
+    with pytest.raises(KeyError):
+        fail()
+
+    assert leftovers().wait(5.0)
+    assert payloads() == []
+    with Lock(write) as lock:
+        assert lock.is_null(write)
+
+
+@CARRIERS
+def test_last_write_of_a_block_counts(online):
+    """A second new, a put or a deletion takes the place of the first; its file goes."""
+    from enact_dist.link.memory import leftovers
+
+    write, read = Write(online, piece, CLOUD), Read(online, piece, CLOUD)
+    with Lock(write) as lock:
+        lock.new(write, (200_000,), np.uint8)[:] = 1
+        lock.new(write, (300_000,), np.uint8)[:] = 2
+        lock[write] = np.full(100_000, 3, np.uint8)
+    with Lock(read) as lock:
+        assert np.array_equal(lock[read], np.full(100_000, 3, np.uint8))
+    assert leftovers().wait(5.0)
+    assert len(payloads()) == (0 if online.session.client.carrier.way_to("local") == "call" else 1)
+
+    with Lock(write) as lock:
+        lock.new(write, (200_000,), np.uint8)[:] = 1
+        del lock[write]
+        assert lock.is_null(write)
+    with Lock(read) as lock:
+        assert lock.is_null(read)
+
+
+@CARRIERS
+@pytest.mark.parametrize("size", [1000, 5_000_000])
+def test_array_that_was_put_may_be_changed_afterwards(online, size):
+    """Only what `new` hands out is the datum itself: `put` copies."""
+    write, read = Write(online, piece, CLOUD), Read(online, piece, CLOUD)
+    mine = np.full(size, 1, np.uint8)
+    with Lock(write) as lock:
+        lock.put(write, mine, stamp_ns=9)
+        mine[:] = 2
+
+    mine[:] = 3
+    with Lock(read) as lock:
+        assert (lock[read] == 1).all()
+
+
+def test_misuse_is_named(online):
+    """Neither shape nor like, another dtype, no array, another access, after the block."""
+    write, read = Write(online, piece, CLOUD), Read(online, Entity("other"), CLOUD)
+    text = Write(online, piece, TEXT)
+    with Lock(write, read, text) as lock:
+        with pytest.raises(MisuseError, match="either shape and dtype, or like"):
+            lock.new(write)
+        with pytest.raises(DatumTypeError, match="Python objects"):
+            lock.new(write, (3,), object)
+        with pytest.raises(DatumTypeError, match="has none"):
+            lock.new(text, like="x" * 100_000)
+        with pytest.raises(ReadonlyError):
+            lock.new(read, (3,), np.float32)
+    with pytest.raises(LockReleasedError):
+        lock.new(write, (3,), np.float32)

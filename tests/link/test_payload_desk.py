@@ -1,0 +1,295 @@
+"""Payloads at a shard: drafts, their adoption by a commit, the cap, and when the files go."""
+
+import errno
+import os
+import stat
+
+import pytest
+
+from enact_dist.core.datum import Datum, LockId, Slot, Token
+from enact_dist.core.messages import Commit, Refused, Stage, Staged, WriteItem
+from enact_dist.link.memory import leftovers
+from enact_dist.link.payload_desk import NO_ROOM, PayloadDesk
+from enact_dist.link.shared_folder import SharedFolder
+
+SIZE = 100_000
+SESSION = "a1b2c3"
+FILE = f"{SESSION}-1"
+NOTHING = Datum(b"", b"", 0)
+SLOT = Slot("online", "arm", "cloud")
+
+
+@pytest.fixture
+def folder(shared_root):
+    made = SharedFolder("cell", "s0", root=shared_root)
+    yield made
+    made.close()
+
+
+@pytest.fixture(params=["file", "memory"])
+def desk(request, folder):
+    """A desk with a shared folder, and one without."""
+    return PayloadDesk(folder if request.param == "file" else None, 10 * SIZE)
+
+
+def stage(desk, file=FILE, offset=0, total=SIZE, body=b"", session=None):
+    session = session or file.partition("-")[0]
+    return desk.stage(Stage(session, file, offset, total, Datum(b"", body, len(body))))
+
+
+def commit_of(file=FILE, size=SIZE, session=SESSION, body=b""):
+    write = WriteItem(SLOT, Datum(b"\x01", body, size, 7, file))
+    return Commit(LockId(session, 0, 1), Token(1, 1), (write,), 0)
+
+
+def adopted(desk, *arguments, **options):
+    """Return the datum that the shard would see."""
+    return desk.with_bodies(commit_of(*arguments, **options)).writes[0].datum
+
+
+def fill(folder, content, file=FILE):
+    with (folder.path / file).open("r+b") as opened:
+        opened.write(content)
+
+
+def names(folder):
+    """Return the payloads in a folder once nothing is on its way out."""
+    assert leftovers().wait(5.0)
+    return sorted(file.name for file in folder.path.iterdir() if file.name != "nonce")
+
+
+# ---------------------------------------------------------------- drafts
+
+
+def test_draft_is_a_whole_file_that_clients_may_fill(folder):
+    """Its blocks are there before anybody maps it, and only its user gets at it."""
+    desk = PayloadDesk(folder, 10 * SIZE)
+
+    assert stage(desk) == Staged(FILE, 0, True)
+
+    found = (folder.path / FILE).stat()
+    assert (found.st_size, stat.S_IMODE(found.st_mode)) == (SIZE, 0o600)
+    assert found.st_blocks * 512 >= SIZE
+
+
+def test_draft_that_is_asked_for_again_is_the_same(desk):
+    """The answer to the first request may be lost."""
+    stage(desk, body=b"x" * 1000)
+
+    assert stage(desk) == stage(desk)
+    assert stage(desk).have == 1000
+    assert desk.figures()["payload_drafts"] == 1
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"session": "other"}, "no payload of session other"),
+        ({"file": "../up-1", "session": "../up"}, "no payload"),
+        ({"file": "nonce"}, "no payload"),
+        ({"total": 1000}, "from 65536"),
+        ({"total": (1 << 30) + 1}, "from 65536"),
+        ({"total": -1}, "from 65536"),
+        ({"offset": SIZE, "body": b"x"}, "a slice to 100001"),
+        ({"offset": -1, "body": b"x"}, "a slice to 0"),
+    ],
+)
+def test_draft_that_cannot_be_is_refused(desk, options, said):
+    """Names of other sessions or files, lengths below the limit, bytes outside."""
+    answer = stage(desk, **options)
+
+    assert isinstance(answer, Refused)
+    assert said in answer.text
+
+
+def test_draft_has_one_length(desk):
+    """A second opinion about it is a mistake of the client."""
+    stage(desk)
+
+    assert "has 100000 bytes, not 100001" in stage(desk, total=SIZE + 1).text
+
+
+def test_slices_may_be_repeated_and_tell_how_far_they_came(desk):
+    """A slice whose answer was lost comes again; one beyond a hole counts when the hole closes."""
+    half = SIZE // 2
+    assert stage(desk, body=b"a" * half).have == half
+    assert stage(desk, body=b"a" * half).have == half
+    assert stage(desk, offset=half + 100, body=b"c" * 100).have == half
+
+    assert adopted(desk).body == b"", "there is a hole in it"
+    assert stage(desk, offset=half, body=b"b" * half).have == SIZE
+    assert bytes(adopted(desk).body) == b"a" * half + b"b" * half
+
+
+def test_draft_that_is_given_up_leaves_nothing(folder):
+    """Neither file nor count; its name is not used again."""
+    desk = PayloadDesk(folder, 10 * SIZE)
+    stage(desk)
+
+    assert stage(desk, total=0) == Staged(FILE, 0, False)
+
+    assert names(folder) == []
+    assert desk.figures()["payload_bytes"] == 0
+
+
+def test_drafts_end_with_their_session(folder, monkeypatch):
+    """A client that is gone commits no more; one that works may take its time."""
+    desk = PayloadDesk(folder, 10 * SIZE)
+    stage(desk, "gone-1")
+    stage(desk, "idle-1")
+    stage(desk, "busy-1")
+    monkeypatch.setattr("enact_dist.link.payload_desk.DRAFT_S", -1.0)
+
+    desk.sweep({"idle", "busy"}.__contains__, {"busy"}.__contains__)
+
+    assert names(folder) == ["busy-1"]
+    assert desk.figures()["drafts_swept"] == 2
+
+
+# ---------------------------------------------------------------- adoption
+
+
+def test_commit_gets_the_bytes_that_its_client_has_filled(folder):
+    """The body is the file itself, which nobody may write any more."""
+    desk = PayloadDesk(folder, 10 * SIZE)
+    stage(desk)
+    fill(folder, b"x" * SIZE)
+
+    datum = adopted(desk)
+
+    assert (datum.file, datum.size, datum.stamp_ns) == (FILE, SIZE, 7)
+    assert bytes(datum.body) == b"x" * SIZE
+    assert datum.body.readonly
+    assert stat.S_IMODE((folder.path / FILE).stat().st_mode) == 0o400
+
+
+def test_payload_in_plain_memory_has_no_name_for_others():
+    """Nobody could map it: readers fetch it."""
+    desk = PayloadDesk(None, 10 * SIZE)
+    stage(desk, body=b"x" * SIZE)
+
+    datum = adopted(desk)
+
+    assert (datum.file, bytes(datum.body)) == ("", b"x" * SIZE)
+
+
+def test_repeated_commit_gets_the_same_bytes(folder):
+    """The first copy's answer may be lost."""
+    desk = PayloadDesk(folder, 10 * SIZE)
+    stage(desk)
+    fill(folder, b"x" * SIZE)
+    first = adopted(desk)
+
+    again = adopted(desk)
+
+    assert (again, bytes(again.body[:3])) == (first, b"xxx")
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"file": f"{SESSION}-2"}, {"size": SIZE - 1}, {"size": SIZE + 1}, {"session": "other"}],
+)
+def test_commit_of_what_is_not_there_stays_without_bytes(desk, options):
+    """Another name, another length or somebody else's: the shard then asks for the bytes."""
+    stage(desk, body=b"x" * SIZE)
+
+    assert adopted(desk, **options).body == b""
+    assert desk.figures()["payloads_missing"] == 1
+
+
+def test_commit_that_brings_its_bytes_is_left_alone(desk):
+    """In one process the datum has a name and its bytes."""
+    commit = commit_of(body=b"x" * SIZE)
+
+    assert desk.with_bodies(commit).writes == commit.writes
+
+
+def test_file_goes_with_the_last_datum_and_reader(folder):
+    """Slices of a body, such as arrays, keep it; a map of another process keeps the content."""
+    desk = PayloadDesk(folder, 10 * SIZE)
+    stage(desk)
+    fill(folder, b"x" * SIZE)
+    datum = adopted(desk)
+    part = datum.body[10:20]
+
+    del datum
+    assert names(folder) == [FILE]
+    assert desk.figures()["payload_bytes"] == SIZE
+    del part
+    assert names(folder) == []
+    assert desk.figures()["payload_bytes"] == desk.figures()["payload_files"] == 0
+    assert adopted(desk).body == b"", "a late copy finds nothing"
+
+
+# ---------------------------------------------------------------- the cap
+
+
+def test_payload_over_the_cap_is_refused_by_name(folder):
+    """Nothing is made; the text says what was asked, what is there, who has it, what to do."""
+    desk = PayloadDesk(folder, 2 * SIZE, biggest=lambda: "; the largest: online:arm/cloud 100000")
+    stage(desk, "a-1")
+    stage(desk, "a-2")
+
+    answer = stage(desk, "b-1")
+
+    assert isinstance(answer, Refused)
+    assert answer.code == NO_ROOM
+    for part in (
+        "100000 bytes",
+        "200000 of at most 200000",
+        "online:arm/cloud",
+        "shared_bytes_max",
+    ):
+        assert part in answer.text
+    assert names(folder) == ["a-1", "a-2"]
+    assert desk.figures()["payloads_refused"] == 1
+
+
+def test_history_goes_before_a_payload_is_refused(folder):
+    """The shard is asked for room once, and its files are waited for."""
+    kept = []
+    desk = PayloadDesk(folder, 2 * SIZE, make_room=lambda _: kept.pop(0))
+    for number in (1, 2):
+        stage(desk, f"{SESSION}-{number}", body=b"x" * SIZE)
+        kept.append(adopted(desk, f"{SESSION}-{number}"))
+
+    assert stage(desk, f"{SESSION}-3") == Staged(f"{SESSION}-3", 0, True)
+    assert names(folder) == [f"{SESSION}-2", f"{SESSION}-3"]
+
+
+def test_cap_that_nobody_has_set_refuses_nothing(folder):
+    """What is beyond half of a small folder lies in plain memory, and the next small one there."""
+    desk = PayloadDesk(folder, 2 * SIZE, firm=False)
+
+    assert stage(desk, "a-1", total=3 * SIZE) == Staged("a-1", 0, False)
+    assert stage(desk, "a-2") == Staged("a-2", 0, True)
+    assert names(folder) == ["a-2"]
+
+
+def test_drafts_in_plain_memory_are_bounded(monkeypatch):
+    """A client that stages and never commits cannot fill the shard."""
+    monkeypatch.setattr("enact_dist.link.payload_desk.DRAFT_BYTES_MAX", 2 * SIZE)
+    desk = PayloadDesk(None, 0)
+    for number in (1, 2):
+        assert isinstance(stage(desk, f"a-{number}"), Staged)
+
+    assert stage(desk, "a-3").code == NO_ROOM
+    stage(desk, "a-2", total=0)
+    assert isinstance(stage(desk, "a-3"), Staged)
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES])
+def test_folder_that_takes_no_file_costs_no_commit(folder, monkeypatch, code):
+    """The bytes then come in slices and lie in plain memory; it is counted."""
+
+    def refuse(*_):
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(os, "posix_fallocate", refuse)
+    desk = PayloadDesk(folder, 10 * SIZE)
+
+    assert stage(desk, body=b"x" * SIZE) == Staged(FILE, SIZE, False)
+
+    assert bytes(adopted(desk).body) == b"x" * SIZE
+    assert names(folder) == []
+    assert desk.figures()["payload_fallbacks"] == 1
