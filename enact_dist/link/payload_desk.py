@@ -79,7 +79,7 @@ class _Draft:
     @property
     def whole(self) -> bool:
         """Whether all of it is here: from slices, or (none came) from its client in the folder."""
-        return self.have == self.size or (self.shared and not self.have)
+        return self.have == self.size or (self.shared and not self.have and not self.beyond)
 
 
 class PayloadDesk:
@@ -114,7 +114,6 @@ class PayloadDesk:
         self._mutex = threading.RLock()  # reentrant: a destructor may run anywhere
         self._opening = tuple(threading.Lock() for _ in range(16))
         self._drafts: dict[str, _Draft] = {}
-        self._used: dict[str, None] = {}
         self._files: dict[str, int] = {}
         self._adopted: dict[str, weakref.ref[Pages | Plain]] = {}
         self._bytes = 0
@@ -162,20 +161,12 @@ class PayloadDesk:
             return Staged(file, draft.have, draft.shared)
 
     def _opened(self, session: str, file: str, total: int) -> _Draft | Refused:
-        with self._mutex:
-            if file in self._used:
-                return Refused("overload", f"payload {file} is being made, or was made before")
-            self._used[file] = None
-        try:
-            shared = self._folder is not None and self._has_room(total)
-            if self._folder is not None and not shared and self._firm:
-                return self._refused(session, total)
-            memory = self._in_folder(self._folder, file, total) if shared else None
-            if memory is None and self._drafted() + total > DRAFT_BYTES_MAX:
-                return self._refused(session, total)
-        finally:
-            with self._mutex:
-                del self._used[file]
+        shared = self._folder is not None and self._has_room(total)
+        if self._folder is not None and not shared and self._firm:
+            return self._refused(session, total)
+        memory = self._in_folder(self._folder, file, total) if shared else None
+        if memory is None and self._drafted() + total > DRAFT_BYTES_MAX:
+            return self._refused(session, total)
         found = memory or plain_memory(total, ended=partial(self._ended, file, None))
         draft = _Draft(session, total, found, memory is not None, time.monotonic())
         with self._mutex:

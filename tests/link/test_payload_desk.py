@@ -121,6 +121,13 @@ def test_slices_may_be_repeated_and_tell_how_far_they_came(desk):
     assert bytes(adopted(desk).body) == b"a" * half + b"b" * half
 
 
+def test_slice_that_came_before_the_first_makes_no_whole(desk):
+    """Nothing at its begin looks like a file that its client has filled."""
+    stage(desk, offset=SIZE // 2, body=b"b" * (SIZE // 2))
+
+    assert adopted(desk).body == b""
+
+
 def test_draft_that_is_given_up_leaves_nothing(folder):
     """Neither file nor count; its name is not used again."""
     desk = PayloadDesk(folder, 10 * SIZE)
