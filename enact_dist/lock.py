@@ -30,7 +30,7 @@ from enact_dist.reading import EachData, Readings, check_requested, null_error, 
 from enact_dist.session import session_of
 from enact_dist.terms import Access, Entity, refuse_duplicates
 from enact_dist.together import Together
-from enact_dist.wire.limits import BODY_BYTES_MAX, ITEMS_MAX, PAYLOAD_BYTES_MIN
+from enact_dist.wire.limits import BODY_BYTES_MAX, ITEMS_MAX
 from enact_dist.wire.payload import decode_datum, encode_parts
 from enact_dist.writable import WritableEach
 from enact_dist.writing import Writing, template
@@ -130,7 +130,7 @@ class Lock:
         self._readings: Readings
         self._each: dict[LockRequest[Any], EachData[Any]] = {}
         self._writes: dict[Slot, Datum | None] = {}
-        self._writing: Writing | None = None
+        self._writing = Writing(self._session.client.payloads)
         self._edits = self._bytes = 0
         self._expects: dict[Slot, SlotVersion] = {}
         self._entity: Entity | None = None
@@ -201,16 +201,14 @@ class Lock:
                 _thread.lock = None
             if kind is None:
                 client.check_usable()
-                if self._writing is not None:
-                    self._writing.fix()
+                self._writing.fix()
                 client.finish(lock, self._writes_by_shard(), tuple(self._expects.values()))
                 self.position = lock.position
         finally:
             # After a commit this is nothing; after an exception, an interrupt too, nothing is held.
             if not client.forked:
                 client.release(lock)
-                if self._writing is not None:
-                    self._writing.end(committed=lock.phase in (Phase.COMMITTED, Phase.UNKNOWN))
+                self._writing.end(committed=lock.phase in (Phase.COMMITTED, Phase.UNKNOWN))
             self._let_go()
 
     def _let_go(self) -> None:
@@ -224,10 +222,9 @@ class Lock:
         self._writes.clear()
 
     def _writes_by_shard(self) -> dict[str, list[WriteItem]]:
-        assert self._lock is not None
         by_shard: dict[str, list[WriteItem]] = {}
         for slot, datum in self._writes.items():
-            by_shard.setdefault(self._lock.shard_of(slot), []).append(WriteItem(slot, datum))
+            by_shard.setdefault(self._shard(slot), []).append(WriteItem(slot, datum))
         return by_shard
 
     def _use(self) -> None:
@@ -327,23 +324,14 @@ class Lock:
         Raises:
             ReadonlyError: The request does not allow writing.
             DatumTypeError: The datum is not of the aspect's type.
+            NoRoomError: The shard's cap of shared memory is reached.
         """
         self._check_writable(request)
         self._put(slot_of(request), request.aspect, datum, stamp_ns=stamp_ns)
 
     def _put(self, slot: Slot, aspect: Aspect[T], datum: T, *, stamp_ns: int = 0) -> None:
         encoded = encode_parts(datum, aspect.datum_type, stamp_ns=stamp_ns)
-        if encoded.size > PAYLOAD_BYTES_MIN:
-            self._note_write(slot, self._large().put(slot, self._shard(slot), encoded))
-        else:
-            if self._writing is not None:
-                self._writing.forget(slot)
-            self._note_write(slot, encoded.datum())
-
-    def _large(self) -> Writing:
-        if self._writing is None:
-            self._writing = Writing(self._session.client.payloads)
-        return self._writing
+        self._note_write(slot, self._writing.put(slot, encoded, self._shard))
 
     def _shard(self, slot: Slot) -> str:
         assert self._lock is not None
@@ -366,25 +354,24 @@ class Lock:
     ) -> T:
         """Return a datum whose arrays are to be filled in place; committing it copies nothing.
 
-        It counts as written at once.  After the block its arrays are read-only.
+        It counts as written; after the block its arrays are read-only.
 
         Args:
             request: A `Write` of this lock.
             shape: Of an array, where the aspect's datum is one.
             dtype: Of that array.
-            like: In place of both, a datum of the aspect's type, such as a dataclass of arrays.
-                They give shapes, dtypes and orders; all else in it is taken over.
+            like: In place of both: a datum, its arrays of the shapes, dtypes and orders wanted.
             stamp_ns: As in `put`.
 
         Raises:
             ReadonlyError: The request does not allow writing.
             DatumTypeError: The array or `like` is not of the aspect's type, or has no array.
-            NoRoomError: The shard's cap of shared memory is reached.
+            NoRoomError: As `put`.
         """
         self._check_writable(request)
         slot, asked = slot_of(request), request.aspect.datum_type
         wanted = template(like, shape, dtype)
-        value, datum = self._large().blank(slot, self._shard(slot), wanted, asked, stamp_ns)
+        value, datum = self._writing.blank(slot, self._shard(slot), wanted, asked, stamp_ns)
         self._note_write(slot, datum)
         return cast("T", value)
 
@@ -408,8 +395,7 @@ class Lock:
         self._delete(slot_of(request))
 
     def _delete(self, slot: Slot) -> None:
-        if self._writing is not None:
-            self._writing.forget(slot)
+        self._writing.forget(slot)
         self._note_write(slot, None)
 
     def expect(self, view: View[Any]) -> None:

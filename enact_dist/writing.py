@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from enact_dist.core.datum import Datum, Slot
 from enact_dist.errors import DatumTypeError, MisuseError
+from enact_dist.wire.limits import PAYLOAD_BYTES_MIN
 from enact_dist.wire.payload import decode_to_fill, encode_parts
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from numpy.typing import DTypeLike, NDArray
 
@@ -43,13 +44,16 @@ class Writing:
         self._payloads = payloads
         self._by_slot: dict[Slot, _Written] = {}
 
-    def put(self, slot: Slot, shard: str, encoded: Encoded) -> Datum:
+    def put(self, slot: Slot, encoded: Encoded, shard_of: Callable[[Slot], str]) -> Datum:
         """Return the datum that stands for a value, its bytes copied once.
 
         Raises:
             NoRoomError: The shard's cap is reached.
         """
-        draft = self._payloads.draft(shard, encoded.size)
+        if encoded.size <= PAYLOAD_BYTES_MIN:
+            self.forget(slot)
+            return encoded.datum()
+        draft = self._payloads.draft(shard_of(slot), encoded.size)
         body = self._payloads.filled(draft, encoded.parts) if draft is not None else None
         if draft is None or body is None:
             return self._keep(slot, _Written(encoded.datum(), None))
@@ -72,6 +76,9 @@ class Writing:
         encoded.put_texts(memory)
         value, arrays = decode_to_fill(encoded.encoding, memory, datum_type)
         if not arrays:
+            if draft is not None:
+                draft.close()
+                self._payloads.drop(shard, draft.file)
             raise DatumTypeError(
                 f"new() hands out arrays to be filled, and {type(like).__name__} has none; put()"
                 " takes any datum"
