@@ -147,7 +147,7 @@ class ShardHost:
         self._on_failure = on_failure
         self._payloads = PayloadDesk(
             shared,
-            payload_bytes_max if payload_bytes_max is not None else half_of(shared),
+            half_of(shared) if shared is None or payload_bytes_max is None else payload_bytes_max,
             firm=payload_bytes_max is not None,
             make_room=lambda size: self.event(MakeRoom(size)),
             biggest=self._biggest,

@@ -87,7 +87,7 @@ class PayloadDesk:
 
     Args:
         folder: Where clients of this host find them; None keeps them in this process.
-        bytes_max: So many bytes of files at most, drafts included.
+        bytes_max: So many bytes of files at most, drafts included; without a folder, of drafts.
         firm: Whether a payload beyond that is refused; else it lies in plain memory.
         make_room: Called to let history go, until so many bytes are free.
         biggest: Names the slots that hold the most, for the text of a refusal.
@@ -109,6 +109,7 @@ class PayloadDesk:
         self._folder = folder
         self._bytes_max = bytes_max
         self._firm = firm
+        self._draft_bytes_max = bytes_max if folder is None else DRAFT_BYTES_MAX
         self._make_room = make_room
         self._biggest = biggest
         self._mutex = threading.RLock()  # reentrant: a destructor may run anywhere
@@ -163,10 +164,12 @@ class PayloadDesk:
     def _opened(self, session: str, file: str, total: int) -> _Draft | Refused:
         shared = self._folder is not None and self._has_room(total)
         if self._folder is not None and not shared and self._firm:
-            return self._refused(session, total)
+            return self._refused(session, total, self._bytes, self._bytes_max)
         memory = self._in_folder(self._folder, file, total) if shared else None
-        if memory is None and self._drafted() + total > DRAFT_BYTES_MAX:
-            return self._refused(session, total)
+        if memory is None:
+            drafted = self._drafted()
+            if drafted + total > self._draft_bytes_max:
+                return self._refused(session, total, drafted, self._draft_bytes_max)
         found = memory or plain_memory(total, ended=partial(self._ended, file, None))
         draft = _Draft(session, total, found, memory is not None, time.monotonic())
         with self._mutex:
@@ -194,13 +197,13 @@ class PayloadDesk:
         with self._mutex:
             return sum(draft.size for draft in self._drafts.values() if not draft.shared)
 
-    def _refused(self, session: str, total: int) -> Refused:
+    def _refused(self, session: str, total: int, used: int, most: int) -> Refused:
         self._count("payloads_refused")
         return Refused(
             NO_ROOM,
-            f"session {session[:8]} asked for a payload of {total} bytes; {self._bytes} of at most"
-            f" {self._bytes_max} are in use{self._biggest()}; raise shared_bytes_max, keep fewer"
-            " versions, or let go of arrays and locks that hold old ones",
+            f"session {session[:8]} asked for a payload of {total} bytes; {used} of at most {most}"
+            f" are in use{self._biggest()}; raise shared_bytes_max, keep fewer versions, or let go"
+            " of arrays and locks that hold old ones",
         )
 
     def _in_folder(self, folder: SharedFolder | None, file: str, total: int) -> Pages | None:
@@ -341,8 +344,8 @@ class PayloadDesk:
 
 
 def half_of(folder: SharedFolder | None) -> int:
-    """Return half of the bytes that the file system of a folder has."""
+    """Return half of the bytes that the file system of a folder has; without one, of drafts."""
     if folder is None:
-        return 0
+        return DRAFT_BYTES_MAX
     system = os.fstatvfs(folder.descriptor)
     return system.f_blocks * system.f_frsize // 2

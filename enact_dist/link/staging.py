@@ -51,7 +51,7 @@ def stage(
 
     Raises:
         LeaseLostError: A shard has restarted, so that the lock is lost.
-        LinkError: A shard has no room for them; the text says how much it has and what to do.
+        NoRoomError: A shard has no room for them; the text says how much it has and what to do.
         ShardUnreachableError: A shard does not answer.
         EnactError: What `alive` raises.
     """

@@ -34,7 +34,7 @@ def far(request, make_settings, endpoint, monkeypatch):
     cells = []
     with TcpProxy(port, bytes_per_s=getattr(request, "param", None)) as proxy:
         shard = make_settings("s0", endpoints=(proxy.endpoint,))
-        started = start_shard(DaemonSettings("cell", shard, (endpoint,), None))
+        started = start_shard(DaemonSettings("cell", shard, (endpoint,), shared_bytes_max=0))
 
         def open_cell(*, direct=False):
             cells.append(connect(endpoint if direct else proxy.endpoint))
@@ -42,7 +42,9 @@ def far(request, make_settings, endpoint, monkeypatch):
 
         def restart():
             open_cell.shard.stop(drain_s=0.0)
-            open_cell.shard = start_shard(DaemonSettings("cell", shard, (endpoint,), None))
+            open_cell.shard = start_shard(
+                DaemonSettings("cell", shard, (endpoint,), shared_bytes_max=0)
+            )
 
         open_cell.proxy, open_cell.shard, open_cell.restart = proxy, started, restart
         yield open_cell

@@ -273,10 +273,9 @@ def test_cap_that_nobody_has_set_refuses_nothing(folder):
     assert names(folder) == ["a-2"]
 
 
-def test_drafts_in_plain_memory_are_bounded(monkeypatch):
+def test_drafts_in_plain_memory_are_bounded():
     """A client that stages and never commits cannot fill the shard."""
-    monkeypatch.setattr("enact_dist.link.payload_desk.DRAFT_BYTES_MAX", 2 * SIZE)
-    desk = PayloadDesk(None, 0)
+    desk = PayloadDesk(None, 2 * SIZE)
     for number in (1, 2):
         assert isinstance(stage(desk, f"a-{number}"), Staged)
 

@@ -8,7 +8,7 @@ import pytest
 
 from enact_dist.core.datum import Datum, Slot
 from enact_dist.core.messages import EpochChanged, Refused, Stage, Staged, WriteItem
-from enact_dist.errors import EnactError, LeaseLostError, LinkError, ShardUnreachableError
+from enact_dist.errors import EnactError, LeaseLostError, NoRoomError, ShardUnreachableError
 from enact_dist.link import staging, transfer
 from enact_dist.link.payload_desk import GAPS_MAX, PayloadDesk
 from enact_dist.link.session_client import FIRST_STAGED
@@ -150,7 +150,7 @@ def test_shard_without_room_refuses_by_name_and_forgets_what_came():
     way.desks["s1"] = PayloadDesk(None, 150_000)
     writes = {"s0": [write_of("a", 100_000)], "s1": [write_of("b", 200_000)]}
 
-    with pytest.raises(LinkError, match="of at most 150000"):
+    with pytest.raises(NoRoomError, match="of at most 150000"):
         stage(way, writes, lambda: None)
 
     assert [desk.figures()["payload_drafts"] for desk in way.desks.values()] == [0, 0]
