@@ -84,7 +84,14 @@ def quoted(path):
             peer, *cells = (cell.strip() for cell in line.strip("| ").split(" | "))
             tables.setdefault((title, peer), dict(zip(head[1:], cells, strict=True)))
     peers = dict.fromkeys(peer for title, peer in tables if title.startswith("W1 "))
-    return {peer: [_quoted_cell(tables, peer, column) for column in COLUMNS] for peer in peers}
+    (promises,) = {title for title, _ in tables if title.startswith("What each peer")} or {""}
+    return {
+        peer: [
+            *(_quoted_cell(tables, peer, column) for column in COLUMNS),
+            _promises(tables.get((promises, peer), {})),
+        ]
+        for peer in peers
+    }
 
 
 def _quoted_cell(tables, peer, column):
@@ -98,24 +105,25 @@ def _quoted_cell(tables, peer, column):
     return NONE
 
 
+def _promises(found):
+    said = (found.get(name, NONE) for name in GUARANTEES)
+    return " / ".join({0: "no", 1: "yes"}.get(promise, str(promise)) for promise in said)
+
+
 def peers_table(folder, old):
     """Return the Markdown of all peers: those measured first, then those quoted."""
-    cells, guarantees = measured(folder)
-    lines = ["| system | " + " | ".join(column[0] for column in COLUMNS) + " |"]
-    lines.append("|" + "---|" * (len(COLUMNS) + 1))
-    lines += [f"| {peer} | " + " | ".join(row) + " |" for peer, row in cells.items()]
+    cells, promises = measured(folder) if folder is not None else ({}, {})
+    head = ["system", *(column[0] for column in COLUMNS), "lease / fencing / several / other hosts"]
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    rows = [(peer, [*row, _promises(promises.get(peer, {}))]) for peer, row in cells.items()]
     if old is not None:
-        lines += [
-            f"| {peer} (quoted) | " + " | ".join(row) + " |"
-            for peer, row in quoted(old).items()
-            if peer not in cells
+        rows += [
+            (f"{peer} (quoted)", row) for peer, row in quoted(old).items() if peer not in cells
         ]
+    lines += [f"| {name} | " + " | ".join(row) + " |" for name, row in rows]
+    if old is not None:
         lines += ["", f"Quoted: {old.stem.replace('_', ' ')}, the same kind of machine."]
-    said = "; ".join(
-        f"{peer}: " + ", ".join(f"{name} {caps.get(name, '?')}" for name in GUARANTEES)
-        for peer, caps in guarantees.items()
-    )
-    return "\n".join([*lines, "", f"What each promises: {said}."]) + "\n"
+    return "\n".join(lines) + "\n"
 
 
 def put(text, name, content):
@@ -139,13 +147,14 @@ def main(words):
     parser.add_argument("--quote", type=Path, metavar="FILE", help="Markdown of earlier figures")
     parser.add_argument("--readme", type=Path, default=README)
     given = parser.parse_args(words)
-    if not given.runs and given.peers is None:
-        parser.error("nothing to write: name runs, --peers or both")
+    peers = given.peers is not None or given.quote is not None
+    if not given.runs and not peers:
+        parser.error("nothing to write: name runs, --peers, --quote or several of them")
     try:
         text = given.readme.read_text()
         if given.runs:
             text = put(text, "bench", table(given.runs))
-        if given.peers is not None:
+        if peers:
             text = put(text, "peers", peers_table(given.peers, given.quote))
     except (MisuseError, OSError) as error:
         print(f"readme_tables: {error}", file=sys.stderr)

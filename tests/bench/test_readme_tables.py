@@ -22,6 +22,12 @@ QUOTED = """
 | redis-lua | 204 | 294 | 2,749 |
 | ray | 4045 | 13.9ms | 278 |
 
+### What each peer guarantees (so that)
+
+| peer | lease | fencing | rw | multi | cross_host |
+|---|---|---|---|---|---|
+| ray | yes | no | yes | ordered locks | yes |
+
 ### W6 wake-up: store by A
 
 | peer | 64 B p50 | 0.9 MB p50 |
@@ -69,6 +75,8 @@ def test_earlier_figures_are_quoted_with_their_units(files):
     cells = quoted(files[2])
 
     assert column(cells["ray"], "update") == "4.04 ms"
+    assert cells["ray"][-1] == "yes / no / ordered locks / yes"
+    assert cells["redis-lua"][-1] == "- / - / - / -"
     assert column(cells["ray"], "wake-up 64 B") == "11.2 ms"
     assert column(cells["ray"], "wake-up 0.9 MB") == NONE
     assert column(cells["redis-lua"], "4 clients, one slot, per s") == "2,749"
@@ -86,6 +94,25 @@ def test_peers_are_written_between_their_markers(files):
     assert "redis-lua (quoted)" not in text
     assert text.startswith("# Title\n<!-- bench -->\nold\n")
     assert text.endswith("<!-- end of peers -->\nafter\n")
+
+
+def test_earlier_figures_may_stand_alone(files):
+    """Until the project itself was measured beside them."""
+    readme, _, old = files
+
+    assert main(["--quote", str(old), "--readme", str(readme)]) == 0
+
+    assert "| redis-lua (quoted) | 204 µs |" in readme.read_text()
+
+
+def test_promises_are_told_in_words(files):
+    """What nobody told is a dash."""
+    readme, results, _ = files
+
+    assert main(["--peers", str(results), "--readme", str(readme)]) == 0
+
+    (line,) = (line for line in readme.read_text().splitlines() if "redis-lua" in line)
+    assert line.endswith("| yes / - / - / - |")
 
 
 def test_nothing_is_written_if_anything_is_wrong(files, capsys):
