@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from enact_dist.core.datum import Datum, Slot
 from enact_dist.core.messages import EpochChanged, Fetch, Gone, Refused, Slice
 from enact_dist.errors import LeaseLostError, ProtocolError
 from enact_dist.link.memory import body_of, plain_memory
+from enact_dist.link.recycling import RECYCLED_BYTES_MAX
 from enact_dist.link.refusals import error_of
 from enact_dist.link.transfer import Piece, Transfer, in_turn
 from enact_dist.wire.limits import BODY_BYTES_MAX
@@ -28,10 +29,6 @@ if TYPE_CHECKING:
     from enact_dist.core.messages import Answer, SlotState
     from enact_dist.link.client import CellClient
     from enact_dist.link.datum_cache import DatumCache
-
-
-RECYCLED_BYTES_MAX: Final = 32 << 20
-"""The C library gives longer memory back to the system each time."""
 
 
 def fetch_all(

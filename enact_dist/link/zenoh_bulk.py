@@ -14,6 +14,7 @@ from __future__ import annotations
 import threading
 from typing import TYPE_CHECKING
 
+from enact_dist.link.recycling import recycle_blocks
 from enact_dist.link.zenoh_config import close_session, keep_after_fork, open_session
 
 if TYPE_CHECKING:
@@ -44,6 +45,7 @@ class BulkWay:
         if session is None:
             with self._mutex:
                 if self._session is None and not self._closed:
+                    recycle_blocks()
                     self._session = open_session(connect=self._endpoints, lease_s=self._lease_s)
                 session = self._session
         return session if session is not None and session.info.peers_zid() else None

@@ -32,6 +32,7 @@ from enact_dist.core.messages import (
 )
 from enact_dist.core.records import SessionSeen
 from enact_dist.errors import ProtocolError
+from enact_dist.link.recycling import recycle_blocks
 from enact_dist.link.senders import Senders, size_of
 from enact_dist.link.zenoh_config import QUEUED_MAX, keep_after_fork
 from enact_dist.wire.frames import decode_frame, encode_frame
@@ -69,6 +70,7 @@ class ZenohService:
         self.senders = Senders(host.count)
         self._closed = False
         keep_after_fork(self)
+        recycle_blocks()
         self._publisher = session.declare_publisher(
             notice_key(cell, host.name), congestion_control=zenoh.CongestionControl.DROP
         )
