@@ -143,6 +143,7 @@ def _settle(session: Session, shard: str) -> None:
     while stamp_ns:
         answer = client.call(shard, AwaitStamp(stamp_ns, SLICE_NS))
         if isinstance(answer, Reached) and answer.reached:
+            client.core.reached(shard, stamp_ns)
             return
         if time.monotonic() >= deadline_s:
             raise ShardUnreachableError(

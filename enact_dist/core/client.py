@@ -21,6 +21,7 @@ from enact_dist.core.messages import (
     Alive,
     Answer,
     EpochChanged,
+    Granted,
     Hello,
     KeepAlive,
     LaneView,
@@ -30,12 +31,13 @@ from enact_dist.core.messages import (
 from enact_dist.core.multilock import MultiLock
 from enact_dist.core.phase import Phase
 from enact_dist.core.placement import shard_of
+from enact_dist.core.unsettled import Unsettled
 from enact_dist.terms import ACCESSES, Access
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping
 
-    from enact_dist.core.messages import Item, Request
+    from enact_dist.core.messages import Item, Prepared, Request
 
 
 PLANNED_MAX: Final = 32
@@ -62,7 +64,6 @@ class Client:
         "_peers",
         "_plans",
         "_seqs",
-        "_unsettled",
         "actor",
         "host",
         "observer",
@@ -73,6 +74,7 @@ class Client:
         "sendings",
         "session",
         "ttl_ns",
+        "unsettled",
     )
 
     def __init__(
@@ -95,7 +97,7 @@ class Client:
         self._peers: dict[str, Peer] = {}
         self._locks: dict[LockId, MultiLock] = {}
         self._seqs: dict[int, int] = {}
-        self._unsettled: dict[str, int] = {}
+        self.unsettled = Unsettled()
         self._plans: dict[tuple[Item, ...], Plan] = {}
 
     # ---------------------------------------------------------------- shards
@@ -139,6 +141,8 @@ class Client:
         if isinstance(answer, Alive) and isinstance(request, KeepAlive):
             self._alive(shard, request, answer, now_ns)
             return True
+        if self.unsettled and isinstance(answer, Granted):
+            self.unsettled.shown(shard, answer.states)
         return False
 
     def _welcomed(self, shard: str, request: Hello, answer: Welcome) -> None:
@@ -180,22 +184,19 @@ class Client:
         """Remember the largest stamp seen: later commits come after it everywhere."""
         self.seen_stamp_ns = max(self.seen_stamp_ns, stamp_ns)
 
-    def committed(self, participants: Iterable[str], stamp_ns: int) -> None:
-        """Note that these shards may not show a commit of ours yet.
-
-        Threads are told in another order than that of their commits.
-        """
-        for shard in participants:
-            self._unsettled[shard] = max(self._unsettled.get(shard, 0), stamp_ns)
+    def committed(self, votes: Mapping[str, Prepared], stamp_ns: int) -> None:
+        """Note on which slots the shards that have voted may not show a commit of ours yet."""
+        for shard, vote in votes.items():
+            slots = (version.slot for version in vote.versions)
+            self.unsettled.committed(shard, slots, stamp_ns)
 
     def unsettled_ns(self, shard: str) -> int:
         """Return the stamp of a commit of ours that a shard may not show yet (0: none)."""
-        return self._unsettled.get(shard, 0)
+        return self.unsettled.stamp_ns(shard)
 
-    def viewed(self, shard: str, until_ns: int) -> None:
+    def reached(self, shard: str, stamp_ns: int) -> None:
         """Note that a shard shows everything up to a stamp."""
-        if self._unsettled.get(shard, until_ns + 1) <= until_ns:
-            del self._unsettled[shard]
+        self.unsettled.reached(shard, stamp_ns)
 
     # ---------------------------------------------------------------- keep-alive
 
@@ -265,7 +266,7 @@ class Client:
         unless it may not show a commit of ours yet.  With `lock_views` they become reads.
         """
         items = tuple(items)
-        usual = not lock_views and not self._unsettled and len(items) <= PLANNED_MAX
+        usual = not lock_views and not self.unsettled and len(items) <= PLANNED_MAX
         plan = self._plans.get(items) if usual else None
         if plan is None:
             plan = self._planned(items, lock_views=lock_views)
@@ -289,13 +290,14 @@ class Client:
                 (locks if access.locks else views).setdefault(shard, []).append(item)
         if len(locks) == 1:
             only = next(iter(locks))
-            if only not in self._unsettled and set(views) <= {only}:
+            here = views.get(only, ())
+            if set(views) <= {only} and not self.unsettled.stamp_ns(only, here):
                 locks[only] += views.pop(only, [])
         return Plan(
             tuple((shard, tuple(locks[shard])) for shard in sorted(locks)),
             tuple((shard, tuple(views[shard])) for shard in sorted(views)),
             self.placement,
-            max((self._unsettled.get(shard, 0) for shard in views), default=0),
+            max((self.unsettled.stamp_ns(shard, views[shard]) for shard in views), default=0),
         )
 
     def assert_invariants(self) -> None:

@@ -299,7 +299,7 @@ class MultiLock:
         if answers is not None:
             for one, viewed in answers.items():
                 self.states += [Reading(one, viewed.epoch, state) for state in viewed.states]
-                self.client.viewed(one, viewed.until_ns)
+                self.client.unsettled.shown(one, viewed.states, until_ns=viewed.until_ns)
             self._advance()
         elif cut.rounds > ROUNDS_MAX:
             self.lose("its views over several shards were never of one moment")

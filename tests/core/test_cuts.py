@@ -21,6 +21,7 @@ from enact_dist.core.multilock import MultiLock
 from enact_dist.core.phase import Phase
 from enact_dist.core.placement import shard_of
 from enact_dist.core.records import Called
+from enact_dist.core.unsettled import SLOTS_MAX
 from enact_dist.terms import Access
 
 R, W, V = Access.READ, Access.WRITE, Access.VIEW
@@ -268,6 +269,62 @@ def test_own_commit_is_shown_though_an_earlier_one_was_told_later(cell):
     client.drive(view)
 
     assert (view.phase, shown(view)) == (Phase.HELD, ["second"])
+
+
+@pytest.mark.parametrize("seen", ["nothing else", "another slot", "a pattern of others"])
+def test_own_commit_is_shown_whatever_else_of_its_shard_was_seen_before(cell, seen):
+    """A shard that shows other slots as of now may still have our commit before it."""
+    y, other = cell.entity_on("b"), cell.entity_on("b", "tray/")
+    client = cell.client("ann")
+    write_both(cell, client, "new")
+    cell.wait(MS)
+    if seen != "nothing else":
+        before = (
+            item(V, other) if seen == "another slot" else item(Access.VIEW_EACH, "tray/*", "note")
+        )
+        assert client.locked(before).phase is Phase.HELD
+
+    alone, beside = (
+        client.begin(item(V, y), lane=1),
+        client.begin(item(W, other), item(V, y), lane=2),
+    )
+    for _ in range(4):
+        for lock in (alone, beside):
+            client.step(lock)
+    assert [lock.phase for lock in (alone, beside)] == [Phase.VIEWING, Phase.VIEWING]
+    tell_decisions(cell)
+
+    assert shown(client.drive(alone)) == ["new"]
+    assert shown(client.drive(beside))[-1] == "new"
+
+
+def test_what_was_shown_once_rides_with_locks_again(cell):
+    """As soon as a shard has shown our commit, views of it need no round trip of their own."""
+    y, other = cell.entity_on("b"), cell.entity_on("b", "tray/")
+    client = cell.client("ann")
+    write_both(cell, client, "new")
+    untold = client.core.plan((item(W, other), item(V, y)))
+    assert [shard for shard, _ in untold.views] == ["b"]
+    assert not client.core.plan((item(W, other), item(V, other, "note"))).views
+    tell_decisions(cell)
+    cell.wait(MS)
+
+    assert shown(client.locked(item(V, y))) == ["new"]
+
+    assert not client.core.plan((item(W, other), item(V, y))).views
+    assert client.core.unsettled_ns("b") == 0
+
+
+def test_commits_on_many_slots_are_forgotten_by_their_stamps(cell):
+    """Who writes ever new slots over shards keeps a bounded memory of them, and misses none."""
+    client = cell.client("ann").core
+    for number in range(2 * SLOTS_MAX):
+        client.unsettled.committed("b", (slot(f"e{number}"),), number + 1)
+
+    assert len(client.unsettled) <= SLOTS_MAX + 1
+    assert client.plan((item(V, "e0"),)).floor_ns >= 1
+    client.reached("b", 2 * SLOTS_MAX)
+    assert client.unsettled_ns("b") == 0
 
 
 def test_view_that_outlived_a_restart_does_not_show_half_a_commit(cell):
