@@ -26,6 +26,7 @@ import os
 import threading
 import time
 import weakref
+from collections import OrderedDict
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Final, TypeVar
@@ -51,6 +52,8 @@ DRAFT_S: Final = 30.0
 """A draft of a session that holds no lock is given up after so long without a slice."""
 DRAFT_BYTES_MAX: Final = 2 << 30
 """Bytes of drafts that wait in plain memory for their commits."""
+OVER_MAX: Final = 4096
+"""Names of payloads that were adopted or given up, by which late slices are known."""
 ROOM_S: Final = 1.0
 """How long a new draft waits for files that are on their way out."""
 
@@ -117,6 +120,7 @@ class PayloadDesk:
         self._drafts: dict[str, _Draft] = {}
         self._files: dict[str, int] = {}
         self._adopted: dict[str, weakref.ref[Pages | Plain]] = {}
+        self._over: OrderedDict[str, None] = OrderedDict()
         self._bytes = 0
 
     # ---------------------------------------------------------------- drafts
@@ -129,6 +133,9 @@ class PayloadDesk:
         if not total:
             self.drop(file)
             return Staged(file, 0, False)
+        with self._mutex:
+            if file in self._over:
+                return Staged(file, total, False)  # a late copy: nobody waits for it
         if not PAYLOAD_BYTES_MIN < total <= BODY_BYTES_MAX:
             return Refused(
                 "protocol",
@@ -239,6 +246,13 @@ class PayloadDesk:
         """Give a draft up; nothing where there is none."""
         with self._mutex:
             self._drafts.pop(file, None)
+            self._end(file)
+
+    def _end(self, file: str) -> None:
+        """Remember that a name has been used, so that a late slice makes no draft of it again."""
+        self._over[file] = None
+        while len(self._over) > OVER_MAX:
+            self._over.popitem(last=False)
 
     def drop_session(self, session: str) -> None:
         """Give up all drafts of a session."""
@@ -288,6 +302,7 @@ class PayloadDesk:
                 return None
             del self._drafts[file]
             self._adopted[file] = weakref.ref(draft.memory)
+            self._end(file)
         if draft.shared and self._folder is not None:
             os.chmod(file, self._folder.access.file_mode, dir_fd=self._folder.descriptor)
         self._count("payloads_adopted")
@@ -326,6 +341,11 @@ class PayloadDesk:
             gone = [self._drafts.pop(file) for file in over]
         if gone:
             self._count("drafts_swept", len(gone))
+
+    def drafts(self) -> dict[str, str]:
+        """Return the session of each draft, by its name.  For tests and simulation."""
+        with self._mutex:
+            return {file: draft.session for file, draft in self._drafts.items()}
 
     def figures(self) -> dict[str, int]:
         """Return counters, and what there is now: files, bytes, drafts."""
