@@ -11,7 +11,7 @@ from itertools import chain
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator
 
     from enact_dist.core.datum import Slot
     from enact_dist.core.slots import Content
@@ -70,6 +70,10 @@ class Past:
         if not states:
             del self._by_slot[slot]
         return slot, old
+
+    def of(self, slot: Slot) -> Iterable[Content]:
+        """Return the replaced states of a slot that are known, oldest first."""
+        return self._by_slot.get(slot, ())
 
     def at(self, slot: Slot, at_ns: int) -> Content | None:
         """Return the replaced state that was current at a stamp, None if it is forgotten."""

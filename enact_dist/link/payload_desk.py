@@ -141,8 +141,6 @@ class PayloadDesk:
                 "protocol",
                 f"a payload of {total} bytes; from {PAYLOAD_BYTES_MIN} to {BODY_BYTES_MAX}",
             )
-        if file in self._adopted:
-            return Staged(file, total, False)  # a late copy of a slice
         draft: _Draft | Refused | None = self._drafts.get(file)
         if draft is None:
             # Slices of one draft may come by several threads.

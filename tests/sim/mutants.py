@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import mutants_directed
 import mutants_one_shard as one
 import mutants_over_shards as over
+import mutants_payloads as payloads
 import mutants_readers as readers
 from mutants_directed import DIRECTED
 
@@ -32,7 +33,7 @@ def _of(module: Any) -> tuple[Mutant, ...]:
     )
 
 
-SIMULATED = (*_of(one), *_of(over), *_of(readers))
+SIMULATED = (*_of(one), *_of(over), *_of(readers), *_of(payloads))
 """Those that the simulator catches."""
 ALL = (*SIMULATED, *DIRECTED)
 

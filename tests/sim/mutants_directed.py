@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 from mutant_parts import forgets_what_ended
 
-from enact_dist.core.client import Client
 from enact_dist.core.commits import Commits
 from enact_dist.core.cuts import Cut
 from enact_dist.core.lock_desk import LockDesk
@@ -21,6 +20,7 @@ from enact_dist.core.retained import Retained
 from enact_dist.core.sessions import Session, SessionTable
 from enact_dist.core.slots import SlotMap
 from enact_dist.core.tenures import Tenures
+from enact_dist.core.unsettled import Unsettled
 from enact_dist.core.view_desk import ViewDesk
 from enact_dist.terms import Durability
 
@@ -137,10 +137,12 @@ def shows_the_future_by_stamp(patch: Patch) -> None:
 def forgets_a_later_commit_of_its_own(patch: Patch) -> None:
     """A client that is told of two commits in the other order waits for the earlier one only."""
 
-    def wrong(self: Client, participants: Any, stamp_ns: int) -> None:
-        self._unsettled.update(dict.fromkeys(participants, stamp_ns))
+    def wrong(self: Unsettled, shard: str, slots: Any, stamp_ns: int) -> None:
+        for other in self._slots.setdefault(shard, {}):
+            self._slots[shard][other] = stamp_ns
+        self._slots[shard].update(dict.fromkeys(slots, stamp_ns))
 
-    patch(Client, "committed", wrong)
+    patch(Unsettled, "committed", wrong)
 
 
 DIRECTED = {

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 from enact_dist.core.client import Client
 from enact_dist.core.retained import Retained
 from enact_dist.core.slots import Shown, SlotMap
+from enact_dist.core.unsettled import Unsettled
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -87,3 +88,12 @@ def forgets_large_data_that_a_stamp_named(patch: Patch) -> None:
 def surveys_before_its_own_commits(patch: Patch) -> None:
     """A client does not wait until a participant shows what it has committed itself."""
     patch(Client, "unsettled_ns", lambda _self, _shard: 0)
+
+
+def takes_one_slot_for_the_whole_shard(patch: Patch) -> None:
+    """A shard that shows one slot as of now counts as showing all that this process committed."""
+
+    def wrong(self: Unsettled, shard: str, _states: Any, *, until_ns: int = 0) -> None:
+        self.reached(shard, until_ns)
+
+    patch(Unsettled, "shown", wrong)

@@ -104,6 +104,14 @@ HAPPENED = (
     "replaced versions surveyed",
     "stamps outside retention",
     "own commits seen",
+    # What came apart from its commit.
+    "slices staged",
+    "slices sent again",
+    "payloads adopted",
+    "payloads released",
+    "payloads held to the end",
+    "payloads named too early",
+    "refused: no_payload",
 )
 
 

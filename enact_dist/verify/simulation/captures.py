@@ -98,5 +98,6 @@ class Captures:
             self._world.tally["surveys that waited"] += 1
             (answer,) = yield Calls([(shard, AwaitStamp(stamp_ns, SLICE_NS))])
             if isinstance(answer, Reached) and answer.reached:
+                host.client.reached(shard, stamp_ns)
                 return True
         return False

@@ -41,10 +41,11 @@ from enact_dist.terms import Durability
 from enact_dist.verify.simulation.client_judge import ClientJudge
 from enact_dist.verify.simulation.history import TOLD_NOT, History
 from enact_dist.verify.simulation.lock_judge import LockJudge
+from enact_dist.verify.simulation.payloads import copied
 from enact_dist.verify.simulation.picture import Picture, State
 from enact_dist.verify.simulation.prefixes import judge_prefixes
 from enact_dist.verify.simulation.reader_judge import ReaderJudge, stamp_of
-from enact_dist.verify.simulation.workload import label_of, value_of, writer_of
+from enact_dist.verify.simulation.workload import FILLED, label_of, value_of, writer_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -323,7 +324,7 @@ class Model:
                 self.decided[lock] = record
                 self._world.tally["decisions"] += 1
         versions = {change.slot: (change.version, change.stamp_ns) for change in notice.changes}
-        datum_of = {slot: host.shard.state.slots[slot].datum for slot in versions}
+        datum_of = {slot: copied(host.shard.state.slots[slot].datum) for slot in versions}
         for change in notice.changes:
             datum = datum_of[change.slot]
             if (change.null, change.captured_ns) != (datum is None, stamp_of(datum)):
@@ -397,6 +398,8 @@ class Model:
     def _check_content(self, lock: LockId, slot: Slot, before: State, datum: Datum) -> None:
         if writer_of(datum) != str(lock):
             self._fail("a commit publishes its own data", slot, datum)
+        if len(datum.body) != datum.size or bytes(datum.body[FILLED:]).strip(b"."):
+            self._fail("no half datum is ever shown", slot, datum.size, len(datum.body))
         if slot.aspect == "made":
             first = self.labels.setdefault((slot.context, label_of(datum)), slot)
             if first != slot:

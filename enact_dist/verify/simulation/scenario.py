@@ -177,6 +177,7 @@ class Scenario:
             self.world.run_until(self.world.now_ns + POLL_NS)
         self._check_quiet()
         for host in self.shards.values():
+            host.payloads.check_released()
             host.close()
         self.model.check_all_or_nothing()
         graph = Graph(self.history, self.model)

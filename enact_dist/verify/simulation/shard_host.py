@@ -5,10 +5,11 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING, cast
 
-from enact_dist.core.messages import Answer, Finish, Refused, Request
+from enact_dist.core.messages import Answer, Finish, Refused, Request, Stage
 from enact_dist.core.records import Call, Called, Persist, Persisted, Reply, SessionSeen, Tick
 from enact_dist.core.shard import Shard
 from enact_dist.verify.simulation.disk import Disk
+from enact_dist.verify.simulation.payloads import ShardPayloads, as_kept
 from enact_dist.verify.simulation.world import MS, Host, S
 
 if TYPE_CHECKING:
@@ -42,6 +43,7 @@ class ShardHost(Host):
         self.asserts = True
         self.model: Model
         self.shard: Shard
+        self.payloads: ShardPayloads
         self.tokens: Callable[[ShardHost], list[str]] = lambda _host: []
         self.on_persist: Callable[[ShardHost], None] = lambda _host: None
         self.on_decision: Callable[[ShardHost, list[str]], None] = lambda _host, _told: None
@@ -63,6 +65,7 @@ class ShardHost(Host):
         recovered = self.disk.recovered(unix_s=self.wall_ns // S)
         self._replies.clear()
         self.shard = Shard(self.settings, recovered, now_ns=self.local_ns, wall_ns=self.wall_ns)
+        self.payloads = ShardPayloads(self.world, self.shard)
         self.model.booted(self, recovered, crashed_at_ns=self._crashed_at_ns)
         self._tick_due_ns = 0
         self._plan_tick()
@@ -121,9 +124,12 @@ class ShardHost(Host):
 
     def request(self, message: Request, reply: Callable[[Answer], None]) -> None:
         """Hand a request to the shard; exactly one answer must come, now or later."""
+        if isinstance(message, Stage):
+            reply(self.payloads.stage(message))
+            return
         self._handle += 1
         self._replies[self._handle] = reply
-        self._give(message, self._handle)
+        self._give(self.payloads.with_bodies(message), self._handle)
 
     def event(self, event: Event) -> None:
         """Hand an event of this host to the shard."""
@@ -134,7 +140,14 @@ class ShardHost(Host):
             self._inbox.append((message, handle))
             return
         now_ns, wall_ns = self.local_ns, self.wall_ns
-        effects = self.shard.handle(message, reply_to=handle, now_ns=now_ns, wall_ns=wall_ns)
+        if isinstance(message, Tick):
+            self.payloads.look()
+        effects = [
+            as_kept(effect)
+            for effect in self.shard.handle(
+                message, reply_to=handle, now_ns=now_ns, wall_ns=wall_ns
+            )
+        ]
         self._steps += 1
         if self.asserts and self._steps % ASSERT_EVERY == 0:
             self.shard.assert_invariants()

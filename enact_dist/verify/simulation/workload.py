@@ -28,6 +28,7 @@ from enact_dist.terms import Access
 from enact_dist.verify.simulation.captures import Captures, drawn_stamp_ns
 from enact_dist.verify.simulation.client_host import Calls, ClientHost, Sleep, Steps, Thread
 from enact_dist.verify.simulation.history import Entry, History
+from enact_dist.verify.simulation.payloads import Stager
 from enact_dist.verify.simulation.world import MS, S
 
 if TYPE_CHECKING:
@@ -65,6 +66,10 @@ SETS = ("view set", "use set")
 """Jobs whose views ask for data of one capture stamp."""
 LARGE = 64 * 1024 + 1
 """Bytes of a datum that does not travel with the grant."""
+WORKS_NS = tuple(ms * MS for ms in (0, 0, 0, 0, 2, 20, 20, 100, 100, 500, 2000))
+"""How long a lock may be held before it ends."""
+FILLED = 200
+"""A datum says what it is in fewer bytes; from here on it is filled with dots."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +93,7 @@ class Workload:
 
     def __init__(self, world: World, history: History, model: Model, *, entities: int) -> None:
         self._world, self._history, self._model = world, history, model
+        self._stager = Stager(world)
         self._captures = Captures(world, model)
         self._entities = ENTITIES[:entities]
         # With one entity nearly all locks want the same few slots.
@@ -108,7 +114,7 @@ class Workload:
             random,
             wait_ns=random.choice((0, 200 * MS, 2 * S, 8 * S)),
             hold_ns=hold_ns,
-            work_ns=random.choice((0, 0, 0, 2 * MS, 20 * MS, 20 * MS, 100 * MS, 500 * MS, 2 * S)),
+            work_ns=random.choice(WORKS_NS),
             abandons=random.random() < 0.08,
             expects=kind == "cross" or random.random() < (0.1 if kind in SETS else 0.7),
             label=f"package-{random.randrange(LABELS)}",
@@ -245,7 +251,7 @@ class Workload:
             if data is None or job.abandons:
                 lock.release()
             elif lock.phase is Phase.HELD:
-                self._finish(host, entry, job, data)
+                yield from self._finish(host, entry, job, data)
             yield from host.drive(lock)
         self._history.end(entry, now_ns=self._world.now_ns)
         self._world.tell(job.name, "is told", entry.told.value if entry.told else "-", lock.cause)
@@ -296,7 +302,8 @@ class Workload:
             (answer,) = yield Calls([(reading.shard, request)])
             if isinstance(answer, Slice):
                 self._world.tally["data fetched"] += 1
-                return replace(answer.body, encoding=answer.encoding, stamp_ns=answer.stamp_ns)
+                stamp_ns, encoding = answer.stamp_ns, answer.encoding
+                return Datum(encoding, bytes(answer.body.body), answer.body.size, stamp_ns)
             if isinstance(answer, Gone) and lock.valid(host.local_ns) and lock.parts:
                 self._world.violation("what a held lock names stays fetchable", lock.lock, state)
             if answer is not None:
@@ -307,12 +314,14 @@ class Workload:
 
     def _finish(
         self, host: ClientHost, entry: Entry, job: Job, data: dict[Slot, Datum | None]
-    ) -> None:
+    ) -> Thread:
         lock = entry.lock
         writes: dict[str, list[WriteItem]] = {}
         for slot in self._slots_to_write(job, data):
             shard = shard_of(slot.entity, host.client.placement)
             writes.setdefault(shard, []).append(WriteItem(slot, self._datum(lock, job, slot, data)))
+        for shard, items in writes.items():
+            writes[shard] = yield from self._stager.staged(host, shard, items, job.luck)
         if len(writes) > 1:
             self._world.tally["locks that write on several shards"] += 1
             self._world.tally["locks that write on three shards"] += len(writes) > 2
@@ -358,7 +367,7 @@ class Workload:
             return None
         old = data.get(slot)
         value = 1 if old is None else value_of(old) + 1
-        large = slot.aspect == "frame" and random.random() < 0.1
+        large = slot.aspect == "frame" and random.random() < 0.2
         datum = datum_of(f"{lock.lock}|{value}", size=LARGE if large else 0)
         return replace(datum, stamp_ns=drawn_stamp_ns(random, self._world.now_ns))
 
@@ -377,14 +386,14 @@ def datum_of(text: str, *, size: int = 0) -> Datum:
 
 def writer_of(datum: Datum) -> str:
     """Return the lock that wrote a datum."""
-    return bytes(datum.body[:200]).decode().partition("|")[0]
+    return bytes(datum.body[:FILLED]).decode().partition("|")[0]
 
 
 def value_of(datum: Datum) -> int:
     """Return the number in a datum."""
-    return int(bytes(datum.body[:200]).decode().rstrip(".").partition("|")[2])
+    return int(bytes(datum.body[:FILLED]).decode().rstrip(".").partition("|")[2])
 
 
 def label_of(datum: Datum) -> str:
     """Return the label in a datum."""
-    return bytes(datum.body[:200]).decode().rstrip(".").partition("|")[2]
+    return bytes(datum.body[:FILLED]).decode().rstrip(".").partition("|")[2]
