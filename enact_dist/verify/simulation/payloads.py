@@ -16,8 +16,9 @@ from enact_dist.core.datum import Datum
 from enact_dist.core.messages import Commit, EpochChanged, Prepare, Stage, Staged
 from enact_dist.core.records import Persist, PreparedRecord, SlotRecord
 from enact_dist.link.memory import Plain
-from enact_dist.link.payload_desk import PAYLOAD_BYTES_MIN, PayloadDesk
+from enact_dist.link.payload_desk import PayloadDesk
 from enact_dist.verify.simulation.client_host import Calls, ClientHost, Steps
+from enact_dist.wire.limits import PAYLOAD_BYTES_MIN
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
