@@ -6,6 +6,7 @@ Zenoh answer of that size), a publication by writing such a file.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 from typing import TYPE_CHECKING, Any, Final
@@ -164,7 +165,39 @@ def run_publish(run: Run) -> None:
     for size, count in SIZES.items():
         goal = times(1.2, written(size), "≤ 1.2 x write()") if size == LARGEST else None
         cases.append(Case("publish", size, _storing(world, size, count), written(size), goal))
+    if hasattr(Lock, "new"):
+        cases += [_filled_case(world, size, count) for size, count in SIZES.items()]
     run.measure(cases)
+
+
+def _filled_case(world: WorldContext, size: str, count: int) -> Case:
+    """Return the case of an array that was filled in place: what its commit alone takes."""
+    variant = "{}, filled in place, commit alone"
+    goal = None
+    if size == LARGEST:
+        goal = times(1.3, ("publish", variant.format(SMALL)), "independent of size (≤ 1.3 x 1 kB)")
+    return Case(
+        "publish", variant.format(size), _committing(world, size, count), written(size), goal
+    )
+
+
+def _committing(world: WorldContext, size: str, count: int) -> Callable[[float], Sequence[float]]:
+    write = Write(world, entity(f"new/{size}"), ARRAY)
+    filled = floats(SIZES[SMALL])
+
+    def measure(seconds_s: float) -> Sequence[float]:
+        with contextlib.ExitStack() as stack:
+
+            def fill() -> None:
+                stack.close()  # of the warm-up, or of an attempt that was interrupted
+                lock: Any = stack.enter_context(Lock(write, wait_s=WAIT_S))
+                array = lock.new(write, (count // 4,), np.float32)
+                array[: filled.size] = filled
+                array[-1] = 1.0
+
+            return timed(stack.close, seconds_s, before=fill)
+
+    return measure
 
 
 def _storing(world: WorldContext, size: str, count: int) -> Callable[[float], Sequence[float]]:
