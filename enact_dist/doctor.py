@@ -302,6 +302,7 @@ def _shard(shard: ShardInfo) -> Iterator[Finding]:
         return
     yield _connection(subject, shard)
     yield clock_skew(f"clock of {shard.name}", shard.clock_ahead_s)
+    yield from _shared_memory(shard)
     stalls = shard.counters.get("disk_stalls", 0)
     if stalls:
         yield Finding(
@@ -320,6 +321,27 @@ def _shard(shard: ShardInfo) -> Iterator[Finding]:
             "read enact lock audit, mend the data, then enact lock audit --settle TEXT"
             f" --shard {shard.name}",
         )
+
+
+def _shared_memory(shard: ShardInfo) -> Iterator[Finding]:
+    counters = shard.counters
+    used, most = counters.get("payload_bytes", 0), counters.get("payload_bytes_max", 0)
+    subject = f"shared memory of {shard.name}"
+    if not most:
+        return
+    text = f"{counters.get('payload_files', 0)} files, {used} of {most} bytes"
+    refused = counters.get("payloads_refused", 0)
+    fell_back = counters.get("payload_fallbacks", 0)
+    if refused:
+        remedy = "raise shared_bytes_max in cell.toml, or retain fewer versions"
+        yield Finding(Level.WARN, subject, f"{text}; {refused} writes were refused", remedy)
+    elif fell_back:
+        remedy = "enlarge the file system of the shared folder (in a container: a tmpfs volume)"
+        yield Finding(
+            Level.WARN, subject, f"{text}; {fell_back} large data did not fit and travel", remedy
+        )
+    elif used:
+        yield Finding(Level.OK, subject, text)
 
 
 def _connection(subject: str, shard: ShardInfo) -> Finding:

@@ -165,8 +165,7 @@ def run_publish(run: Run) -> None:
     for size, count in SIZES.items():
         goal = times(1.2, written(size), "≤ 1.2 x write()") if size == LARGEST else None
         cases.append(Case("publish", size, _storing(world, size, count), written(size), goal))
-    if hasattr(Lock, "new"):
-        cases += [_filled_case(world, size, count) for size, count in SIZES.items()]
+    cases += [_filled_case(world, size, count) for size, count in SIZES.items()]
     run.measure(cases)
 
 
@@ -190,7 +189,7 @@ def _committing(world: WorldContext, size: str, count: int) -> Callable[[float],
 
             def fill() -> None:
                 stack.close()  # of the warm-up, or of an attempt that was interrupted
-                lock: Any = stack.enter_context(Lock(write, wait_s=WAIT_S))
+                lock = stack.enter_context(Lock(write, wait_s=WAIT_S))
                 array = lock.new(write, (count // 4,), np.float32)
                 array[: filled.size] = filled
                 array[-1] = 1.0

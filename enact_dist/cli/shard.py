@@ -102,8 +102,8 @@ def list_shards(arguments: argparse.Namespace) -> int:
         print_json(shards)
     else:
         print_table(
-            ("shard", "endpoint", "state", "epoch", "up", "slots", "data", "sessions", "locks",
-             "rtt"),
+            ("shard", "endpoint", "state", "epoch", "up", "slots", "data", "shared", "sessions",
+             "locks", "rtt"),
             [_row(shard) for shard in shards],
             empty="no shards",
         )  # fmt: skip
@@ -112,7 +112,7 @@ def list_shards(arguments: argparse.Namespace) -> int:
 
 def _row(shard: ShardInfo) -> tuple[object, ...]:
     if not shard.reachable:
-        return (shard.name, shard.endpoint, "UNREACHABLE", *["-"] * 7)
+        return (shard.name, shard.endpoint, "UNREACHABLE", *["-"] * 8)
     return (
         shard.name,
         shard.endpoint,
@@ -121,10 +121,17 @@ def _row(shard: ShardInfo) -> tuple[object, ...]:
         shown_s(shard.uptime_s),
         shard.slots,
         shown_bytes(shard.size_bytes),
+        _shared(shard),
         shard.sessions,
         shard.locks,
         shown_s(shard.round_trip_s),
     )
+
+
+def _shared(shard: ShardInfo) -> str:
+    """Return how much large data lies in shared memory, and of how much."""
+    used, most = (shard.counters.get(f"payload_{name}", 0) for name in ("bytes", "bytes_max"))
+    return f"{shown_bytes(used)} of {shown_bytes(most)}" if most else "-"
 
 
 def _state(shard: ShardInfo) -> str:

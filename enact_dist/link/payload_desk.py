@@ -170,6 +170,8 @@ class PayloadDesk:
         shared = self._folder is not None and self._has_room(total)
         if self._folder is not None and not shared and self._firm:
             return self._refused(session, total, self._bytes, self._bytes_max)
+        if self._folder is not None and not shared:
+            self._count("payload_fallbacks")
         memory = self._in_folder(self._folder, file, total) if shared else None
         if memory is None:
             drafted = self._drafted()
@@ -352,7 +354,7 @@ class PayloadDesk:
                 **self.counters,
                 "payload_files": len(self._files),
                 "payload_bytes": self._bytes,
-                "payload_bytes_max": self._bytes_max,
+                "payload_bytes_max": self._bytes_max if self._folder is not None else 0,
                 "payload_drafts": len(self._drafts),
             }
 
