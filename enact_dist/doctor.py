@@ -302,7 +302,7 @@ def _shard(shard: ShardInfo) -> Iterator[Finding]:
         return
     yield _connection(subject, shard)
     yield clock_skew(f"clock of {shard.name}", shard.clock_ahead_s)
-    yield from _shared_memory(shard)
+    yield from shared_data(shard)
     stalls = shard.counters.get("disk_stalls", 0)
     if stalls:
         yield Finding(
@@ -323,7 +323,8 @@ def _shard(shard: ShardInfo) -> Iterator[Finding]:
         )
 
 
-def _shared_memory(shard: ShardInfo) -> Iterator[Finding]:
+def shared_data(shard: ShardInfo) -> Iterator[Finding]:
+    """Check how much large data lies in the memory that a shard shares, and what did not fit."""
     counters = shard.counters
     used, most = counters.get("payload_bytes", 0), counters.get("payload_bytes_max", 0)
     subject = f"shared memory of {shard.name}"

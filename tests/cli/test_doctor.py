@@ -124,3 +124,24 @@ def test_doctor_checks_the_machine_without_a_cell(enact):
 
     assert result.status == 0
     assert "warn  cell: not checked: no cell.toml here" in result.out
+
+
+@pytest.mark.parametrize(
+    ("counters", "level", "said"),
+    [
+        ({}, None, ""),
+        ({"payload_bytes_max": 100}, None, ""),
+        ({"payload_bytes": 80, "payload_files": 2}, Level.OK, "2 files, 80 of 100 bytes"),
+        ({"payload_bytes": 80, "payloads_refused": 3}, Level.WARN, "3 writes were refused"),
+        ({"payload_fallbacks": 4}, Level.WARN, "4 large data did not fit"),
+    ],
+)
+def test_shared_memory_of_a_shard_that_is_short_is_a_warning(counters, level, said):
+    """What was refused at the cap, or did not fit into the folder, is told with what to do."""
+    most = {"payload_bytes_max": 100} if counters else {}
+    shard = ShardInfo("s0", "tcp/h:1", reachable=True, counters={**most, **counters})
+
+    found = list(doctor.shared_data(shard))
+
+    assert [finding.level for finding in found] == ([level] if level else [])
+    assert all(said in finding.text for finding in found)

@@ -336,3 +336,14 @@ def test_user_of_the_group_shares_and_a_stranger_does_not(make_cell, run, root):
     done(worker)
     assert seen(run, cell) == f"{SMALL} 2 2 mapped"
     assert seen(run, cell, before=stranger) == f"{SMALL} 2 2 copied"
+
+
+@pytest.mark.parametrize("carrier", ["zenoh"], indirect=True)
+@pytest.mark.parametrize("way", ["put", "new"])
+def test_data_are_shared_whatever_carries_the_messages(make_cell, run, root, way):
+    """A cell without sockets shares memory as well."""
+    cell = make_cell().start_all()
+
+    assert committed(run, cell, way, SMALL, 1) == 0
+    assert seen(run, cell) == f"{SMALL} 1 1 mapped"
+    assert not list(root.glob("*/socket"))
