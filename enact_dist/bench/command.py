@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import platform
+import signal
 import sys
 import tempfile
 import time
@@ -115,7 +116,7 @@ def run(arguments: argparse.Namespace) -> int:
         return DONE
     names = names_of(arguments)
     found = machine()  # its load is that of others, before this adds its own
-    with contextlib.ExitStack() as stack:
+    with _ends_in_order(), contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="enact-bench-")))
         memory_root = MEMORY if MEMORY.is_dir() else None
         memory = Path(
@@ -140,6 +141,20 @@ def run(arguments: argparse.Namespace) -> int:
     else:
         _print(found, rows)
     return FAILED if failed else DONE
+
+
+@contextlib.contextmanager
+def _ends_in_order() -> Iterator[None]:
+    """Let SIGTERM end the processes and remove the files, of which some lie in memory."""
+
+    def leave(*_: object) -> None:
+        raise SystemExit(FAILED)
+
+    before = signal.signal(signal.SIGTERM, leave)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _ran(name: str, measured: Run) -> bool:

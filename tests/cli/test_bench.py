@@ -1,6 +1,10 @@
 """`enact bench`: what it prints, what JSON has, how it ends.  No time is judged here."""
 
 import json
+import os
+import subprocess
+import sys
+import time
 
 import pytest
 
@@ -183,6 +187,27 @@ def test_runs_side_by_side_measure_nothing(enact, tmp_path):
     assert shown.status == 0
     (line,) = (line for line in shown.out.splitlines() if "acquire + commit, one slot" in line)
     assert line.startswith("| core: acquire + commit, one slot | ≤ 50 µs |")
+
+
+@pytest.mark.slow
+def test_bench_that_is_told_to_leave_removes_its_files(tmp_path):
+    """Nothing stays on the disk, nor in shared memory, where it would count for good."""
+    running = subprocess.Popen(
+        [sys.executable, "-m", "enact_dist.cli.main", "bench", "core", "--seconds", "300"],
+        env={**os.environ, "TMPDIR": str(tmp_path)},
+    )
+    try:
+        deadline_s = time.monotonic() + 30
+        while not list(tmp_path.glob("enact-bench-*")):
+            assert time.monotonic() < deadline_s
+            time.sleep(0.01)
+        running.terminate()
+
+        assert running.wait(30) == 1
+        assert list(tmp_path.glob("enact-bench-*")) == []
+    finally:
+        running.kill()
+        running.wait()
 
 
 @pytest.mark.slow
