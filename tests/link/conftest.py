@@ -111,6 +111,12 @@ def endpoint():
 
 
 @pytest.fixture
+def free_endpoints():
+    """Endpoints of the loopback, `free_endpoints(count)`."""
+    return lambda count: [free_endpoint() for _ in range(count)]
+
+
+@pytest.fixture
 def daemon(make_settings):
     """Start shards in this process: `daemon(endpoint, name=…)`; stopped after the test."""
     from enact_dist.link.shard_daemon import DaemonSettings, start_shard

@@ -19,7 +19,10 @@ from enact_dist import (
     Write,
     connect,
 )
+from enact_dist.core.messages import Pin, PlacementMap, ShardEntry
+from enact_dist.core.shard_state import ShardSettings
 from enact_dist.errors import LeaseLostError
+from enact_dist.link.blobs import BlobFolder
 from enact_dist.link.shard_daemon import DaemonSettings, start_shard
 
 CLOUD = Aspect("cloud", np.ndarray, Durability.VOLATILE)
@@ -321,3 +324,44 @@ def test_shard_that_lost_what_was_staged_gets_the_bytes_with_the_commit(far):
     publish(cell, tray, data)
 
     assert np.array_equal(found(far(direct=True), tray), data)
+
+
+def test_commit_over_shards_stores_each_large_body_once(tmp_path, monkeypatch, free_endpoints):
+    """What was prepared becomes the slot's own: no body is written to a disk a second time."""
+    monkeypatch.setenv("ENACT_CARRIER", "zenoh")
+    written, write_blob = [], BlobFolder.write
+
+    def count(self, body, *, durable):
+        written.append((self.folder.parent.name, len(body)))
+        return write_blob(self, body, durable=durable)
+
+    monkeypatch.setattr(BlobFolder, "write", count)
+    endpoints = dict(zip(("s0", "s1"), free_endpoints(2), strict=True))
+    entries = tuple(ShardEntry(name, (endpoint,)) for name, endpoint in endpoints.items())
+    placement = PlacementMap(1, entries, (Pin("left/**", "s0"), Pin("right/**", "s1")))
+    shards = [
+        start_shard(
+            DaemonSettings(
+                "cell",
+                ShardSettings(name, placement, worlds=("online",)),
+                (endpoint,),
+                tmp_path / name,
+                shared_bytes_max=0,
+            )
+        )
+        for name, endpoint in endpoints.items()
+    ]
+    model = Aspect("model", np.ndarray, Durability.DURABLE)
+    try:
+        with connect(endpoints["s0"]) as cell:
+            online = cell.world("online")
+            left = Write(online, Entity("left/a"), model)
+            right = Write(online, Entity("right/a"), model)
+            with Lock(left, right, wait_s=30.0) as lock:
+                lock[left] = np.zeros(3_000_000, np.uint8)
+                lock[right] = np.ones(2_000_000, np.uint8)
+    finally:
+        for shard in shards:
+            shard.stop(drain_s=0.0)  # keeps what is on its way to the store
+
+    assert sorted(written) == [("s0", 3_000_000), ("s1", 2_000_000)]

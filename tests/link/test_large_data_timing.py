@@ -16,8 +16,7 @@ COUNT = Aspect("count", int, Durability.VOLATILE)
 BYTES = 100_000_000
 
 PUBLISHER = """
-import os, sys
-os.environ["ENACT_CARRIER"] = "zenoh"
+import sys
 import numpy as np
 from enact_dist import Aspect, Durability, Entity, Lock, Write, connect
 cloud = Aspect("cloud", np.ndarray, Durability.VOLATILE)
@@ -63,9 +62,11 @@ def judge(calm, disturbed, what):
 
 
 @pytest.fixture
-def far(process, endpoint, monkeypatch):
+def far(process, endpoint, monkeypatch, tmp_path):
+    """A cell whose clients share no memory with the shard, which has some."""
     monkeypatch.setenv("ENACT_CARRIER", "zenoh")
     process(endpoint)
+    monkeypatch.setenv("ENACT_SHARED_FOLDER", str(tmp_path))
     with connect(endpoint) as cell:
         yield cell
 

@@ -161,3 +161,18 @@ def test_kernel_ends_a_wait(ends):
 def test_waits_are_rounded_up(asked, expected):
     """Few different times occur, none of them too short."""
     assert rounded_s(asked) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(("room", "placed"), [(200_000, True), (199_999, False), (200_001, False)])
+def test_payload_is_put_where_it_will_stay_if_it_fits(ends, room, placed):
+    """A payload exactly as long as the memory that is offered is received there, without a copy."""
+    near, far = ends
+    body, memory = random.Random(1).randbytes(200_000), bytearray(room)
+    sender = threading.Thread(target=send_frame, args=(near, b"head", [body]))
+    sender.start()
+    _, header, payload = Stream(far).receive(memoryview(memory))
+    sender.join()
+
+    assert (header, bytes(payload)) == (b"head", body)
+    assert (payload.obj is memory) == placed
+    assert any(memory) == placed
