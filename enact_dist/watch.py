@@ -4,6 +4,9 @@ Notices are small, best effort and numbered without a gap per shard and epoch.  
 skipped, a number that a keep-alive knows and no notice brought, or a new epoch means that some
 were missed: the watch then lists the slots again and yields one change per slot that moved, whose
 `gap` says how many versions were skipped.
+
+Versions that a restarted shard did not keep begin anew, so its new epoch makes each of its states a
+new one: the next number follows nothing, and nobody knows what was lost with the old ones.
 """
 
 from __future__ import annotations
@@ -12,13 +15,14 @@ import threading
 import time
 from collections import deque
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from enact_dist.core.datum import Position, Slot
+from enact_dist.core.epochs import is_kept
 from enact_dist.core.messages import Notice, Survey, Surveyed
 from enact_dist.errors import ShardUnreachableError
 from enact_dist.link.notices import Skipped
-from enact_dist.terms import Entities, Entity, pattern_matches
+from enact_dist.terms import Durability, Entities, Entity, pattern_matches
 
 if TYPE_CHECKING:
     from types import TracebackType
@@ -34,6 +38,13 @@ VANISHED: Final = (0, 0)
 """Version and stamp of a slot that its shard does not know any more."""
 
 
+class _Known(NamedTuple):
+    """What was told last of a slot, and in which epoch of its shard."""
+
+    epoch: int
+    state: tuple[int, int]
+
+
 @dataclass(frozen=True, slots=True)
 class Change:
     """One slot has a new state.
@@ -43,7 +54,8 @@ class Change:
         aspect: Name of the aspect.
         version: The slot's version; starts again for volatile aspects when their shard restarts.
         position: Where the commit stands in time.
-        gap: How many versions of this slot were skipped before this one.
+        gap: How many versions of this slot were skipped before this one; at least 1 where its
+            versions began anew, since the last ones of before may have been seen by nobody.
         null: Whether the slot is null now.
         captured_ns: When the datum was captured, as its writer said (0: not said, or null).
     """
@@ -84,7 +96,7 @@ class Watch:
         self._context, self._aspects = context, aspects
         self._patterns = tuple(str(Entities(pattern)) for pattern in patterns)
         self._survey = Survey((context,), self._patterns, aspects)
-        self._known: dict[Slot, tuple[int, int]] = {}
+        self._known: dict[Slot, _Known] = {}
         self._following: dict[str, _Following] = {}
         self._pending: deque[Change] = deque()
         self._closed = threading.Event()
@@ -145,7 +157,8 @@ class Watch:
         following.number = notice.number
         for slot, version, stamp_ns, null, captured_ns in notice.changes:
             if self._covers(slot):
-                self._note(notice.shard, slot, version, stamp_ns, null=null, captured=captured_ns)
+                known = _Known(notice.epoch, (version, stamp_ns))
+                self._note(notice.shard, slot, known, null=null, captured=captured_ns)
 
     def _pass_over(self, skipped: Skipped) -> None:
         """Account for notices of other slots; one that is missing before them remains missing."""
@@ -191,33 +204,20 @@ class Watch:
             null = bool(state.null_reason)
             if null and state.slot not in self._known:
                 continue
-            self._note(
-                shard,
-                state.slot,
-                state.version,
-                state.stamp_ns,
-                null=null,
-                captured=state.captured_ns,
-            )
-        self._note_vanished(shard, {state.slot for state in states})
+            known = _Known(answer.epoch, (state.version, state.stamp_ns))
+            self._note(shard, state.slot, known, null=null, captured=state.captured_ns)
+        self._note_vanished(shard, answer.epoch, {state.slot for state in states})
         self._following[shard] = _Following(answer.epoch, answer.notice_number, listed=True)
 
-    def _note_vanished(self, shard: str, listed: set[Slot]) -> None:
+    def _note_vanished(self, shard: str, epoch: int, listed: set[Slot]) -> None:
         """Tell of slots that the shard lists no more: it kept them in memory and restarted."""
         for slot, known in list(self._known.items()):
-            gone = slot not in listed and known != VANISHED
+            gone = slot not in listed and known.state != VANISHED
             if gone and self._client.shard_of(slot.entity) == shard:
-                self._note(shard, slot, *VANISHED, null=True)
+                self._note(shard, slot, _Known(epoch, VANISHED), null=True)
 
     def _note(
-        self,
-        shard: str,
-        slot: Slot,
-        version: int,
-        stamp_ns: int,
-        *,
-        null: bool,
-        captured: int = 0,
+        self, shard: str, slot: Slot, state: _Known, *, null: bool, captured: int = 0
     ) -> None:
         """Add a change unless it is known.
 
@@ -225,19 +225,29 @@ class Watch:
         shard, volatile ones start counting again with a later stamp.
         """
         known = self._known.get(slot)
-        if known == (version, stamp_ns):
+        self._known[slot] = state
+        if known is not None and known.state == state.state:
             return
+        version, stamp_ns = state.state
         if known is None:
             gap = version - 1 if self._following[shard].listed else 0
+        elif known.epoch != state.epoch and not self._goes_on(slot, state.epoch):
+            gap = max(1, version - 1)
         else:
-            gap = version - known[0] - 1 if version > known[0] else version - 1
+            last = known.state[0]
+            gap = version - last - 1 if version > last else version - 1
         gap = max(0, gap)
-        self._known[slot] = (version, stamp_ns)
         self._missed += gap
         position = Position(stamp_ns, shard)
         self._pending.append(
             Change(Entity(slot.entity), slot.aspect, version, position, gap, null, captured)
         )
+
+    def _goes_on(self, slot: Slot, epoch: int) -> bool:
+        """Whether a restarted shard goes on counting the versions of a slot."""
+        entry = self._client.aspect_entries().get(slot.aspect)
+        kept = entry is not None and entry.durability != Durability.VOLATILE.value
+        return kept and is_kept(epoch)
 
     def close(self) -> None:
         """End the watch; a `next` that waits returns None within 0.1 s."""

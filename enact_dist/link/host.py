@@ -27,6 +27,7 @@ import time
 from collections import deque
 from typing import TYPE_CHECKING, Final, cast
 
+from enact_dist.core.epochs import unkept_epoch
 from enact_dist.core.messages import (
     Acquire,
     AwaitStamp,
@@ -101,8 +102,7 @@ def open_host(
     clock = clock or SystemClock()
     wall_ns = clock.wall_ns()
     if folder is None:
-        # Nothing remembers the epoch before: milliseconds tell two starts within a second apart.
-        store, recovered = None, Recovered(epoch=wall_ns // 1_000_000)
+        store, recovered = None, Recovered(epoch=unkept_epoch(wall_ns))
     else:
         from enact_dist.link.store import open_store
 

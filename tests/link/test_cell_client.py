@@ -194,6 +194,60 @@ def test_watch_tells_what_a_shard_without_folder_lost_when_it_restarted(two):
             assert watch.next(5.0).version == 2
 
 
+@pytest.mark.parametrize("aspect", [COUNT, KEPT], ids=["volatile", "durable"])
+def test_watch_tells_a_gap_where_versions_began_anew_at_the_next_number(two, aspect):
+    """Version 2 of a restarted shard is no successor of version 1 of before: 1 was missed.
+
+    A shard without a folder keeps nothing of a durable aspect either.
+    """
+    two.start("a")
+    two.start("b")
+    with two.connect() as cell:
+        online = cell.world("online")
+        add_one(online, there, aspect)
+        with online.watch("**", aspect) as watch:
+            assert watch.next(5.0).version == 1
+            two.restart("b")
+            add_one(online, there, aspect)
+            add_one(online, there, aspect)
+            change = watch.next(5.0)
+            assert (change.version, change.gap, change.null) == (2, 1, False)
+            assert watch.missed == 1
+            add_one(online, there, aspect)
+            assert (watch.next(5.0).gap, watch.missed) == (0, 1)
+
+
+def test_watch_tells_that_it_may_have_missed_what_a_restart_took_along(two):
+    """What was committed last before a restart may have been seen by nobody: that is a gap."""
+    two.start("a")
+    two.start("b")
+    with two.connect() as cell:
+        online = cell.world("online")
+        add_one(online, there)
+        with online.watch("**", COUNT) as watch:
+            assert watch.next(5.0).version == 1
+            two.restart("b")
+            add_one(online, there)
+            change = watch.next(5.0)
+            assert (change.version, change.gap, change.null) == (1, 1, False)
+
+
+def test_watch_tells_a_gap_of_a_volatile_aspect_on_a_shard_that_keeps_others(kept):
+    """The epoch of a shard with a folder says nothing of its volatile slots."""
+    kept.start("a")
+    kept.start("b")
+    with kept.connect() as cell:
+        online = cell.world("online")
+        add_one(online, there)
+        with online.watch("**", COUNT) as watch:
+            assert watch.next(5.0).version == 1
+            kept.restart("b")
+            add_one(online, there)
+            add_one(online, there)
+            change = watch.next(5.0)
+            assert (change.version, change.gap) == (2, 1)
+
+
 def test_watch_keeps_durable_slots_over_a_restart_of_their_shard(kept):
     """What a restarted shard still has is no change; what follows is, without a gap."""
     kept.start("a")
