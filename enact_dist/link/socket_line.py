@@ -14,6 +14,7 @@ import select
 import socket
 import threading
 import time
+import weakref
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.messages import Answer, Notice
@@ -55,9 +56,9 @@ _log = logging.getLogger("enact.link")
 
 
 class Connection:
-    """One connection to a shard; for one call at a time."""
+    """One connection to a shard; for one call at a time.  Ends with whoever holds it."""
 
-    __slots__ = ("_poll", "_stream", "_wait_s", "shard", "socket")
+    __slots__ = ("__weakref__", "_poll", "_stream", "_wait_s", "shard", "socket")
 
     def __init__(self, shard: str, connected: socket.socket) -> None:
         self.shard = shard
@@ -66,6 +67,9 @@ class Connection:
         self._wait_s = CONNECT_S
         self._poll = select.poll()
         self._poll.register(connected, select.POLLIN)
+
+    def __del__(self) -> None:
+        self.socket.close()
 
     def send(self, request: Request, timeout_s: float) -> None:
         """Send a request, whose answer `receive` waits for so long.
@@ -175,7 +179,8 @@ class SocketLine:
         self._nonce = nonce
         self._session = session
         self._idle: list[Connection] = []
-        self._open: set[Connection] = set()
+        # Weak: Ctrl-C may come between any two steps of who holds one, and takes it out of use.
+        self._open: weakref.WeakSet[Connection] = weakref.WeakSet()
         self._mutex = threading.Lock()
         self._retry_at_s = 0.0
         self._retry_s = RETRY_S_MIN

@@ -1,6 +1,8 @@
 """Slices through a window, over a way that loses, repeats and reorders what it is given."""
 
 import random
+import socket
+from collections import deque
 from types import SimpleNamespace
 
 import pytest
@@ -12,6 +14,8 @@ from enact_dist.errors import EnactError, LeaseLostError, ProtocolError, ShardUn
 from enact_dist.link import transfer
 from enact_dist.link.datum_cache import DatumCache
 from enact_dist.link.fetching import fetch_all
+from enact_dist.link.socket_carrier import _Begun
+from enact_dist.link.socket_line import Connection, SocketLine
 from enact_dist.link.transfer import Piece, Transfer
 
 LOCK = LockId("session", 0, 1)
@@ -233,3 +237,49 @@ def test_what_the_cache_knows_is_not_asked():
     )
 
     assert {fetch.slot for _, fetch in way.asked} == {slots[2]}
+
+
+class Interrupted(deque):
+    """A queue at whose edge Ctrl-C comes: after something was taken, or before it was added."""
+
+    def popleft(self):
+        super().popleft()
+        raise KeyboardInterrupt
+
+
+class InterruptedSooner(deque):
+    """As `Interrupted`, when the third one is added."""
+
+    def append(self, one):
+        if len(self) == 2:
+            raise KeyboardInterrupt
+        super().append(one)
+
+
+@pytest.mark.parametrize("queue", [Interrupted, InterruptedSooner])
+def test_interrupt_between_two_steps_leaves_no_connection_open(queue, monkeypatch):
+    """What neither waits nor stands in the queue when Ctrl-C comes is closed all the same."""
+    line, far = SocketLine("s0", "x", b"", "session"), []
+
+    def connected():
+        near, other = socket.socketpair()
+        far.append(other)
+        return Connection("s0", near)
+
+    monkeypatch.setattr(line, "_connected", connected)
+    way = Way()
+    way.begin = lambda *_, **__: _Begun(line, line.take())
+    moving = Transfer(way, lambda: None, window_bytes=4 * SLICE)
+    moving._under_way = queue()
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            moving.run(Piece("s0", None, SLICE, lambda _: None) for _ in range(9))
+
+        assert len(far) > 2
+        for end in far:
+            end.settimeout(5)
+            assert end.recv(1) == b""
+        assert len(line._open) == 0
+    finally:
+        for end in far:
+            end.close()
