@@ -3,6 +3,7 @@
 Rules a change must keep
   * Shards are up before actors start, and actors are gone before shards stop: an actor that stops
     can still commit, and a shard that stops has nobody left to wait for.
+  * The death of a child is that of its process: what it has started may hold its output for ever.
   * A child never outlives its supervisor, even one that was killed: the kernel sends it SIGTERM.
   * A child is restarted unless it ended as it should (an actor: 0) or can never run (2: usage or
     configuration); pauses double up to `PAUSE_S_MAX` and start again after a good while.
@@ -10,14 +11,20 @@ Rules a change must keep
 
 from __future__ import annotations
 
+import codecs
 import contextlib
+import fcntl
+import io
 import os
 import queue
+import select
 import signal
 import subprocess
+import sys
+import termios
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -33,6 +40,7 @@ READY_S: Final = 20.0
 DRAIN_S: Final = {"actor": 10.0, "shard": 5.0}
 """How long a child may take to end after SIGTERM; then it is killed."""
 SUPERVISOR_VARIABLE: Final = "ENACT_SUPERVISOR_PID"
+PIPE_BYTES: Final = 64 << 10
 NEVER_AGAIN: Final = 2
 """Exit status of wrong usage or configuration: the same command would fail the same way."""
 
@@ -78,7 +86,7 @@ class _Child:
         self.over = False
         self.restart_at_s = 0.0
         self._say, self._events = say, events
-        self._process: subprocess.Popen[str] | None = None
+        self._process: subprocess.Popen[bytes] | None = None
         self._pause_s = PAUSE_S_MIN
         self._started_s = 0.0
 
@@ -97,9 +105,7 @@ class _Child:
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
-            text=True,
-            errors="replace",
-            bufsize=1,
+            bufsize=0,
             env={**os.environ, SUPERVISOR_VARIABLE: str(os.getpid()), "PYTHONUNBUFFERED": "1"},
             process_group=0,  # Ctrl-C on the terminal is the supervisor's to pass on, in order
         )
@@ -123,14 +129,81 @@ class _Child:
             with contextlib.suppress(ProcessLookupError):
                 self._process.send_signal(number)
 
-    def _read(self, process: subprocess.Popen[str]) -> None:
+    def _read(self, process: subprocess.Popen[bytes]) -> None:
+        """Pass on what the child writes, and tell of its end before that of its output.
+
+        Whatever the child has started may hold the output for as long as it likes.
+        """
         assert process.stdout is not None
-        with process.stdout as output:
-            for line in output:
-                if line.startswith(READY_MARK):
-                    self._events.put(_Ready(self))
-                self._say(self.task.name, line.rstrip("\n"))
-        self._events.put(_Ended(self, process.wait()))
+        lines, told = _Lines(), False
+        with process.stdout as output, select.epoll() as poll:
+            poll.register(output, select.EPOLLIN)
+            with _end_of(process, poll) as end:
+                while True:
+                    ready = [number for number, _ in poll.poll()]
+                    if end in ready:
+                        poll.unregister(end)
+                        last = lines.take(_what_is_left(output.fileno())) + lines.rest()
+                        self._pass_on(last, alive=True)
+                        self._events.put(_Ended(self, process.wait()))
+                        told = True
+                    elif not (some := os.read(output.fileno(), PIPE_BYTES)):
+                        break
+                    else:
+                        self._pass_on(lines.take(some), alive=not told)
+        self._pass_on(lines.rest(), alive=not told)
+        if not told:
+            self._events.put(_Ended(self, process.wait()))
+
+    def _pass_on(self, lines: list[str], *, alive: bool) -> None:
+        for line in lines:
+            if alive and line.startswith(READY_MARK):
+                self._events.put(_Ready(self))
+            self._say(self.task.name, line)
+
+
+class _Lines:
+    """Makes lines of pieces of output."""
+
+    def __init__(self) -> None:
+        text = codecs.getincrementaldecoder("utf-8")(errors="replace")
+        self._decoder = io.IncrementalNewlineDecoder(text, translate=True)
+        self._begun = ""
+
+    def take(self, some: bytes) -> list[str]:
+        """Add a piece; return the lines that are whole now."""
+        *whole, self._begun = (self._begun + self._decoder.decode(some)).split("\n")
+        return whole
+
+    def rest(self) -> list[str]:
+        """Return a last line that nobody has ended, if there is one."""
+        rest = self._begun + self._decoder.decode(b"", final=True)
+        self._begun = ""
+        return [rest.rstrip("\n")] if rest else []
+
+
+@contextlib.contextmanager
+def _end_of(process: subprocess.Popen[bytes], poll: select.epoll) -> Iterator[int]:
+    """Let `poll` tell of the end of a process; yield its number there, -1 where it cannot."""
+    try:
+        end = os.pidfd_open(process.pid)
+    except OSError:  # a kernel, or a container, without it: the end of the output has to do
+        yield -1
+        return
+    try:
+        poll.register(end, select.EPOLLIN)
+        yield end
+    finally:
+        os.close(end)
+
+
+def _what_is_left(output: int) -> bytes:
+    """Return what is in a pipe now, and not what others write while it is read."""
+    left = int.from_bytes(fcntl.ioctl(output, termios.FIONREAD, bytes(4)), sys.byteorder)
+    found = b""
+    while len(found) < left and (some := os.read(output, left - len(found))):
+        found += some
+    return found
 
 
 class Supervisor:

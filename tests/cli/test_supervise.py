@@ -117,6 +117,50 @@ def test_children_go_on_when_nobody_reads_the_log():
     assert said == ["ready: serving"]
 
 
+HOLDS = (
+    "import os, subprocess, sys;"
+    "held = subprocess.Popen([sys.executable, '-c', 'import signal; signal.pause()']);"
+    "print('holder', held.pid, flush=True); os.kill(os.getpid(), 9)"
+)
+
+
+def test_death_is_noticed_while_a_grandchild_holds_the_output(request):
+    """The end of a child is that of its process, whoever still has its end of the pipe."""
+    story = Story("started again")
+    say, held = story.__call__, []
+
+    def note(name, line):
+        if line.startswith("holder"):
+            held.append(int(line.split()[1]))
+        say(name, line)
+
+    request.addfinalizer(lambda: [os.kill(pid, 9) for pid in held])
+    running = threading.Thread(
+        target=Supervisor([task("shard", "shard", HOLDS)], note).run, args=(story.stop,)
+    )
+    running.start()
+    heard = story.stop.wait(20)
+    story.stop.set()
+    for pid in held[:] if not heard else ():
+        held.remove(pid)
+        os.kill(pid, 9)  # or the supervisor would wait for it, too
+    running.join(20)
+
+    assert heard
+    assert "shard: ended by SIGKILL; started again in 0.2 s" in story.lines
+
+
+def test_last_words_of_a_child_come_before_its_end():
+    """All that a child has written is in the log before its death is told."""
+    story = Story("started again")
+    code = "import os; print('x' * 60_000); print('last', flush=True); os.kill(os.getpid(), 9)"
+
+    story.run(task("shard", "shard", code))
+
+    assert story.lines[1] == "shard: last"
+    assert "ended by SIGKILL" in story.lines[2]
+
+
 def test_pids_name_the_running_children():
     """Who looks on can find the processes."""
     story = Story("ready:")
