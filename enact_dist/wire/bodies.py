@@ -110,8 +110,12 @@ class BodyReader:
         if start == 0 and end == len(payload):
             # Whole, it keeps nothing else alive; a writable buffer could change under its reader.
             return payload if type(payload) is bytes else memoryview(payload).toreadonly()
-        part = memoryview(payload)[start:end]
-        return bytes(part) if end - start < SMALL_BODY_BYTES else part.toreadonly()
+        part, size = memoryview(payload)[start:end], end - start
+        # A view keeps the whole payload alive: at most twice what it shows.  A copy takes 0.02 ms
+        # per MB.
+        if size < SMALL_BODY_BYTES or 2 * size < len(payload):
+            return bytes(part)
+        return part.toreadonly()
 
 
 def _check_file(file: str, size: int, offset: int = 0) -> None:

@@ -135,7 +135,7 @@ def encode_parts(message: m.Message) -> tuple[bytes, list[bytes | memoryview]]:
 def decode_frame(header: bytes, payload: bytes | memoryview = b"") -> m.Message:
     """Return the message of a frame.
 
-    Bodies from 64 KiB up are views on `payload`, smaller ones are copied out of it.
+    A body is a view on `payload` where it is at least 64 KiB and half of it, and else a copy.
 
     Raises:
         ProtocolError: Whatever is wrong with the frame; it is checked whole.

@@ -59,7 +59,8 @@ FIELDS_MAX: Final = 1024
 """Most fields of a structured dtype, nested ones counted."""
 
 SMALL_BODY_BYTES: Final = 64 << 10
-"""Bodies below this are copied out of a received payload, so that they do not keep it alive."""
+"""Bodies below this, or below half of a received payload, are copied out of it, so that they do not
+keep it alive."""
 
 
 def aligned(length: int) -> int:

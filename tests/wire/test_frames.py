@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import weakref
+
 import msgpack
 import pytest
 from hypothesis import given, settings
@@ -93,6 +95,28 @@ def test_frame_shares_a_single_body_instead_of_copying_it():
 
     assert payload is body
     assert decode_frame(header, payload).writes[0].datum.body is payload
+
+
+class Received(bytearray):
+    """A payload whose end can be seen."""
+
+
+def test_datum_keeps_at_most_twice_its_own_bytes_alive():
+    """Of a frame of many large data one does not pin the others; most of a frame is no copy."""
+    part = SMALL_BODY_BYTES
+    for sizes in ([3 * part, part, part], [part] * 16, [part, 9 * part]):
+        header, payload = encode_frame(commit(*(b"x" * size for size in sizes)))
+        received = Received(payload)
+        data = [write.datum for write in decode_frame(header, received).writes]
+        ended = weakref.ref(received)
+        largest = max(data, key=lambda datum: datum.size)
+        is_view = type(largest.body) is memoryview and largest.body.obj is received
+        assert is_view == (2 * max(sizes) >= len(payload))
+        del received, largest
+        data = [datum for datum in data if 2 * datum.size < len(payload)]
+
+        assert ended() is None
+        assert all(bytes(datum.body) == b"x" * datum.size for datum in data)
 
 
 def test_frame_views_large_bodies_and_copies_small_ones():
