@@ -417,10 +417,8 @@ class Lock:
         self._expects[slot] = SlotVersion(slot, state.version if state is not None else 0)
 
     def _check(self, request: LockRequest[Any]) -> None:
-        if self._lock is None or self._over:
-            raise LockReleasedError(f"{self!r} is used outside its `with` block")
-        check_requested(request, self._requests, "lock")
         self._use()
+        check_requested(request, self._requests, "lock")
 
     def _check_writable(self, request: LockRequest[Any]) -> None:
         self._check(request)

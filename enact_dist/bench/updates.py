@@ -140,7 +140,7 @@ def _update_goal(
 
 
 def run_multi(run: Run) -> None:
-    """One lock over several slots: two read and two written, many, and some of every shard."""
+    """Several slots of one lock, of one shard or more, and several locks at a time."""
     cases = []
     for carrier in run.place.carriers:
         world, floor = run.place.world(carrier), floor_of(run.place.way(carrier))
@@ -151,6 +151,9 @@ def run_multi(run: Run) -> None:
             _multi_case(carrier, floor, "2 read, 2 written", writes, reads),
             _multi_case(carrier, floor, "32 written", many),
         ]
+        acts = [_updating(*slots(world, 1, entity=f"multi/{number}")) for number in range(8)]
+        variant = f"{carrier}, 8 threads, each its own slot, per update"
+        cases.append(Case("multi", variant, _side_by_side(acts), floor))
         if carrier != EMBEDDED and len(run.place.shard_names) > 1:
             spread = [
                 write for shard in run.place.shard_names

@@ -217,10 +217,11 @@ def size_of(answer: Answer) -> int:
 
 
 def _size_of_states(answer: Granted | Viewed) -> int:
-    return sum(
-        SURVEYED_BYTES + (state.size if state.datum is not None and not state.large else 0)
-        for state in answer.states
-    )
+    size = SURVEYED_BYTES * len(answer.states)
+    for state in answer.states:
+        if state.datum is not None and not state.large:
+            size += state.size
+    return size
 
 
 _SIZE_OF: Final[dict[type, Callable[[Any], int]]] = {

@@ -31,6 +31,9 @@ if TYPE_CHECKING:
 JOINED_BYTES_MIN: Final = 1 << 20
 """From here on data are copied while other threads run."""
 
+INT_ENCODING_BYTES: Final = 10
+"""The version, and a msgpack int of up to 9 bytes."""
+
 _VERSION = bytes([DATUM_VERSION])
 
 
@@ -154,14 +157,28 @@ def decode_datum(datum: Datum, datum_type: Any) -> Any:
         DatumTypeError: It is a value of another type.
         ProtocolError: Its bytes are damaged, or of a later version.
     """
+    if datum_type is int:
+        number = _int_of(datum)
+        if number is not None:
+            return number
     node = TreeReader(datum).tree()
-    if type(node) is int and datum_type is int:
-        return node
     shape = shape_of(datum_type)
     try:
         return build(node, shape, _name(datum_type))
     except RecursionError as error:
         raise ProtocolError("a datum is nested too deeply") from error
+
+
+def _int_of(datum: Datum) -> int | None:
+    """Return the int that a datum is, the commonest one; None where it is none, or damaged."""
+    encoding = datum.encoding
+    if len(encoding) > INT_ENCODING_BYTES or encoding[:1] != _VERSION or datum.size or datum.body:
+        return None
+    try:
+        node = msgpack.unpackb(encoding[1:])
+    except (ValueError, TypeError, msgpack.UnpackException):
+        return None
+    return node if type(node) is int else None
 
 
 def decode_to_fill(
