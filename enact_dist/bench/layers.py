@@ -9,12 +9,14 @@ the carrier's floor, and what it costs to go on with cold caches after each wait
 from __future__ import annotations
 
 import contextlib
+import itertools
 import threading
 import time
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 from enact_dist.bench.rows import Case
+from enact_dist.bench.run import ROUNDS
 from enact_dist.bench.timing import COUNT_MAX, timed
 from enact_dist.bench.updates import floor_of, slots, update
 from enact_dist.core.shard import Shard
@@ -78,16 +80,23 @@ class Watch:
 
 def run_layers(run: Run) -> None:
     """Measure updates with a watch at every layer, and what travels by itself."""
-    messages: Sequence[Message] = ()
-    for carrier in run.place.carriers:
-        world, way = run.place.world(carrier), run.place.way(carrier)
-        run.told(f"{NAME}: {carrier}")
-        act = _update_of(world)
-        floor = floor_of(way)
-        run.measure([Case(NAME, f"{carrier}, whole update", partial(timed, act), floor)])
-        own_us, messages = layer_times_us(act, world, seconds_s=run.seconds_s)
+    acts = {carrier: _update_of(run.place.world(carrier)) for carrier in run.place.carriers}
+    floors = {carrier: floor_of(run.place.way(carrier)) for carrier in acts}
+    run.measure(
+        [
+            Case(NAME, f"{carrier}, whole update", partial(timed, act), floors[carrier])
+            for carrier, act in acts.items()
+        ]
+    )
+    messages: list[Message] = []
+    for number, (carrier, act) in itertools.product(range(ROUNDS), acts.items()):
+        run.told(f"{NAME}: {carrier} ({number + 1} of {ROUNDS})")
+        own_us, messages = layer_times_us(
+            act, run.place.world(carrier), seconds_s=run.seconds_s / ROUNDS
+        )
         for layer, times_us in own_us.items():
-            run.add(Case(NAME, f"{carrier}, {layer}", lambda _s: (), floor), times_us)
+            case = Case(NAME, f"{carrier}, {layer}", lambda _seconds_s: (), floors[carrier])
+            run.add(case, times_us)
     run.measure(_wire_cases(messages))
 
 
