@@ -50,6 +50,8 @@ NO_ROOM: Final = "no_room"
 """The code of a refusal because of the cap."""
 DRAFT_S: Final = 30.0
 """A draft of a session that holds no lock is given up after so long without a slice."""
+FULL_S: Final = 0.1
+"""So long after a payload did not fit, none that is as large is made room for."""
 DRAFT_BYTES_MAX: Final = 2 << 30
 """Bytes of drafts that wait in plain memory for their commits."""
 OVER_MAX: Final = 4096
@@ -122,6 +124,7 @@ class PayloadDesk:
         self._adopted: dict[str, weakref.ref[Pages | Plain]] = {}
         self._over: OrderedDict[str, None] = OrderedDict()
         self._bytes = 0
+        self._full = 0.0, 0
 
     # ---------------------------------------------------------------- drafts
 
@@ -187,10 +190,16 @@ class PayloadDesk:
         """Count the bytes of a new file if they fit under the cap, history gone if need be."""
         if self._reserved(total):
             return True
+        until_s, least = self._full
+        if time.monotonic() < until_s and total >= least:
+            return False  # looking through all history again would only delay the others
         self._make_room(self._bytes + total - self._bytes_max)
         # What is let go of takes a moment to leave.
         leftovers().wait(ROOM_S)
-        return self._reserved(total)
+        if self._reserved(total):
+            return True
+        self._full = time.monotonic() + FULL_S, total
+        return False
 
     def _reserved(self, total: int) -> bool:
         with self._mutex:

@@ -264,6 +264,19 @@ def test_history_goes_before_a_payload_is_refused(folder):
     assert names(folder) == [f"{SESSION}-2", f"{SESSION}-3"]
 
 
+def test_client_that_asks_again_and_again_delays_nobody(folder):
+    """History is looked through once for what cannot fit; what is smaller is another matter."""
+    asked = []
+    desk = PayloadDesk(folder, SIZE, make_room=asked.append)
+    for number in range(5):
+        assert stage(desk, f"a-{number}", total=2 * SIZE).code == NO_ROOM
+
+    assert asked == [SIZE]
+    stage(desk, "b-1")
+    assert stage(desk, "b-2").code == NO_ROOM
+    assert asked == [SIZE, SIZE]
+
+
 def test_cap_that_nobody_has_set_refuses_nothing(folder):
     """What is beyond half of a small folder lies in plain memory, and the next small one there."""
     desk = PayloadDesk(folder, 2 * SIZE, firm=False)
