@@ -36,10 +36,8 @@ from enact_dist.writable import WritableEach
 from enact_dist.writing import Writing, template
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Iterable, Mapping
     from types import TracebackType
-
-    from numpy.typing import DTypeLike
 
     from enact_dist.core.datum import Position
     from enact_dist.core.messages import Item
@@ -53,6 +51,7 @@ if TYPE_CHECKING:
         Write,
         WriteEach,
     )
+    from enact_dist.writing import DTypesLike, ShapesLike
 
 T = TypeVar("T")
 
@@ -339,15 +338,15 @@ class Lock:
 
     @overload
     def new(
-        self, request: Write[T], shape: int | Sequence[int], dtype: DTypeLike, *, stamp_ns: int = 0
+        self, request: Write[T], shape: ShapesLike, dtype: DTypesLike = None, *, stamp_ns: int = 0
     ) -> T: ...
     @overload
     def new(self, request: Write[T], *, like: T, stamp_ns: int = 0) -> T: ...
     def new(
         self,
         request: Write[T],
-        shape: int | Sequence[int] | None = None,
-        dtype: DTypeLike | None = None,
+        shape: ShapesLike | None = None,
+        dtype: DTypesLike = None,
         *,
         like: T | None = None,
         stamp_ns: int = 0,
@@ -358,19 +357,19 @@ class Lock:
 
         Args:
             request: A `Write` of this lock.
-            shape: Of an array, where the aspect's datum is one.
-            dtype: Of that array.
+            shape: Of the array; for a dataclass of arrays ``{field: shape}``.
+            dtype: Of the array, or ``{field: dtype}``; as annotated, else float64, if left out.
             like: In place of both: a datum, its arrays of the shapes, dtypes and orders wanted.
             stamp_ns: As in `put`.
 
         Raises:
             ReadonlyError: The request does not allow writing.
-            DatumTypeError: The array or `like` is not of the aspect's type, or has no array.
+            DatumTypeError: What was asked is not of the aspect's type, or has no array.
             NoRoomError: As `put`.
         """
         self._check_writable(request)
         slot, asked = slot_of(request), request.aspect.datum_type
-        wanted = template(like, shape, dtype)
+        wanted = template(asked, like, shape, dtype)
         value, datum = self._writing.blank(slot, self._shard(slot), wanted, asked, stamp_ns)
         self._note_write(slot, datum)
         return cast("T", value)

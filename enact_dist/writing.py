@@ -7,12 +7,14 @@ filled in place; once the block ends nobody can change it any more.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, cast
 
 from enact_dist.core.datum import Datum, Slot
 from enact_dist.errors import DatumTypeError, MisuseError
 from enact_dist.wire.limits import PAYLOAD_BYTES_MIN
 from enact_dist.wire.payload import decode_to_fill, encode_parts
+from enact_dist.wire.shapes import ArrayOf, RecordOf, shape_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -21,6 +23,11 @@ if TYPE_CHECKING:
 
     from enact_dist.link.payload_client import Draft, SharedPayloads
     from enact_dist.wire.payload import Encoded
+    from enact_dist.wire.shapes import Shape
+
+    ShapeLike: TypeAlias = int | Sequence[int]
+    ShapesLike: TypeAlias = ShapeLike | Mapping[str, ShapeLike]
+    DTypesLike: TypeAlias = DTypeLike | Mapping[str, DTypeLike] | None
 
 
 class _Written(NamedTuple):
@@ -134,16 +141,68 @@ def _plain(encoded: Encoded) -> memoryview:
     return memoryview(raw.data)[start : start + encoded.size]
 
 
-def template(like: object, shape: int | Sequence[int] | None, dtype: DTypeLike | None) -> object:
-    """Return what an array that is to be filled looks like, without memory of its own.
+def template(
+    datum_type: object, like: object, shape: ShapesLike | None, dtype: DTypesLike
+) -> object:
+    """Return what a datum that is to be filled looks like, without memory of its own.
+
+    Args:
+        datum_type: The aspect's type.
+        like: A datum that looks so, or None.
+        shape: In its place: of the array; of each array by field where the type is a dataclass.
+        dtype: Of the array, or of all, or of each by field; None takes what the type is annotated
+            with, float64 where it is not.
 
     Raises:
         MisuseError: Both ways to say it were taken, or none.
+        DatumTypeError: The type has other fields, or fields that are no arrays, or numpy knows no
+            such shape or dtype.
     """
     if (like is None) == (shape is None):
         raise MisuseError("new() takes either shape and dtype, or like=…")
     if shape is None:
         return like
+    wanted = shape_of(datum_type)
+    if not isinstance(shape, Mapping):
+        return _empty("the array", wanted, shape, dtype)
+    arrays = _arrays_of(wanted, datum_type, shape)
+    assert isinstance(wanted, RecordOf)
+    by_field = cast("Mapping[str, DTypeLike]", dtype) if isinstance(dtype, Mapping) else None
+    dtypes = by_field if by_field is not None else dict.fromkeys(arrays, dtype)
+    unknown = sorted(set(dtypes) - set(arrays))
+    if unknown:
+        raise DatumTypeError(f"dtypes of {unknown} were given; the fields are {sorted(arrays)}")
+    made = {
+        name: _empty(name, kind, shape[name], dtypes.get(name)) for name, kind in arrays.items()
+    }
+    return wanted.kind(**made)
+
+
+def _arrays_of(
+    wanted: Shape, datum_type: object, shape: Mapping[str, ShapeLike]
+) -> dict[str, Shape]:
+    """Return the fields of a dataclass of arrays, each of which must have been given a shape."""
+    fields = dict(wanted.fields) if isinstance(wanted, RecordOf) else {}
+    if not fields or not all(isinstance(kind, ArrayOf) for kind in fields.values()):
+        raise DatumTypeError(
+            f"shapes by field were given, but {datum_type} is no dataclass of arrays alone; give"
+            " like=… a datum that looks like the new one"
+        )
+    if set(fields) != set(shape):
+        raise DatumTypeError(
+            f"shapes of {sorted(shape)} were given; the fields of {datum_type} are {sorted(fields)}"
+        )
+    return fields
+
+
+def _empty(name: str, wanted: Shape, shape: ShapeLike, dtype: DTypesLike) -> NDArray[Any]:
     import numpy as np
 
-    return np.empty(shape, dtype)
+    if dtype is None and isinstance(wanted, ArrayOf):
+        dtype = wanted.dtype
+    try:
+        return np.empty(shape, cast("DTypeLike", dtype))
+    except (TypeError, ValueError, OverflowError, MemoryError) as error:
+        raise DatumTypeError(
+            f"{name}: no array of shape {shape!r:.80} and dtype {dtype!r:.80}: {error}"
+        ) from None

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from enact_dist import Aspect, Durability, Entity, Lock, Read, View, Write
 from enact_dist.errors import DatumTypeError, LockReleasedError, MisuseError, ReadonlyError
@@ -30,6 +31,13 @@ class Surface:
     note: str
 
 
+@dataclass(frozen=True)
+class Points:
+    points_m: NDArray[np.float32]
+    colors: np.ndarray
+
+
+VIEW = Aspect("view", Points, Durability.VOLATILE)
 CLOUD = Aspect("cloud", np.ndarray, Durability.VOLATILE)
 SURFACE = Aspect("surface", Surface, Durability.VOLATILE)
 TEXT = Aspect("text", str, Durability.VOLATILE)
@@ -83,6 +91,43 @@ def test_dataclass_is_filled_in_place(online):
     assert (found.vertices_m == 1.5).all()
     assert (found.triangles == 7).all()
     assert np.array_equal(found.pose.matrix, np.eye(4))
+
+
+@CARRIERS
+def test_dataclass_of_arrays_is_filled_in_place(online):
+    """Shapes stand by field; dtypes as annotated, as given for all, or as given by field."""
+    write, read = Write(online, piece, VIEW), Read(online, piece, VIEW)
+    shapes = {"points_m": (20_000, 3), "colors": (20_000, 3)}
+    with Lock(write) as lock:
+        view = lock.new(write, shapes)
+        view.points_m[:] = 0.5
+        view.colors[:] = 7
+    with Lock(read) as lock:
+        found = lock[read]
+    assert (found.points_m == 0.5).all()
+    assert (found.points_m.dtype, found.colors.dtype) == (np.float32, np.float64)
+    with Lock(write) as lock:
+        assert lock.new(write, shapes, {"colors": np.uint8}).colors.dtype == np.uint8
+        lock.new(write, shapes, np.float32)
+
+
+def test_wrong_fields_and_shapes_are_named(online):
+    """Each wrong way to ask for a dataclass or an array says what was asked and what there is."""
+    write, surface = Write(online, piece, VIEW), Write(online, piece, SURFACE)
+    cloud = Write(online, piece, CLOUD)
+    with Lock(write, surface, cloud) as lock:
+        with pytest.raises(DatumTypeError, match=r"\['points_m'\] were given; the fields"):
+            lock.new(write, {"points_m": (3, 3)})
+        with pytest.raises(DatumTypeError, match=r"dtypes of \['normals'\]"):
+            lock.new(write, {"points_m": 1, "colors": 1}, {"normals": np.uint8})
+        with pytest.raises(DatumTypeError, match="no dataclass of arrays alone; give like"):
+            lock.new(surface, {"vertices_m": (3, 3)})
+        with pytest.raises(DatumTypeError, match="no dataclass of arrays alone; give like"):
+            lock.new(cloud, {"points_m": (3, 3)})
+        with pytest.raises(DatumTypeError, match="no array of shape -1"):
+            lock.new(cloud, -1)
+        with pytest.raises(DatumTypeError, match="no array of shape"):
+            lock.new(cloud, (3,), "no dtype")
 
 
 @CARRIERS
