@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from typing import TYPE_CHECKING
 
+from enact_dist.cli.counters import told
 from enact_dist.cli.output import print_json, print_table, shown_bytes, shown_s
 from enact_dist.cli.verbs import (
     DONE,
@@ -56,6 +57,9 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
         run=list_shards,
         example="enact shard ls --cell tcp/127.0.0.1:7447",
     )
+    ls.add_argument(
+        "--counters", action="store_true", help="list what each has counted, and what that means"
+    )
     add_reader(ls)
 
 
@@ -100,6 +104,12 @@ def list_shards(arguments: argparse.Namespace) -> int:
         shards = cell.shards()
     if arguments.json:
         print_json(shards)
+    elif arguments.counters:
+        print_table(
+            ("shard", "counter", "value", "meaning", "what to do"),
+            [(shard.name, *row) for shard in shards for row in told(shard.counters)],
+            empty="no counters",
+        )
     else:
         print_table(
             ("shard", "endpoint", "state", "epoch", "up", "slots", "data", "shared", "sessions",

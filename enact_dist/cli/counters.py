@@ -1,0 +1,146 @@
+"""What the counters of a shard and of a connection mean, and what to do where one grows.
+
+A shard counts from its start (`enact shard ls --counters`, `--json`), a connection from its own
+(`Cell.statistics`).  An empty remedy: that is work done, or harmless by itself.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+
+class Counter(NamedTuple):
+    """One counter.
+
+    Attributes:
+        meaning: What it counts.
+        remedy: What to do where it grows; empty where that is as it should be.
+    """
+
+    meaning: str
+    remedy: str = ""
+
+
+_BUSY: Final = "look for a busy host: top, and the shard's log"
+_DYING: Final = "see why actors die or freeze: enact actor ls, and their log"
+_NETWORK: Final = "look at the network between these hosts: enact doctor"
+_SLOW_READER: Final = "find the client that is stopped or too slow: enact actor ls"
+
+OF_A_SHARD: Final[dict[str, Counter]] = {
+    # Work
+    "commits": Counter("commits that were applied here"),
+    "bytes_written": Counter("bytes of data in them"),
+    "bytes_fetched": Counter("bytes that were fetched in slices"),
+    "locks_granted": Counter("locks that were granted"),
+    "locks_validated": Counter("locks without a write here that were confirmed at their end"),
+    "lock_waits": Counter("locks that had to wait", "where too many: shorter locks, or View"),
+    "locks_bypassed": Counter("grants to one who came later than somebody who still waits"),
+    "prepared": Counter("commits over several shards that were prepared here"),
+    "decisions": Counter("commits over several shards that were decided here"),
+    "commits_finished": Counter("prepared commits that were applied"),
+    "views_waited": Counter("views that waited for a commit over several shards to be decided"),
+    # Things that happen where messages are lost
+    "commits_repeated": Counter("commits that came again and got their first answer", _NETWORK),
+    "prepares_repeated": Counter("prepares that came again and got their first answer", _NETWORK),
+    "finishes_repeated": Counter("decisions that were told again", _NETWORK),
+    "stale": Counter("lock requests that came too late to count", _NETWORK),
+    "superseded": Counter("locks ended by the next one of their thread: a lost release", _NETWORK),
+    "orphans_freed": Counter("locks that their client did not know of: a lost grant", _NETWORK),
+    "grants_without_listener": Counter("locks granted between two questions of their client"),
+    # Commits and locks that came to nothing
+    "commits_changed": Counter(
+        "locks refused because an expected view had changed", "where many: Read instead of View"
+    ),
+    "fenced": Counter("commits refused because their lock was lost", _DYING),
+    "epoch_refusals": Counter("requests of clients from before this start, or of ended sessions"),
+    "wrong_shard": Counter(
+        "requests made with another shard list", "start all shards with the same cell.toml"
+    ),
+    "fetches_gone": Counter("slices asked for after their datum had gone: a lost lock", _DYING),
+    "leases_expired": Counter("locks lost because their client was silent for a TTL", _DYING),
+    "held_too_long": Counter("locks that went over hold_s", "raise hold_s, or do less in the lock"),
+    "sessions_died": Counter("clients that went without a goodbye", _DYING),
+    "waiters_dropped": Counter("waiting locks of clients that went or were silent", _DYING),
+    "locks_broken": Counter("locks that somebody ended by enact lock break"),
+    # Commits in doubt
+    "prepared_restored": Counter("commits in doubt that were found at the start"),
+    "resolves_asked": Counter(
+        "questions to other shards how a commit ended", "enact lock ls; start the shard it names"
+    ),
+    "resolved_committed": Counter("commits in doubt that turned out as committed"),
+    "resolved_aborted": Counter("commits in doubt that turned out as aborted"),
+    "prepared_forced": Counter("commits in doubt aborted by hand (enact lock resolve)"),
+    "forced_confirmed": Counter("such that had not been committed elsewhere: all is well"),
+    "forced_but_committed": Counter(
+        "such that had been committed elsewhere: they stand in part", "enact lock audit"
+    ),
+    "alarms": Counter("of these, those that nobody has settled yet", "enact lock audit"),
+    # This process and its host
+    "stalls": Counter("times this host stood still; no lease paid for it", _BUSY),
+    "disk_stalls": Counter(
+        "times a write took more than a second",
+        "move the shard's folder to another disk; see its log for when",
+    ),
+    "overloads": Counter("requests refused because too many wait", "find who asks: enact lock ls"),
+    "frames_refused": Counter(
+        "messages that could not be read", "run the same release everywhere; see the shard's log"
+    ),
+    "connections_refused": Counter(
+        "sockets refused: too many, another user, or no greeting", "see the shard's log"
+    ),
+    "answers_dropped": Counter("answers to clients that did not read them", _SLOW_READER),
+    "notices_dropped": Counter(
+        "notices to watchers that did not read them; a watch tells its gap", _SLOW_READER
+    ),
+    # History
+    "retained_bytes": Counter("bytes of older versions that are kept now"),
+    "retained_dropped": Counter(
+        "older versions let go early: the limit of 256 MiB", "retain fewer versions of large data"
+    ),
+    "history_dropped": Counter(
+        "older versions let go early for the room of a new datum",
+        "raise shared_bytes_max, or retain fewer versions of large data",
+    ),
+    # Large data
+    "payload_files": Counter("payloads that lie here now"),
+    "payload_bytes": Counter("bytes of these and of drafts now"),
+    "payload_bytes_max": Counter("the cap of the shared folder in bytes; 0 where there is none"),
+    "payload_drafts": Counter("payloads now that no commit has named yet"),
+    "payloads_adopted": Counter("payloads that a commit has named"),
+    "payloads_missing": Counter("payloads named by a commit and not here; they came again"),
+    "payloads_refused": Counter(
+        "payloads refused because of the cap",
+        "raise shared_bytes_max, or let go of arrays that hold old versions",
+    ),
+    "payload_fallbacks": Counter(
+        "payloads that are no file of the shared folder: it is full",
+        "enlarge the folder: mount -o remount,size=…; docker run --shm-size=…",
+    ),
+    "drafts_swept": Counter("drafts whose client went or gave them up", _DYING),
+}
+
+OF_A_CONNECTION: Final[dict[str, Counter]] = {
+    "keep_alives_failed": Counter("answers to keep-alives that made no sense", "see the log"),
+    "keep_alives_unanswered": Counter("keep-alives without an answer in time", _NETWORK),
+    "releases_unsent": Counter("locks whose release could not be sent; the next one ends them"),
+    "views_locked": Counter("views that took a lock, since their shards did not agree"),
+    "slices_repeated": Counter("slices of large data that were asked or sent again", _NETWORK),
+    "maps_failed": Counter("payloads that could not be mapped and were fetched", "see the log"),
+    "payload_fallbacks": Counter("data that travelled though the folder is shared", "see the log"),
+    "payload_folders_elsewhere": Counter(
+        "shards whose shared folder this process does not see",
+        "for containers: mount one tmpfs in all of them, see Large data in the README",
+    ),
+}
+
+
+def told(counters: Mapping[str, int]) -> Iterator[tuple[str, int, str, str]]:
+    """Yield name, value, meaning and remedy of all that are not 0, as they stand in the table."""
+    order = {name: number for number, name in enumerate(OF_A_SHARD)}
+    for name in sorted(counters, key=lambda name: (order.get(name, len(order)), name)):
+        if counters[name]:
+            known = OF_A_SHARD.get(name, Counter("of a newer release"))
+            yield name, counters[name], known.meaning, known.remedy

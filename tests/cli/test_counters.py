@@ -1,0 +1,78 @@
+"""Counters: each that a shard or a connection can report is explained in one table."""
+
+import ast
+from pathlib import Path
+
+import enact_dist
+from enact_dist.cli.counters import OF_A_CONNECTION, OF_A_SHARD, told
+from enact_dist.core.messages import ListSessions, PlacementMap, ShardEntry
+from enact_dist.core.shard_state import ShardSettings
+from enact_dist.link.host import open_host
+from enact_dist.link.payload_desk import PayloadDesk
+
+OF_CLIENTS = {"client.py", "fetching.py", "payload_client.py", "session_client.py", "staging.py"}
+CALLS = {"count", "_count"}
+
+
+def counted(paths):
+    """Return the texts with which something is counted in these files."""
+    names = set()
+    for path in paths:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Call) and node.args:
+                called = getattr(node.func, "attr", getattr(node.func, "id", ""))
+                first = node.args[0]
+                if called in CALLS and isinstance(first, ast.Constant):
+                    names.add(first.value)
+    return {name for name in names if isinstance(name, str)}
+
+
+def test_every_counter_of_a_shard_is_explained_and_no_other():
+    """The table has what the code counts, what is there now, and nothing that is gone."""
+    root = Path(enact_dist.__file__).parent
+    link = [path for path in (root / "link").glob("*.py") if path.name not in OF_CLIENTS]
+    now = set(PayloadDesk(None, 1).figures()) | {"alarms", "retained_bytes", "retained_dropped"}
+
+    found = counted([*(root / "core").glob("*.py"), *link]) | now
+
+    assert found == set(OF_A_SHARD)
+
+
+def test_every_counter_of_a_connection_is_explained_and_no_other():
+    """As for shards."""
+    link = Path(enact_dist.__file__).parent / "link"
+
+    assert counted([link / name for name in OF_CLIENTS]) == set(OF_A_CONNECTION)
+
+
+def test_counters_of_a_running_shard_are_in_the_table():
+    """What a shard answers has no name that only its code knows."""
+    answers = []
+    placement = PlacementMap(1, (ShardEntry("s0", ("tcp/h:1",)),), ())
+    host = open_host(ShardSettings("s0", placement), None)
+    host.submit(ListSessions(), answers.append)
+    host.close()
+
+    assert {counter.name for counter in answers[0].counters} <= set(OF_A_SHARD)
+    assert {"payload_files", "payload_bytes_max"} <= {each.name for each in answers[0].counters}
+
+
+def test_table_is_shown_in_its_order_without_what_is_zero():
+    """A counter of a newer release is shown last, by its name."""
+    rows = list(told({"newer": 2, "disk_stalls": 1, "commits": 7, "fenced": 0}))
+
+    assert [row[:2] for row in rows] == [("commits", 7), ("disk_stalls", 1), ("newer", 2)]
+    assert "another disk" in rows[1][3]
+
+
+def test_ls_shows_counters_with_what_they_mean(enact, cell_file):
+    """`--counters` prints one line for each that is not 0."""
+    with enact_dist.connect(str(cell_file)) as cell:
+        counted_here = enact_dist.Aspect("counted", int)
+        cell.world("online").init(enact_dist.Entity("counted"), counted_here, 1)
+
+    out = enact("shard", "ls", "--counters", "--cell", cell_file).out
+
+    assert "what to do" in out.splitlines()[0]
+    assert OF_A_SHARD["commits"].meaning in out
+    assert {line.split()[1] for line in out.splitlines()[1:]} <= set(OF_A_SHARD)
