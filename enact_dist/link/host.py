@@ -154,6 +154,7 @@ class ShardHost:
             firm=payload_bytes_max is not None,
             make_room=lambda size: self.event(MakeRoom(size)),
             biggest=self._biggest,
+            clock=self._clock,
         )
         self._mutex = threading.RLock()  # reentrant for `count` in reply callbacks only
         self._uninterrupted = Uninterrupted()

@@ -24,7 +24,6 @@ from __future__ import annotations
 import logging
 import os
 import threading
-import time
 import weakref
 from collections import OrderedDict
 from dataclasses import dataclass, field, replace
@@ -32,6 +31,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Final, TypeVar
 
 from enact_dist.core.messages import Refused, Staged
+from enact_dist.link.clock import Clock, SystemClock
 from enact_dist.link.memory import Pages, Plain, body_of, leftovers, map_file, plain_memory
 from enact_dist.wire.limits import BODY_BYTES_MAX, PAYLOAD_BYTES_MIN, PAYLOAD_NAME
 
@@ -48,9 +48,9 @@ GAPS_MAX: Final = 1024
 """Slices of one draft that may be here while one before them is not."""
 NO_ROOM: Final = "no_room"
 """The code of a refusal because of the cap."""
-DRAFT_S: Final = 30.0
+DRAFT_NS: Final = 30_000_000_000
 """A draft of a session that holds no lock is given up after so long without a slice."""
-FULL_S: Final = 0.1
+FULL_NS: Final = 100_000_000
 """So long after a payload did not fit, none that is as large is made room for."""
 DRAFT_BYTES_MAX: Final = 2 << 30
 """Bytes of drafts that wait in plain memory for their commits."""
@@ -70,7 +70,7 @@ class _Draft:
     size: int
     memory: Pages | Plain
     shared: bool
-    touched_s: float
+    touched_ns: int
     have: int = 0
     beyond: list[tuple[int, int]] = field(default_factory=list)
 
@@ -96,6 +96,7 @@ class PayloadDesk:
         firm: Whether a payload beyond that is refused; else it lies in plain memory.
         make_room: Called to let history go, until so many bytes are free.
         biggest: Names the slots that hold the most, for the text of a refusal.
+        clock: Tells how long a draft has had no slice.
 
     Attributes:
         counters: What happened, by name, for `ListSessions`.
@@ -109,6 +110,7 @@ class PayloadDesk:
         firm: bool = True,
         make_room: Callable[[int], None] = lambda _: None,
         biggest: Callable[[], str] = lambda: "",
+        clock: Clock | None = None,
     ) -> None:
         self.counters: dict[str, int] = {}
         self._folder = folder
@@ -117,6 +119,7 @@ class PayloadDesk:
         self._draft_bytes_max = bytes_max if folder is None else DRAFT_BYTES_MAX
         self._make_room = make_room
         self._biggest = biggest
+        self._clock: Clock = clock or SystemClock()
         self._mutex = threading.RLock()  # reentrant: a destructor may run anywhere
         self._opening = tuple(threading.Lock() for _ in range(16))
         self._drafts: dict[str, _Draft] = {}
@@ -124,7 +127,7 @@ class PayloadDesk:
         self._adopted: dict[str, weakref.ref[Pages | Plain]] = {}
         self._over: OrderedDict[str, None] = OrderedDict()
         self._bytes = 0
-        self._full = 0.0, 0
+        self._full = 0, 0
 
     # ---------------------------------------------------------------- drafts
 
@@ -164,7 +167,7 @@ class PayloadDesk:
         if slice_.size:
             body_of(draft.memory)[offset:end] = slice_.body
         with self._mutex:
-            draft.touched_s = time.monotonic()
+            draft.touched_ns = self._clock.monotonic_ns()
             if slice_.size:
                 draft.add(offset, end)
             return Staged(file, draft.have, draft.shared)
@@ -181,7 +184,7 @@ class PayloadDesk:
             if drafted + total > self._draft_bytes_max:
                 return self._refused(session, total, drafted, self._draft_bytes_max)
         found = memory or plain_memory(total, ended=partial(self._ended, file, None))
-        draft = _Draft(session, total, found, memory is not None, time.monotonic())
+        draft = _Draft(session, total, found, memory is not None, self._clock.monotonic_ns())
         with self._mutex:
             self._drafts[file] = draft
         return draft
@@ -190,15 +193,15 @@ class PayloadDesk:
         """Count the bytes of a new file if they fit under the cap, history gone if need be."""
         if self._reserved(total):
             return True
-        until_s, least = self._full
-        if time.monotonic() < until_s and total >= least:
+        until_ns, least = self._full
+        if self._clock.monotonic_ns() < until_ns and total >= least:
             return False  # looking through all history again would only delay the others
         self._make_room(self._bytes + total - self._bytes_max)
         # What is let go of takes a moment to leave.
         leftovers().wait(ROOM_S)
         if self._reserved(total):
             return True
-        self._full = time.monotonic() + FULL_S, total
+        self._full = self._clock.monotonic_ns() + FULL_NS, total
         return False
 
     def _reserved(self, total: int) -> bool:
@@ -262,14 +265,6 @@ class PayloadDesk:
         self._over[file] = None
         while len(self._over) > OVER_MAX:
             self._over.popitem(last=False)
-
-    def drop_session(self, session: str) -> None:
-        """Give up all drafts of a session."""
-        with self._mutex:
-            mine = [file for file, draft in self._drafts.items() if draft.session == session]
-            gone = [self._drafts.pop(file) for file in mine]
-        if gone:
-            self._count("drafts_swept", len(gone))
 
     # ---------------------------------------------------------------- adoption
 
@@ -339,13 +334,13 @@ class PayloadDesk:
         """
         if not self._drafts:
             return
-        late_s = time.monotonic() - DRAFT_S
+        late_ns = self._clock.monotonic_ns() - DRAFT_NS
         with self._mutex:
             over = [
                 file
                 for file, draft in self._drafts.items()
                 if not lives(draft.session)
-                or (draft.touched_s < late_s and not works(draft.session))
+                or (draft.touched_ns < late_ns and not works(draft.session))
             ]
             gone = [self._drafts.pop(file) for file in over]
         if gone:

@@ -11,6 +11,7 @@ from enact_dist.core.messages import Commit, Refused, Stage, Staged, WriteItem
 from enact_dist.link.memory import leftovers
 from enact_dist.link.payload_desk import NO_ROOM, PayloadDesk
 from enact_dist.link.shared_folder import SharedFolder
+from enact_dist.testing import ManualClock
 
 SIZE = 100_000
 SESSION = "a1b2c3"
@@ -139,16 +140,38 @@ def test_draft_that_is_given_up_leaves_nothing(folder):
     assert desk.figures()["payload_bytes"] == 0
 
 
-def test_drafts_end_with_their_session(folder, monkeypatch):
-    """A client that is gone commits no more; one that works may take its time."""
+def test_drafts_end_with_their_session(folder):
+    """A client that is gone commits no more."""
     desk = PayloadDesk(folder, 10 * SIZE)
     stage(desk, "gone-1")
     stage(desk, "idle-1")
-    stage(desk, "busy-1")
-    monkeypatch.setattr("enact_dist.link.payload_desk.DRAFT_S", -1.0)
 
-    desk.sweep({"idle", "busy"}.__contains__, {"busy"}.__contains__)
+    desk.sweep({"idle"}.__contains__, {"idle"}.__contains__)
 
+    assert names(folder) == ["idle-1"]
+    assert desk.figures()["drafts_swept"] == 1
+
+
+def test_drafts_end_after_a_time_without_a_slice(folder):
+    """To the nanosecond, by the clock that the desk was given; one that works takes its time."""
+    clock = ManualClock()
+    desk = PayloadDesk(folder, 10 * SIZE, clock=clock)
+    for file in ("idle-1", "late-1", "busy-1"):
+        stage(desk, file)
+    live, works = {"idle", "late", "busy"}.__contains__, {"busy"}.__contains__
+    clock.advance(20.0)
+    stage(desk, "late-1", offset=0, body=b"s" * (SIZE // 2))
+    clock.advance(10.0)
+
+    desk.sweep(live, works)
+    assert names(folder) == ["busy-1", "idle-1", "late-1"]
+
+    clock.advance(1e-9)
+    desk.sweep(live, works)
+    assert names(folder) == ["busy-1", "late-1"]
+
+    clock.advance(20.0)
+    desk.sweep(live, works)
     assert names(folder) == ["busy-1"]
     assert desk.figures()["drafts_swept"] == 2
 

@@ -111,6 +111,8 @@ HAPPENED = (
     "payloads released",
     "payloads held to the end",
     "payloads named too early",
+    "payloads adopted after a long time",
+    "drafts given up for want of slices",
     "refused: no_payload",
 )
 

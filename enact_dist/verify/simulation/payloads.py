@@ -3,7 +3,8 @@
 Each simulated shard has a real `PayloadDesk` in plain memory, new with each start.  Clients bring
 some of their large data in slices, which are lost, doubled, late and cut off by crashes; some name
 a payload of which only a part has come, or nothing.  Whatever happens, a commit has all of its
-bytes, and a payload is gone as soon as nothing of its shard shows it any more.
+bytes, and a payload is gone as soon as nothing of its shard shows it any more.  A draft ends with
+its session, or, where the session holds no lock, after 30 s of its shard without a slice.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ from enact_dist.core.messages import Commit, EpochChanged, Prepare, Stage, Stage
 from enact_dist.core.records import Persist, PreparedRecord, SlotRecord
 from enact_dist.link.memory import Plain
 from enact_dist.link.payload_desk import PayloadDesk
-from enact_dist.verify.simulation.client_host import Calls, ClientHost, Steps
+from enact_dist.verify.simulation.client_host import Calls, ClientHost, Sleep, Steps, Thread
+from enact_dist.verify.simulation.world import Host, S
 from enact_dist.wire.limits import PAYLOAD_BYTES_MIN
 
 if TYPE_CHECKING:
@@ -27,30 +29,57 @@ if TYPE_CHECKING:
     from enact_dist.core.messages import Answer, Request, WriteItem
     from enact_dist.core.records import Effect
     from enact_dist.core.shard import Shard
+    from enact_dist.verify.simulation.shard_host import ShardHost
     from enact_dist.verify.simulation.world import World
 
 BYTES_MAX: Final = 64 << 20
 SLICES: Final = 3
 TRIES: Final = 8
+DRAFT_NS: Final = 30 * S
+"""A draft of a session without a lock ends when it has had no slice for longer."""
+RARE_NS: Final = DRAFT_NS * 2 // 3
+"""Slices that come so seldom keep their draft."""
 
 
 # ---------------------------------------------------------------- at a shard
 
 
+class HostClock:
+    """The clocks of a simulated host, as the real parts read them."""
+
+    def __init__(self, host: Host) -> None:
+        self._host = host
+
+    def monotonic_ns(self) -> int:
+        """Return what its steady clock shows."""
+        return self._host.local_ns
+
+    def wall_ns(self) -> int:
+        """Return what its wall clock shows."""
+        return self._host.wall_ns
+
+
 class ShardPayloads:
     """The payloads of one life of a shard, and who may still hold them."""
 
-    def __init__(self, world: World, shard: Shard) -> None:
-        self._world, self._shard = world, shard
-        self.desk = PayloadDesk(None, BYTES_MAX)
+    def __init__(self, host: ShardHost) -> None:
+        self._world, self._shard, self._host = host.world, host.shard, host
+        self.desk = PayloadDesk(None, BYTES_MAX, clock=HostClock(host))
         self._adopted: dict[str, weakref.ref[Plain]] = {}
+        self._drafts: dict[str, tuple[str, int, int]] = {}
+        """Of each draft its session, its first and its newest slice, by the shard's clock."""
 
     def stage(self, message: Stage) -> Answer:
         """Take a slice, as the shard's link does."""
         if message.total and message.session not in self._shard.state.sessions.by_id:
             return EpochChanged(self._shard.epoch)
         self._world.tally["slices staged"] += 1
-        return self.desk.stage(message)
+        answer = self.desk.stage(message)
+        file, now_ns = message.file, self._host.local_ns
+        if file not in self._adopted and isinstance(answer, Staged):
+            _, begun_ns, _ = self._drafts.get(file, ("", now_ns, now_ns))
+            self._drafts[file] = message.session, begun_ns, now_ns
+        return answer
 
     def with_bodies(self, message: Request) -> Request:
         """Put in what a commit names, as the shard's link does."""
@@ -71,17 +100,34 @@ class ShardPayloads:
             again = known is not None and known() is memory
             self._world.tally["payloads adopted again" if again else "payloads adopted"] += 1
             self._adopted[before.datum.file] = weakref.ref(memory)
+            _, begun_ns, _ = self._drafts.pop(before.datum.file, ("", self._host.local_ns, 0))
+            late = self._host.local_ns - begun_ns > DRAFT_NS
+            self._world.tally["payloads adopted after a long time"] += late
         return found
 
     def look(self) -> None:
-        """Give up drafts as the shard's link does at each tick; none outlives its session."""
-        state = self._shard.state
-        self.desk.sweep(state.sessions.by_id.__contains__, state.tenures.by_session.__contains__)
-        for file, session in self.desk.drafts().items():
-            if session not in state.sessions.by_id:
-                self._world.violation("drafts end with their session", file)
+        """Give up drafts as the shard's link does at each tick: those that must end, no others."""
+        state, now_ns = self._shard.state, self._host.local_ns
+        sessions, holders = state.sessions.by_id, state.tenures.by_session
+        self.desk.sweep(sessions.__contains__, holders.__contains__)
+        left = self.desk.drafts()
+        for file in left:
             if file in self._adopted:
                 self._world.violation("a payload is made once", file)
+        for file, (session, _, newest_ns) in list(self._drafts.items()):
+            if session not in sessions:
+                over = "drafts end with their session"
+            elif session not in holders and now_ns - newest_ns > DRAFT_NS:
+                over = "drafts end after a time without a slice"
+                self._world.tally["drafts given up for want of slices"] += 1
+            else:
+                over = ""
+            if over and file in left:
+                self._world.violation(over, file)
+            if not over and file not in left:
+                self._world.violation("a draft stays while its client may commit it", file)
+            if over:
+                del self._drafts[file]
 
     def check_released(self) -> None:
         """When nothing is under way, a payload lives as long as a slot or a reader shows it."""
@@ -157,30 +203,59 @@ class Stager:
         self._made = 0
 
     def staged(
-        self, host: ClientHost, shard: str, writes: list[WriteItem], luck: Random
+        self,
+        host: ClientHost,
+        shard: str,
+        writes: list[WriteItem],
+        luck: Random,
+        *,
+        rests_ns: int = 0,
     ) -> Steps[list[WriteItem]]:
-        """Return writes that name what was staged; of some, that only a part or nothing was."""
+        """Return writes that name what was staged; of some, that only a part or nothing was.
+
+        With `rests_ns` all is staged, with so long a rest after the first slice.
+        """
         found: list[WriteItem] = []
         for write in writes:
             datum = write.datum
-            if datum is None or datum.size <= PAYLOAD_BYTES_MIN or luck.random() < 0.2:
+            small = datum is None or datum.size <= PAYLOAD_BYTES_MIN
+            if small or (not rests_ns and luck.random() < 0.2):
                 found.append(write)
                 continue
-            self._made += 1
-            file = f"{host.client.session}-{self._made:x}"
-            hasty = luck.random() < 0.2
-            whole = yield from self._stage(host, shard, file, datum, luck, hasty=hasty)
+            assert datum is not None
+            file = self._new_name(host)
+            hasty = not rests_ns and luck.random() < 0.2
+            tries = luck.randrange(SLICES) if hasty else TRIES
+            whole = yield from self._stage(host, shard, file, datum, tries=tries, rests_ns=rests_ns)
             named = whole or hasty
             self._world.tally["payloads named too early"] += named and not whole
             found.append(write._replace(datum=replace(datum, file=file)) if named else write)
         return found
 
+    def _new_name(self, host: ClientHost) -> str:
+        self._made += 1
+        return f"{host.client.session}-{self._made:x}"
+
+    def given_up(self, host: ClientHost, shard: str, datum: Datum) -> Thread:
+        """Send two slices with a long time between them, and nothing more, under no lock."""
+        file = self._new_name(host)
+        yield from self._stage(host, shard, file, datum, tries=2, rests_ns=RARE_NS)
+
     def _stage(
-        self, host: ClientHost, shard: str, file: str, datum: Datum, luck: Random, *, hasty: bool
+        self,
+        host: ClientHost,
+        shard: str,
+        file: str,
+        datum: Datum,
+        *,
+        tries: int,
+        rests_ns: int = 0,
     ) -> Steps[bool]:
         """Send slices from where the shard is, whatever is lost; return whether it has them all."""
         have, step = 0, datum.size // SLICES + 1
-        for _ in range(luck.randrange(SLICES) if hasty else TRIES):
+        for attempt in range(tries):
+            if attempt == 1 and rests_ns:
+                yield Sleep(rests_ns)
             here = datum.body[have : have + step]
             part = Datum(b"", here, len(here))
             stage = Stage(host.client.session, file, have, datum.size, part)

@@ -24,6 +24,7 @@ from enact_dist.verify.simulation.history import History
 from enact_dist.verify.simulation.injector import Injector
 from enact_dist.verify.simulation.model import Model
 from enact_dist.verify.simulation.network import Network
+from enact_dist.verify.simulation.payloads import DRAFT_NS
 from enact_dist.verify.simulation.schedule import WHOLE, Happening, Part, Schedule
 from enact_dist.verify.simulation.shard_host import ShardHost
 from enact_dist.verify.simulation.workload import ASPECTS, CONTEXTS, Workload
@@ -37,6 +38,8 @@ if TYPE_CHECKING:
 QUIET_NS = 30 * S
 """How long after that everything must have come to rest."""
 POLL_NS = 500 * MS
+LINGERING = 0.1
+"""Share of the runs that go on for twice as long as a draft may be without a slice."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,6 +179,7 @@ class Scenario:
         while not self._quiet() and self.world.now_ns < end_ns:
             self.world.run_until(self.world.now_ns + POLL_NS)
         self._check_quiet()
+        self._linger()
         for host in self.shards.values():
             host.payloads.check_released()
             host.close()
@@ -185,6 +189,19 @@ class Scenario:
         cycle = graph.cycle()
         if cycle is not None:
             self.world.violation("I6 strict serializability", *("\n  " + line for line in cycle))
+
+    def _linger(self) -> None:
+        """Let a client that is left work very slowly, in some runs, and drafts grow old."""
+        hosts = [host for host in self.model.of_clients.clients if host.up]
+        if not hosts or self.schedule.stream("lingering").random() >= LINGERING:
+            return
+        for thread in self.workload.lingering(hosts[0]):
+            hosts[0].start(thread)
+        self.world.run_until(self.world.now_ns + 2 * DRAFT_NS)
+        self._check_quiet()
+        for shard in self.shards.values():
+            for file in shard.payloads.desk.drafts():
+                self.world.violation("I12 nothing is left", shard.name, file)
 
     def _wind_down(self) -> None:
         self.world.winding_down = True

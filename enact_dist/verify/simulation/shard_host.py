@@ -65,7 +65,7 @@ class ShardHost(Host):
         recovered = self.disk.recovered(unix_s=self.wall_ns // S)
         self._replies.clear()
         self.shard = Shard(self.settings, recovered, now_ns=self.local_ns, wall_ns=self.wall_ns)
-        self.payloads = ShardPayloads(self.world, self.shard)
+        self.payloads = ShardPayloads(self)
         self.model.booted(self, recovered, crashed_at_ns=self._crashed_at_ns)
         self._tick_due_ns = 0
         self._plan_tick()

@@ -28,7 +28,7 @@ from enact_dist.terms import Access
 from enact_dist.verify.simulation.captures import Captures, drawn_stamp_ns
 from enact_dist.verify.simulation.client_host import Calls, ClientHost, Sleep, Steps, Thread
 from enact_dist.verify.simulation.history import Entry, History
-from enact_dist.verify.simulation.payloads import Stager
+from enact_dist.verify.simulation.payloads import DRAFT_NS, Stager
 from enact_dist.verify.simulation.world import MS, S
 
 if TYPE_CHECKING:
@@ -86,6 +86,8 @@ class Job:
     abandons: bool
     expects: bool
     label: str = ""
+    rests_ns: int = 0
+    """How long it rests after the first slice of a large datum; with this all data are large."""
 
 
 class Workload:
@@ -209,6 +211,23 @@ class Workload:
         views = (view for view in self._view_set(random) if view[1:4] != made[1:4])
         return (made, *views)
 
+    def lingering(self, host: ClientHost) -> tuple[Thread, Thread]:
+        """Return two threads: one takes its time for a large datum, one gives a draft up."""
+        entity = self._entities[0]
+        item = Item(Access.WRITE, "online", entity, "frame")
+        luck = self._world.schedule.stream("who takes its time")
+        name = f"{host.name}/slow"
+        job = Job(
+            name, "derive", (item,), luck, 8 * S, 60 * S, 0, False, False, rests_ns=DRAFT_NS + S
+        )
+        shard = shard_of(entity, host.client.placement)
+        gives_up = self._stager.given_up(host, shard, datum_of("never committed", size=LARGE))
+        return self._once(host, job), gives_up
+
+    def _once(self, host: ClientHost, job: Job) -> Thread:
+        if self._world.schedule.begins(job.name):
+            yield from self._do(host, 0, job)
+
     # ---------------------------------------------------------------- doing
 
     def thread(self, host: ClientHost, lane: int) -> Thread:
@@ -321,7 +340,9 @@ class Workload:
             shard = shard_of(slot.entity, host.client.placement)
             writes.setdefault(shard, []).append(WriteItem(slot, self._datum(lock, job, slot, data)))
         for shard, items in writes.items():
-            writes[shard] = yield from self._stager.staged(host, shard, items, job.luck)
+            writes[shard] = yield from self._stager.staged(
+                host, shard, items, job.luck, rests_ns=job.rests_ns
+            )
         if len(writes) > 1:
             self._world.tally["locks that write on several shards"] += 1
             self._world.tally["locks that write on three shards"] += len(writes) > 2
@@ -367,7 +388,7 @@ class Workload:
             return None
         old = data.get(slot)
         value = 1 if old is None else value_of(old) + 1
-        large = slot.aspect == "frame" and random.random() < 0.2
+        large = job.rests_ns or (slot.aspect == "frame" and random.random() < 0.2)
         datum = datum_of(f"{lock.lock}|{value}", size=LARGE if large else 0)
         return replace(datum, stamp_ns=drawn_stamp_ns(random, self._world.now_ns))
 
