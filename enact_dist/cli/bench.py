@@ -43,8 +43,7 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
         "enact bench update --embedded\n"
         "enact bench multi --shards 3\n"
         "enact bench fetch --connect tcp/tray-pc:7447\n"
-        "for n in 1 2 3; do enact bench --json > run$n.json; done;"
-        " enact bench --table run?.json",
+        "enact bench --table run1.json run2.json run3.json",
     )
     bench.add_argument(
         "names",
