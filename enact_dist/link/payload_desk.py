@@ -72,6 +72,7 @@ class _Draft:
     shared: bool
     touched_ns: int
     have: int = 0
+    writing: int = 0
     beyond: list[tuple[int, int]] = field(default_factory=list)
 
     def add(self, begin: int, end: int) -> None:
@@ -83,7 +84,12 @@ class _Draft:
 
     @property
     def whole(self) -> bool:
-        """Whether all of it is here: from slices, or (none came) from its client in the folder."""
+        """Whether all of it is here: from slices, or (none came) from its client in the folder.
+
+        Not while a slice is being written: nothing may change once a commit has it.
+        """
+        if self.writing:
+            return False
         return self.have == self.size or (self.shared and not self.have and not self.beyond)
 
 
@@ -164,12 +170,22 @@ class PayloadDesk:
             return Refused("protocol", f"a slice to {end} of payload {file}, of {draft.size} bytes")
         if len(draft.beyond) >= GAPS_MAX:
             return Refused("protocol", f"{GAPS_MAX} slices of payload {file} came before others")
-        if slice_.size:
-            body_of(draft.memory)[offset:end] = slice_.body
         with self._mutex:
             draft.touched_ns = self._clock.monotonic_ns()
-            if slice_.size:
-                draft.add(offset, end)
+            if self._drafts.get(file) is not draft:
+                return Staged(file, draft.size, False)  # meanwhile: a late copy, as in `stage`
+            if not slice_.size or end <= draft.have:
+                return Staged(file, draft.have, draft.shared)
+            draft.writing += 1
+        try:
+            body_of(draft.memory)[offset:end] = slice_.body
+        except BaseException:
+            with self._mutex:
+                draft.writing -= 1
+            raise
+        with self._mutex:
+            draft.writing -= 1
+            draft.add(offset, end)
             return Staged(file, draft.have, draft.shared)
 
     def _opened(self, session: str, file: str, total: int) -> _Draft | Refused:
@@ -183,7 +199,11 @@ class PayloadDesk:
             drafted = self._drafted()
             if drafted + total > self._draft_bytes_max:
                 return self._refused(session, total, drafted, self._draft_bytes_max)
-        found = memory or plain_memory(total, ended=partial(self._ended, file, None))
+        try:
+            found = memory or plain_memory(total, ended=partial(self._ended, file, None))
+        except OSError as error:
+            self._count("payloads_refused")
+            return Refused(NO_ROOM, f"{total} bytes for a payload cannot be had: {error.strerror}")
         draft = _Draft(session, total, found, memory is not None, self._clock.monotonic_ns())
         with self._mutex:
             self._drafts[file] = draft
@@ -308,7 +328,11 @@ class PayloadDesk:
             self._adopted[file] = weakref.ref(draft.memory)
             self._end(file)
         if draft.shared and self._folder is not None:
-            os.chmod(file, self._folder.access.file_mode, dir_fd=self._folder.descriptor)
+            try:
+                os.chmod(file, self._folder.access.file_mode, dir_fd=self._folder.descriptor)
+            except OSError as error:  # somebody has cleared the folder
+                _log.warning("payload %s is lost: %s", file, error.strerror)
+                return None
         self._count("payloads_adopted")
         return draft.memory
 

@@ -8,6 +8,7 @@ import pytest
 
 from enact_dist.core.datum import Datum, LockId, Slot, Token
 from enact_dist.core.messages import Commit, Refused, Stage, Staged, WriteItem
+from enact_dist.link import payload_desk
 from enact_dist.link.memory import leftovers
 from enact_dist.link.payload_desk import NO_ROOM, PayloadDesk
 from enact_dist.link.shared_folder import SharedFolder
@@ -335,3 +336,62 @@ def test_folder_that_takes_no_file_costs_no_commit(folder, monkeypatch, code):
     assert bytes(adopted(desk).body) == b"x" * SIZE
     assert names(folder) == []
     assert desk.figures()["payload_fallbacks"] == 1
+
+
+def test_draft_whose_file_somebody_has_removed_is_no_payload(folder):
+    """Its bytes come again with the commit; whoever serves all clients does not fail of it."""
+    desk = PayloadDesk(folder, 10 * SIZE)
+    stage(desk)
+    (folder.path / FILE).unlink()
+
+    assert adopted(desk).body == b""
+
+    assert leftovers().wait(5.0)
+    assert desk.figures()["payloads_missing"] == 1
+    assert desk.figures()["payload_bytes"] == 0
+
+
+def test_system_without_memory_refuses_a_payload_by_name(monkeypatch):
+    """It is an answer, not the end of the thread that takes the slices."""
+
+    def none_left(*_, **__):
+        raise OSError(errno.ENOMEM, os.strerror(errno.ENOMEM))
+
+    monkeypatch.setattr(payload_desk, "plain_memory", none_left)
+
+    answer = stage(PayloadDesk(None, 10 * SIZE))
+
+    assert (answer.code, "Cannot allocate memory" in answer.text) == (NO_ROOM, True)
+
+
+def test_payload_never_changes_once_a_commit_has_it(desk, monkeypatch):
+    """While a second copy of a slice, with other bytes, is being taken, a commit gets nothing."""
+    stage(desk, body=b"a" * (SIZE - 1))
+    seen, inside = [], payload_desk.body_of
+
+    def body_of(memory):
+        if not seen:  # the second copy is about to be written
+            seen.append(None)
+            stage(desk, offset=SIZE - 1, body=b"a")
+            found = adopted(desk)
+            seen[:] = [found, bytes(found.body)]
+        return inside(memory)
+
+    monkeypatch.setattr(payload_desk, "body_of", body_of)
+    stage(desk, offset=SIZE - 1, body=b"b")
+
+    assert bytes(seen[0].body) == seen[1]
+    found = adopted(desk)
+    whole = bytes(found.body)
+    assert len(whole) == SIZE
+    stage(desk, offset=1, body=b"d" * 10)
+    assert bytes(found.body) == whole
+
+
+def test_slice_that_is_here_already_is_not_written_again(desk):
+    """The first copy counts: a later one with other bytes changes nothing."""
+    stage(desk, body=b"a" * (SIZE - 1))
+    stage(desk, body=b"b" * 10)
+    stage(desk, offset=SIZE - 1, body=b"a")
+
+    assert bytes(adopted(desk).body) == b"a" * SIZE
