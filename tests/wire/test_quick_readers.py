@@ -9,8 +9,9 @@ import pytest
 from wire_samples import CLASSES, sample
 
 from enact_dist.errors import ProtocolError
+from enact_dist.wire import frames
 from enact_dist.wire.bodies import BodyReader
-from enact_dist.wire.frames import encode_frame
+from enact_dist.wire.frames import CODES, decode_frame, encode_frame
 from enact_dist.wire.message_parts import reader_of
 from enact_dist.wire.quick_readers import quick_reader_of
 
@@ -59,3 +60,54 @@ def test_quick_reader_agrees(cls):
             refused += isinstance(expected, str)
 
     assert refused
+
+
+def damaged(header, payload, draw):
+    """Return a frame with a few things wrong in its parts, its bytes or its payload."""
+    way = draw.randrange(4)
+    if way == 0:
+        raw = msgpack.unpackb(header, use_list=False)
+        for _ in range(draw.randrange(1, 4)):
+            raw = with_other(raw, draw.choice(list(places(raw))), draw.choice(WRONG))
+        header = msgpack.packb(raw)
+    elif way == 1:
+        flipped = bytearray(header)
+        for _ in range(draw.randrange(1, 4)):
+            flipped[draw.randrange(len(flipped))] ^= 1 << draw.randrange(8)
+        header = bytes(flipped)
+    elif way == 2:
+        payload = draw.choice((payload[:-1], payload + b"\0", payload[64:], b"\1" + payload))
+    else:
+        whole = msgpack.unpackb(header, use_list=False)
+        at = draw.randrange(2, len(whole) + 1)
+        header = msgpack.packb((*whole[:at], draw.choice(whole), *whole[at + draw.randrange(2) :]))
+    return header, payload
+
+
+def answer_of(header, payload):
+    """Return the message of a frame, or the words of its refusal."""
+    try:
+        return decode_frame(header, payload)
+    except ProtocolError as error:
+        return str(error)
+
+
+def test_damaged_frames_pass_both_or_neither(monkeypatch):
+    """What the general reader refuses does not pass a quick one, however a frame is damaged."""
+    draw = random.Random(188545)
+    general = {code: reader_of(cls) for cls, code in CODES.items()}
+    quick, passed, refused = frames._readers, 0, 0
+
+    hot = [cls for cls in CLASSES if cls in frames._OF_EVERY_LOCK]
+    for number in range(4000):
+        header, payload = encode_frame(sample(hot[number % len(hot)], draw))
+        frame = damaged(header, payload or b"", draw)
+        monkeypatch.setattr(frames, "_readers", general)
+        expected = answer_of(*frame)
+        monkeypatch.setattr(frames, "_readers", quick)
+        assert answer_of(*frame) == expected, frame
+        passed += not isinstance(expected, str)
+        refused += isinstance(expected, str)
+
+    assert passed > 400
+    assert refused > 1500
