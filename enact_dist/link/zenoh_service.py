@@ -139,20 +139,23 @@ class ZenohService:
             return
         client = client_of(message) or str(query.key_expr)
         self.senders.heard(client)
+        call = _Call(self, query, client)
         if type(message) is Stage:
-            self._staged.put((message, _Call(self, query, client)))
+            self._staged.put((message, call))
         else:
-            self._host.submit(cast("Request", message), _Call(self, query, client))
+            self._submit(cast("Request", message), call)
 
     def _stage(self) -> None:
         """Take the slices of large data to where they belong: making room for them takes time."""
         while (staged := self._staged.get()) is not None:
-            message, call = staged
-            try:
-                self._host.submit(message, call)
-            except Exception:  # noqa: BLE001 - the thread serves all clients
-                _log.exception("a slice of payload %s was not taken", message.file)
-                call.drop()
+            self._submit(*staged)
+
+    def _submit(self, message: Request, call: _Call) -> None:
+        try:
+            self._host.submit(message, call)
+        except Exception:  # noqa: BLE001 - these threads serve all clients
+            _log.exception("a %s was not taken", type(message).__name__)
+            call.drop()
 
     def reply_key(self, query: zenoh.Query, answer: Answer) -> zenoh.KeyExpr | str:
         """Return the key to answer under: the query's own, unless that asked every shard."""

@@ -12,6 +12,7 @@ import zenoh
 
 from enact_dist import Aspect, Entity, Lock, Write, connect
 from enact_dist.core import messages as m
+from enact_dist.core.datum import LockId, Token
 from enact_dist.errors import ProtocolError
 from enact_dist.link.zenoh_config import close_session, open_session
 from enact_dist.wire.frames import decode_frame, encode_frame
@@ -149,6 +150,24 @@ def test_shard_hears_on_after_a_frame_that_breaks_the_decoder(daemon, endpoint, 
     assert answer_of(refused) == m.Refused("protocol", "nested without end")
     assert type(answer_of(answered)) is m.Locks
     assert shard.host._shard.counters["frames_refused"] == 1
+
+
+def test_shard_hears_on_after_a_request_that_fails_before_the_core(
+    daemon, endpoint, raw, monkeypatch
+):
+    """What the system refuses to one commit is no answer to it, and the next client gets his."""
+    shard = daemon(endpoint)
+
+    def fails(*_):
+        raise OSError("the folder is gone")
+
+    monkeypatch.setattr(shard.host._payloads, "with_bodies", fails)
+    commit = encode_frame(m.Commit(LockId("session", 0, 1), Token(1, 1), (), 0))[0]
+    *unanswered, answered = raw(*[(commit, b"")] * 3, (encode_frame(m.ListLocks())[0], b""))
+
+    assert unanswered == [[]] * 3
+    assert type(answer_of(answered)) is m.Locks
+    assert shard.failure is None
 
 
 @pytest.mark.parametrize("other", [FRAME_VERSION - 1, FRAME_VERSION + 1])
