@@ -115,6 +115,9 @@ OF_A_SHARD: Final[dict[str, Counter]] = {
         "payloads refused because of the cap",
         "raise shared_bytes_max, or let go of arrays that hold old versions",
     ),
+    "slices_dropped": Counter(
+        "slices dropped since too many wait for their place; they came again", _BUSY
+    ),
     "payload_fallbacks": Counter(
         "payloads that are no file of the shared folder: it is full",
         "enlarge the folder: mount -o remount,size=…; docker run --shm-size=…",

@@ -53,6 +53,8 @@ DATA_SUFFIX: Final = "/data"
 """Slices of a client count, and wait, apart from its other answers."""
 _NOTICES: Final = "@notices"
 """Stands for all watchers together among the clients of `Senders`."""
+STAGED_BYTES_MAX: Final = 256 << 20
+"""Bytes of slices that wait for their place: 32 transfers; a client asks again for a lost one."""
 JOIN_S: Final = 0.5
 """How long a closing service waits for each of its threads."""
 
@@ -85,6 +87,8 @@ class ZenohService:
         self._inbox: zenoh.Handler[zenoh.Query] = self._queryable.handler
         host.add_inbox(self.drain_inbox)
         self._staged: queue.SimpleQueue[tuple[Stage, _Call] | None] = queue.SimpleQueue()
+        self._staged_mutex = threading.Lock()
+        self._staged_bytes = 0
         self._threads = [
             threading.Thread(target=run, name=name, daemon=True)
             for name, run in (
@@ -141,14 +145,28 @@ class ZenohService:
         self.senders.heard(client)
         call = _Call(self, query, client)
         if type(message) is Stage:
-            self._staged.put((message, call))
+            self._stage_later(message, call)
         else:
             self._submit(cast("Request", message), call)
+
+    def _stage_later(self, message: Stage, call: _Call) -> None:
+        size = message.body.size
+        with self._staged_mutex:
+            full = self._staged_bytes and self._staged_bytes + size > STAGED_BYTES_MAX
+            if not full:
+                self._staged_bytes += size
+        if full:
+            self._host.count("slices_dropped")
+            call.drop()
+        else:
+            self._staged.put((message, call))
 
     def _stage(self) -> None:
         """Take the slices of large data to where they belong: making room for them takes time."""
         while (staged := self._staged.get()) is not None:
             self._submit(*staged)
+            with self._staged_mutex:
+                self._staged_bytes -= staged[0].body.size
 
     def _submit(self, message: Request, call: _Call) -> None:
         try:

@@ -12,7 +12,7 @@ import zenoh
 
 from enact_dist import Aspect, Entity, Lock, Write, connect
 from enact_dist.core import messages as m
-from enact_dist.core.datum import LockId, Token
+from enact_dist.core.datum import Datum, LockId, Token
 from enact_dist.errors import ProtocolError
 from enact_dist.link.zenoh_config import close_session, open_session
 from enact_dist.wire.frames import decode_frame, encode_frame
@@ -168,6 +168,31 @@ def test_shard_hears_on_after_a_request_that_fails_before_the_core(
     assert unanswered == [[]] * 3
     assert type(answer_of(answered)) is m.Locks
     assert shard.failure is None
+
+
+def test_slices_that_wait_for_their_place_are_bounded(daemon, endpoint, raw, monkeypatch):
+    """While one waits for room, those beyond the limit are dropped, counted, and asked again."""
+    monkeypatch.setattr("enact_dist.link.zenoh_service.STAGED_BYTES_MAX", 100_000)
+    shard, full = daemon(endpoint), threading.Event()
+    take, count = shard.host._stage, shard.host.count
+
+    def take_later(message, reply):
+        full.wait(10)
+        take(message, reply)
+
+    def note(name, amount=1):
+        count(name, amount)
+        if shard.host._shard.counters.get("slices_dropped") == 3:
+            full.set()
+
+    monkeypatch.setattr(shard.host, "_stage", take_later)
+    monkeypatch.setattr(shard.host, "count", note)
+    stage = m.Stage("session", "session-1", 0, 80_000, Datum(b"", bytes(40_000), 40_000))
+    replies = raw(*[encode_frame(stage)] * 5)
+
+    assert full.is_set()
+    assert [len(each) for each in replies] == [1, 1, 0, 0, 0]
+    assert [len(each) for each in raw(*[encode_frame(stage)] * 2)] == [1, 1]
 
 
 @pytest.mark.parametrize("other", [FRAME_VERSION - 1, FRAME_VERSION + 1])
