@@ -137,7 +137,7 @@ class Peer(harness.Peer):
 
     name = "enact"
     caps = dict(  # noqa: C408, RUF012 (as the harness has it)
-        lease=1, fencing=1, rw=1, multi="atomic", cross_host=1, zero_copy=0, notify="push"
+        lease=1, fencing=1, rw=1, multi="atomic", cross_host=1, zero_copy="same host", notify="push"
     )
 
     def start(self):
