@@ -51,6 +51,7 @@ def test_increments_add_up_when_shard_is_killed_and_restarted(make_cell):
     assert counted(cell) == 4000
 
 
+@both
 def test_stopped_holder_is_fenced_when_it_wakes(make_cell):
     """A holder stopped for three TTLs while another commits: its commit is refused, the value stands."""
     cell = make_cell().start_all()
@@ -88,6 +89,7 @@ def test_holder_of_the_interpreter_lock_keeps_its_lease(make_cell):
     assert len(json.loads(ticking.expect("times"))) > 1000
 
 
+@both
 def test_killed_holder_leaves_its_lock_within_one_ttl(make_cell):
     """After `kill -9` of a holder the next one gets the lock within TTL + 0.5 s."""
     cell = make_cell().start_all()
