@@ -315,6 +315,25 @@ class TestBelief:
         assert lock.valid(begun_ns + S * 98 // 100 - 10 * MS)
         assert not lock.valid(begun_ns + S)
 
+    def test_hold_limit_runs_from_the_grant_whose_answer_was_lost(self, cell):
+        """The shard has counted since then; a later answer to the same lock gives no new time."""
+        ann = cell.client("ann")
+        lock = ann.begin(item(W), hold_s=1.0)
+        begun_ns = cell.now_ns
+        ((shard, request),), _ = lock.next_calls(begun_ns)
+        cell.shards["s0"].ask(request)
+        cell.wait(S * 6 // 10)
+        lock.answered(shard, request, None, cell.now_ns)
+        _, again_ns = lock.next_calls(cell.now_ns)
+        cell.wait(again_ns - cell.now_ns)
+        ((shard, again),), _ = lock.next_calls(cell.now_ns)
+
+        lock.answered(shard, again, cell.shards["s0"].ask(again), cell.now_ns)
+
+        assert lock.phase is Phase.HELD
+        assert lock.valid(begun_ns + S * 98 // 100 - 10 * MS)
+        assert not lock.valid(begun_ns + S)
+
     def test_keep_alive_prolongs_the_belief(self, cell):
         """What the shard has renewed may be believed in for longer."""
         ann = cell.client("ann")

@@ -10,11 +10,14 @@ import subprocess
 import sys
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import mutants
 
 from enact_dist.verify.simulation.scenario import Scenario
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
 
 SEEDS = 600
 """A mutant that survives so many seeds counts as not caught."""
@@ -31,15 +34,15 @@ class Caught(NamedTuple):
     seeds: int
 
 
-def simulate(mutant: mutants.Mutant, *, seeds: int = SEEDS) -> Caught:
-    """Run seeds from 0 on, with the edit and without the shard's own assertions."""
+def simulate(mutant: mutants.Mutant, *, first: Iterable[int] = (), seeds: int = SEEDS) -> Caught:
+    """Run some seeds first, then those from 0 on, with the edit and no assertions of the shard."""
     with mutants.planted(mutant):
-        for seed in range(seeds):
+        for count, seed in enumerate((*first, *range(seeds)), 1):
             rule = Scenario(seed, through_wire=False, asserts=False).run().rule
             if rule in MISFITS:
                 raise RuntimeError(f"{mutant.__name__} does not fit the core any more: {rule}")
             if rule:
-                return Caught(mutant.__name__, rule, seed + 1)
+                return Caught(mutant.__name__, rule, count)
     return Caught(mutant.__name__, "", seeds)
 
 
