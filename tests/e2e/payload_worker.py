@@ -1,15 +1,21 @@
 """Client processes that write and read large arrays; each line of output is waited for by a test.
 
-payload_worker.py ROLE CELL [ARGUMENT…]; an array of version v is full of v.
+payload_worker.py ROLE CELL [ARGUMENT…]; an array of version v is full of v.  PAYLOAD_WORKER_USER
+names another user, its group and further groups by number.
 """
 
+import importlib
 import os
+import pkgutil
 import sys
 import time
 from pathlib import Path
 
 import numpy as np
 
+import enact_dist.core
+import enact_dist.link
+import enact_dist.wire
 from enact_dist import Aspect, Durability, Entity, Lock, Read, Write, connect
 from enact_dist.errors import NullDatumError
 
@@ -83,7 +89,21 @@ def payload_maps():
     return [line for line in Path("/proc/self/maps").read_text().splitlines() if root in line]
 
 
+def become(user, group, *groups):
+    """Go on as another user, who may not be able to read the interpreter's own files."""
+    import zenoh  # noqa: F401
+
+    for package in (enact_dist, enact_dist.core, enact_dist.wire, enact_dist.link):
+        for module in pkgutil.iter_modules(package.__path__, f"{package.__name__}."):
+            importlib.import_module(module.name)
+    os.setgroups([int(one) for one in groups])
+    os.setresgid(int(group), int(group), int(group))
+    os.setresuid(int(user), int(user), int(user))
+
+
 if __name__ == "__main__":
+    if os.environ.get("PAYLOAD_WORKER_USER"):
+        become(*os.environ["PAYLOAD_WORKER_USER"].split())
     role, file, *arguments = sys.argv[1:]
     with connect(file) as cell:
         globals()[role](cell, *arguments)

@@ -5,6 +5,7 @@ import os
 import shutil
 import signal
 import subprocess
+import sys
 import tempfile
 import time
 from pathlib import Path
@@ -54,7 +55,7 @@ def run(tmp_path):
         # By the endpoint: another user may not read the file.
         line = [WORKER, role, f"tcp/127.0.0.1:{cell.ports['s0']}", *map(str, words)]
         if before:
-            line = ["-c", LAUNCH, *before, shutil.which("python") or "python", *line]
+            line = ["-c", LAUNCH, *before, sys.executable, *line]
         log = tmp_path / f"worker{len(started)}.log"
         process = Process(line, log, **{**cell.variables, **variables})
         started.append(process)
@@ -318,7 +319,6 @@ def test_folder_that_can_only_be_read_gives_maps_and_takes_nothing(make_cell, ru
         assert seen(run, cell, before=enter).startswith(f"{SMALL} 2 2 ")
 
 
-@pytest.mark.skipif(shutil.which("setpriv") is None, reason="needs setpriv of util-linux")
 def test_user_of_the_group_shares_and_a_stranger_does_not(make_cell, run, root):
     """Two users of one group read and write in place; another user takes the network."""
     if os.geteuid() != 0:
@@ -327,15 +327,15 @@ def test_user_of_the_group_shares_and_a_stranger_does_not(make_cell, run, root):
     root.chmod(0o2770)
     cell = make_cell().start_all()
     committed(run, cell, "new", SMALL, 1)
-    user = ["setpriv", "--reuid=4243", "--regid=4243", "--groups=4242"]
-    stranger = ["setpriv", "--reuid=4244", "--regid=4244", "--clear-groups"]
+    user = {"PAYLOAD_WORKER_USER": "4243 4243 4242"}
+    stranger = {"PAYLOAD_WORKER_USER": "4244 4244"}
 
-    assert seen(run, cell, before=user) == f"{SMALL} 1 1 mapped"
-    worker = run(cell, "fill", "new", SMALL, 2, before=user)
+    assert seen(run, cell, **user) == f"{SMALL} 1 1 mapped"
+    worker = run(cell, "fill", "new", SMALL, 2, **user)
     assert worker.expect("filled:") == "0"
     done(worker)
     assert seen(run, cell) == f"{SMALL} 2 2 mapped"
-    assert seen(run, cell, before=stranger) == f"{SMALL} 2 2 copied"
+    assert seen(run, cell, **stranger) == f"{SMALL} 2 2 copied"
 
 
 @pytest.mark.parametrize("carrier", ["zenoh"], indirect=True)
