@@ -27,9 +27,10 @@ from enact_dist.bench.usage import Usage
 from enact_dist.link.shared_folder import shared_root
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
     from enact_dist.bench.run import Run
+    from enact_dist.bench.usage import Sampled
     from enact_dist.verify.daemons import LineProcess
 
 NAME: Final = "pipeline"
@@ -120,9 +121,16 @@ def _add_memory(run: Run, usage: Usage) -> None:
     }
     for variant, figure in figures.items():
         note = "after 10 s"
+        if variant.endswith("of their own"):
+            grown = {kind: usage.growth(_private_of(kind)) or 0.0 for kind in usage.kinds}
+            note += ": " + ", ".join(f"{kind} {one / 1e3:.1f}" for kind, one in grown.items())
         if variant.endswith("folder"):
             note += f"; {last.files} files, {last.files_bytes / 1e6:.1f} MB at the end"
         run.add_row(_growth_row(usage, variant, figure, n, note))
+
+
+def _private_of(kind: str) -> Callable[[Sampled], float]:
+    return lambda one: one.kinds[kind].private
 
 
 def _growth_row(usage: Usage, variant: str, figure: Any, n: int, note: str) -> Row:
