@@ -46,6 +46,8 @@ SHAPE: Final = (480, 640, 3)
 WAIT_S: Final = 30.0
 LATE_NS: Final = 2_000_000_000
 """For so long after the last tick its set may still come."""
+AGAIN_MAX: Final = 64
+"""So often an actor may be run for a tick that it has seen already."""
 FRAMES: Final = 4
 IMAGE: Final[Aspect[Any]] = Aspect("pipeline_image", np.ndarray, Durability.VOLATILE)
 MASK: Final[Aspect[Any]] = Aspect("pipeline_mask", np.ndarray, Durability.VOLATILE, retention=4)
@@ -98,6 +100,29 @@ def tick_of_set(masks: Sequence[NDArray[np.uint8]], areas: Sequence[Sequence[int
     return tick if found == [area[tick % FRAMES] for area in areas] else None
 
 
+class Kept:
+    """Rows of integers, in memory that is taken and touched before the run: they do not grow it.
+
+    Args:
+        rows: How many there may be; further ones raise `IndexError`.
+        width: How many integers each has.
+    """
+
+    def __init__(self, rows: int, width: int) -> None:
+        self._rows = np.full((rows, width), -1, np.int64)
+        self._count = 0
+
+    def add(self, *row: int) -> None:
+        """Take one row."""
+        self._rows[self._count] = row
+        self._count += 1
+
+    def told(self) -> list[list[int]]:
+        """Return all rows that were taken."""
+        rows: list[list[int]] = self._rows[: self._count].tolist()
+        return rows
+
+
 class _Ticks:
     """The moments of a run."""
 
@@ -128,7 +153,7 @@ def _camera(cell: Cell, options: dict[str, Any]) -> None:
     with Lock(write, wait_s=WAIT_S) as lock:  # a null datum: registers the aspect, and connects
         del lock[write]
     ticks = _started(options)
-    stored: list[tuple[int, int, int]] = []
+    stored = Kept(ticks.count, 3)
     for tick in range(ticks.count):
         ticks.wait(tick)
         np.copyto(image, frames[tick % FRAMES])  # a driver's copy out of its ring
@@ -136,8 +161,8 @@ def _camera(cell: Cell, options: dict[str, Any]) -> None:
         head_of(image)[:] = tick, begun_ns
         with Lock(write, wait_s=WAIT_S) as lock:
             lock.put(write, image, stamp_ns=tick + 1)
-        stored.append((tick, begun_ns, time.perf_counter_ns()))
-    _say(ticks=stored)
+        stored.add(tick, begun_ns, time.perf_counter_ns())
+    _say(ticks=stored.told())
 
 
 def _segmenter(cell: Cell, options: dict[str, Any]) -> None:
@@ -152,13 +177,14 @@ def _segmenter(cell: Cell, options: dict[str, Any]) -> None:
             """Make the mask of one image."""
             mask = mask_of(lock[self.image])
             lock.put(self.mask, mask, stamp_ns=lock.stamp_ns(self.image))
-            done.append((int(head_of(mask)[0]), time.perf_counter_ns()))
-            if done[-1][0] == options["ticks"] - 1:
+            tick = int(head_of(mask)[0])
+            done.add(tick, time.perf_counter_ns())
+            if tick == options["ticks"] - 1:
                 stop.set()
 
-    done: list[tuple[int, int]] = []
+    done = Kept(options["ticks"] + AGAIN_MAX, 2)
     stop = threading.Event()
-    _run_actor(Segmenter(), cell, options, stop, lambda: {"ticks": done})
+    _run_actor(Segmenter(), cell, options, stop, lambda: {"ticks": done.told()})
 
 
 def _consumer(cell: Cell, options: dict[str, Any]) -> None:
@@ -176,15 +202,15 @@ def _consumer(cell: Cell, options: dict[str, Any]) -> None:
             if tick is None:
                 torn.append(lock.stamp_ns(self.masks) - 1)
                 return
-            sets.append((tick, had_ns, had_ns - min(int(head_of(mask)[1]) for mask in masks)))
+            sets.add(tick, had_ns, had_ns - min(int(head_of(mask)[1]) for mask in masks))
             if tick == options["ticks"] - 1:
                 stop.set()
 
-    sets: list[tuple[int, int, int]] = []
+    sets = Kept(options["ticks"] + AGAIN_MAX, 3)
     torn: list[int] = []
     areas = areas_of_frames()
     stop = threading.Event()
-    _run_actor(Consumer(), cell, options, stop, lambda: {"sets": sets, "torn": torn})
+    _run_actor(Consumer(), cell, options, stop, lambda: {"sets": sets.told(), "torn": torn})
 
 
 def _run_actor(
