@@ -84,9 +84,13 @@ class Finishing:
             tuple(sorted(self.prepared)),
         )
 
-    def unname(self) -> bool:
-        """Let the bytes travel with the messages from now on; say whether any did not so far."""
-        named = [write for writes in self.writes.values() for write in writes if _is_named(write)]
+    def unname(self, refused: Request) -> bool:
+        """Let the bytes travel with the messages from now on.
+
+        Returns:
+            Whether the refused message had named bytes that are here.  Its refusal may come late,
+            when a copy with the bytes is on its way or was applied, and then says nothing.
+        """
         self.writes = {
             shard: tuple(
                 write._replace(datum=replace(write.datum, file=""))
@@ -96,7 +100,7 @@ class Finishing:
             )
             for shard, writes in self.writes.items()
         }
-        return bool(named)
+        return isinstance(refused, Commit | Prepare) and any(map(_is_named, refused.writes))
 
     @property
     def token(self) -> Token:

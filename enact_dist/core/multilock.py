@@ -216,7 +216,7 @@ class MultiLock:
         self, shard: str, request: Request, answer: Refused | WrongShard | EpochChanged
     ) -> None:
         if isinstance(answer, Refused):
-            if answer.code == NO_PAYLOAD and self._finishing and self._finishing.unname():
+            if answer.code == NO_PAYLOAD and self._finishing and self._finishing.unname(request):
                 return  # asked again, with the bytes
             self._end(Phase.REFUSED)
             self.refusal = answer
