@@ -65,12 +65,7 @@ def fetch_all(
     by_shard: dict[str, list[Iterator[Piece]]] = {}
     for incoming in missing:
         by_shard.setdefault(incoming.reading.shard, []).append(incoming.pieces())
-    transfer = Transfer(client, alive)
-    try:
-        transfer.run(in_turn(by_shard))
-    finally:
-        if transfer.repeated:
-            client.count("slices_repeated", transfer.repeated)
+    Transfer(client, alive).run(in_turn(by_shard))
     for incoming in missing:
         datum = found[incoming.state.slot] = incoming.datum()
         reading = incoming.reading

@@ -13,7 +13,7 @@ import os
 import queue
 import threading
 from functools import cache
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from enact_dist.wire.limits import BODY_BYTES_MAX
 
@@ -30,10 +30,10 @@ _FAILED: Final = ctypes.c_void_p(-1).value
 _MAP_FIXED: Final = 0x10
 
 
-class Pages(ctypes.Union):
-    """A map of a file; its memory is what a memoryview of this shows.
+class _Mapped(ctypes.Union):
+    """Mapped memory, which a memoryview of this shows; `_mapped` makes it and `body_of` cuts it.
 
-    Only `map_file` makes them.  The declared length is the longest possible: `body_of` cuts it.
+    The declared length is the longest possible.
     """
 
     _fields_ = (("bytes", ctypes.c_ubyte * BODY_BYTES_MAX),)
@@ -49,23 +49,18 @@ class Pages(ctypes.Union):
             _leftovers.later(_unmap, self.address, self.size, self.ended)
 
 
-class Plain(ctypes.Union):
+class Pages(_Mapped):
+    """A map of a file."""
+
+
+class Plain(_Mapped):
     """Memory of this process alone, with the same end as `Pages`.
 
     A `bytearray` would be set to zero while all other threads wait: 50 ms for 100 MB.
     """
 
-    _fields_ = (("bytes", ctypes.c_ubyte * BODY_BYTES_MAX),)
 
-    address: int
-    size: int
-    ended: Callable[[], None] | None
-
-    def __del__(self) -> None:
-        if self.size <= AT_ONCE_BYTES:
-            _unmap(self.address, self.size, self.ended)
-        else:
-            _leftovers.later(_unmap, self.address, self.size, self.ended)
+Kind = TypeVar("Kind", bound=_Mapped)
 
 
 def plain_memory(size: int, *, ended: Callable[[], None] | None = None) -> Plain:
@@ -80,11 +75,7 @@ def plain_memory(size: int, *, ended: Callable[[], None] | None = None) -> Plain
     """
     protection = mmap.PROT_READ | mmap.PROT_WRITE
     address = _map(None, size, protection, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS, -1)
-    plain = Plain.from_address(address)
-    plain.address, plain.size, plain.ended = address, size, ended
-    if size > AT_ONCE_BYTES:
-        _leftovers.start()
-    return plain
+    return _mapped(Plain, address, size, ended)
 
 
 def map_file(
@@ -103,11 +94,15 @@ def map_file(
     """
     protection = mmap.PROT_READ | (mmap.PROT_WRITE if writable else 0)
     address = _map(None, size, protection, mmap.MAP_SHARED, descriptor)
-    pages = Pages.from_address(address)
-    pages.address, pages.size, pages.ended = address, size, ended
+    return _mapped(Pages, address, size, ended)
+
+
+def _mapped(kind: type[Kind], address: int, size: int, ended: Callable[[], None] | None) -> Kind:
+    mapped = kind.from_address(address)
+    mapped.address, mapped.size, mapped.ended = address, size, ended
     if size > AT_ONCE_BYTES:
         _leftovers.start()
-    return pages
+    return mapped
 
 
 def body_of(pages: Pages | Plain) -> memoryview:

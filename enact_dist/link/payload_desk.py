@@ -15,8 +15,9 @@ Rules that a change must keep:
 - A name is used once.  Nobody is told of a payload before its commit stands, so no half-filled one
   is ever read.
 - What is counted against the cap is counted until the file is gone, and before it is made.
-- A client that still has a draft mapped for writing could change it after the commit.  Ours cuts
-  itself off first; a hostile one runs as the same user or group, who could do worse.
+- A client that still has a draft mapped for writing could change it after the commit.  Ours hands
+  out read-only arrays then and cuts itself off some milliseconds later; a hostile one runs as
+  the same user or group, who could do worse.
 """
 
 from __future__ import annotations

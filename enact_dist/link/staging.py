@@ -62,17 +62,13 @@ def stage(
         if each is not writes[shard]
     }
     if by_shard:
-        transfer = Transfer(client, alive)
         try:
-            transfer.run(in_turn(by_shard))
+            Transfer(client, alive).run(in_turn(by_shard))
         except ShardUnreachableError:
             raise  # nobody is there to be told
         except BaseException:
             drop_staged(client, named)
             raise
-        finally:
-            if transfer.repeated:
-                client.count("slices_repeated", transfer.repeated)
     return named
 
 

@@ -62,9 +62,6 @@ class Transfer:
         client: The session that asks.
         alive: Raises where nobody wants the data any more; called after each loss.
         window_bytes: How much may be under way.
-
-    Attributes:
-        repeated: How many slices had to be asked again.
     """
 
     def __init__(
@@ -74,7 +71,7 @@ class Transfer:
         *,
         window_bytes: int = WINDOW_BYTES,
     ) -> None:
-        self.repeated = 0
+        self._repeated = 0
         self._client = client
         self._alive = alive
         self._window_max = window_bytes
@@ -86,7 +83,7 @@ class Transfer:
         self._began_s = self._heard_s = time.monotonic()
 
     def run(self, pieces: Iterable[Piece]) -> None:
-        """Move all pieces; returns once each answer was taken.
+        """Move all pieces; returns once each answer was taken.  Counts slices asked again.
 
         Raises:
             ShardUnreachableError: None was answered for 10 s.
@@ -107,6 +104,8 @@ class Transfer:
         finally:
             for _, begun in self._under_way:
                 begun.abandon()
+            if self._repeated:
+                self._client.count("slices_repeated", self._repeated)
 
     def _fill(self, again: deque[Piece], left: Iterator[Piece]) -> None:
         while not self._under_way or self._bytes < self._window:
@@ -130,7 +129,7 @@ class Transfer:
         self._bytes -= piece.size
         answer = begun.wait(piece.into)
         if answer is None:
-            self.repeated += 1
+            self._repeated += 1
             self._window = max(1, self._window // 2)
             return piece
         self._heard_s = time.monotonic()

@@ -10,7 +10,14 @@ from enact_dist.core.shard_state import ShardSettings
 from enact_dist.link.host import open_host
 from enact_dist.link.payload_desk import PayloadDesk
 
-OF_CLIENTS = {"client.py", "fetching.py", "payload_client.py", "session_client.py", "staging.py"}
+OF_CLIENTS = {
+    "client.py",
+    "fetching.py",
+    "payload_client.py",
+    "session_client.py",
+    "staging.py",
+    "transfer.py",
+}
 CALLS = {"count", "_count"}
 
 
