@@ -15,9 +15,10 @@ OWN_MEMORY = (
     'mount -t tmpfs none /dev/shm && exec "$@"', "own-memory",
 )  # fmt: skip
 """Runs what follows with a /dev/shm of its own, as on another host."""
-TTL_S = 8.0
-CUT_S = 5.0
-"""Longer than the lease of a link, shorter than that of a lock."""
+TTL_S = 12.0
+CUT_S = 6.5
+"""Longer than the lease of a link (TTL_S / 2); the lock and the patience of a transfer (10 s)
+outlive it and one more second or two, in which a repeated SYN finds the way open."""
 
 
 @pytest.fixture

@@ -241,11 +241,8 @@ def test_carrier_wakes_pending_calls_when_it_is_closed(daemon, carry, endpoint):
     daemon(endpoint)
     carrier = carry(endpoint)
     answers = []
-    waiting = threading.Thread(
-        target=lambda: answers.append(
-            carrier.request("s0", AwaitStamp(2**62, 60_000_000_000), timeout_s=60)
-        )
-    )
+    begun = carrier.begin("s0", AwaitStamp(2**62, 60_000_000_000), timeout_s=60)
+    waiting = threading.Thread(target=lambda: answers.append(begun.wait()))
     waiting.start()
     feed = carrier.subscribe()
 
