@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from enact_dist.core.datum import Datum, LockId, Position, Slot, Token
-from enact_dist.core.messages import AspectEntry, Item, SlotVersion, WriteItem
+from enact_dist.core.messages import AspectEntry, Cause, Item, SlotVersion, WriteItem
 from enact_dist.terms import Durability
 
 
@@ -31,9 +31,22 @@ class SessionEnded:
 
 @dataclass(frozen=True, slots=True)
 class WorldRecord:
-    """A world context exists."""
+    """A world context exists; a fork says of which context, as of which stamp."""
 
     name: str
+    source: str = ""
+    at_ns: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class WorldDropped:
+    """A world context and all states of its slots are gone.
+
+    If it is made again, its versions start above `version_base`: none is ever used twice.
+    """
+
+    name: str
+    version_base: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,9 +58,11 @@ class AspectRecord:
 
 @dataclass(frozen=True, slots=True)
 class SlotRecord:
-    """The new state of a slot; replaces the one before.
+    """The new state of a slot, in place of the one before, which stays if `history` is said.
 
-    `volatile` records only say that the slot exists: neither version nor datum is kept.
+    `volatile` records only say that the slot exists: neither version nor datum is kept.  Where the
+    bytes are those of another version that is stored here, `same_as` names it, so that they need
+    not be stored twice.
     """
 
     slot: Slot
@@ -56,6 +71,27 @@ class SlotRecord:
     datum: Datum | None
     null_reason: str
     volatile: bool = False
+    history: bool = False
+    cause: Cause | None = None
+    same_as: SlotVersion | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class HistoryForgotten:
+    """Replaced versions that are kept no longer."""
+
+    versions: tuple[SlotVersion, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class KeptRecord:
+    """Versions that stay, whatever their retention, while the label does; replaces its last one.
+
+    No versions: the label is gone.
+    """
+
+    label: str
+    versions: tuple[SlotVersion, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +119,7 @@ class PreparedRecord:
     stamp_ns: int
     primary: str
     primary_token: Token
+    cause: Cause | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,8 +178,11 @@ Record = (
     SessionRecord
     | SessionEnded
     | WorldRecord
+    | WorldDropped
     | AspectRecord
     | SlotRecord
+    | HistoryForgotten
+    | KeptRecord
     | OutcomeRecord
     | PreparedRecord
     | PreparedEnded
@@ -156,13 +196,19 @@ Record = (
 
 @dataclass(slots=True)
 class Recovered:
-    """Everything a store held when it was opened.  `epoch` is already the new, durable one."""
+    """Everything a store held when it was opened.  `epoch` is already the new, durable one.
+
+    `slots` are the newest states, `history` the replaced ones, oldest first within each slot.
+    """
 
     epoch: int
     sessions: list[SessionRecord] = field(default_factory=list)
-    worlds: list[str] = field(default_factory=list)
+    worlds: list[WorldRecord] = field(default_factory=list)
+    dropped: list[WorldDropped] = field(default_factory=list)
     aspects: list[AspectEntry] = field(default_factory=list)
     slots: list[SlotRecord] = field(default_factory=list)
+    history: list[SlotRecord] = field(default_factory=list)
+    kept: list[KeptRecord] = field(default_factory=list)
     outcomes: list[OutcomeRecord] = field(default_factory=list)
     prepared: list[PreparedRecord] = field(default_factory=list)
     decisions: list[DecisionRecord] = field(default_factory=list)

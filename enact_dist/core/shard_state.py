@@ -90,7 +90,7 @@ class ShardState:
             # Contexts that were only configured once have data, which must stay in reach.
             worlds=(
                 *settings.worlds,
-                *recovered.worlds,
+                *(record.name for record in recovered.worlds),
                 *dict.fromkeys(record.slot.context for record in recovered.slots),
             ),
         )

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, NoReturn
 
 import msgpack
 
-from enact_dist.core.records import Recovered, SlotRecord
+from enact_dist.core.records import Recovered, SlotRecord, WorldRecord
 from enact_dist.errors import StoreError
 from enact_dist.link.blobs import Blob, BlobFolder, DamagedBlobError, allow_mapped
 from enact_dist.link.store_database import Database, DatabaseRow, is_damage
@@ -257,7 +257,7 @@ def _read_row(row: DatabaseRow, contents: Contents) -> None:
             ended = read_ended(key, row.body)
             contents.ended[ended.session] = ended.wall_ns
         case Kind.WORLD:
-            recovered.worlds.append(read_world(key))
+            recovered.worlds.append(WorldRecord(read_world(key)))
         case Kind.ASPECT:
             recovered.aspects.append(read_aspect(key, row.body))
         case Kind.SLOT | Kind.PREPARED_WRITE:

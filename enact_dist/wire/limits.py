@@ -11,7 +11,7 @@ from typing import Final
 
 from enact_dist.terms import NAME_LENGTH_MAX
 
-FRAME_VERSION: Final = 5
+FRAME_VERSION: Final = 6
 """Version of the frames; both ends must speak the same.  2: commits over shards; 3: a WELCOME
 names shared memory; 5: a datum may name a payload in place of its bytes."""
 DATUM_VERSION: Final = 1

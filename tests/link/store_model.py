@@ -120,7 +120,7 @@ class State:
         """Return what of a recovered state is not this one, "" where nothing is."""
         pairs = (
             ("sessions", {r.session: r for r in recovered.sessions}, self.sessions),
-            ("worlds", set(recovered.worlds), self.worlds),
+            ("worlds", {record.name for record in recovered.worlds}, self.worlds),
             ("aspects", {entry.name: entry for entry in recovered.aspects}, self.aspects),
             ("outcomes", {r.lock[:2]: r for r in recovered.outcomes}, self.outcomes),
             ("given up", {r.lock: r for r in recovered.forced}, self.given_up),

@@ -88,7 +88,7 @@ def contents(recovered):
     return (
         {record.slot: flat(record) for record in recovered.slots},
         {(outcome.lock.session, outcome.lock.lane): outcome for outcome in recovered.outcomes},
-        sorted(recovered.worlds),
+        sorted(record.name for record in recovered.worlds),
         sorted(recovered.aspects),
         sorted((record.session, record.ttl_ns) for record in recovered.sessions),
     )

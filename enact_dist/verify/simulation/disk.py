@@ -9,20 +9,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from enact_dist.core.records import (
-    AspectRecord,
-    DecisionDone,
-    DecisionRecord,
-    OutcomeRecord,
-    Persist,
-    PreparedEnded,
-    PreparedRecord,
-    Recovered,
-    SessionEnded,
-    SessionRecord,
-    SlotRecord,
-    WorldRecord,
-)
+from enact_dist.core.ledger import Ledger
 from enact_dist.terms import Durability
 from enact_dist.verify.simulation.world import MS
 
@@ -30,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from random import Random
 
-    from enact_dist.core.datum import LockId
+    from enact_dist.core.records import Persist, Recovered
     from enact_dist.verify.simulation.faults import Faults
     from enact_dist.verify.simulation.world import Host, World
 
@@ -119,42 +106,5 @@ class Disk:
 
     def left(self, count: int) -> Recovered:
         """Return what a store holds that has kept so many records of the log, in this epoch."""
-        sessions: dict[str, SessionRecord] = {}
-        worlds: dict[str, None] = {}
-        aspects: dict[str, AspectRecord] = {}
-        slots: dict[object, SlotRecord] = {}
-        outcomes: dict[tuple[str, int], OutcomeRecord] = {}
-        prepared: dict[LockId, PreparedRecord] = {}
-        decisions: dict[LockId, DecisionRecord] = {}
-        for persist in self.log[:count]:
-            for record in persist.records:
-                if isinstance(record, SlotRecord):
-                    slots[record.slot] = record
-                elif isinstance(record, OutcomeRecord):
-                    outcomes[record.lock.session, record.lock.lane] = record
-                elif isinstance(record, PreparedRecord):
-                    prepared[record.lock] = record
-                elif isinstance(record, PreparedEnded):
-                    prepared.pop(record.lock, None)
-                elif isinstance(record, DecisionRecord):
-                    decisions[record.lock] = record
-                elif isinstance(record, DecisionDone):
-                    decisions.pop(record.lock, None)
-                elif isinstance(record, SessionRecord):
-                    sessions[record.session] = record
-                elif isinstance(record, SessionEnded):
-                    sessions.pop(record.session, None)
-                elif isinstance(record, WorldRecord):
-                    worlds[record.name] = None
-                elif isinstance(record, AspectRecord):
-                    aspects[record.entry.name] = record
-        return Recovered(
-            self.epoch,
-            list(sessions.values()),
-            list(worlds),
-            [record.entry for record in aspects.values()],
-            list(slots.values()),
-            list(outcomes.values()),
-            list(prepared.values()),
-            list(decisions.values()),
-        )
+        records = (record for persist in self.log[:count] for record in persist.records)
+        return Ledger(records).recovered(self.epoch)

@@ -1,0 +1,364 @@
+"""What a client, or another shard, asks a shard; see `core.messages` for the rules."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from enact_dist.core.datum import Datum, LockId, Position, Slot, Token
+from enact_dist.core.message_parts import (
+    AspectEntry,
+    DatumRead,
+    Item,
+    LaneView,
+    SlotVersion,
+    WriteItem,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Hello:
+    """Open a session, or acknowledge an epoch.  Answer: `Welcome`.
+
+    `known_epoch` equal to the shard's epoch means: *all my older grants here are dropped*.
+    The client drops first and acknowledges after.  0 means that it knows none.
+    An observer never locks: it gets no durable session record.
+    """
+
+    session: str
+    known_epoch: int
+    ttl_ns: int
+    actor: str
+    host: str
+    pid: int
+    observer: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Register:
+    """Create world contexts and register aspects, idempotently.  Answer: `Registered`."""
+
+    session: str
+    worlds: tuple[str, ...]
+    aspects: tuple[AspectEntry, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Acquire:
+    """Ask for a set of locks at once, with views beside them.
+
+    Answer: `Granted`, `Waiting`, `Stale` or `WrongShard`.
+
+    Idempotent: the same lock asked again finds its place in the queue or gets its grant again.
+    `wait_ns` is how long this one call may be parked (at most `WAIT_SLICE_NS_MAX`), not how long
+    the lock may take.  `count` is the session's message counter (see `KeepAlive`).
+    `seen_stamp_ns` is the largest commit stamp the client has seen.  `alone` says that the whole
+    lock, its views included, lies on this shard, so that its commit decides in one step.
+    """
+
+    lock: LockId
+    epoch: int
+    map_version: int
+    count: int
+    items: tuple[Item, ...]
+    wait_ns: int
+    hold_ns: int
+    seen_stamp_ns: int
+    alone: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class TakeView:
+    """Read committed data without a lock.  Answer: `Viewed`, `Forgotten` or `WrongShard`.
+
+    Large data stay fetchable for the lock id until it is released or overtaken by its lane.
+    With `at_ns` the data are asked as of that stamp: the shard moves its clock past it, waits (at
+    most a slice) for undecided commits stamped up to it, and goes back to it where it still can.
+    With `strict` it never shows the present instead: what is forgotten is answered `Forgotten`.
+    """
+
+    lock: LockId
+    epoch: int
+    map_version: int
+    count: int
+    items: tuple[Item, ...]
+    seen_stamp_ns: int
+    at_ns: int = 0
+    strict: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Fetch:
+    """Ask for a part of a large datum that a grant or view named.  Answer: `Slice` or `Gone`."""
+
+    lock: LockId
+    epoch: int
+    slot: Slot
+    version: int
+    offset: int
+    length: int
+
+
+@dataclass(frozen=True, slots=True)
+class KeepAlive:
+    """Renew the session and say what is still wanted.  Answer: `Alive`.
+
+    The shard frees every grant and waiter of a lane below its `view`: a lost release or an orphan
+    grant ends here.  `count` increases with each message of the session; the client remembers when
+    it sent which, and believes in its locks from *sending* times only.
+    `report` is the actor's own statistics (msgpack), shown by `enact actor ls`.
+    """
+
+    session: str
+    epoch: int
+    count: int
+    view: tuple[LaneView, ...]
+    report: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Commit:
+    """Publish all writes of a lock and release it.  Answer: `Committed`, `Fenced` or `Changed`.
+
+    Every slot of `expects` must still be at that version, and in nobody's way (see `Commits`).
+    Where other shards have prepared writes, they are the `participants`, and the record of this
+    commit decides for them too; it is then forced to the disk, whatever its own data survive.
+    `reads` and `reads_left_out` are the lineage of the writes (see `Cause`).
+    """
+
+    lock: LockId
+    token: Token
+    writes: tuple[WriteItem, ...]
+    seen_stamp_ns: int
+    expects: tuple[SlotVersion, ...] = ()
+    participants: tuple[str, ...] = ()
+    reads: tuple[DatumRead, ...] = ()
+    reads_left_out: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """Bring a payload to the shard apart from the commit that will name it.  Answer: `Staged`.
+
+    The first one, at offset 0 and without a body, makes room for `total` bytes: on the same host
+    the client then fills the shard's file by itself.  Where it cannot, slices follow, in order or
+    again.  A total of 0 gives the payload up.  Answered by the shard's link, not by its core.
+    """
+
+    session: str
+    file: str
+    offset: int
+    total: int
+    body: Datum
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """Ask what became of a commit.  Answer: `OutcomeIs`."""
+
+    lock: LockId
+
+
+@dataclass(frozen=True, slots=True)
+class Validate:
+    """Is this lock still continuously held?  If so, release it.
+
+    Answer: `Valid`, `Fenced` or `Changed`.  A token with number 0 stands for a shard where the lock
+    holds nothing but expects something.
+    """
+
+    lock: LockId
+    token: Token
+    expects: tuple[SlotVersion, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Prepare:
+    """Keep these writes, and the lock with them, until shard `primary` has decided.
+
+    Answer: `Prepared`, `Fenced` or `Changed`.  From then on neither the client nor the end of a
+    lease frees the lock: the shard itself asks the primary, for as long as it takes.
+    """
+
+    lock: LockId
+    token: Token
+    writes: tuple[WriteItem, ...]
+    seen_stamp_ns: int
+    expects: tuple[SlotVersion, ...]
+    primary: str
+    primary_token: Token
+    reads: tuple[DatumRead, ...] = ()
+    reads_left_out: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Finish:
+    """Shard to shard: the lock has committed, apply what was prepared.  Answer: `Finished`."""
+
+    lock: LockId
+    position: Position
+
+
+@dataclass(frozen=True, slots=True)
+class Resolve:
+    """Shard to shard: what became of a lock that `asker` has prepared?  Answer: `Resolved`."""
+
+    lock: LockId
+    primary_token: Token
+    asker: str
+
+
+@dataclass(frozen=True, slots=True)
+class Release:
+    """Give up a lock, its place in the queue and its pinned views.  Answer: `Released`, always."""
+
+    lock: LockId
+
+
+@dataclass(frozen=True, slots=True)
+class Goodbye:
+    """End a session.  Answer: `Released`."""
+
+    session: str
+
+
+@dataclass(frozen=True, slots=True)
+class AwaitStamp:
+    """Wait until all commits up to a stamp are visible.  Answer: `Reached` (maybe not yet)."""
+
+    stamp_ns: int
+    wait_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Survey:
+    """List slots without their data.  Answer: `Surveyed`.
+
+    Empty `contexts` or `aspects` mean all; `patterns` are entity patterns, empty means all.
+    With `retained` the retained versions of each slot come before its newest one, oldest first.
+    """
+
+    contexts: tuple[str, ...]
+    patterns: tuple[str, ...]
+    aspects: tuple[str, ...]
+    retained: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class ListLocks:
+    """List holders and waiters.  Answer: `Locks`."""
+
+
+@dataclass(frozen=True, slots=True)
+class ListSessions:
+    """List sessions, catalogue and counters of the shard.  Answer: `Sessions`."""
+
+
+@dataclass(frozen=True, slots=True)
+class Break:
+    """Take a lock away by its grant number, by hand.  Answer: `Broken`.
+
+    A restarted shard gives its numbers anew: `epoch` says in which one it was read (0: unsaid), so
+    that a late copy breaks nobody else's lock.
+    """
+
+    number: int
+    reason: str
+    epoch: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class ForceAbort:
+    """Give up a prepared lock whose primary is lost for good, by hand.  Answer: `Broken`.
+
+    If the primary had decided to commit after all, the commit is torn: only for an operator who
+    knows that it never comes back.  `epoch` is that of `Break`.
+    """
+
+    number: int
+    reason: str
+    epoch: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class ListAudit:
+    """List what operators did here.  Answer: `Audited`.
+
+    A text in `settle` says that somebody has seen to all alarms so far, and how.  `seen_ns` is the
+    wall-clock stamp of the newest act that this somebody had seen (0: unsaid): a late copy settles
+    no alarm that came since.
+    """
+
+    settle: str
+    seen_ns: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class ListHistory:
+    """List the known versions of slots, oldest first, without their data.  Answer: `Versions`.
+
+    Empty `contexts`, `patterns` or `aspects` mean all.  Only versions that were current after
+    `since_ns` (0: all), of each slot the newest `count_max` (0: all).
+    """
+
+    contexts: tuple[str, ...]
+    patterns: tuple[str, ...]
+    aspects: tuple[str, ...]
+    since_ns: int = 0
+    count_max: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Explain:
+    """Ask for these versions with their causes (version 0: the newest).  Answer: `Versions`.
+
+    What is forgotten is left out.
+    """
+
+    versions: tuple[SlotVersion, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class FindEffects:
+    """Ask for all known versions that one of these data went into.  Answer: `Versions`."""
+
+    reads: tuple[DatumRead, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Fork:
+    """Make a world context with the data of `source` as of a stamp.
+
+    Answer: `Forked`, `Forgotten`, or `Refused` where the world is there and no such fork.
+
+    Copies no data.  Idempotent: the same fork again is answered the same.  Like a view as of a
+    stamp it waits a little for undecided commits; where that is not enough, it is refused as
+    "overload" and may be asked again.
+    """
+
+    session: str
+    world: str
+    source: str
+    at_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class DropWorld:
+    """Forget a world context with all its data and their history.
+
+    Answer: `Dropped`, or `Refused` while a lock is held in it.  Idempotent.
+    """
+
+    session: str
+    world: str
+
+
+@dataclass(frozen=True, slots=True)
+class KeepVersions:
+    """Keep versions from being forgotten under a label; no versions: let go of the label's.
+
+    Answer: `Kept`.  Asked again with the same label, versions are added.
+    """
+
+    session: str
+    label: str
+    versions: tuple[SlotVersion, ...]
