@@ -14,10 +14,9 @@ from __future__ import annotations
 import functools
 import threading
 import time
-from typing import TYPE_CHECKING, Any, TypeVar, cast, overload
+from typing import TYPE_CHECKING, Any, TypeVar, overload
 
-from enact_dist.core.datum import Datum, Slot
-from enact_dist.core.messages import SlotVersion, WriteItem
+from enact_dist.core.messages import SlotVersion
 from enact_dist.core.phase import Phase
 from enact_dist.errors import (
     LockHeldError,
@@ -30,7 +29,7 @@ from enact_dist.reading import EachData, Readings, check_requested, null_error, 
 from enact_dist.session import session_of
 from enact_dist.terms import Access, Entity, refuse_duplicates
 from enact_dist.together import Together
-from enact_dist.wire.limits import BODY_BYTES_MAX, ITEMS_MAX
+from enact_dist.wire.limits import ITEMS_MAX
 from enact_dist.wire.payload import decode_datum, encode_parts
 from enact_dist.writable import WritableEach
 from enact_dist.writing import Writing, template
@@ -39,7 +38,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
     from types import TracebackType
 
-    from enact_dist.core.datum import Position
+    from enact_dist.core.datum import Position, Slot
     from enact_dist.core.messages import Item
     from enact_dist.core.multilock import MultiLock
     from enact_dist.terms import (
@@ -128,9 +127,7 @@ class Lock:
         self._interrupt: threading.Event | None = None
         self._readings: Readings
         self._each: dict[LockRequest[Any], EachData[Any]] = {}
-        self._writes: dict[Slot, Datum | None] = {}
         self._writing = Writing(self._session.client.payloads)
-        self._edits = self._bytes = 0
         self._expects: dict[Slot, SlotVersion] = {}
         self._entity: Entity | None = None
         self._asked_s = self._granted_s = self._ended_s = 0.0
@@ -201,7 +198,8 @@ class Lock:
             if kind is None:
                 client.check_usable()
                 self._writing.fix()
-                client.finish(lock, self._writes_by_shard(), tuple(self._expects.values()))
+                writes = self._writing.by_shard(lock.shard_of)
+                client.finish(lock, writes, tuple(self._expects.values()))
                 self.position = lock.position
         finally:
             # After a commit this is nothing; after an exception, an interrupt too, nothing is held.
@@ -218,13 +216,6 @@ class Lock:
         """
         self._readings.end(functools.partial(_refuse_released, self._requests))
         self._each.clear()
-        self._writes.clear()
-
-    def _writes_by_shard(self) -> dict[str, list[WriteItem]]:
-        by_shard: dict[str, list[WriteItem]] = {}
-        for slot, datum in self._writes.items():
-            by_shard.setdefault(self._shard(slot), []).append(WriteItem(slot, datum))
-        return by_shard
 
     def _use(self) -> None:
         """Raise unless the block is running and the lock not known to be lost."""
@@ -258,7 +249,7 @@ class Lock:
         return self._value(slot_of(request), request)
 
     def _value(self, slot: Slot, request: Any) -> Any:
-        if slot in self._writes:
+        if slot in self._writing.data:
             return self._written(slot, request.aspect)
         return self._readings.value(slot, request.aspect)
 
@@ -296,13 +287,13 @@ class Lock:
         return self._is_null(slot_of(request))
 
     def _is_null(self, slot: Slot) -> bool:
-        if slot in self._writes:
-            return self._writes[slot] is None
+        if slot in self._writing.data:
+            return self._writing.data[slot] is None
         state = self._readings.state(slot)
         return state is None or bool(state.null_reason)
 
     def _written(self, slot: Slot, aspect: Aspect[T]) -> T:
-        datum = self._writes[slot]
+        datum = self._writing.data[slot]
         if datum is None:
             raise null_error(slot, None)
         value: T = decode_datum(datum, aspect.datum_type)
@@ -330,7 +321,7 @@ class Lock:
 
     def _put(self, slot: Slot, aspect: Aspect[T], datum: T, *, stamp_ns: int = 0) -> None:
         encoded = encode_parts(datum, aspect.datum_type, stamp_ns=stamp_ns)
-        self._note_write(slot, self._writing.put(slot, encoded, self._shard))
+        self._writing.put(slot, encoded, self._shard)
 
     def _shard(self, slot: Slot) -> str:
         assert self._lock is not None
@@ -370,32 +361,13 @@ class Lock:
         self._check_writable(request)
         slot, asked = slot_of(request), request.aspect.datum_type
         wanted = template(asked, like, shape, dtype)
-        value, datum = self._writing.blank(slot, self._shard(slot), wanted, asked, stamp_ns)
-        self._note_write(slot, datum)
-        return cast("T", value)
-
-    def _note_write(self, slot: Slot, datum: Datum | None) -> None:
-        old = self._writes.get(slot)
-        size = self._bytes - (old.size if old else 0) + (datum.size if datum else 0)
-        if slot not in self._writes and len(self._writes) >= ITEMS_MAX:
-            raise MisuseError(f"one lock writes at most {ITEMS_MAX} data; use several locks")
-        if size > BODY_BYTES_MAX:
-            raise MisuseError(
-                f"the writes of one lock have {size} bytes; at most {BODY_BYTES_MAX}: use several"
-                " locks"
-            )
-        self._writes[slot] = datum
-        self._bytes = size
-        self._edits += 1
+        value: T = self._writing.blank(slot, self._shard(slot), wanted, asked, stamp_ns)
+        return value
 
     def __delitem__(self, request: Write[Any]) -> None:
         """Write null when the block ends cleanly."""
         self._check_writable(request)
-        self._delete(slot_of(request))
-
-    def _delete(self, slot: Slot) -> None:
-        self._writing.forget(slot)
-        self._note_write(slot, None)
+        self._writing.delete(slot_of(request))
 
     def expect(self, view: View[Any]) -> None:
         """Let the commit fail with `ChangedError` if the viewed slot has moved on by then.

@@ -35,11 +35,11 @@ class WritableEach(EachData[T], MutableMapping[Entity, T]):
 
     def follow(self) -> None:
         """Take over what was set through other requests of the lock since the last look."""
-        if self._followed == self._lock._edits:
+        if self._followed == self._lock._writing.edits:
             return
-        self._followed = self._lock._edits
+        self._followed = self._lock._writing.edits
         context, pattern, aspect = self._request.address
-        for slot, datum in self._lock._writes.items():
+        for slot, datum in self._lock._writing.data.items():
             same = (slot.context, slot.aspect) == (context, aspect)
             if same and pattern_matches(pattern, slot.entity):
                 self._note(Entity(slot.entity), slot, null=datum is None)
@@ -62,7 +62,7 @@ class WritableEach(EachData[T], MutableMapping[Entity, T]):
         slot = self._slots.get(entity)
         if slot is None:
             raise KeyError(entity)
-        if slot in self._lock._writes:
+        if slot in self._lock._writing.data:
             return self._lock._written(slot, self._request.aspect)
         return super().__getitem__(entity)
 
@@ -76,7 +76,7 @@ class WritableEach(EachData[T], MutableMapping[Entity, T]):
         self._lock._use()
         self._lock._put(slot, self._request.aspect, datum, stamp_ns=stamp_ns)
         self._note(entity, slot, null=False)
-        self._followed = self._lock._edits
+        self._followed = self._lock._writing.edits
 
     def __delitem__(self, entity: Entity) -> None:
         self.follow()
@@ -84,9 +84,9 @@ class WritableEach(EachData[T], MutableMapping[Entity, T]):
             raise KeyError(entity)
         slot = self._slot(entity)
         self._lock._use()
-        self._lock._delete(slot)
+        self._lock._writing.delete(slot)
         self._note(entity, slot, null=True)
-        self._followed = self._lock._edits
+        self._followed = self._lock._writing.edits
 
     def __iter__(self) -> Iterator[Entity]:
         return iter(list(self._slots))

@@ -11,8 +11,9 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, cast
 
 from enact_dist.core.datum import Datum, Slot
+from enact_dist.core.messages import WriteItem
 from enact_dist.errors import DatumTypeError, MisuseError
-from enact_dist.wire.limits import PAYLOAD_BYTES_MIN
+from enact_dist.wire.limits import BODY_BYTES_MAX, ITEMS_MAX, PAYLOAD_BYTES_MIN
 from enact_dist.wire.payload import decode_to_fill, encode_parts
 from enact_dist.wire.shapes import ArrayOf, RecordOf, shape_of
 
@@ -43,22 +44,60 @@ class Writing:
 
     Args:
         payloads: The memory that shards share with this process.
+
+    Attributes:
+        data: What the commit sets; None writes null.
+        edits: How often that was changed.
     """
 
-    __slots__ = ("_by_slot", "_payloads")
+    __slots__ = ("_by_slot", "_bytes", "_payloads", "data", "edits")
 
     def __init__(self, payloads: SharedPayloads) -> None:
         self._payloads = payloads
         self._by_slot: dict[Slot, _Written] = {}
+        self._bytes = 0
+        self.data: dict[Slot, Datum | None] = {}
+        self.edits = 0
 
-    def put(self, slot: Slot, encoded: Encoded, shard_of: Callable[[Slot], str]) -> Datum:
-        """Return the datum that stands for a value, its bytes copied once.
+    def by_shard(self, shard_of: Callable[[Slot], str]) -> dict[str, list[WriteItem]]:
+        """Return what each shard has to set."""
+        by_shard: dict[str, list[WriteItem]] = {}
+        for slot, datum in self.data.items():
+            by_shard.setdefault(shard_of(slot), []).append(WriteItem(slot, datum))
+        return by_shard
+
+    def put(self, slot: Slot, encoded: Encoded, shard_of: Callable[[Slot], str]) -> None:
+        """Set a slot to a value, whose bytes are copied once.
 
         Raises:
+            MisuseError: It is more than one lock may write.
             NoRoomError: The shard's cap is reached.
         """
+        self._note(slot, self._datum(slot, encoded, shard_of))
+
+    def delete(self, slot: Slot) -> None:
+        """Set a slot to null."""
+        self._forget(slot)
+        self._note(slot, None)
+
+    def _note(self, slot: Slot, datum: Datum | None) -> None:
+        old = self.data.get(slot)
+        size = self._bytes - (old.size if old else 0) + (datum.size if datum else 0)
+        if slot not in self.data and len(self.data) >= ITEMS_MAX:
+            raise MisuseError(f"one lock writes at most {ITEMS_MAX} data; use several locks")
+        if size > BODY_BYTES_MAX:
+            raise MisuseError(
+                f"the writes of one lock have {size} bytes; at most {BODY_BYTES_MAX}: use several"
+                " locks"
+            )
+        self.data[slot] = datum
+        self._bytes = size
+        self.edits += 1
+
+    def _datum(self, slot: Slot, encoded: Encoded, shard_of: Callable[[Slot], str]) -> Datum:
+        """Return the datum that stands for a value."""
         if encoded.size <= PAYLOAD_BYTES_MIN:
-            self.forget(slot)
+            self._forget(slot)
             return encoded.datum()
         draft = self._payloads.draft(shard_of(slot), encoded.size)
         body = self._payloads.filled(draft, encoded.parts) if draft is not None else None
@@ -66,13 +105,12 @@ class Writing:
             return self._keep(slot, _Written(encoded.datum(), None))
         return self._keep(slot, _Written(encoded.over(body, draft.file), draft))
 
-    def blank(
-        self, slot: Slot, shard: str, like: object, datum_type: Any, stamp_ns: int
-    ) -> tuple[Any, Datum]:
-        """Return a value like `like` whose arrays are to be filled, and its datum.
+    def blank(self, slot: Slot, shard: str, like: object, datum_type: Any, stamp_ns: int) -> Any:
+        """Set a slot to a value like `like`, whose arrays are to be filled, and return it.
 
         Raises:
             DatumTypeError: `like` is not of the type, or has no array.
+            MisuseError: It is more than one lock may write.
             NoRoomError: The shard's cap is reached.
         """
         encoded = encode_parts(like, datum_type, stamp_ns=stamp_ns)
@@ -91,10 +129,10 @@ class Writing:
                 " takes any datum"
             )
         datum = encoded.over(memory.toreadonly(), draft.file if draft is not None else "")
-        self._keep(slot, _Written(datum, draft, arrays))
-        return value, datum
+        self._note(slot, self._keep(slot, _Written(datum, draft, arrays)))
+        return value
 
-    def forget(self, slot: Slot) -> None:
+    def _forget(self, slot: Slot) -> None:
         """Drop what was written to a slot: something else takes its place."""
         old = self._by_slot.pop(slot, None)
         if old is not None:
@@ -103,7 +141,7 @@ class Writing:
                 self._payloads.drop(old.draft.shard, old.draft.file)
 
     def _keep(self, slot: Slot, written: _Written) -> Datum:
-        self.forget(slot)
+        self._forget(slot)
         if written.draft is not None or written.arrays:
             self._by_slot[slot] = written
         return written.datum
@@ -120,7 +158,8 @@ class Writing:
             if committed:
                 _fix(self._by_slot.pop(slot))
             else:
-                self.forget(slot)
+                self._forget(slot)
+        self.data.clear()
 
 
 def _fix(written: _Written) -> None:

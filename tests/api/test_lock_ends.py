@@ -185,7 +185,7 @@ def test_nothing_is_held_when_ctrl_c_strikes_before_the_commit(cell, online, mon
     count = Write(online, bench, COUNT)
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt), Lock(count) as held:
         held[count] = 1
-        patch.setattr(held, "_writes_by_shard", interrupt)
+        patch.setattr(lock.Writing, "by_shard", lambda *_: interrupt())
     assert online.view(View(online, bench, COUNT)).get(View(online, bench, COUNT)) is None
     assert_nothing_left(cell, online)
 
