@@ -58,6 +58,7 @@ class Change:
             versions began anew, since the last ones of before may have been seen by nobody.
         null: Whether the slot is null now.
         captured_ns: When the datum was captured, as its writer said (0: not said, or null).
+        world: Name of the world context.
     """
 
     entity: Entity
@@ -67,6 +68,7 @@ class Change:
     gap: int
     null: bool
     captured_ns: int = 0
+    world: str = ""
 
 
 @dataclass(slots=True)
@@ -88,14 +90,14 @@ class Watch:
     def __init__(
         self,
         client: CellClient,
-        context: str,
+        contexts: tuple[str, ...],
         patterns: tuple[str, ...],
         aspects: tuple[str, ...],
     ) -> None:
         self._client = client
-        self._context, self._aspects = context, aspects
+        self._contexts, self._aspects = contexts, aspects
         self._patterns = tuple(str(Entities(pattern)) for pattern in patterns)
-        self._survey = Survey((context,), self._patterns, aspects)
+        self._survey = Survey(contexts, self._patterns, aspects)
         self._known: dict[Slot, _Known] = {}
         self._following: dict[str, _Following] = {}
         self._pending: deque[Change] = deque()
@@ -172,7 +174,7 @@ class Watch:
 
     def _covers(self, slot: Slot) -> bool:
         return (
-            slot.context == self._context
+            slot.context in self._contexts
             and (not self._aspects or slot.aspect in self._aspects)
             and any(pattern_matches(pattern, slot.entity) for pattern in self._patterns)
         )
@@ -239,8 +241,9 @@ class Watch:
         gap = max(0, gap)
         self._missed += gap
         position = Position(stamp_ns, shard)
+        entity = Entity(slot.entity)
         self._pending.append(
-            Change(Entity(slot.entity), slot.aspect, version, position, gap, null, captured)
+            Change(entity, slot.aspect, version, position, gap, null, captured, slot.context)
         )
 
     def _goes_on(self, slot: Slot, epoch: int) -> bool:

@@ -124,7 +124,7 @@ class WorldContext(Context):
         if aspects:
             self.session.register_aspects(aspects)
         names = tuple(aspect.name for aspect in aspects)
-        return Watch(self.session.client, self.name, tuple(patterns), names)
+        return Watch(self.session.client, (self.name,), tuple(patterns), names)
 
     def survey(
         self, entities: Entities | str = "**", aspects: tuple[str, ...] = ()
