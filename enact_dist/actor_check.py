@@ -15,8 +15,8 @@ error    own trigger          an actor that, as bound, writes what triggers it
 error    two writers          two actors that write one slot, not both declaring it as `shared`
 warning  unwritten trigger    a trigger that no actor writes: only a write from outside runs it
 warning  unwritten read       a reading request for data that no actor writes
-warning  set not retained     the aspects of a `Together` retain one version: a set is gone as soon
-                              as one of its slots moves on
+warning  set not retained     an aspect of a `Together` has no history (retention = 1): a set is
+                              gone as soon as one of its slots moves on
 warning  unused aspect        `cell.toml` configures an aspect that no actor names: misspelt?
 =======  ===================  ===================================================================
 
@@ -32,6 +32,9 @@ from typing import TYPE_CHECKING, Literal
 from enact_dist.actor import same_data
 from enact_dist.actor_load import check_every_s, load_class, read_options
 from enact_dist.config_table import suggestion
+from enact_dist.core.messages import AspectEntry
+from enact_dist.core.retaining import limits_of, said, with_larger
+from enact_dist.retention import checked_retention
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -153,7 +156,7 @@ def check_cell(config: CellConfig, *, initial: Collection[str] = ()) -> tuple[Fi
         except Exception as error:  # noqa: BLE001 (importing a module can raise anything)
             findings.append(Finding("error", "no such actor", (actor.name,), str(error)))
     findings += check_actors(actors, worlds=config.worlds, initial=initial)
-    findings += _sets(actors, {entry.name: entry.retention for entry in config.aspects})
+    findings += _sets(actors, {entry.name: entry for entry in config.aspect_entries()})
     named = {
         request.aspect.name
         for actor in actors
@@ -173,19 +176,23 @@ def check_cell(config: CellConfig, *, initial: Collection[str] = ()) -> tuple[Fi
     return _ordered(findings)
 
 
-def _sets(actors: Iterable[ActorDeclaration], configured: Mapping[str, int]) -> Iterator[Finding]:
-    """Find sets whose data nobody retains, by the word of `cell.toml` or of the actor."""
+def _sets(
+    actors: Iterable[ActorDeclaration], configured: Mapping[str, AspectEntry]
+) -> Iterator[Finding]:
+    """Find sets of data that have no history, by the word of `cell.toml` or of the actor."""
     for actor in actors:
         together = actor.actor_class.declaration.together
         for request in together.requests if together is not None else ():
             aspect = request.aspect
-            if max(aspect.retention, configured.get(aspect.name, 1)) == 1:
+            entry = AspectEntry(aspect.name, "", "", *said(checked_retention(aspect.retention)))
+            entry = with_larger(entry, configured.get(aspect.name, entry))
+            if limits_of(entry).versions == 1:
                 yield Finding(
                     "warning",
                     "set not retained",
                     (actor.name,),
-                    f"{request!r} of {actor.name} is part of a set, and {aspect.name} retains one"
-                    " version: the set is gone as soon as this datum is written again; give"
+                    f"{request!r} of {actor.name} is part of a set, and {aspect.name} has no"
+                    " history: the set is gone as soon as this datum is written again; give"
                     f" [aspects.{aspect.name}] or Aspect(…) a retention of as many versions as"
                     " are under way at once",
                 )

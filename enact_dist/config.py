@@ -55,9 +55,11 @@ shared_bytes_max       none           cap of each shard's large data in the memo
   shard                required       name of a shard
 [aspects.NAME]         none           an aspect whose commits differ from the rest
   durability           "durable"      "durable", "os" or "volatile"
-  retention            1              how many versions of each datum stay readable by capture
-                                      stamp, the newest included (1 to 256); the older ones are
-                                      in memory until the shard restarts, whatever the durability
+  retention            the actors'    how much of each datum's history stays: a number of
+                                      versions, the newest included (1: none), or a table of
+                                      `versions`, `age_s` (since it was replaced) and `size_bytes`
+                                      (replaced data per datum), unlimited where unsaid; where
+                                      nobody says anything: 16 versions, 600 s, 16 MiB
 [actors.NAME]          none           an actor process
   class                required       ``package.module:Class``
   worlds               {}             role of the class = world context of the cell
@@ -100,7 +102,8 @@ from enact_dist.config_values import (
 )
 from enact_dist.core.messages import Pin
 from enact_dist.errors import ConfigError
-from enact_dist.terms import RETENTION_MAX, Durability, Entities, checked_name
+from enact_dist.retention import AGE_S_MAX, Retention, checked_retention
+from enact_dist.terms import Durability, Entities, checked_name
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -313,15 +316,17 @@ def _aspect(name: str, table: Table) -> AspectConfig:
     return AspectConfig(name, Durability(found), _retention(table))
 
 
-def _retention(table: Table) -> int:
-    found = table.values.get("retention", 1)
-    if type(found) is not int or not 1 <= found <= RETENTION_MAX:
-        table.refuse(
-            "retention",
-            f"'retention' in {table.title} is a number of versions from 1 to {RETENTION_MAX}, not"
-            f" {found!r}; the older ones are kept in memory until their shard restarts",
-        )
-    return found
+def _retention(table: Table) -> Retention | None:
+    found = table.values.get("retention")
+    if not isinstance(found, dict):
+        return table.checked("retention", lambda: checked_retention(found))
+    parts = table.take_table("retention")
+    parts.refuse_unknown("versions", "age_s", "size_bytes")
+    age_s = None
+    if "age_s" in parts.values:
+        age_s = parts.take_float("age_s", 0.0, low=0.001, high=AGE_S_MAX)
+    versions, size_bytes = parts.take_count("versions"), parts.take_count("size_bytes")
+    return table.checked("retention", lambda: Retention(versions, age_s, size_bytes))
 
 
 def _actor(name: str, table: Table, worlds: tuple[str, ...]) -> ActorConfig:

@@ -100,6 +100,15 @@ class Table:
             )
         return float(found)
 
+    def take_count(self, key: str) -> int | None:
+        """Return the whole number above zero at `key`, None where it is absent."""
+        found = self.values.get(key)
+        if found is not None and (type(found) is not int or found < 1):
+            self.refuse(
+                key, f"{key!r} in {self.title} is a whole number above 0, not {_shown(found)}"
+            )
+        return found
+
     def take_strings(self, key: str, default: tuple[str, ...] = ()) -> tuple[str, ...]:
         """Return the strings at `key`; one bare string counts as a list of one."""
         found = self.values.get(key, list(default))

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.messages import AspectEntry, Pin, PlacementMap, ShardEntry
+from enact_dist.core.retaining import said
 from enact_dist.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from enact_dist.core.shard_state import ShardSettings
+    from enact_dist.retention import Retention
     from enact_dist.terms import Durability
 
 TTL_S_DEFAULT: Final = 2.0
@@ -52,12 +54,16 @@ class AspectConfig:
     Attributes:
         name: Name of the aspect.
         durability: What its commits survive; wins over the actors' own word.
-        retention: Versions of each datum that stay readable, the newest included.
+        retention: How much of each datum's history stays; None leaves it to the actors.
     """
 
     name: str
     durability: Durability
-    retention: int = 1
+    retention: Retention | None = None
+
+    def entry(self) -> AspectEntry:
+        """Return it as an entry of a catalogue, without a fingerprint: any type may register."""
+        return AspectEntry(self.name, "", self.durability.value, *said(self.retention))
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,11 +150,8 @@ class CellConfig:
         return PlacementMap(version, shards, self.pins)
 
     def aspect_entries(self) -> tuple[AspectEntry, ...]:
-        """Return the aspects with their durability and no fingerprint: any type may register."""
-        return tuple(
-            AspectEntry(entry.name, "", entry.durability.value, entry.retention)
-            for entry in self.aspects
-        )
+        """Return the aspects as entries of a catalogue."""
+        return tuple(aspect.entry() for aspect in self.aspects)
 
     def shard_settings(self, name: str) -> ShardSettings:
         """Return what the core of shard `name` has to know.

@@ -12,6 +12,7 @@
     │  ├─ UnknownWorldError    a world context that the cell does not have     .known
     │  └─ ConfigError          a cell.toml, folder or option that cannot be used   .line
     ├─ NullDatumError          the world context does not know this datum      .reason
+    ├─ ForgottenError          a past state that has left its retention        .oldest_ns
     ├─ ChangedError            an expected view moved on; nothing written
     ├─ LockTimeoutError        not granted within wait_s; nothing held         .holders .waited_s
     ├─ NoRoomError             a shard's cap of shared memory is reached; nothing written
@@ -91,6 +92,19 @@ class NullDatumError(EnactError):
     def __init__(self, message: str, *, reason: str = "") -> None:
         super().__init__(message)
         self.reason = reason
+
+
+class ForgottenError(EnactError):
+    """A past state of a datum has left its retention; what came after it may be known.
+
+    Attributes:
+        oldest_ns: The stamp from which on what was asked is known, nanoseconds since 1970; 0 where
+            that cannot be said.
+    """
+
+    def __init__(self, message: str, *, oldest_ns: int = 0) -> None:
+        super().__init__(message)
+        self.oldest_ns = oldest_ns
 
 
 class ChangedError(EnactError):

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import time
 from typing import TYPE_CHECKING, Any, Final
 
-from enact_dist.core.messages import AspectEntry, Item
+from enact_dist.core.messages import AspectEntry, AwaitStamp, Item, Reached
 from enact_dist.core.placement import shard_of
-from enact_dist.errors import MisuseError
+from enact_dist.core.retaining import said
+from enact_dist.errors import MisuseError, ShardUnreachableError, UnknownWorldError
 from enact_dist.link.datum_cache import DatumCache
 from enact_dist.link.session_client import CALL_S, FINISH_S
 from enact_dist.reading import slot_of
+from enact_dist.retention import checked_retention
 from enact_dist.terms import Entity, LockRequest
 from enact_dist.wire.fingerprint import fingerprint
 
@@ -21,6 +24,9 @@ if TYPE_CHECKING:
     from enact_dist.terms import Aspect
 
 
+SETTLE_S: Final = 10.0
+"""How long our own commit may take to be shown by all its shards."""
+SETTLE_SLICE_NS: Final = 500_000_000
 ENTRIES_MAX: Final = 1024
 """Aspect objects whose catalogue entries are remembered."""
 
@@ -82,7 +88,7 @@ class Session:
                 aspect.name,
                 fingerprint(aspect.datum_type),
                 durability,
-                aspect.retention if aspect.retention > 1 else 0,
+                *said(checked_retention(aspect.retention)),
             )
             known = self._entries[id(aspect)] = (aspect, entry)
         return known[1]
@@ -91,10 +97,12 @@ class Session:
         """Return the name of the shard that owns the slot."""
         return shard_of(slot.entity, self.client.core.placement)
 
-    def item_of(self, request: LockRequest[Any], captured_ns: int = 0) -> Item:
+    def item_of(
+        self, request: LockRequest[Any], captured_ns: int = 0, *, nearest: bool = False
+    ) -> Item:
         """Return the protocol's line for a request, with the version that the cache holds.
 
-        With `captured_ns` it asks for the version with that capture stamp.
+        With `captured_ns` it asks for the version with that capture stamp, or the `nearest`.
         """
         context, entity, aspect = request.address
         if request.access.each:
@@ -103,14 +111,65 @@ class Session:
         if slot in self.cache:
             shard = self.shard_of(slot)
             known = self.cache.version(slot, shard, self.client.core.epoch(shard))
-        return Item(int(request.access), context, entity, aspect, known, captured_ns)
+        return Item(int(request.access), context, entity, aspect, known, captured_ns, nearest)
+
+    def settle(self, shard: str) -> None:
+        """Wait until a shard shows our own commits over shards, which may be on their way to it.
+
+        Raises:
+            ShardUnreachableError: It does not in time.
+        """
+        stamp_ns = self.client.core.unsettled_ns(shard)
+        deadline_s = time.monotonic() + SETTLE_S
+        while stamp_ns:
+            answer = self.client.call(shard, AwaitStamp(stamp_ns, SETTLE_SLICE_NS))
+            if isinstance(answer, Reached) and answer.reached:
+                self.client.core.reached(shard, stamp_ns)
+                return
+            if time.monotonic() >= deadline_s:
+                raise ShardUnreachableError(
+                    f"shard {shard} does not show a commit of this process after {SETTLE_S:g} s:"
+                    " the shard that decided it is away; see `enact lock ls`",
+                    shard=shard,
+                )
+
+    def check_world(self, name: str) -> None:
+        """Make sure that the cell has a world context: where a listing came back empty.
+
+        Raises:
+            UnknownWorldError: Not every shard has it (any more).
+            ShardUnreachableError: A shard does not answer.
+        """
+        self.client.greet()
+        if name not in self.client.worlds():
+            raise self.unknown_world(name)
+
+    def unknown_world(self, name: str) -> UnknownWorldError:
+        """Return the error for a world context that the cell does not have."""
+        known = tuple(self.client.worlds())
+        part = self.client.worlds_at(name)
+        remedy = f"make one with cell.create_world({name!r})"
+        if part:
+            remedy = (
+                f"a part of it is on {', '.join(part)} alone: complete the fork, or"
+                f" cell.drop_world({name!r})"
+            )
+        return UnknownWorldError(
+            f"the cell has no world context {name!r}; it has {', '.join(known) or 'none'};"
+            f" {remedy}",
+            known=known,
+        )
 
 
-def session_of(requests: tuple[LockRequest[Any], ...]) -> Session:
+def session_of(requests: tuple[LockRequest[Any], ...], *, view: bool = False) -> Session:
     """Return the one cell session that all requests belong to.
 
+    Args:
+        requests: Of a lock, or of a `view`, which may be one of the past.
+        view: Whether they only look.
+
     Raises:
-        MisuseError: A request names an unbound role, or two cells are mixed.
+        MisuseError: A request names an unbound role, two cells are mixed, or one locks the past.
     """
     session: Session | None = None
     for request in requests:
@@ -125,6 +184,11 @@ def session_of(requests: tuple[LockRequest[Any], ...]) -> Session:
         if not request.access.each and not isinstance(request.entity, Entity):
             raise MisuseError(
                 f"{request!r} names a pattern; outside an actor use {type(request).__name__}Each"
+            )
+        if request.world.past and (request.access.locks or not view):
+            raise MisuseError(
+                f"{request!r} names {request.world!r}: what was cannot be locked; view it with"
+                " past.view(View(past, …)), or name the world context as it is now"
             )
         if session is not None and found is not session:
             raise MisuseError("one lock names world contexts of two connections; connect once")

@@ -23,8 +23,14 @@ import secrets
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, Self, TypeVar
 
+from enact_dist.retention import DEFAULT_RETENTION as DEFAULT_RETENTION  # noqa: PLC0414
+from enact_dist.retention import Retention as Retention  # noqa: PLC0414 - both are found here, too
+from enact_dist.retention import checked_retention
+
 if TYPE_CHECKING:
     from collections.abc import Iterable
+
+    from enact_dist.comparing import Comparator
 
 T = TypeVar("T")
 T_co = TypeVar("T_co", covariant=True)
@@ -32,9 +38,6 @@ T_co = TypeVar("T_co", covariant=True)
 
 NAME_LENGTH_MAX: Final = 200
 """Longest name of an entity, aspect or world context; keeps every key of the wire below 1 kB."""
-
-RETENTION_MAX: Final = 256
-"""Most versions of one slot that an aspect may retain."""
 
 _SEGMENT = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.\-]*\Z")
 _PATTERN_SEGMENT = re.compile(r"(?:\*\*|(?!.*\*\*)[A-Za-z0-9_*][A-Za-z0-9_.\-*]*)\Z")
@@ -221,27 +224,29 @@ class Aspect(Generic[T]):
             frozen dataclass of these, or a type with a registered codec.
         durability: What a commit of this aspect survives; ``None`` leaves it to `cell.toml`
             (there: `durable` unless written otherwise).  `cell.toml` wins over this argument.
-        retention: How many versions of each datum stay readable by capture stamp (`Together`), the
-            newest one included; of several numbers, that of `cell.toml` too, the largest counts.
-            The older ones are in memory until their shard restarts, whatever the durability, and
-            within a limit of 256 MiB per shard (counter `retained_dropped`).
+        retention: How much of each datum's history stays, as a number of versions (the newest
+            included; 1 is none) or a `Retention`; ``None`` leaves it to `cell.toml` (there:
+            `DEFAULT_RETENTION` unless written otherwise).  Of several that ask, `cell.toml` too,
+            the largest figures count.
+        compare: How `WorldContext.diff` tells its data apart; not part of what makes two aspects
+            the same one.
 
     Raises:
-        ValueError: The name is not allowed, or `retention` does not lie in 1 to 256.
+        ValueError: The name is not allowed, or the retention is none that can be kept to.
     """
 
     name: str
     datum_type: type[T]
     durability: Durability | None = None
-    retention: int = 1
+    retention: Retention | int | None = None
+    compare: Comparator[T] | None = field(default=None, compare=False, repr=False)
 
     def __post_init__(self) -> None:
         checked_name("aspect", self.name, slashes=False)
-        if type(self.retention) is not int or not 1 <= self.retention <= RETENTION_MAX:
-            raise ValueError(
-                f"retention of aspect {self.name!r} is {self.retention!r}; it must be a number of"
-                f" versions from 1 to {RETENTION_MAX}"
-            )
+        try:
+            checked_retention(self.retention)
+        except ValueError as error:
+            raise ValueError(f"aspect {self.name!r}: {error}") from None
 
     def __str__(self) -> str:
         return self.name
@@ -312,6 +317,8 @@ class Context:
     """Anything that names a world context: a `WorldContext` of a cell, or a `World` role."""
 
     __slots__ = ("name",)
+    past: ClassVar[bool] = False
+    """Whether it shows what was, which can only be viewed."""
 
     def __init__(self, name: str) -> None:
         self.name = checked_name("world context", name, slashes=False)

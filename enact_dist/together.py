@@ -19,11 +19,10 @@ shards too.
 
 from __future__ import annotations
 
-import time
 from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, TypeVar
 
-from enact_dist.core.messages import AwaitStamp, Reached, Survey, Surveyed
-from enact_dist.errors import ProtocolError, ShardUnreachableError
+from enact_dist.core.messages import Survey, Surveyed
+from enact_dist.errors import ProtocolError
 from enact_dist.reading import slot_of
 from enact_dist.terms import Entity, View
 
@@ -38,9 +37,6 @@ T_co = TypeVar("T_co", covariant=True)
 OPEN_MAX: Final = 16
 """Sets that an actor follows at once, unless `Together` says otherwise."""
 OPEN_LIMIT: Final = 256
-SETTLE_S: Final = 10.0
-"""How long our own commit may take to be shown by all its shards."""
-SLICE_NS: Final = 500_000_000
 
 
 class Together(Generic[T_co]):
@@ -121,7 +117,7 @@ def captured_versions(session: Session, requests: Sequence[View[Any]]) -> list[l
     found: dict[Slot, list[Captured]] = {slot: [] for slot in slots}
     shards = sorted(session.shards_of(requests))
     for shard in shards:
-        _settle(session, shard)
+        session.settle(shard)
     for answer in session.client.call_all([(shard, message) for shard in shards]):
         if not isinstance(answer, Surveyed):
             raise ProtocolError(f"{type(answer).__name__} came as the answer to Survey")
@@ -133,24 +129,6 @@ def captured_versions(session: Session, requests: Sequence[View[Any]]) -> list[l
                     )
                 )
     return [found[slot] for slot in slots]
-
-
-def _settle(session: Session, shard: str) -> None:
-    """Wait until a shard shows our own commits over shards: its part may still be on its way."""
-    client = session.client
-    stamp_ns = client.core.unsettled_ns(shard)
-    deadline_s = time.monotonic() + SETTLE_S
-    while stamp_ns:
-        answer = client.call(shard, AwaitStamp(stamp_ns, SLICE_NS))
-        if isinstance(answer, Reached) and answer.reached:
-            client.core.reached(shard, stamp_ns)
-            return
-        if time.monotonic() >= deadline_s:
-            raise ShardUnreachableError(
-                f"shard {shard} does not show a commit of this process after {SETTLE_S:g} s: the"
-                " shard that decided it is away; see `enact lock ls`",
-                shard=shard,
-            )
 
 
 def newest_set_ns(versions: Sequence[Sequence[Captured]]) -> int:

@@ -10,7 +10,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.messages import Commit, Refused
-from enact_dist.terms import RETENTION_MAX, Access, Durability, checked_name
+from enact_dist.core.retaining import NO_LIMIT
+from enact_dist.terms import Access, Durability, checked_name
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable
@@ -53,11 +54,12 @@ def wrong_aspect(entry: AspectEntry) -> Refused | None:
             f"durability {entry.durability!r} of aspect {entry.name!r} was asked; there are"
             f" {', '.join(filter(None, _DURABILITIES))}"
         )
-    if not 0 <= entry.retention <= RETENTION_MAX:
-        return _refused(
-            f"retention {entry.retention} of aspect {entry.name!r} was asked; it must lie between"
-            f" 1 and {RETENTION_MAX}"
-        )
+    for figure in (entry.retention, entry.age_ns, entry.size):
+        if not 0 <= figure <= NO_LIMIT:
+            return _refused(
+                f"a retention of {figure} of aspect {entry.name!r} was asked; none of its figures"
+                f" lies outside 0 to {NO_LIMIT}"
+            )
     return wrong_name("aspect", entry.name, slashes=False)
 
 

@@ -16,6 +16,7 @@ from enact_dist.core.datum import Column, Datum, Slot
 from enact_dist.core.messages import AspectEntry, SlotState
 from enact_dist.core.past import Past
 from enact_dist.core.retained import Retained
+from enact_dist.core.retaining import covers, with_larger
 from enact_dist.terms import ACCESSES, Durability, NullReason, pattern_matches
 
 if TYPE_CHECKING:
@@ -278,8 +279,8 @@ class Catalogue:
         configured = self._configured.get(entry.name)
         durability = configured.durability if configured else ""
         durability = durability or entry.durability or Durability.DURABLE.value
-        retention = max(entry.retention, configured.retention if configured else 0)
-        return entry._replace(durability=durability, retention=retention)
+        entry = entry._replace(durability=durability)
+        return with_larger(entry, configured) if configured else entry
 
     def register(self, entry: AspectEntry) -> tuple[AspectEntry, bool] | str:
         """Register an aspect; return its entry and whether it changed, or why it is refused."""
@@ -298,8 +299,8 @@ class Catalogue:
                 f"aspect {entry.name!r} is registered as {known.durability}, and was now asked as"
                 f" {wanted.durability}; state one durability in cell.toml or in Aspect(…)"
             )
-        if known.retention < wanted.retention:
-            known = self.aspects[entry.name] = known._replace(retention=wanted.retention)
+        if not covers(known, wanted):
+            known = self.aspects[entry.name] = with_larger(known, wanted)
             return known, True
         return known, False
 

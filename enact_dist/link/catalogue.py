@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.core.messages import AspectEntry, Registered, Welcome
+from enact_dist.core.messages import AspectEntry, Registered, Welcome, WorldEntry
+from enact_dist.core.retaining import covers
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -24,14 +25,15 @@ class KnownCatalogue:
 
     def __init__(self) -> None:
         self._aspects: dict[str, dict[str, AspectEntry]] = {}
-        self._worlds: dict[str, tuple[str, ...]] = {}
+        self._worlds: dict[str, dict[str, WorldEntry]] = {}
         self._settled: set[AspectEntry] = set()
         self._settled_for: PlacementMap | None = None
 
     def learn(self, shard: str, answer: Welcome | Registered) -> None:
         """Take the catalogue that an answer carries."""
         self._settled = set()
-        self._worlds[shard] = answer.worlds
+        self._worlds[shard] = {name: WorldEntry(name) for name in answer.worlds}
+        self._worlds[shard].update((entry.name, entry) for entry in answer.forks)
         self._aspects[shard] = {entry.name: entry for entry in answer.aspects}
 
     def forget(self, shard: str) -> None:
@@ -54,10 +56,16 @@ class KnownCatalogue:
                 settled.add(entry)
         return True
 
-    def worlds(self) -> tuple[str, ...]:
-        """Return the world contexts that every greeted shard knows."""
-        known = [set(worlds) for worlds in list(self._worlds.values())]
-        return tuple(sorted(set.intersection(*known))) if known else ()
+    def worlds(self) -> dict[str, WorldEntry]:
+        """Return the world contexts that every greeted shard knows, and knows as the same fork."""
+        known = [set(worlds.values()) for worlds in list(self._worlds.values())]
+        common = set.intersection(*known) if known else set()
+        return {entry.name: entry for entry in sorted(common)}
+
+    def worlds_at(self, name: str) -> dict[str, WorldEntry]:
+        """Return the shards that know a world context, and as what."""
+        known = list(self._worlds.items())
+        return {shard: worlds[name] for shard, worlds in known if name in worlds}
 
     def aspects(self) -> dict[str, AspectEntry]:
         """Return the registered aspects of all greeted shards by name."""
@@ -71,7 +79,7 @@ class KnownCatalogue:
         known = self._aspects.get(shard, {})
         return not all(_agrees(known.get(entry.name), entry) for entry in aspects) or not set(
             worlds
-        ) <= set(self._worlds.get(shard, ()))
+        ) <= set(self._worlds.get(shard, {}))
 
 
 def _agrees(known: AspectEntry | None, wanted: AspectEntry) -> bool:
@@ -79,5 +87,5 @@ def _agrees(known: AspectEntry | None, wanted: AspectEntry) -> bool:
         known is not None
         and known.fingerprint == wanted.fingerprint
         and wanted.durability in ("", known.durability)
-        and wanted.retention <= known.retention
+        and covers(known, wanted)
     )

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
     from enact_dist.core.client import Client
-    from enact_dist.core.messages import Request, Survey, WriteItem
+    from enact_dist.core.messages import Request, Survey, WorldEntry, WriteItem
     from enact_dist.errors import ShardUnreachableError
     from enact_dist.link.carrier import Begun, Carrier, NoticeFeed
 
@@ -170,22 +170,29 @@ class SessionClient:
         Raises:
             ShardUnreachableError: One stays without an answer for `timeout_s`.
         """
+        answers = self.call_each(calls, timeout_s=timeout_s)
+        for (shard, _), answer in zip(calls, answers, strict=True):
+            if answer is None:
+                raise self._unreachable(shard, timeout_s)
+        return [answer for answer in answers if answer is not None]
+
+    def call_each(
+        self, calls: Sequence[tuple[str, Request]], *, timeout_s: float = FINISH_S
+    ) -> list[Answer | None]:
+        """Make idempotent calls at once, each again until it is answered or the time is over."""
         self.check_usable()
-        answers: dict[int, Answer] = {}
+        answers: list[Answer | None] = [None] * len(calls)
         deadline_ns = self._now_ns() + int(min(timeout_s, CALLS_S_MAX) * 1e9)
         pause_s = 0.02
         while True:
-            left = [index for index in range(len(calls)) if index not in answers]
+            left = [index for index, answer in enumerate(answers) if answer is None]
             sent = [calls[index] for index in left]
             for index, answer in zip(left, self._send(sent), strict=True):
                 if answer is not None:
                     self._take(*calls[index], answer)
                     answers[index] = answer
-            if len(answers) == len(calls):
-                return [answers[index] for index in range(len(calls))]
-            if self._now_ns() >= deadline_ns:
-                missing = next(index for index in left if index not in answers)
-                raise self._unreachable(calls[missing][0], timeout_s)
+            if None not in answers or self._now_ns() >= deadline_ns:
+                return answers
             self._rest(pause_s, self._returns)
             pause_s = min(2 * pause_s, 0.3)
 
@@ -267,9 +274,13 @@ class SessionClient:
             if isinstance(answer, Refused):
                 raise error_of(answer)
 
-    def worlds(self) -> tuple[str, ...]:
+    def worlds(self) -> dict[str, WorldEntry]:
         """Return the world contexts that every greeted shard knows."""
         return self._catalogue.worlds()
+
+    def worlds_at(self, name: str) -> dict[str, WorldEntry]:
+        """Return the greeted shards that know a world context, and as what."""
+        return self._catalogue.worlds_at(name)
 
     def aspect_entries(self) -> dict[str, AspectEntry]:
         """Return the registered aspects of all greeted shards by name."""

@@ -7,7 +7,7 @@ import pytest
 from enact_dist.config import parse_config
 from enact_dist.core.messages import AspectEntry, Pin, ShardEntry
 from enact_dist.errors import ConfigError
-from enact_dist.terms import Durability
+from enact_dist.terms import Durability, Retention
 
 FILE = Path("/cells/demo/cell.toml")
 
@@ -100,8 +100,19 @@ def test_config_lists_its_aspects_as_catalogue_entries():
     """An aspect of the file has a durability and a retention, and lets any type register."""
     assert parsed(FULL).aspect_entries() == (
         AspectEntry("depth", "", "volatile", 8),
-        AspectEntry("flags", "", "durable", 1),
+        AspectEntry("flags", "", "durable"),
     )
+
+
+def test_config_bounds_history_by_versions_age_and_bytes():
+    """A table says each figure by itself; what it leaves out has no limit."""
+    text = 'name = "c"\n' + SHARD + "[aspects.x]\nretention = { versions = 100, age_s = 60 }\n"
+    both = parsed(text)
+    size = parsed(text.replace("age_s = 60", "size_bytes = 1_000_000"))
+
+    assert both.aspects[0].retention == Retention(versions=100, age_s=60.0)
+    assert both.aspect_entries() == (AspectEntry("x", "", "durable", 100, 60_000_000_000),)
+    assert size.aspect_entries() == (AspectEntry("x", "", "durable", 100, 0, 1_000_000),)
 
 
 def test_placement_map_names_advertised_endpoints_and_pins():
@@ -173,8 +184,12 @@ WRONG = {
     "pins type": ('name = "c"\n' + SHARD + '[pins]\nshard = "left"\n', 4, "'pins' is an array of tables ([[pins]]), not a table"),
     "pin type": ('name = "c"\npins = [\n1]\n' + SHARD, 3, "'pins' holds tables ([[pins]]), not an integer (1)"),
     "durability": ('name = "c"\n' + SHARD + '[aspects.x]\ndurability = "volatil"\n', 5, "unknown durability 'volatil' of aspect 'x'; did you mean 'volatile'?"),
-    "retention": ('name = "c"\n' + SHARD + "[aspects.x]\nretention = 0\n", 5, "'retention' in [aspects.x] is a number of versions from 1 to 256, not 0; the older ones are kept in memory until their shard restarts"),
-    "retention kind": ('name = "c"\n' + SHARD + "[aspects.x]\nretention = true\n", 5, "from 1 to 256, not True"),
+    "retention": ('name = "c"\n' + SHARD + "[aspects.x]\nretention = 0\n", 5, "versions of a retention is a number from 1 to 100000, not 0"),
+    "retention kind": ('name = "c"\n' + SHARD + "[aspects.x]\nretention = true\n", 5, "a retention is a number of versions or Retention(versions, age_s, size_bytes), not True"),
+    "retention key": ('name = "c"\n' + SHARD + "[aspects.x]\nretention = { version = 3 }\n", 5, "unknown key 'version' in [aspects.x.retention]; did you mean 'versions'?"),
+    "retention age": ('name = "c"\n' + SHARD + "[aspects.x]\nretention = { age_s = 0 }\n", 5, "'age_s' in [aspects.x.retention] must lie between 0.001 and 1e+09, not 0"),
+    "retention bytes": ('name = "c"\n' + SHARD + "[aspects.x]\nretention = { size_bytes = 0.5 }\n", 5, "'size_bytes' in [aspects.x.retention] is a whole number above 0, not a float (0.5)"),
+    "retention empty": ('name = "c"\n' + SHARD + "[aspects.x]\nretention = {}\n", 5, "Retention() says nothing"),
     "aspect key": ('name = "c"\n' + SHARD + "[aspects]\nx = { durable = true }\n", 5, "unknown key 'durable' in [aspects.x]; did you mean 'durability'?"),
     "aspect name": ('name = "c"\n' + SHARD + '[aspects."a/b"]\n', 4, "'a/b' cannot name a aspect"),
     "no class": ('name = "c"\n' + SHARD + "[actors.x]\n", 4, "[actors.x] needs the key 'class'"),

@@ -30,8 +30,9 @@ from enact_dist.core.messages import (
     WriteItem,
 )
 from enact_dist.core.retained import Retained
+from enact_dist.core.retaining import NO_LIMIT
 from enact_dist.core.slots import INLINE_BYTES_MAX, Content
-from enact_dist.terms import RETENTION_MAX, Access, NullReason
+from enact_dist.terms import Access, NullReason
 
 W, V = Access.WRITE, Access.VIEW
 KEPT = 3
@@ -232,7 +233,7 @@ def test_larger_retention_outlives_a_restart(cameras):
     assert cameras.shard.state.catalogue.retention("mask") == 5
 
 
-@pytest.mark.parametrize("retention", [-1, RETENTION_MAX + 1])
+@pytest.mark.parametrize("retention", [-1, NO_LIMIT + 1])
 def test_retention_without_bound_is_refused(cameras, retention):
     """A shard's memory is nobody's to fill."""
     entry = AspectEntry("other", "int", "volatile", retention)
@@ -240,7 +241,7 @@ def test_retention_without_bound_is_refused(cameras, retention):
     answer = cameras.ask(Register("admin", (), (entry,)))
 
     assert isinstance(answer, Refused)
-    assert str(RETENTION_MAX) in answer.text
+    assert str(NO_LIMIT) in answer.text
 
 
 def test_restart_leaves_the_newest_version(cameras):
