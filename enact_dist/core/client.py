@@ -11,7 +11,7 @@ One `Client` per process, one lane per thread.  Rules a change must keep:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.beliefs import Sendings
@@ -259,11 +259,12 @@ class Client:
         """Return the locks that are not at rest."""
         return list(self._locks.values())
 
-    def plan(self, items: Iterable[Item], *, lock_views: bool = False) -> Plan:
+    def plan(self, items: Iterable[Item], *, lock_views: bool = False, past_ns: int = 0) -> Plan:
         """Split requested items by shard, in the one global order of acquisition.
 
         A pattern goes to every shard.  Views ride with the locks where one shard has them all,
-        unless it may not show a commit of ours yet.  With `lock_views` they become reads.
+        unless it may not show a commit of ours yet.  With `lock_views` they become reads.  With
+        `past_ns` they are views alone, as of that stamp.
         """
         items = tuple(items)
         usual = not lock_views and not self.unsettled and len(items) <= PLANNED_MAX
@@ -274,7 +275,7 @@ class Client:
                 if len(self._plans) >= PLANS_MAX:
                     self._plans.clear()
                 self._plans[items] = plan
-        return plan
+        return replace(plan, past_ns=past_ns) if past_ns else plan
 
     def _planned(self, items: Iterable[Item], *, lock_views: bool) -> Plan:
         locks: dict[str, list[Item]] = {}

@@ -6,6 +6,9 @@ end, and the shards whose interval ended before it are asked again as of T.  Tha
 a shard does not remember so far back, or an undecided commit stays in its way; then T moves on,
 `ROUNDS_MAX` times at most.  Whoever gets no cut takes read locks instead.
 
+Who asks about the past names T himself: every shard is asked as of T from the first round on, and
+T never moves.  What a shard has forgotten it says, and what is undecided up to T is waited for.
+
 Rule a change must keep: a shard that restarts may give stamps below those that it has answered
 with (its clock is not on its disk), so an answer counts only while nobody can have been granted a
 lock in a later epoch.  For a session that locks this is so until it has acknowledged that epoch
@@ -20,6 +23,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
+    from enact_dist.core.lock_parts import Plan
     from enact_dist.core.messages import Item, TakeView, Viewed
 
 ROUNDS_MAX: Final = 8
@@ -42,12 +46,14 @@ class Cut:
         items: What to view at which shard.
         floor_ns: The cut must not lie before this stamp (the session's own commits).
         observer: No shard waits for this session when it restarts.
+        past_ns: The cut must lie exactly here (0: wherever it can be had).
     """
 
     __slots__ = (
         "_answers",
         "_floor_ns",
         "_observer",
+        "_past_ns",
         "_settled",
         "at_ns",
         "items",
@@ -56,20 +62,37 @@ class Cut:
     )
 
     def __init__(
-        self, items: Mapping[str, tuple[Item, ...]], *, floor_ns: int, observer: bool = False
+        self,
+        items: Mapping[str, tuple[Item, ...]],
+        *,
+        floor_ns: int,
+        observer: bool = False,
+        past_ns: int = 0,
     ) -> None:
         self.items = dict(items)
         self.left = dict.fromkeys(self.items)
-        self.at_ns = 0
+        self.at_ns = past_ns
         self.rounds = 1
         self._floor_ns = floor_ns
+        self._past_ns = past_ns
         self._observer = observer and len(self.items) > 1
         self._answers: dict[str, _Answer] = {}
         self._settled: dict[str, Viewed] = {}
 
+    @classmethod
+    def of(cls, plan: Plan, *, observer: bool) -> Cut:
+        """Return the cut that the views of a plan ask for."""
+        items = dict(plan.views)
+        return cls(items, floor_ns=plan.floor_ns, observer=observer, past_ns=plan.past_ns)
+
     def not_before(self, stamp_ns: int) -> None:
         """Let the cut show whatever was committed up to a stamp; before it is taken."""
         self._floor_ns = max(self._floor_ns, stamp_ns)
+
+    @property
+    def strict(self) -> bool:
+        """Whether it lies where it was asked for: what shards forgot they must not make up for."""
+        return bool(self._past_ns)
 
     def take(self, shard: str, request: TakeView, answer: Viewed, *, until_ns: int) -> None:
         """Take an answer of this round; others are too late.
@@ -93,7 +116,7 @@ class Cut:
         at_ns = max((viewed.from_ns for viewed in answers.values()), default=0)
         if len(answers) == 1 and not self.at_ns:
             at_ns = 0  # one shard shows every commit whole as of now, whatever its stamp
-        at_ns = max(at_ns, self._floor_ns)
+        at_ns = self._past_ns or max(at_ns, self._floor_ns)
         lagging = [
             shard
             for shard, (viewed, until_ns) in self._answers.items()

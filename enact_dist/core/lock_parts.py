@@ -65,12 +65,13 @@ class Plan:
     """What one lock asks of which shard; both in the order of the shards' names.
 
     A shard appears once in each.  Locks on several shards take their views afterwards, as one cut
-    that lies not before `floor_ns`, nor before anything that the locks show.  `placement` is what
-    the lock was placed by, to its end: the client may learn another meanwhile, and a shard refuses
-    what was placed by any other than its own.
+    that lies not before `floor_ns`, nor before anything that the locks show; views of the past lie
+    at `past_ns`.  `placement` is what the lock was placed by, to its end: the client may learn
+    another meanwhile, and a shard refuses what was placed by any other than its own.
     """
 
     locks: tuple[tuple[str, tuple[Item, ...]], ...]
     views: tuple[tuple[str, tuple[Item, ...]], ...]
     placement: PlacementMap
     floor_ns: int = 0
+    past_ns: int = 0

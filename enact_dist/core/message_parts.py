@@ -124,13 +124,13 @@ CAUSE_FORK = "fork"
 class VersionEntry(NamedTuple):
     """One version of a slot's history, without its datum.
 
-    `until_ns` is the stamp of the version that replaced it (0: it is the newest).  `kept` says
-    that somebody has asked to keep it.  `cause` is None where it is not known.
+    `until_ns` is the stamp of the version that replaced it (0: it is the newest).  `kept` are the
+    labels under which somebody has asked to keep it.  `cause` is None where it is not known.
     """
 
     state: SlotState
     until_ns: int
-    kept: bool
+    kept: tuple[str, ...]
     cause: Cause | None
 
 

@@ -38,6 +38,7 @@ from enact_dist.core.messages import (
     Committed,
     EpochChanged,
     Fenced,
+    Forgotten,
     Granted,
     Outcome,
     OutcomeIs,
@@ -71,7 +72,7 @@ RETRY_NS_MAX: Final = 300_000_000
 OVERLOAD: Final = "overload"
 """The code of refusals by a shard that has not looked at the request."""
 # Tuples: a union would be made anew for each answer.
-_TO_ANY_REQUEST: Final = (Refused, WrongShard, EpochChanged)
+_TO_ANY_REQUEST: Final = (Refused, Forgotten, WrongShard, EpochChanged)
 _DECIDERS: Final = (Commit, Outcome)
 
 FREE_CALLS: Final = 3
@@ -90,7 +91,7 @@ class MultiLock:
     hold_ns: int
     phase: Phase = Phase.ACQUIRING
     cause: str = ""
-    refusal: Refused | None = None
+    refusal: Refused | Forgotten | None = None
     silent_shard: str = ""
     blockers: tuple[Holder, ...] = ()
     taken_from: Part | None = None
@@ -110,11 +111,7 @@ class MultiLock:
     def __post_init__(self) -> None:
         self.parts = [Part(shard, items) for shard, items in self.plan.locks]
         if self.plan.views:
-            self.cut = Cut(
-                dict(self.plan.views),
-                floor_ns=self.plan.floor_ns,
-                observer=self.client.observer,
-            )
+            self.cut = Cut.of(self.plan, observer=self.client.observer)
         self._advance()
 
     # ---------------------------------------------------------------- what to send
@@ -171,14 +168,11 @@ class MultiLock:
         )
 
     def _view(self, shard: str, cut: Cut, now_ns: int) -> Request:
+        client, map_version = self.client, self.plan.placement.version
+        count = client.sendings.next(now_ns)
+        epoch, seen_ns = client.epoch(shard), client.seen_stamp_ns
         return TakeView(
-            self.lock,
-            self.client.epoch(shard),
-            self.plan.placement.version,
-            self.client.sendings.next(now_ns),
-            cut.items[shard],
-            self.client.seen_stamp_ns,
-            cut.at_ns,
+            self.lock, epoch, map_version, count, cut.items[shard], seen_ns, cut.at_ns, cut.strict
         )
 
     def take_farewells(self) -> list[tuple[str, Request]]:
@@ -213,10 +207,11 @@ class MultiLock:
             self._on_vote(shard, answer)
 
     def _on_refusal(
-        self, shard: str, request: Request, answer: Refused | WrongShard | EpochChanged
+        self, shard: str, request: Request, answer: Refused | Forgotten | WrongShard | EpochChanged
     ) -> None:
-        if isinstance(answer, Refused):
-            if answer.code == NO_PAYLOAD and self._finishing and self._finishing.unname(request):
+        if isinstance(answer, Refused | Forgotten):
+            code = answer.code if isinstance(answer, Refused) else ""
+            if code == NO_PAYLOAD and self._finishing and self._finishing.unname(request):
                 return  # asked again, with the bytes
             self._end(Phase.REFUSED)
             self.refusal = answer

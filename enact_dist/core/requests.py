@@ -297,7 +297,8 @@ class ListHistory:
     """List the known versions of slots, oldest first, without their data.  Answer: `Versions`.
 
     Empty `contexts`, `patterns` or `aspects` mean all.  Only versions that were current after
-    `since_ns` (0: all), of each slot the newest `count_max` (0: all).
+    `since_ns` (0: all), of each slot the newest `count_max` (0: all).  With `kept` only versions
+    that some label keeps.
     """
 
     contexts: tuple[str, ...]
@@ -305,6 +306,7 @@ class ListHistory:
     aspects: tuple[str, ...]
     since_ns: int = 0
     count_max: int = 0
+    kept: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,6 +20,7 @@ from enact_dist.core.messages import (
     OUTCOME_UNSEEN,
     Outcome,
     OutcomeIs,
+    Refused,
     Release,
 )
 from enact_dist.core.multilock import MultiLock
@@ -66,6 +67,7 @@ class CellClient(SessionClient):
         hold_s: float,
         interrupt: threading.Event | None = None,
         begun: list[MultiLock] | None = None,
+        past_ns: int = 0,
     ) -> MultiLock:
         """Acquire a lock; it rests in HELD when this returns.
 
@@ -76,9 +78,11 @@ class CellClient(SessionClient):
             interrupt: Ends the waiting within 0.2 s once it is set.
             begun: Gets the lock before anything is asked, so that its caller can release it when
                 an exception comes between the return and the assignment.
+            past_ns: The items are views alone, as of this stamp.
 
         Raises:
             LockTimeoutError: Not granted in time; nothing is held.
+            ForgottenError: A state as of `past_ns` has left its retention.
             ShardUnreachableError: A shard stayed without an answer.
             MisuseError: Too many threads hold or await locks.
             EnactError: The shard refused the request.
@@ -90,7 +94,7 @@ class CellClient(SessionClient):
 
         def begin(*, lock_views: bool = False) -> MultiLock:
             with self._mutex:
-                plan = self.core.plan(items, lock_views=lock_views)
+                plan = self.core.plan(items, lock_views=lock_views, past_ns=past_ns)
                 now_ns = self._now_ns()
                 wait_ns, hold_ns = max(0, give_up_ns - now_ns), int(hold_s * 1e9)
                 lock = self.core.begin(lane, plan, now_ns=now_ns, wait_ns=wait_ns, hold_ns=hold_ns)
@@ -114,7 +118,7 @@ class CellClient(SessionClient):
                 over = attempt > 0 and self._now_ns() >= give_up_ns
                 if over or not self._begins_anew(lock, attempt):
                     break
-                lock_views = lock.no_cut and not self.core.observer
+                lock_views = lock.no_cut and not self.core.observer and not past_ns
                 if lock_views:
                     self.count("views_locked")
                 lock = begin(lock_views=lock_views)
@@ -131,7 +135,8 @@ class CellClient(SessionClient):
                 self._pause(min(0.02 * 2 ** min(attempt, 8), RESTART_S_MAX))
             return True
         refusal = lock.refusal
-        if refusal is None or refusal.code != "unknown_aspect" or attempt >= REGISTRATIONS_MAX:
+        unknown = isinstance(refusal, Refused) and refusal.code == "unknown_aspect"
+        if not unknown or attempt >= REGISTRATIONS_MAX:
             return False
         # A shard that keeps nothing restarted since: its catalogue is empty again.
         shards = {shard for shard, _ in (*lock.plan.locks, *lock.plan.views)}

@@ -6,8 +6,10 @@ Each text says what was asked, what was found, who holds it and what to do.
 from __future__ import annotations
 
 import re
+import time
 from typing import TYPE_CHECKING
 
+from enact_dist.core.messages import Forgotten
 from enact_dist.core.multilock import MultiLock
 from enact_dist.core.phase import Phase
 from enact_dist.errors import (
@@ -16,6 +18,7 @@ from enact_dist.errors import (
     CommitUnknownError,
     DatumTypeError,
     EnactError,
+    ForgottenError,
     LeaseLostError,
     LinkError,
     LockTimeoutError,
@@ -56,6 +59,13 @@ def not_granted(lock: MultiLock, waited_s: float, endpoint_of: Callable[[str], s
     if lock.phase is Phase.UNREACHABLE:
         return unreachable(lock.silent_shard, waited_s, endpoint_of)
     wanted = _wanted(lock)
+    if lock.plan.past_ns:
+        return LockTimeoutError(
+            f"waited {waited_s:.1f} s to see {wanted} as of {moment_name(lock.plan.past_ns)}: a"
+            " commit stamped before is not decided yet, or a shard restarts again and again; the"
+            " shard that decides it may be away (enact shard ls; enact lock ls)",
+            waited_s=waited_s,
+        )
     holders = tuple(holder_line(holder) for holder in lock.blockers)
     if lock.phase is Phase.MISPLACED:
         return LinkError(
@@ -128,8 +138,34 @@ def holder_line(holder: Holder) -> str:
     )
 
 
-def error_of(refused: Refused) -> EnactError:
+def moment_name(stamp_ns: int) -> str:
+    """Return a stamp as people read it: date and time of this host's zone."""
+    seconds, rest_ns = divmod(stamp_ns, 1_000_000_000)
+    try:
+        clock = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(seconds))
+    except (OverflowError, ValueError, OSError):
+        return f"stamp {stamp_ns}"
+    return f"{clock}.{rest_ns // 1_000_000:03d}"
+
+
+def forgotten(answer: Forgotten) -> ForgottenError:
+    """Return the error for a past state that its shard does not keep any more."""
+    known = (
+        f"known from {moment_name(answer.oldest_ns)} on (stamp {answer.oldest_ns})"
+        if answer.oldest_ns
+        else "nothing of it is known"
+    )
+    return ForgottenError(
+        f"the asked state of {answer.slot} is older than its retention; {known}; ask for a later"
+        " time, or let the aspect retain more: Aspect(…, retention=…) or cell.toml",
+        oldest_ns=answer.oldest_ns,
+    )
+
+
+def error_of(refused: Refused | Forgotten) -> EnactError:
     """Return the exception that a refusal stands for."""
+    if isinstance(refused, Forgotten):
+        return forgotten(refused)
     if refused.code == "unknown_world":
         known = refused.text.partition("known: ")[2]
         names = tuple(name for name in known.split(", ") if name not in ("", "none"))
