@@ -21,6 +21,7 @@ from enact_dist.terms import (
     NullReason,
     Read,
     ReadEach,
+    Retention,
     View,
     ViewEach,
     World,
@@ -33,11 +34,14 @@ if TYPE_CHECKING:
     from enact_dist.actor_runner import run_actor
     from enact_dist.cell import Cell
     from enact_dist.connecting import connect, local
+    from enact_dist.history import Version
     from enact_dist.lock import Lock
+    from enact_dist.past_context import PastContext
+    from enact_dist.snapshot import Snapshot
     from enact_dist.together import Together
     from enact_dist.watch import Change, Watch
     from enact_dist.wire.codecs import register_codec
-    from enact_dist.world import Snapshot, WorldContext
+    from enact_dist.world import WorldContext
 
 __all__ = [
     "NULL",
@@ -50,11 +54,14 @@ __all__ = [
     "Entity",
     "Lock",
     "NullReason",
+    "PastContext",
     "Position",
     "Read",
     "ReadEach",
+    "Retention",
     "Snapshot",
     "Together",
+    "Version",
     "View",
     "ViewEach",
     "Watch",
@@ -73,8 +80,10 @@ _HOME_OF = {
     "Cell": "cell",
     "Change": "watch",
     "Lock": "lock",
-    "Snapshot": "world",
+    "PastContext": "past_context",
+    "Snapshot": "snapshot",
     "Together": "together",
+    "Version": "history",
     "Watch": "watch",
     "WorldContext": "world",
     "connect": "connecting",

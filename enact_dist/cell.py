@@ -26,7 +26,9 @@ from enact_dist.core.messages import (
     Reached,
     Sessions,
 )
-from enact_dist.errors import EnactError, MisuseError, UnknownWorldError
+from enact_dist.errors import EnactError, MisuseError
+from enact_dist.forking import drop_world
+from enact_dist.history import keep_versions, kept_versions, let_go
 from enact_dist.lock import refuse_inside_lock
 from enact_dist.session import Session
 from enact_dist.terms import checked_name
@@ -36,6 +38,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
     from types import TracebackType
 
+    from enact_dist.history import Version
     from enact_dist.link.client import CellClient
 
 _open: set[Cell] = set()
@@ -69,7 +72,7 @@ class Cell:
             ShardUnreachableError: A shard does not answer.
         """
         self._client.greet()
-        return self._client.worlds()
+        return tuple(self._client.worlds())
 
     def world(self, name: str) -> WorldContext:
         """Return the handle of a world context.
@@ -79,13 +82,8 @@ class Cell:
             ShardUnreachableError: A shard does not answer.
         """
         self._client.check_usable()
-        if name not in self._client.worlds() and name not in self.worlds():
-            known = self._client.worlds()
-            raise UnknownWorldError(
-                f"cell {self.name!r} has no world context {name!r}; it has"
-                f" {', '.join(known) or 'none'}; make one with cell.create_world({name!r})",
-                known=known,
-            )
+        if name not in self._client.worlds():
+            self._session.check_world(name)
         return WorldContext(name, self._session)
 
     def create_world(self, name: str) -> WorldContext:
@@ -93,12 +91,75 @@ class Cell:
 
         Raises:
             LockHeldError: This thread holds a lock.
+            UnknownWorldError: Some shards have it as a fork that is not complete.
             ValueError: The name is not allowed.
         """
         refuse_inside_lock("create_world")
         checked_name("world context", name, slashes=False)
+        if any(entry.source for entry in self._client.worlds_at(name).values()):
+            self._session.check_world(name)
         self._client.register(worlds=[name])
         return WorldContext(name, self._session)
+
+    def drop_world(self, name: str) -> int:
+        """Forget a world context: its data, their history, what is kept of it, on every shard.
+
+        Whoever watches it is told, whoever uses a handle of it gets `UnknownWorldError`.  Forks of
+        it stay as they are.  A context of the same name may be made anew; no version comes twice.
+
+        Returns:
+            How many slots went.
+
+        Raises:
+            UnknownWorldError: The cell has none of that name.
+            MisuseError: A lock is held or awaited in it, or `cell.toml` names it.
+            LockHeldError: This thread holds a lock.
+            ShardUnreachableError: A shard does not answer; the message says where it is gone.
+        """
+        refuse_inside_lock("drop_world")
+        self._client.check_usable()
+        return drop_world(self._session, name)
+
+    # ---------------------------------------------------------------- kept versions
+
+    def keep(self, label: str, versions: Iterable[Version[Any]]) -> None:
+        """Keep versions from being forgotten, whatever their retention, until `let_go`.
+
+        They stay listed and readable (`Version.datum`), and count in the shard's room.  Asked again
+        with the same label, versions are added.
+
+        Args:
+            label: Letters, digits, ``_ . -``, slashes between.
+            versions: As `WorldContext.history` or `kept` returns them.
+
+        Raises:
+            ForgottenError: Some had gone before; the others are kept.
+            MisuseError: The label cannot be used, or something is no version.
+            ShardUnreachableError: A shard does not answer; asking again does no harm.
+        """
+        self._client.check_usable()
+        keep_versions(self._session, label, versions)
+
+    def kept(self) -> dict[str, tuple[Version[Any], ...]]:
+        """Return the versions that are kept, by label; their aspects are of the type `object`.
+
+        Raises:
+            ShardUnreachableError: A shard does not answer.
+        """
+        self._client.check_usable()
+        return kept_versions(self._session, lambda name: WorldContext(name, self._session))
+
+    def let_go(self, label: str) -> None:
+        """Let go of what a label keeps; what no other label and no retention keeps is forgotten.
+
+        Nothing where the label keeps nothing.
+
+        Raises:
+            MisuseError: No version can have that label.
+            ShardUnreachableError: A shard does not answer; asking again does no harm.
+        """
+        self._client.check_usable()
+        let_go(self._session, label)
 
     def wait(self, position: Position, *, timeout_s: float = 10.0) -> bool:
         """Wait until everything committed up to `position` is visible; say whether it is.

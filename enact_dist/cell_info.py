@@ -1,12 +1,15 @@
-"""What a cell tells people about its locks, shards, actors and operators."""
+"""What a cell tells people about its slots, locks, shards, actors and operators."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from enact_dist.core.datum import Position
+from enact_dist.terms import Entity, NullReason
+
 if TYPE_CHECKING:
-    from enact_dist.core.messages import Holder
+    from enact_dist.core.messages import Holder, SlotState
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,6 +98,38 @@ class AuditInfo:
     stamp_s: float
     kind: str
     text: str
+
+
+@dataclass(frozen=True, slots=True)
+class SlotInfo:
+    """One slot of a world context, without its datum.
+
+    Attributes:
+        size_bytes: Length of the datum's buffers; 0 for null and for plain numbers.
+        null_reason: Why it is null, or the empty string.
+        shard: Where it lies.
+    """
+
+    entity: Entity
+    aspect: str
+    version: int
+    position: Position
+    size_bytes: int
+    null_reason: str
+    shard: str
+
+
+def slot_info(shard: str, state: SlotState) -> SlotInfo:
+    """Return a shard's description of a slot."""
+    return SlotInfo(
+        Entity(state.slot.entity),
+        state.slot.aspect,
+        state.version,
+        Position(state.stamp_ns, shard),
+        state.size,
+        NullReason[state.null_reason].value if state.null_reason else "",
+        shard,
+    )
 
 
 def lock_info(shard: str, holder: Holder) -> LockInfo:

@@ -80,6 +80,12 @@ class Readings:
         reading = self._readings.get(slot)
         return reading.state if reading is not None else None
 
+    def shown(self) -> Iterator[tuple[str, SlotState]]:
+        """Yield every state that is not null, with the shard that showed it."""
+        for reading in self._readings.values():
+            if not is_null(reading.state):
+                yield reading.shard, reading.state
+
     def shard(self, slot: Slot) -> str:
         """Return the shard that showed the slot."""
         return self._readings[slot].shard

@@ -6,52 +6,27 @@ handle, the map itself lies on the shards.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeVar, overload
 
-from enact_dist.core.datum import Position
-from enact_dist.core.messages import Survey, Surveyed
-from enact_dist.errors import LeaseLostError, MisuseError, NullDatumError, ProtocolError
+from enact_dist.cell_info import SlotInfo, slot_info
+from enact_dist.errors import MisuseError
+from enact_dist.forking import fork_world
+from enact_dist.history import Version, versions_of
 from enact_dist.lock import Lock, refuse_inside_lock
-from enact_dist.reading import EachData, Readings, check_requested, null_error, slot_of
-from enact_dist.session import session_of
-from enact_dist.terms import Aspect, Context, Entities, Entity, NullReason, View, Write
-from enact_dist.together import Together, captured_versions, newest_set_ns
+from enact_dist.moments import Moment, When, stamp_of
+from enact_dist.past_context import PastContext
+from enact_dist.snapshot import Snapshot, raw_datum, survey_states, take_snapshot
+from enact_dist.terms import Aspect, Context, Entities, Entity, Write
 from enact_dist.watch import Watch
-from enact_dist.wire.limits import ITEMS_MAX
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterable
 
-    from enact_dist.core.messages import Item, SlotState
     from enact_dist.session import Session
-    from enact_dist.terms import LockRequest, LockRequestEach, LockRequestOne
+    from enact_dist.terms import LockRequest
+    from enact_dist.together import Together
 
 T = TypeVar("T")
-
-VIEW_WAIT_S = 10.0
-"""How long a view waits for its shards before they count as unreachable."""
-VIEWS_MAX = 3
-"""How often a view is taken anew when its data are gone before they were fetched."""
-
-
-@dataclass(frozen=True, slots=True)
-class SlotInfo:
-    """One slot of a world context, without its datum.
-
-    Attributes:
-        size_bytes: Length of the datum's buffers; 0 for null and for plain numbers.
-        null_reason: Why it is null, or the empty string.
-        shard: Where it lies.
-    """
-
-    entity: Entity
-    aspect: str
-    version: int
-    position: Position
-    size_bytes: int
-    null_reason: str
-    shard: str
 
 
 class WorldContext(Context):
@@ -134,16 +109,9 @@ class WorldContext(Context):
         Raises:
             ShardUnreachableError: A shard does not answer.
         """
-        client = self.session.client
-        request = Survey((self.name,), (str(Entities(str(entities))),), tuple(aspects))
-        shards = client.shards()
-        found = []
-        answers = client.call_all([(shard, request) for shard in shards])
-        for shard, answer in zip(shards, answers, strict=True):
-            if not isinstance(answer, Surveyed):
-                raise ProtocolError(f"{type(answer).__name__} came as the answer to Survey")
-            found += [_info(state, shard) for state in answer.states]
-        return tuple(sorted(found, key=lambda info: (info.entity, info.aspect)))
+        found = survey_states(self.session, self.name, str(Entities(str(entities))), tuple(aspects))
+        infos = [slot_info(shard, state) for shard, state in found]
+        return tuple(sorted(infos, key=lambda info: (info.entity, info.aspect)))
 
     def entities(self, pattern: Entities | str = "**") -> tuple[Entity, ...]:
         """Return the entities that have some datum here."""
@@ -157,195 +125,104 @@ class WorldContext(Context):
             NullDatumError: It is null.
             MisuseError: No such aspect is registered.
         """
-        from enact_dist.wire.payload import decode_untyped
+        return raw_datum(self, self.session, entity, aspect)
 
-        if aspect not in self.session.client.aspect_entries():
-            self.session.client.greet()
-        known = self.session.client.aspect_entries()
-        if aspect not in known:
-            raise MisuseError(
-                f"no aspect {aspect!r} is registered; known: {', '.join(sorted(known)) or 'none'}"
-            )
-        request = View(self, entity, Aspect(aspect, object))
-        # Its shard may never have held this aspect; then the datum is null, not the aspect unknown.
-        client = self.session.client
-        client.register(aspects=[known[aspect]], needed=lambda: self.session.shards_of((request,)))
-        snapshot = take_snapshot((request,), register=False)
-        return decode_untyped(snapshot.encoded(request))
+    # ---------------------------------------------------------------- in time
 
-
-def _info(state: SlotState, shard: str) -> SlotInfo:
-    reason = NullReason[state.null_reason].value if state.null_reason else ""
-    return SlotInfo(
-        Entity(state.slot.entity),
-        state.slot.aspect,
-        state.version,
-        Position(state.stamp_ns, shard),
-        state.size,
-        reason,
-        shard,
-    )
-
-
-def take_snapshot(
-    asked: tuple[LockRequest[Any] | Together[Any], ...], *, register: bool = True
-) -> Snapshot:
-    """Take a view of what is asked; large data are fetched before this returns."""
-    together, requests = _spread(asked)
-    if not requests:
-        raise MisuseError("a view of nothing: name at least one View or ViewEach")
-    if len(requests) > ITEMS_MAX:
-        raise MisuseError(f"a view of {len(requests)} requests; at most {ITEMS_MAX}: use ViewEach")
-    session = session_of(requests)
-    session.client.check_usable()
-    for request in requests:
-        if request.access.locks:
-            raise MisuseError(f"{request!r} locks; view(…) takes View and ViewEach, or use Lock(…)")
-    if register:
-        aspects = {request.aspect.name: request.aspect for request in requests}
-        session.register_aspects(aspects.values(), requests=requests)
-    for attempt in range(1, VIEWS_MAX + 1):
-        try:
-            captured_ns = _newest_set_ns(session, together) if together is not None else 0
-            snapshot = Snapshot(
-                _view(session, requests, together, captured_ns), requests, together, captured_ns
-            )
-            if together is None or attempt == VIEWS_MAX or snapshot.has_set():
-                return snapshot  # what has left retention just now is null in it
-        except LeaseLostError:
-            # A shard restarted, or the session rested too long, between the view and its data.
-            if attempt == VIEWS_MAX:
-                raise
-    raise AssertionError("a view ends in its data or an error")
-
-
-def _spread(
-    asked: tuple[LockRequest[Any] | Together[Any], ...],
-) -> tuple[Together[Any] | None, tuple[LockRequest[Any], ...]]:
-    """Return the set that is asked for, and all requests, those of the set in its place."""
-    sets = [request for request in asked if isinstance(request, Together)]
-    if len(sets) > 1:
-        raise MisuseError(f"one view shows one set; take {sets[1]!r} in a view of its own")
-    requests: list[LockRequest[Any]] = []
-    for request in asked:
-        requests += request.requests if isinstance(request, Together) else (request,)
-    return (sets[0] if sets else None), tuple(requests)
-
-
-def _newest_set_ns(session: Session, together: Together[Any]) -> int:
-    """Return the capture stamp of the newest complete set."""
-    versions = captured_versions(session, together.requests)
-    captured_ns = newest_set_ns(versions)
-    if not captured_ns:
-        found = "; ".join(
-            f"{slot_of(request)} has {sorted({one.captured_ns for one in each})[-3:] or 'none'}"
-            for request, each in zip(together.requests, versions, strict=True)
-        )
-        raise NullDatumError(
-            f"no capture stamp is common to all {len(versions)} data (newest stamps, 0 is unsaid:"
-            f" {found}); write with lock.put(…, stamp_ns=…), and let the aspects retain as many"
-            " versions as are under way at once",
-            reason=NullReason.OUTSIDE_RETENTION.value,
-        )
-    return captured_ns
-
-
-def _view(
-    session: Session,
-    requests: tuple[LockRequest[Any], ...],
-    together: Together[Any] | None,
-    captured_ns: int,
-) -> Readings:
-    """Take one view and fetch what is large."""
-    client = session.client
-    in_set = together.requests if together is not None else ()
-    items: list[Item] = [
-        session.item_of(request, captured_ns if request in in_set else 0) for request in requests
-    ]
-    lock = client.acquire(items, wait_s=VIEW_WAIT_S, hold_s=VIEW_WAIT_S)
-    try:
-        readings = Readings(client, session.cache, lock.lock, lock.states, lambda: None)
-        readings.keep_all()
-        client.finish(lock, {})
-    finally:
-        client.release(lock)
-    return readings
-
-
-class Snapshot:
-    """Data as of one view, indexed by the requests it was made with.
-
-    Attributes:
-        captured_ns: The capture stamp of its `Together`, 0 where none was asked for.
-    """
-
-    def __init__(
+    def history(
         self,
-        readings: Readings,
-        requests: tuple[LockRequest[Any], ...],
-        together: Together[Any] | None = None,
-        captured_ns: int = 0,
-    ) -> None:
-        self._readings = readings
-        self._requests = {request: request for request in requests}
-        self._together = together
-        self.captured_ns = captured_ns
+        entity: Entity,
+        aspect: Aspect[T],
+        *,
+        since: When | None = None,
+        count: int | None = None,
+    ) -> tuple[Version[T], ...]:
+        """List the versions of a datum that are still known, the oldest first, without their data.
 
-    def has_set(self) -> bool:
-        """Whether no datum of the `Together` is null."""
-        requests = self._together.requests if self._together is not None else ()
-        states = [self._readings.state(slot_of(request)) for request in requests]
-        return all(state is not None and not state.null_reason for state in states)
+        Whatever this process has committed is among them.
 
-    @overload
-    def __getitem__(self, request: Together[T]) -> tuple[T, ...]: ...
-    @overload
-    def __getitem__(self, request: LockRequestEach[T]) -> Mapping[Entity, T]: ...
-    @overload
-    def __getitem__(self, request: LockRequestOne[T]) -> T: ...
-    def __getitem__(self, request: LockRequest[Any] | Together[Any]) -> Any:
-        """Return the datum; for a pattern, the data by entity; for a set, its data in order.
+        Args:
+            entity: The entity.
+            aspect: The aspect; ``Aspect(name, object)`` where its type is not known.
+            since: Only versions that were current after this moment; None: all.
+            count: Only the newest so many; None: all.
 
         Raises:
-            NullDatumError: The world context does not know it.
-            NotRequestedError: The view did not ask for it.
+            UnknownWorldError: The cell has this world context no more.
+            MisuseError: `since` is no moment of the past, or `count` no number above 0.
+            ShardUnreachableError: The entity's shard does not answer.
         """
-        if isinstance(request, Together):
-            return tuple(self[one] for one in request.requests)
-        check_requested(request, self._requests, "view")
-        if request.access.each:
-            return EachData(self._readings, request)
-        return self._readings.value(slot_of(request), request.aspect)
+        if count is not None and (type(count) is not int or count < 1):
+            raise MisuseError(f"count is {count!r}; it must be a number of versions above 0")
+        since_ns = stamp_of(since, seen_ns=self._seen_ns) if since is not None else 0
+        return versions_of(self, entity, aspect, since_ns=since_ns, count=count or 0)
 
     @overload
-    def get(self, request: LockRequestOne[T]) -> T | None: ...
+    def at(self, when: When, /) -> PastContext: ...
     @overload
-    def get(self, request: LockRequestOne[T], default: T) -> T: ...
-    def get(self, request: LockRequestOne[T], default: T | None = None) -> T | None:
-        """Return the datum, or `default` where the world context does not know it."""
-        try:
-            return self[request]
-        except NullDatumError:
-            return default
+    def at(self, when: None = None, /, *, stamp_ns: int, nearest: bool = False) -> PastContext: ...
+    def at(
+        self, when: When | None = None, /, *, stamp_ns: int | None = None, nearest: bool = False
+    ) -> PastContext:
+        """Return this world context as it was, read-only; asks nobody yet.
 
-    def version(self, request: LockRequestOne[Any]) -> int:
-        """Return the version of the viewed datum (0: never set)."""
-        check_requested(request, self._requests, "view")
-        state = self._readings.state(slot_of(request))
-        return state.version if state is not None else 0
-
-    def encoded(self, request: LockRequest[Any]) -> Any:
-        """Return the encoded datum of one request.
+        Args:
+            when: As of this moment: the `Position` of a commit (this one included), an aware
+                `datetime` or seconds since 1970.
+            stamp_ns: In its place: each datum as it was captured at this stamp (`lock.put(…,
+                stamp_ns=…)`), its newest such version; null where none is known.
+            nearest: Of each datum the version whose capture stamp lies nearest to `stamp_ns`, of
+                two as near the later one.
 
         Raises:
-            NullDatumError: The world context does not know it.
+            MisuseError: The moment lies in the future or is none, or both or none are given.
         """
-        check_requested(request, self._requests, "view")
-        slot = slot_of(request)
-        state = self._readings.state(slot)
-        if state is None or state.null_reason:
-            raise null_error(slot, state)
-        return self._readings.datum(slot)
+        if when is not None and stamp_ns is None and not nearest:
+            moment = Moment(stamp_of(when, seen_ns=self._seen_ns))
+        elif when is None and type(stamp_ns) is int and 0 < stamp_ns < 1 << 63:
+            moment = Moment(0, stamp_ns, nearest)
+        else:
+            raise MisuseError(
+                "at(…) takes a moment, or stamp_ns=… (a capture stamp, nanoseconds above 0; with it"
+                f" nearest=True), not {when!r} with stamp_ns={stamp_ns!r} and nearest={nearest!r}"
+            )
+        return PastContext(self.name, self.session, moment)
 
-    def __repr__(self) -> str:
-        return f"Snapshot({', '.join(map(repr, self._requests))})"
+    @property
+    def _seen_ns(self) -> int:
+        return self.session.client.core.seen_stamp_ns
+
+    def fork(self, name: str, *, at: When | None = None) -> WorldContext:
+        """Make another world context with the data of this one; a write to either stays there.
+
+        Copies pointers, not data, in one step on each shard, and of one cut over all of them.
+
+        Args:
+            name: Of the new context; there must be none of that name.
+            at: As of this moment, as in `at`; None: as it is now, every reported commit included.
+
+        Returns:
+            The fork.  Asked again with the same `at`, the one that is there.
+
+        Raises:
+            ForgottenError: A state of then has left its retention; no fork is made.
+            MisuseError: There is such a context, or the name or the moment cannot be used.
+            UnknownWorldError: The cell has this world context no more.
+            LockHeldError: This thread holds a lock.
+            ShardUnreachableError: A shard does not answer; the message says how to go on.
+            LinkError: A commit stamped before stays undecided; the message says how to go on.
+        """
+        refuse_inside_lock("fork")
+        self.session.client.check_usable()
+        at_ns = stamp_of(at, seen_ns=self._seen_ns) if at is not None else 0
+        fork_world(self.session, self.name, name, at_ns=at_ns)
+        return WorldContext(name, self.session)
+
+    @property
+    def forked_from(self) -> tuple[str, int] | None:
+        """Of which context it is a fork and as of which stamp (ns since 1970); None if of none.
+
+        As this connection has last learned of the cell's contexts; asks nobody.
+        """
+        entry = self.session.client.worlds().get(self.name)
+        return (entry.source, entry.at_ns) if entry is not None and entry.source else None

@@ -8,11 +8,11 @@ import pytest
 import enact_dist
 from enact_dist import errors
 
-NAMES_MAX = 26
+NAMES_MAX = 29
 
 
 def test_public_names_are_sorted_and_few():
-    """`__all__` is sorted (constants, classes, functions), each name exists, and there are about 25."""
+    """`__all__` is sorted (constants, classes, functions), each name exists, and there are less than 30."""
     assert enact_dist.__all__ == sorted(
         enact_dist.__all__, key=lambda n: (not n.isupper(), not n[0].isupper(), n)
     )

@@ -32,9 +32,9 @@ from enact_dist.terms import Entities, Entity
 if TYPE_CHECKING:
     import argparse
 
+    from enact_dist.cell_info import SlotInfo
     from enact_dist.cli.verbs import Verb
     from enact_dist.watch import Change
-    from enact_dist.world import SlotInfo
 
 WATCH_SLICE_S = 0.2
 """How soon a watch notices a signal."""

@@ -1,0 +1,195 @@
+"""Forks and ends of world contexts: one step on each shard, told as one.
+
+Every shard forks as of the same stamp.  A fork that some shards have and others lack is no world
+context yet: nobody is given a handle of it, and asking again with the same source and stamp
+completes it.  One that cannot be completed, because a shard has forgotten that stamp, is taken
+back where it was made.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.core.messages import (
+    AwaitStamp,
+    Dropped,
+    DropWorld,
+    Forgotten,
+    Fork,
+    Forked,
+    ListLocks,
+    Locks,
+    Reached,
+    Refused,
+    WorldEntry,
+)
+from enact_dist.core.multilock import OVERLOAD
+from enact_dist.errors import (
+    EnactError,
+    LinkError,
+    MisuseError,
+    ProtocolError,
+    ShardUnreachableError,
+)
+from enact_dist.link.refusals import error_of, holder_line, moment_name
+from enact_dist.link.session_client import FINISH_S
+from enact_dist.terms import checked_name
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from enact_dist.core.messages import Answer
+    from enact_dist.session import Session
+
+UNDO_S: Final = 2.0
+"""How long taking back a fork may take that cannot be completed; what is left is told."""
+
+_log = logging.getLogger("enact")
+
+
+def fork_world(session: Session, source: str, name: str, *, at_ns: int = 0) -> None:
+    """Make world context `name` a fork of `source` on every shard; see `WorldContext.fork`."""
+    try:
+        checked_name("world context", name, slashes=False)
+    except ValueError as error:
+        raise MisuseError(str(error)) from None
+    client = session.client
+    session.check_world(source)
+    there = client.worlds_at(name)
+    if not at_ns:
+        _refuse_existing(name, there)
+        at_ns = _present_ns(session)
+    wanted = WorldEntry(name, source, at_ns)
+    _refuse_existing(name, {s: entry for s, entry in there.items() if entry != wanted})
+    left, refusal = list(client.shards()), ""
+    deadline_s = time.monotonic() + FINISH_S
+    request = Fork(client.core.session, name, source, at_ns)
+    while left and (left_s := deadline_s - time.monotonic()) > 0.0:
+        answers = client.call_each([(shard, request) for shard in left], timeout_s=left_s)
+        for shard, answer in zip(list(left), answers, strict=True):
+            if isinstance(answer, Forked):
+                left.remove(shard)
+            elif isinstance(answer, Refused) and answer.code == OVERLOAD:
+                refusal = answer.text  # an undecided commit stands in the way: ask again
+            elif answer is not None:
+                _take_back(session, name, [s for s in client.shards() if s not in there])
+                raise _failure(answer)
+        client.rest(0.02 if left else 0.0)
+    _learn_worlds(session)
+    if left:
+        raise _incomplete(session, wanted, left, refusal)
+
+
+def _learn_worlds(session: Session) -> None:
+    """Learn from every shard that answers at once which world contexts there are now."""
+    client = session.client
+    client.call_once([(shard, client.core.hello(shard)) for shard in client.shards()])
+
+
+def _refuse_existing(name: str, there: Mapping[str, WorldEntry]) -> None:
+    """Raise if some shard has a world context of that name that is not the fork which is wanted."""
+    for shard, (_, source, at_ns) in there.items():
+        what = f"a fork of {source!r} as of {moment_name(at_ns)}" if source else "no fork"
+        remedy = f"take another name, or cell.drop_world({name!r})"
+        if source:
+            remedy += (
+                "; if it is not complete, because a shard was away, ask again with"
+                f" at=Position({at_ns}, {shard!r})"
+            )
+        raise MisuseError(f"there is a world context {name!r} on shard {shard}, {what}; {remedy}")
+
+
+def _present_ns(session: Session) -> int:
+    """Return a stamp that no commit reported so far exceeds."""
+    client = session.client
+    answers = client.call_all([(shard, AwaitStamp(0, 0)) for shard in client.shards()])
+    stamps_ns = [answer.stamp_ns for answer in answers if isinstance(answer, Reached)]
+    return max(client.core.seen_stamp_ns, *stamps_ns)
+
+
+def _failure(answer: Answer) -> EnactError:
+    if isinstance(answer, Refused | Forgotten):
+        return error_of(answer)
+    return ProtocolError(f"{type(answer).__name__} came as the answer to Fork")
+
+
+def _take_back(session: Session, name: str, shards: list[str]) -> None:
+    """Drop what has come to be of a fork on shards where there was no such context before."""
+    client = session.client
+    calls = [(shard, DropWorld(client.core.session, name)) for shard in shards]
+    for (shard, _), answer in zip(calls, client.call_each(calls, timeout_s=UNDO_S), strict=True):
+        if not isinstance(answer, Dropped):
+            _log.warning("shard %s may have a part of the fork %s: drop it", shard, name)
+
+
+def _incomplete(session: Session, wanted: WorldEntry, left: list[str], refusal: str) -> EnactError:
+    client = session.client
+    done = [shard for shard in client.shards() if shard not in left]
+    name, source, at_ns = wanted
+    text = (
+        f"the fork {name!r} of {source!r} is made on {', '.join(done) or 'no shard'} and not on"
+        f" {', '.join(left)}, so it is no world context yet: "
+        + (refusal or f"no answer came for {FINISH_S:g} s")
+        + f"; complete it with fork({name!r}, at=Position({at_ns}, {left[0]!r})), or give it up"
+        f" with cell.drop_world({name!r})"
+    )
+    if refusal:
+        return LinkError(text)
+    endpoint = client.carrier.endpoint_of(left[0])
+    return ShardUnreachableError(text, shard=left[0], endpoint=endpoint)
+
+
+def drop_world(session: Session, name: str) -> int:
+    """Drop a world context on every shard and return its slots; see `Cell.drop_world`."""
+    client = session.client
+    if not client.worlds_at(name):
+        client.greet()
+        if not client.worlds_at(name):
+            raise session.unknown_world(name)
+    _refuse_locked(session, name)
+    shards = client.shards()
+    answers = client.call_each([(s, DropWorld(client.core.session, name)) for s in shards])
+    _learn_worlds(session)
+    done = [s for s, answer in zip(shards, answers, strict=True) if isinstance(answer, Dropped)]
+    for shard, answer in zip(shards, answers, strict=True):
+        if not isinstance(answer, Dropped):
+            raise _not_dropped(session, name, done, shard, answer)
+    return sum(answer.slots for answer in answers if isinstance(answer, Dropped))
+
+
+def _refuse_locked(session: Session, name: str) -> None:
+    """Raise while anything of a context is locked, before one shard has dropped it."""
+    client = session.client
+    for answer in client.call_all([(shard, ListLocks()) for shard in client.shards()]):
+        for holder in answer.holders if isinstance(answer, Locks) else ():
+            if any(slot.startswith(f"{name}:") for slot in holder.slots):
+                raise MisuseError(
+                    f"world context {name!r} is not dropped: {holder_line(holder)}; end that lock"
+                    " first (enact lock ls)"
+                )
+
+
+def _not_dropped(
+    session: Session, name: str, done: list[str], shard: str, answer: Answer | None
+) -> EnactError:
+    """Return the error for a shard that has not dropped a context, which others may have."""
+    state = f"world context {name!r} is not dropped"
+    remedy = ""
+    if done:
+        state = f"world context {name!r} is dropped on {', '.join(done)}, but not on {shard}"
+        remedy = (
+            f"; it is no world context any more, and what {shard} has left of it goes when"
+            f" cell.drop_world({name!r}) is called again"
+        )
+    if isinstance(answer, Refused):
+        found = error_of(answer)
+        return type(found)(f"{state}: {found}{remedy}")
+    if answer is not None:
+        return ProtocolError(f"{type(answer).__name__} came as the answer to DropWorld")
+    return ShardUnreachableError(
+        f"{state}: no answer came for {FINISH_S:g} s{remedy}",
+        shard=shard,
+        endpoint=session.client.carrier.endpoint_of(shard),
+    )

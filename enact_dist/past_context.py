@@ -1,0 +1,146 @@
+"""A world context as it was: what `WorldContext.at` returns.
+
+::
+
+    before = online.at(position)                       # or a datetime, or seconds since 1970
+    lowest = View(before, piece, LOWEST)
+    before.view(lowest)[lowest]
+
+Making one asks nobody.  Each view of it is one cut over all shards that lies exactly at its stamp:
+every commit stamped up to it, none after, whatever restarts meanwhile; so is every later view.
+Reading what was waits for nobody's lock: at most a moment, until commits that are stamped before
+and under way are decided.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, ClassVar, NoReturn
+
+from enact_dist.cell_info import SlotInfo, slot_info
+from enact_dist.core.messages import Item
+from enact_dist.errors import MisuseError
+from enact_dist.link.refusals import moment_name
+from enact_dist.snapshot import raw_datum, survey_states, take_readings, take_snapshot
+from enact_dist.terms import Access, Context, Entities, Entity
+
+if TYPE_CHECKING:
+    from enact_dist.moments import Moment
+    from enact_dist.session import Session
+    from enact_dist.snapshot import Snapshot
+    from enact_dist.terms import LockRequest
+
+
+class PastContext(Context):
+    """A world context as of a moment, read-only; made by `WorldContext.at`.
+
+    Requests name it as they do a world context: ``View(past, entity, ASPECT)``.  All views of one
+    call name the same moment; they may name several contexts of it.
+
+    Attributes:
+        moment: What is shown.
+    """
+
+    __slots__ = ("moment", "session")
+    past: ClassVar[bool] = True
+
+    def __init__(self, name: str, session: Session, moment: Moment) -> None:
+        super().__init__(name)
+        self.session = session
+        self.moment = moment
+
+    @property
+    def at_ns(self) -> int:
+        """The stamp as of which it is shown; 0 where data are shown by their capture stamp."""
+        return self.moment.at_ns
+
+    @property
+    def stamp_ns(self) -> int:
+        """The capture stamp of the data that are shown, 0 where it does not matter."""
+        return self.moment.captured_ns
+
+    def view(self, *requests: LockRequest[Any]) -> Snapshot:
+        """Read data as they were; inside a lock, too, as no lock can stand in the way.
+
+        Args:
+            requests: `View`s and `ViewEach`es of this moment.
+
+        Raises:
+            ForgottenError: A state of then has left its retention; never shown as another one.
+            MisuseError: A request locks, or names another moment; the moment lies in the future.
+            LockTimeoutError: A commit stamped before stays undecided.
+            ShardUnreachableError: A shard does not answer.
+        """
+        for request in requests:
+            if getattr(getattr(request, "world", None), "moment", None) != self.moment:
+                raise MisuseError(
+                    f"{request!r} does not name {self!r}; write View(past, …) with the context"
+                    " whose view is taken"
+                )
+        return take_snapshot(requests)
+
+    def survey(
+        self, entities: Entities | str = "**", aspects: tuple[str, ...] = ()
+    ) -> tuple[SlotInfo, ...]:
+        """List the data that matched then, without them; what was null is left out.
+
+        Raises:
+            ForgottenError: A state of then has left its retention.
+            UnknownWorldError: The cell has no such world context any more.
+            ShardUnreachableError: A shard does not answer.
+        """
+        client, pattern = self.session.client, str(Entities(str(entities)))
+        client.check_usable()
+        client.greet()
+        known = client.aspect_entries()
+        asked = [name for name in (aspects or known) if name in known]
+        client.register(aspects=[known[name] for name in asked])
+        items = [Item(int(Access.VIEW_EACH), self.name, pattern, name) for name in asked]
+        if self.stamp_ns:
+            items = [
+                Item(int(Access.VIEW), *state.slot, 0, self.stamp_ns, self.moment.nearest)
+                for _, state in survey_states(self.session, self.name, pattern, tuple(asked))
+            ]
+        readings = take_readings(self.session, items, past_ns=self.at_ns, data=False)
+        infos = [slot_info(shard, state) for shard, state in readings.shown()]
+        return tuple(sorted(infos, key=lambda info: (info.entity, info.aspect)))
+
+    def entities(self, pattern: Entities | str = "**") -> tuple[Entity, ...]:
+        """Return the entities that had some datum then; raises as `survey`."""
+        return tuple(sorted({info.entity for info in self.survey(pattern)}))
+
+    def raw(self, entity: Entity, aspect: str) -> object:
+        """Return a datum of then without knowing its Python type: dataclasses come as dicts.
+
+        Raises:
+            NullDatumError: It was null.
+            ForgottenError: It has left its retention.
+            MisuseError: No such aspect is registered.
+        """
+        return raw_datum(self, self.session, entity, aspect)
+
+    # ---------------------------------------------------------------- what only the present has
+
+    def init(self, *_: object) -> NoReturn:
+        """Refuse: what was cannot be set.
+
+        Raises:
+            MisuseError: Always.
+        """
+        self._refuse("init", f"set it in cell.world({self.name!r}), or in a fork of it: world.fork")
+
+    def watch(self, *_: object) -> NoReturn:
+        """Refuse: what was does not change.
+
+        Raises:
+            MisuseError: Always.
+        """
+        self._refuse("watch", f"watch cell.world({self.name!r}), or read world.history(…)")
+
+    def _refuse(self, what: str, remedy: str) -> NoReturn:
+        raise MisuseError(f"{what} on {self!r}, which is past and only to be viewed; {remedy}")
+
+    def __repr__(self) -> str:
+        if self.at_ns:
+            return f"PastContext({self.name!r} at {moment_name(self.at_ns)})"
+        nearest = ", nearest" if self.moment.nearest else ""
+        return f"PastContext({self.name!r}, captured at {self.stamp_ns}{nearest})"

@@ -1,0 +1,288 @@
+"""A view without a lock: taken over all shards as one cut, then read like a lock's data."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final, TypeVar, overload
+
+from enact_dist.core.messages import Survey, Surveyed
+from enact_dist.errors import LeaseLostError, MisuseError, NullDatumError, ProtocolError
+from enact_dist.moments import Moment
+from enact_dist.reading import EachData, Readings, check_requested, null_error, slot_of
+from enact_dist.session import session_of
+from enact_dist.terms import Aspect, Entity, NullReason, View
+from enact_dist.together import Together, captured_versions, newest_set_ns
+from enact_dist.wire.limits import ITEMS_MAX
+from enact_dist.wire.payload import decode_untyped
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+    from enact_dist.core.messages import AspectEntry, Item, SlotState
+    from enact_dist.session import Session
+    from enact_dist.terms import Context, LockRequest, LockRequestEach, LockRequestOne
+
+T = TypeVar("T")
+
+NOW: Final = Moment(0)
+
+VIEW_WAIT_S = 10.0
+"""How long a view waits for its shards before they count as unreachable."""
+VIEWS_MAX = 3
+"""How often a view is taken anew when its data are gone before they were fetched."""
+
+
+def take_snapshot(
+    asked: tuple[LockRequest[Any] | Together[Any], ...], *, register: bool = True
+) -> Snapshot:
+    """Take a view of what is asked; large data are fetched before this returns."""
+    together, requests = _spread(asked)
+    if not requests:
+        raise MisuseError("a view of nothing: name at least one View or ViewEach")
+    if len(requests) > ITEMS_MAX:
+        raise MisuseError(f"a view of {len(requests)} requests; at most {ITEMS_MAX}: use ViewEach")
+    session = session_of(requests, view=True)
+    session.client.check_usable()
+    for request in requests:
+        if request.access.locks:
+            raise MisuseError(f"{request!r} locks; view(…) takes View and ViewEach, or use Lock(…)")
+    moment = _moment_of(requests, together)
+    if register:
+        aspects = {request.aspect.name: request.aspect for request in requests}
+        session.register_aspects(aspects.values(), requests=requests)
+    for attempt in range(1, VIEWS_MAX + 1):
+        try:
+            captured_ns = _newest_set_ns(session, together) if together is not None else 0
+            in_set = together.requests if together is not None else ()
+            items = [
+                item
+                for request in requests
+                for item in _items_of(
+                    session, request, moment, captured_ns if request in in_set else 0
+                )
+            ]
+            readings = take_readings(session, items, past_ns=moment.at_ns)
+            snapshot = Snapshot(readings, requests, together, captured_ns)
+            if together is None or attempt == VIEWS_MAX or snapshot.has_set():
+                return snapshot  # what has left retention just now is null in it
+        except LeaseLostError:
+            # A shard restarted, or the session rested too long, between the view and its data.
+            if attempt == VIEWS_MAX:
+                raise
+    raise AssertionError("a view ends in its data or an error")
+
+
+def _moment_of(requests: tuple[LockRequest[Any], ...], together: Together[Any] | None) -> Moment:
+    """Return the one moment that all requests name.
+
+    Raises:
+        MisuseError: They name several, or a set of the past.
+    """
+    moments: dict[Moment, LockRequest[Any]] = {}
+    for request in requests:
+        moments.setdefault(getattr(request.world, "moment", NOW), request)
+    if len(moments) > 1:
+        raise MisuseError(
+            "one view shows one moment; take views of their own for"
+            f" {' and '.join(repr(request.world) for request in moments.values())}"
+        )
+    (moment,) = moments
+    if together is not None and moment != NOW:
+        raise MisuseError(
+            f"{together!r} asks for the newest set, which is not past; see an older one with"
+            " world.at(stamp_ns=…)"
+        )
+    return moment
+
+
+def _items_of(
+    session: Session, request: LockRequest[Any], moment: Moment, captured_ns: int
+) -> Iterable[Item]:
+    """Yield the protocol's lines for one request."""
+    captured_ns = captured_ns or moment.captured_ns
+    if not captured_ns or not request.access.each:
+        yield session.item_of(request, captured_ns, nearest=moment.nearest)
+        return
+    # What was captured when is asked slot by slot.
+    context, pattern, aspect = request.address
+    for _, state in survey_states(session, context, pattern, (aspect,)):
+        view = View(request.world, Entity(state.slot.entity), request.aspect)
+        yield session.item_of(view, captured_ns, nearest=moment.nearest)
+
+
+def survey_states(
+    session: Session, context: str, pattern: str, aspects: tuple[str, ...] = ()
+) -> list[tuple[str, SlotState]]:
+    """Return the newest states of matching slots with their shards, without their data.
+
+    Raises:
+        UnknownWorldError: The cell has no such world context.
+        ShardUnreachableError: A shard does not answer.
+    """
+    client = session.client
+    request = Survey((context,), (pattern,), aspects)
+    shards = client.shards()
+    found = []
+    answers = client.call_all([(shard, request) for shard in shards])
+    for shard, answer in zip(shards, answers, strict=True):
+        if not isinstance(answer, Surveyed):
+            raise ProtocolError(f"{type(answer).__name__} came as the answer to Survey")
+        found += [(shard, state) for state in answer.states]
+    if not found:
+        session.check_world(context)
+    return found
+
+
+def _spread(
+    asked: tuple[LockRequest[Any] | Together[Any], ...],
+) -> tuple[Together[Any] | None, tuple[LockRequest[Any], ...]]:
+    """Return the set that is asked for, and all requests, those of the set in its place."""
+    sets = [request for request in asked if isinstance(request, Together)]
+    if len(sets) > 1:
+        raise MisuseError(f"one view shows one set; take {sets[1]!r} in a view of its own")
+    requests: list[LockRequest[Any]] = []
+    for request in asked:
+        requests += request.requests if isinstance(request, Together) else (request,)
+    return (sets[0] if sets else None), tuple(requests)
+
+
+def _newest_set_ns(session: Session, together: Together[Any]) -> int:
+    """Return the capture stamp of the newest complete set."""
+    versions = captured_versions(session, together.requests)
+    captured_ns = newest_set_ns(versions)
+    if not captured_ns:
+        found = "; ".join(
+            f"{slot_of(request)} has {sorted({one.captured_ns for one in each})[-3:] or 'none'}"
+            for request, each in zip(together.requests, versions, strict=True)
+        )
+        raise NullDatumError(
+            f"no capture stamp is common to all {len(versions)} data (newest stamps, 0 is unsaid:"
+            f" {found}); write with lock.put(…, stamp_ns=…), and let the aspects retain as many"
+            " versions as are under way at once",
+            reason=NullReason.OUTSIDE_RETENTION.value,
+        )
+    return captured_ns
+
+
+def take_readings(
+    session: Session, items: list[Item], *, past_ns: int = 0, data: bool = True
+) -> Readings:
+    """Take one view, as of a stamp if one is given, and fetch what is large of its `data`."""
+    client = session.client
+    lock = client.acquire(items, wait_s=VIEW_WAIT_S, hold_s=VIEW_WAIT_S, past_ns=past_ns)
+    try:
+        readings = Readings(client, session.cache, lock.lock, lock.states, lambda: None)
+        if data:
+            readings.keep_all()
+        client.finish(lock, {})
+    finally:
+        client.release(lock)
+    return readings
+
+
+class Snapshot:
+    """Data as of one view, indexed by the requests it was made with.
+
+    Attributes:
+        captured_ns: The capture stamp of its `Together`, 0 where none was asked for.
+    """
+
+    def __init__(
+        self,
+        readings: Readings,
+        requests: tuple[LockRequest[Any], ...],
+        together: Together[Any] | None = None,
+        captured_ns: int = 0,
+    ) -> None:
+        self._readings = readings
+        self._requests = {request: request for request in requests}
+        self._together = together
+        self.captured_ns = captured_ns
+
+    def has_set(self) -> bool:
+        """Whether no datum of the `Together` is null."""
+        requests = self._together.requests if self._together is not None else ()
+        states = [self._readings.state(slot_of(request)) for request in requests]
+        return all(state is not None and not state.null_reason for state in states)
+
+    @overload
+    def __getitem__(self, request: Together[T]) -> tuple[T, ...]: ...
+    @overload
+    def __getitem__(self, request: LockRequestEach[T]) -> Mapping[Entity, T]: ...
+    @overload
+    def __getitem__(self, request: LockRequestOne[T]) -> T: ...
+    def __getitem__(self, request: LockRequest[Any] | Together[Any]) -> Any:
+        """Return the datum; for a pattern, the data by entity; for a set, its data in order.
+
+        Raises:
+            NullDatumError: The world context does not know it.
+            NotRequestedError: The view did not ask for it.
+        """
+        if isinstance(request, Together):
+            return tuple(self[one] for one in request.requests)
+        check_requested(request, self._requests, "view")
+        if request.access.each:
+            return EachData(self._readings, request)
+        return self._readings.value(slot_of(request), request.aspect)
+
+    @overload
+    def get(self, request: LockRequestOne[T]) -> T | None: ...
+    @overload
+    def get(self, request: LockRequestOne[T], default: T) -> T: ...
+    def get(self, request: LockRequestOne[T], default: T | None = None) -> T | None:
+        """Return the datum, or `default` where the world context does not know it."""
+        try:
+            return self[request]
+        except NullDatumError:
+            return default
+
+    def state(self, request: LockRequestOne[Any]) -> SlotState | None:
+        """Return what was shown of a slot; as `version`, for the framework."""
+        check_requested(request, self._requests, "view")
+        return self._readings.state(slot_of(request))
+
+    def version(self, request: LockRequestOne[Any]) -> int:
+        """Return the version of the viewed datum (0: never set)."""
+        state = self.state(request)
+        return state.version if state is not None else 0
+
+    def encoded(self, request: LockRequest[Any]) -> Any:
+        """Return the encoded datum of one request.
+
+        Raises:
+            NullDatumError: The world context does not know it.
+        """
+        check_requested(request, self._requests, "view")
+        slot = slot_of(request)
+        state = self._readings.state(slot)
+        if state is None or state.null_reason:
+            raise null_error(slot, state)
+        return self._readings.datum(slot)
+
+    def __repr__(self) -> str:
+        return f"Snapshot({', '.join(map(repr, self._requests))})"
+
+
+def raw_datum(context: Context, session: Session, entity: Entity, aspect: str) -> object:
+    """Return a datum without knowing its Python type; as `WorldContext.raw`."""
+    known = known_aspect(session, aspect)
+    request = View(context, entity, Aspect(aspect, object))
+    # Its shard may never have held this aspect; then the datum is null, not the aspect unknown.
+    session.client.register(aspects=[known], needed=lambda: session.shards_of((request,)))
+    return decode_untyped(take_snapshot((request,), register=False).encoded(request))
+
+
+def known_aspect(session: Session, name: str) -> AspectEntry:
+    """Return the entry of a registered aspect.
+
+    Raises:
+        MisuseError: No such aspect is registered.
+    """
+    client = session.client
+    if name not in client.aspect_entries():
+        client.greet()
+    known = client.aspect_entries()
+    if name not in known:
+        raise MisuseError(
+            f"no aspect {name!r} is registered; known: {', '.join(sorted(known)) or 'none'}"
+        )
+    return known[name]
