@@ -17,12 +17,20 @@ from typing import TYPE_CHECKING
 
 from enact_dist.core.datum import Token
 from enact_dist.core.messages import Commit, Prepare, Validate
+from enact_dist.core.placement import shard_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
     from enact_dist.core.datum import LockId
-    from enact_dist.core.messages import Prepared, Request, SlotVersion, WriteItem
+    from enact_dist.core.messages import (
+        DatumRead,
+        PlacementMap,
+        Prepared,
+        Request,
+        SlotVersion,
+        WriteItem,
+    )
 
 
 @dataclass(slots=True)
@@ -33,6 +41,8 @@ class Finishing:
         tokens: The grants; number 0 where something is expected but nothing held.
         primary: The shard whose commit decides; empty where nothing is written.
         left: Shards that have not validated or prepared yet.
+        reads: The lineage of the writes, which every shard that is written to keeps beside them.
+        reads_left_out: How many data more than these were read.
         prepared: What the other writing shards have answered.
         pending: Whether the last word about the commit was that its shard still works on it.
     """
@@ -41,6 +51,8 @@ class Finishing:
     tokens: Mapping[str, Token]
     writes: Mapping[str, tuple[WriteItem, ...]]
     expects: Mapping[str, tuple[SlotVersion, ...]]
+    reads: tuple[DatumRead, ...] = ()
+    reads_left_out: int = 0
     primary: str = ""
     left: dict[str, None] = field(default_factory=dict)
     prepared: dict[str, Prepared] = field(default_factory=dict)
@@ -66,6 +78,8 @@ class Finishing:
                     expects,
                     self.primary,
                     self.tokens[self.primary],
+                    self.reads,
+                    self.reads_left_out,
                 )
             else:
                 request = Validate(self.lock, token, expects)
@@ -82,6 +96,8 @@ class Finishing:
             max(seen_stamp_ns, *stamps) if stamps else seen_stamp_ns,
             self.expects.get(self.primary, ()),
             tuple(sorted(self.prepared)),
+            self.reads,
+            self.reads_left_out,
         )
 
     def unname(self, refused: Request) -> bool:
@@ -106,6 +122,16 @@ class Finishing:
     def token(self) -> Token:
         """The grant that the commit is compared with."""
         return self.tokens[self.primary]
+
+
+def by_shard(
+    versions: Iterable[SlotVersion], placement: PlacementMap
+) -> dict[str, tuple[SlotVersion, ...]]:
+    """Split versions by the shard that has their slots."""
+    found: dict[str, list[SlotVersion]] = {}
+    for version in versions:
+        found.setdefault(shard_of(version.slot.entity, placement), []).append(version)
+    return {shard: tuple(some) for shard, some in found.items()}
 
 
 def _is_named(write: WriteItem) -> bool:

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.admission import NO_PAYLOAD
 from enact_dist.core.cuts import ROUNDS_MAX, Cut
-from enact_dist.core.finishing import Finishing, tokens_of
+from enact_dist.core.finishing import Finishing, by_shard, tokens_of
 from enact_dist.core.lock_parts import OF_SESSIONS, Part, Plan, Reading, first_asking
 from enact_dist.core.messages import (
     OUTCOME_COMMITTED,
@@ -62,7 +62,7 @@ if TYPE_CHECKING:
 
     from enact_dist.core.client import Client
     from enact_dist.core.datum import LockId, Position, Slot
-    from enact_dist.core.messages import Holder, Request, SlotVersion, WriteItem
+    from enact_dist.core.messages import DatumRead, Holder, Request, SlotVersion, WriteItem
 
 WAIT_SLICE_NS: Final = 900_000_000
 """How long one call of a waiting lock is parked; below the shard's own limit of 1 s."""
@@ -389,19 +389,20 @@ class MultiLock:
         *,
         give_up_ns: int,
         expects: Sequence[SlotVersion] = (),
+        reads: Sequence[DatumRead] = (),
+        reads_left_out: int = 0,
     ) -> None:
         """Publish `writes` (by shard) if every lock is still held.
 
-        `expects` are versions that were viewed and must still be the newest.
+        `expects` are versions that were viewed and must still be the newest; `reads` are kept as
+        the lineage of what is written: at most `READS_MAX`, of further ones their number.
         Ends in COMMITTED, LOST, CHANGED, REFUSED, UNREACHABLE (nothing written) or UNKNOWN.
         """
         if self.phase is not Phase.HELD:
             return
         self.give_up_ns = give_up_ns
         self._free_calls = self._retry_at_ns = 0
-        expected: dict[str, list[SlotVersion]] = {}
-        for expect in expects:
-            expected.setdefault(self.shard_of(expect.slot), []).append(expect)
+        expected = by_shard(expects, self.plan.placement)
         self._finishing = Finishing(
             self.lock,
             tokens_of(
@@ -409,7 +410,9 @@ class MultiLock:
                 ((shard, self._epoch_viewed(shard)) for shard in expected),
             ),
             {shard: tuple(items) for shard, items in writes.items() if items},
-            {shard: tuple(versions) for shard, versions in expected.items()},
+            expected,
+            tuple(reads),
+            reads_left_out,
         )
         self.phase = Phase.VALIDATING
         self._after_votes()
@@ -428,15 +431,10 @@ class MultiLock:
         if finishing.primary:
             self.phase = Phase.COMMITTING
         else:
-            if not self.parts:
-                self._farewells += [(shard, Release(self.lock)) for shard in self._pinned_shards()]
+            if not self.parts and any(r.state.large or r.state.same for r in self.states):
+                # The shards keep large data of a lock of views alone.
+                self._farewells += [(shard, Release(self.lock)) for shard, _ in self.plan.views]
             self._end(Phase.COMMITTED)
-
-    def _pinned_shards(self) -> list[str]:
-        """Return the shards that keep large data of a lock of views alone."""
-        if not any(reading.state.large or reading.state.same for reading in self.states):
-            return []
-        return [shard for shard, _ in self.plan.views]
 
     def _on_vote(self, shard: str, answer: Answer) -> None:
         assert self._finishing is not None
