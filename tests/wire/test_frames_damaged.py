@@ -171,7 +171,7 @@ def test_frame_with_a_body_elsewhere_is_refused(offset, size):
     write = [list(SLOT), [b"\x01\x00", offset, size, 0, ""]]
 
     with pytest.raises(ProtocolError):
-        decode_frame(header_of(7, list(LOCK), [1, 1], [write], 0, [], []), b"x" * 100)
+        decode_frame(header_of(7, list(LOCK), [1, 1], [write], 0, [], [], [], 0), b"x" * 100)
 
 
 def test_frame_bodies_cannot_overlap():
@@ -179,7 +179,7 @@ def test_frame_bodies_cannot_overlap():
     write = [list(SLOT), [b"\x01\x00", 0, 100, 0, ""]]
 
     with pytest.raises(ProtocolError, match="expected at 128"):
-        decode_frame(header_of(7, list(LOCK), [1, 1], [write, write], 0, [], []), b"x" * 100)
+        decode_frame(header_of(7, list(LOCK), [1, 1], [write, write], 0, [], [], [], 0), b"x" * 100)
 
 
 @pytest.mark.parametrize("mark", [b"\xdd", b"\xdf", b"\xdb", b"\xc6", b"\xc9"])
@@ -259,4 +259,4 @@ def test_frame_with_a_payload_that_cannot_be_is_refused(file, offset, size):
     write = [list(SLOT), [b"\x01\x00", offset, size, 0, file]]
 
     with pytest.raises(ProtocolError, match="payload"):
-        decode_frame(header_of(7, list(LOCK), [1, 1], [write], 0, [], []))
+        decode_frame(header_of(7, list(LOCK), [1, 1], [write], 0, [], [], [], 0))
