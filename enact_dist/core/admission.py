@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
+from enact_dist.core.message_parts import READS_MAX
 from enact_dist.core.messages import Commit, Refused
 from enact_dist.core.retaining import NO_LIMIT
 from enact_dist.terms import Access, Durability, checked_name
@@ -47,6 +48,12 @@ def wrong_name(kind: str, name: str, *, slashes: bool) -> Refused | None:
     return None
 
 
+def unknown_world(name: str, worlds: Iterable[str]) -> Refused:
+    """Refuse a world context that is not here, naming those that are."""
+    known = ", ".join(sorted(worlds)) or "none"
+    return Refused("unknown_world", f"no world context {name!r} here; known: {known}")
+
+
 def wrong_aspect(entry: AspectEntry) -> Refused | None:
     """Refuse an aspect whose name, durability or retention nobody could use."""
     if entry.durability not in _DURABILITIES:
@@ -73,6 +80,16 @@ def wrong_writes(writes: Collection[WriteItem]) -> Refused | None:
             return _refused(f"{write.slot} is written twice in one commit")
         seen.add(write.slot)
     return None
+
+
+def wrong_reads(message: Commit | Prepare) -> Refused | None:
+    """Refuse to keep a longer lineage than any honest client tells."""
+    if len(message.reads) <= READS_MAX and message.reads_left_out >= 0:
+        return None
+    return _refused(
+        f"{message.lock} named {len(message.reads)} data as read and left out"
+        f" {message.reads_left_out}; at most {READS_MAX} are named"
+    )
 
 
 def missing_payload(writes: Iterable[WriteItem]) -> Refused | None:

@@ -320,11 +320,12 @@ class Refused:
 
 @dataclass(frozen=True, slots=True)
 class Versions:
-    """Versions of slots: slot by slot, oldest first."""
+    """Versions of slots: slot by slot, oldest first; `left_out` is how many more there are."""
 
     epoch: int
     stamp_ns: int
     entries: tuple[VersionEntry, ...]
+    left_out: int = 0
 
 
 @dataclass(frozen=True, slots=True)

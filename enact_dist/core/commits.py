@@ -33,8 +33,10 @@ from enact_dist.core.admission import (
     missing_payload,
     wrong_name,
     wrong_parties,
+    wrong_reads,
     wrong_writes,
 )
+from enact_dist.core.causes import cause_of
 from enact_dist.core.datum import Position, Slot
 from enact_dist.core.messages import (
     OUTCOME_COMMITTED,
@@ -75,7 +77,7 @@ if TYPE_CHECKING:
 
     from enact_dist.core.datum import LockId, Token
     from enact_dist.core.decisions import Decisions
-    from enact_dist.core.messages import Prepare
+    from enact_dist.core.messages import Cause, Prepare
     from enact_dist.core.sessions import SessionTable
     from enact_dist.core.stamps import Stamps
     from enact_dist.core.tenures import Tenure, Tenures
@@ -93,6 +95,7 @@ class _InFlight:
     tenure: Tenure
     writes: tuple[WriteItem, ...]
     outcome: OutcomeRecord
+    cause: Cause
     reply_to: list[int] = field(default_factory=list)
     decision: DecisionRecord | None = None
 
@@ -202,10 +205,12 @@ class Commits:
             yield from self.changed(tenure, moved, reply_to=reply_to, now_ns=now_ns)
             return
         stamp_ns = self._stamps.next(seen_ns=message.seen_stamp_ns, wall_ns=wall_ns)
-        slots = self._slots
-        versions = tuple([SlotVersion(slot, slots[slot].version + 1) for slot, _ in message.writes])
+        next_version = self._slots.next_version
+        versions = tuple([SlotVersion(slot, next_version(slot)) for slot, _ in message.writes])
         outcome = OutcomeRecord(message.lock, Position(stamp_ns, self._shard), versions)
-        commit = _InFlight(tenure, message.writes, outcome, [reply_to])
+        session = self._sessions.by_id[message.lock.session]
+        cause = cause_of(message, tenure, session, versions, stamp_ns=stamp_ns, now_ns=now_ns)
+        commit = _InFlight(tenure, message.writes, outcome, cause, [reply_to])
         if message.participants:
             commit.decision = DecisionRecord(message.lock, outcome.position, message.participants)
         yield from self._make_durable(commit, now_ns=now_ns)
@@ -249,8 +254,8 @@ class Commits:
     def _make_durable(self, commit: _InFlight, *, now_ns: int) -> Iterator[Effect]:
         """Hand the commit to the store, or apply it at once where nothing is to survive."""
         durability = self._strictest(commit)
-        stamp_ns = commit.outcome.position.stamp_ns
-        records = self.records(commit.writes, commit.outcome.versions, stamp_ns)
+        versions, stamp_ns = commit.outcome.versions, commit.outcome.position.stamp_ns
+        records = self.records(commit.writes, versions, stamp_ns, commit.cause)
         if durability is Durability.VOLATILE:
             if records:
                 yield Persist(0, records, Durability.OS)
@@ -288,7 +293,8 @@ class Commits:
 
     def _apply(self, commit: _InFlight, *, now_ns: int) -> Iterator[Effect]:
         lock, outcome = commit.tenure.lock, commit.outcome
-        changes = self.apply_writes(commit.writes, outcome.versions, outcome.position.stamp_ns)
+        stamp_ns = outcome.position.stamp_ns
+        changes = self.apply_writes(commit.writes, outcome.versions, stamp_ns, commit.cause)
         lanes = self._sessions.lanes_of(lock.session)
         if lanes is not None:
             lane = lanes.get(lock.lane)
@@ -306,12 +312,16 @@ class Commits:
             yield from self._decisions.decided(commit.decision, now_ns=now_ns)
 
     def apply_writes(
-        self, writes: tuple[WriteItem, ...], versions: tuple[SlotVersion, ...], stamp_ns: int
+        self,
+        writes: tuple[WriteItem, ...],
+        versions: tuple[SlotVersion, ...],
+        stamp_ns: int,
+        cause: Cause | None,
     ) -> list[Change]:
         """Make writes visible; return what a notice tells of them."""
         changes, size = [], 0
         for (_, datum), (slot, version) in zip(writes, versions, strict=True):
-            content = Content(version, stamp_ns, datum, _DELETED)
+            content = Content(version, stamp_ns, datum, _DELETED, cause)
             self._slots.replace(slot, content, retention=self._catalogue.retention(slot.aspect))
             captured_ns = 0
             if datum is not None:
@@ -327,7 +337,11 @@ class Commits:
             yield Publish(Notice(self._shard, self._epoch, self.notice_number, tuple(changes)))
 
     def records(
-        self, writes: tuple[WriteItem, ...], versions: tuple[SlotVersion, ...], stamp_ns: int
+        self,
+        writes: tuple[WriteItem, ...],
+        versions: tuple[SlotVersion, ...],
+        stamp_ns: int,
+        cause: Cause | None,
     ) -> tuple[Record, ...]:
         """Return what the store must keep: durable states, and that volatile slots exist."""
         records: list[Record] = []
@@ -336,8 +350,11 @@ class Commits:
             if volatile and self._slots.exists(slot):
                 continue
             reason = "" if write.datum else NullReason.DELETED.name
-            datum = None if volatile else write.datum
-            records.append(SlotRecord(slot, version, stamp_ns, datum, reason, volatile))
+            if volatile:
+                records.append(SlotRecord(slot, version, stamp_ns, None, reason, volatile=True))
+            else:
+                record = SlotRecord(slot, version, stamp_ns, write.datum, reason, cause=cause)
+                records.append(record)
         return tuple(records)
 
     # ---------------------------------------------------------------- fence
@@ -351,7 +368,11 @@ class Commits:
         if fenced is not None:
             return fenced
         assert tenure is not None
-        wrong = wrong_writes(message.writes) or wrong_parties(message, peers=self._peers)
+        wrong = (
+            wrong_writes(message.writes)
+            or wrong_parties(message, peers=self._peers)
+            or wrong_reads(message)
+        )
         if wrong is not None:
             return wrong
         if tenure.bound:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.core.admission import wrong_access
+from enact_dist.core.admission import unknown_world, wrong_access
 from enact_dist.core.datum import Datum, LockId
 from enact_dist.core.messages import (
     Acquire,
@@ -115,10 +115,7 @@ class LockDesk:
         worlds, aspects = self._state.catalogue.worlds, self._state.catalogue.aspects
         for item in items:
             if item.context not in worlds:
-                known = ", ".join(sorted(worlds)) or "none"
-                return Refused(
-                    "unknown_world", f"no world context {item.context!r} here; known: {known}"
-                )
+                return unknown_world(item.context, worlds)
             if item.aspect not in aspects:
                 return Refused("unknown_aspect", f"aspect {item.aspect!r} is not registered here")
         return None

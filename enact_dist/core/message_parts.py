@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from enact_dist.core.datum import Datum, LockId, Slot, Token
 
@@ -89,6 +89,10 @@ class DatumRead(NamedTuple):
     stamp_ns: int
 
 
+READS_MAX: Final = 1024
+"""Data that one commit names as read; of further ones it says only how many there were."""
+
+
 class Cause(NamedTuple):
     """Where a version comes from: who committed it, when, and what went in.
 
@@ -99,7 +103,7 @@ class Cause(NamedTuple):
         host: Where it ran.
         pid: Its process.
         stamp_ns: Stamp of the commit.
-        held_ns: How long the lock had been held then.
+        held_ns: How long the lock had been held when its commit, or its promise, reached the shard.
         reads: Every datum that the lock read or viewed, and each replaced one that it looked at.
         reads_left_out: How many further ones there were than a message holds.
         writes: What the commit set on this shard.

@@ -71,6 +71,13 @@ class Past:
             del self._by_slot[slot]
         return slot, old
 
+    def drop(self, context: str) -> None:
+        """Forget all states of a context."""
+        self._order = deque(entry for entry in self._order if entry[1].context != context)
+        for slot in [slot for slot in self._by_slot if slot.context == context]:
+            for old in self._by_slot.pop(slot):
+                self.bytes -= old.datum.size if old.datum is not None else 0
+
     def of(self, slot: Slot) -> Iterable[Content]:
         """Return the replaced states of a slot that are known, oldest first."""
         return self._by_slot.get(slot, ())

@@ -24,6 +24,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.admission import wrong_finish
+from enact_dist.core.causes import cause_of, decided_cause
 from enact_dist.core.datum import LockId, Position
 from enact_dist.core.forced import FORCED, ForcedAborts
 from enact_dist.core.messages import (
@@ -102,7 +103,7 @@ class PrepareDesk:
         for record in recovered:
             # Versions of volatile slots have started again.
             versions = tuple(
-                SlotVersion(write.slot, state.slots[write.slot].version + 1)
+                SlotVersion(write.slot, state.slots.next_version(write.slot))
                 for write in record.writes
             )
             record = replace(record, versions=versions)  # noqa: PLW2901 - the same, as of now
@@ -134,18 +135,21 @@ class PrepareDesk:
             yield from state.commits.changed(tenure, moved, reply_to=reply_to, now_ns=state.now_ns)
             return
         stamp_ns = state.stamps.next(seen_ns=message.seen_stamp_ns, wall_ns=state.wall_ns)
+        versions = tuple(
+            SlotVersion(write.slot, state.slots.next_version(write.slot))
+            for write in message.writes
+        )
+        session = state.sessions.by_id[message.lock.session]
         record = PreparedRecord(
             message.lock,
             message.token,
             tenure.items,
             message.writes,
-            tuple(
-                SlotVersion(write.slot, state.slots[write.slot].version + 1)
-                for write in message.writes
-            ),
+            versions,
             stamp_ns,
             message.primary,
             message.primary_token,
+            cause_of(message, tenure, session, versions, stamp_ns=stamp_ns, now_ns=state.now_ns),
         )
         state.pins.pop(message.lock, None)
         yield self._persist(_AtStore(tenure, record, replies=[reply_to]), (record,))
@@ -178,7 +182,8 @@ class PrepareDesk:
                 yield Reply(reply_to, _prepared(record))
             return
         commits = self._state.commits
-        changes = commits.apply_writes(record.writes, record.versions, work.stamp_ns)
+        cause = decided_cause(record, stamp_ns=work.stamp_ns)
+        changes = commits.apply_writes(record.writes, record.versions, work.stamp_ns, cause)
         yield from self._end(tenure)
         self._state.count("commits_finished")
         for reply_to in work.replies:
@@ -214,7 +219,8 @@ class PrepareDesk:
         # Never before what views were told of the lock, whatever its client has said elsewhere.
         stamp_ns = max(position.stamp_ns, record.stamp_ns)
         self._state.stamps.saw(stamp_ns)
-        written = self._state.commits.records(record.writes, record.versions, stamp_ns)
+        cause = decided_cause(record, stamp_ns=stamp_ns)
+        written = self._state.commits.records(record.writes, record.versions, stamp_ns, cause)
         yield self._persist(
             _AtStore(tenure, record, stamp_ns, replies), (*written, PreparedEnded(record.lock))
         )

@@ -334,24 +334,30 @@ class Fork:
 
     Copies no data.  Idempotent: the same fork again is answered the same.  Like a view as of a
     stamp it waits a little for undecided commits; where that is not enough, it is refused as
-    "overload" and may be asked again.
+    "overload" and may be asked again.  `epoch` and `count` are those of `Acquire`: with them a
+    copy that comes late makes no context that was dropped meanwhile (0: unsaid).
     """
 
     session: str
     world: str
     source: str
     at_ns: int
+    epoch: int = 0
+    count: int = 0
 
 
 @dataclass(frozen=True, slots=True)
 class DropWorld:
     """Forget a world context with all its data and their history.
 
-    Answer: `Dropped`, or `Refused` while a lock is held in it.  Idempotent.
+    Answer: `Dropped`, or `Refused` while a lock is held in it.  Idempotent.  `epoch` and `count`
+    are those of `Fork`: a late copy drops no context that was made since.
     """
 
     session: str
     world: str
+    epoch: int = 0
+    count: int = 0
 
 
 @dataclass(frozen=True, slots=True)

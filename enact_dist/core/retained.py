@@ -85,6 +85,12 @@ class Retained:
             del self._by_slot[slot]
         return old
 
+    def drop(self, context: str) -> None:
+        """Forget all versions of a context."""
+        for slot in [slot for slot in self._by_slot if slot.context == context]:
+            while slot in self._by_slot:
+                self._forget(slot)
+
     def of(self, slot: Slot) -> Iterable[Content]:
         """Return the replaced versions of a slot, oldest first."""
         return self._by_slot.get(slot, ())

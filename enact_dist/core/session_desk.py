@@ -18,6 +18,7 @@ from enact_dist.core.messages import (
     Registered,
     Released,
     Welcome,
+    WorldEntry,
 )
 from enact_dist.core.records import (
     AspectRecord,
@@ -82,6 +83,7 @@ class SessionDesk:
             tuple(self._state.catalogue.aspects.values()),
             self._state.settings.shared,
             self._state.settings.shared_nonce,
+            self._state.catalogue.forks(),
         )
         if unrecorded and session.session not in self._recording:
             # A session that a restart would not know could lose its grants without the grace, so
@@ -119,29 +121,29 @@ class SessionDesk:
 
     def on_register(self, message: Register, reply_to: int) -> Iterator[Effect]:
         """Create world contexts and register aspects, all or none."""
-        records: list[Record] = []
-        before = dict(self._state.catalogue.aspects)
-        for name in message.worlds:
-            wrong = wrong_name("world context", name, slashes=False)
+        catalogue = self._state.catalogue
+        before = dict(catalogue.aspects)
+        missing = [name for name in message.worlds if name not in catalogue.worlds]
+        for name in missing:
+            wrong = wrong_name("world context", name, slashes=False) or self._state.busy_world(name)
             if wrong is not None:
                 yield Reply(reply_to, wrong)
                 return
-            if name not in self._state.catalogue.worlds:
-                records.append(WorldRecord(name))
+        records: list[Record] = [WorldRecord(name) for name in missing]
         for entry in message.aspects:
             wrong = wrong_aspect(entry)
-            registered = self._state.catalogue.register(entry) if wrong is None else wrong
+            registered = catalogue.register(entry) if wrong is None else wrong
             if isinstance(registered, str):
                 registered = Refused("datum_type", registered)
             if isinstance(registered, Refused):
-                self._state.catalogue.aspects = before
+                catalogue.aspects = before
                 yield Reply(reply_to, registered)
                 return
             if registered[1]:
                 records.append(AspectRecord(registered[0]))
-        self._state.catalogue.worlds.update(dict.fromkeys(message.worlds))
+        catalogue.worlds.update((name, WorldEntry(name)) for name in missing)
         answer = Registered(
-            tuple(self._state.catalogue.worlds), tuple(self._state.catalogue.aspects.values())
+            tuple(catalogue.worlds), tuple(catalogue.aspects.values()), catalogue.forks()
         )
         yield from self._answer_when_durable(reply_to, answer, tuple(records))
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
     from enact_dist.core.datum import LockId, Token
-    from enact_dist.core.messages import Changed, Hello
+    from enact_dist.core.messages import Answer, Changed, Hello
     from enact_dist.core.records import OutcomeRecord, SessionRecord
 
 LANES_MAX: Final = 1024
@@ -56,7 +56,8 @@ class Session:
 
     `acknowledged` says that it has dropped all grants of earlier epochs; until every recovered
     session has, or their leases must have run out, a restarted shard grants nothing.
-    `present` says that it has said hello in this epoch.
+    `present` says that it has said hello in this epoch.  `world_act` is the count of the newest
+    fork or drop that it has asked for, and its answer once there is one.
     """
 
     session: str
@@ -74,6 +75,7 @@ class Session:
     token_present: bool = False
     token_seen_ns: int | None = None
     lanes: dict[int, Lane] = field(default_factory=dict)
+    world_act: tuple[int, Answer | None] = (0, None)
 
     def lease_end_ns(self, now_ns: int) -> int:
         """Return when the lease ends if no further sign of life comes."""

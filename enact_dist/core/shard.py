@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 
 from enact_dist.core import inspection
 from enact_dist.core.forced import BROKEN, SETTLED
+from enact_dist.core.lineage_desk import LineageDesk
 from enact_dist.core.lock_desk import LockDesk
 from enact_dist.core.messages import (
     Acquire,
@@ -26,9 +27,13 @@ from enact_dist.core.messages import (
     Break,
     Broken,
     Commit,
+    DropWorld,
+    Explain,
     Fetch,
+    FindEffects,
     Finish,
     ForceAbort,
+    Fork,
     Goodbye,
     Hello,
     KeepAlive,
@@ -68,6 +73,7 @@ from enact_dist.core.session_desk import SessionDesk
 from enact_dist.core.shard_state import ShardSettings, ShardState
 from enact_dist.core.tenures import WAIT_SLICE_NS_MAX
 from enact_dist.core.view_desk import ViewDesk
+from enact_dist.core.worlds import WorldDesk
 from enact_dist.terms import Durability
 
 if TYPE_CHECKING:
@@ -89,6 +95,8 @@ class Shard:
         self._prepares = PrepareDesk(self.state, recovered.prepared, recovered.forced)
         self._locks = LockDesk(self.state, self._prepares)
         self._views = ViewDesk(self.state, self._locks, self._prepares)
+        self._worlds = WorldDesk(self.state, self._prepares)
+        lineage = LineageDesk(self.state)
         self._parked_stamps: dict[int, AwaitStamp] = {}
         self._parked_stamp_ends: dict[int, int] = {}
         self._handlers: dict[type, Callable[..., Iterator[Effect]]] = {
@@ -116,6 +124,10 @@ class Shard:
             ListSessions: self._on_list_sessions,
             Break: self._on_break,
             ListAudit: self._on_list_audit,
+            Explain: lineage.on_explain,
+            FindEffects: lineage.on_find_effects,
+            Fork: self._worlds.on_fork,
+            DropWorld: self._worlds.on_drop,
             Stage: self._on_stage,
             Persisted: self._on_persisted,
             Tick: self._on_tick,
@@ -140,6 +152,8 @@ class Shard:
         effects = list(self._handlers[type(message)](message, reply_to))
         if self._views.waits:
             effects += self._views.answer_parked()
+        if self._worlds.waits:
+            effects += self._worlds.answer_waiting()
         if self.state.tenures.table.any_ready:
             effects += self.state.grant_ready()
         return effects
@@ -166,7 +180,7 @@ class Shard:
         soonest = self.state.tenures.next_deadline_ns()
         if soonest is not None:
             deadlines.append(soonest)
-        for desk in (self._prepares, self._views, self.state.decisions):
+        for desk in (self._prepares, self._views, self._worlds, self.state.decisions):
             due_ns = desk.next_deadline_ns()
             if due_ns is not None:
                 deadlines.append(due_ns)
@@ -194,7 +208,8 @@ class Shard:
             tenure.token is not None and (tenure.committing or tenure.prepared is None)
             for tenure in self.state.tenures.by_lock.values()
         )
-        return not self.state.commits.in_flight and not held and not self._sessions.waits_for_store
+        waits = self._sessions.waits_for_store or self._worlds.waits_for_store
+        return not self.state.commits.in_flight and not held and not waits
 
     # ---------------------------------------------------------------- commits
 
@@ -212,6 +227,8 @@ class Shard:
         if message.ticket > 0:
             if self.state.commits.is_commit(message.ticket):
                 yield from self.state.commits.persisted(message.ticket, now_ns=self.state.now_ns)
+            elif self._worlds.is_mine(message.ticket):
+                yield from self._worlds.persisted(message.ticket)
             else:
                 yield from self._prepares.persisted(message.ticket)
             yield from self._answer_reached()
@@ -337,6 +354,7 @@ class Shard:
         """Assert I1, I8, I10, I11 and the bookkeeping of all parts.  For tests and simulation."""
         self._prepares.assert_invariants()
         self.state.tenures.assert_invariants()
+        self._worlds.assert_invariants()
         self.state.slots.retained.assert_invariants()
         if self.state.sessions.in_grace(self.state.now_ns):
             granted = [t for t in self.state.tenures.by_lock.values() if t.token is not None]

@@ -13,7 +13,7 @@ from enact_dist.core import inspection
 from enact_dist.core.commits import Commits
 from enact_dist.core.decisions import Decisions
 from enact_dist.core.forced import Audit
-from enact_dist.core.messages import AspectEntry, PlacementMap
+from enact_dist.core.messages import AspectEntry, PlacementMap, Refused, WorldEntry
 from enact_dist.core.sessions import Session, SessionTable
 from enact_dist.core.slots import Catalogue, SlotMap
 from enact_dist.core.stamps import Stamps
@@ -66,6 +66,7 @@ class ShardState:
         wall_ns: Wall clock at that moment; for stamps only.
         peers: The other shards of the cell.
         pins: Data that a view without a lock keeps fetchable.
+        busy_worlds: What is being done to the context of a name, which is not to be used meanwhile.
         shortest_ttl_ns: Of all sessions; bounds how often the shard must look at the time.
         draining: The shard is about to stop and grants nothing.
     """
@@ -79,19 +80,22 @@ class ShardState:
         self.draining = False
         self.counters: dict[str, int] = {}
         self.pins: dict[LockId, dict[tuple[Slot, int], Datum]] = {}
+        self.busy_worlds: dict[str, str] = {}
         names = {shard.name for shard in settings.placement.shards}
         self.peers = frozenset(names - {settings.name})
         self.slots = SlotMap(
-            recovered.slots, answer_bytes_max=ANSWER_FETCHES * settings.fetch_bytes_max
+            recovered.slots,
+            answer_bytes_max=ANSWER_FETCHES * settings.fetch_bytes_max,
+            version_bases={record.name: record.version_base for record in recovered.dropped},
         )
         self.catalogue = Catalogue(
             configured=settings.aspects,
             recovered=recovered.aspects,
             # Contexts that were only configured once have data, which must stay in reach.
             worlds=(
-                *settings.worlds,
-                *(record.name for record in recovered.worlds),
-                *dict.fromkeys(record.slot.context for record in recovered.slots),
+                *map(WorldEntry, settings.worlds),
+                *(WorldEntry(r.name, r.source, r.at_ns) for r in recovered.worlds),
+                *map(WorldEntry, dict.fromkeys(r.slot.context for r in recovered.slots)),
             ),
         )
         self.sessions = SessionTable(recovered.sessions, outcomes=recovered.outcomes, now_ns=now_ns)
@@ -155,6 +159,13 @@ class ShardState:
         session = self.sessions.by_id.get(lock.session)
         if session is not None and session.lane(lock.lane).top == lock.seq:
             session.lane(lock.lane).top = lock.seq - 1
+
+    def busy_world(self, world: str) -> Refused | None:
+        """Refuse the name of a context that is just being made or dropped."""
+        act = self.busy_worlds.get(world)
+        if act is None:
+            return None
+        return Refused("overload", f"world context {world!r} is {act}; ask again")
 
     def numbered(self, number: int, epoch: int) -> Tenure | None:
         """Return the lock of a number that people were told in an epoch (0: this one)."""

@@ -13,14 +13,14 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from enact_dist.core.datum import Column, Datum, Slot
-from enact_dist.core.messages import AspectEntry, SlotState
+from enact_dist.core.messages import AspectEntry, Cause, SlotState, WorldEntry
 from enact_dist.core.past import Past
 from enact_dist.core.retained import Retained
 from enact_dist.core.retaining import covers, with_larger
 from enact_dist.terms import ACCESSES, Durability, NullReason, pattern_matches
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterable, Iterator, Mapping
 
     from enact_dist.core.messages import Item
     from enact_dist.core.records import SlotRecord
@@ -39,6 +39,7 @@ class Content:
     stamp_ns: int
     datum: Datum | None
     null_reason: NullReason
+    cause: Cause | None = None
 
 
 NOTHING: Final = Content(0, 0, None, NullReason.NEVER_SET)
@@ -62,12 +63,25 @@ class Shown(NamedTuple):
 class SlotMap:
     """All slots of one shard by context and aspect."""
 
-    __slots__ = ("_answer_bytes_max", "_columns", "bytes", "count", "past", "retained")
+    __slots__ = (
+        "_answer_bytes_max",
+        "_columns",
+        "_version_bases",
+        "bytes",
+        "count",
+        "past",
+        "retained",
+    )
 
     def __init__(
-        self, recovered: Iterable[SlotRecord], *, answer_bytes_max: int = ANSWER_BYTES_MAX
+        self,
+        recovered: Iterable[SlotRecord],
+        *,
+        answer_bytes_max: int = ANSWER_BYTES_MAX,
+        version_bases: Mapping[str, int] | None = None,
     ) -> None:
         self._answer_bytes_max = answer_bytes_max
+        self._version_bases = dict(version_bases or {})
         self._columns: dict[Column, dict[str, Content]] = {}
         self.count = 0
         self.bytes = 0
@@ -81,7 +95,8 @@ class SlotMap:
                     NullReason[record.null_reason] if record.null_reason else NullReason.DELETED
                 )
                 self.set(
-                    record.slot, Content(record.version, record.stamp_ns, record.datum, reason)
+                    record.slot,
+                    Content(record.version, record.stamp_ns, record.datum, reason, record.cause),
                 )
 
     def __getitem__(self, slot: Slot) -> Content:
@@ -92,6 +107,45 @@ class SlotMap:
     def exists(self, slot: Slot) -> bool:
         """Whether the slot was ever written or is known to have been."""
         return self[slot] is not NOTHING
+
+    def next_version(self, slot: Slot) -> int:
+        """Return the version that the next write of a slot makes.
+
+        In a context that was dropped before, the first one lies above all that it had then.
+        """
+        version = self[slot].version
+        return (version or self._version_bases.get(slot.context, 0)) + 1
+
+    def version_base(self, context: str) -> int:
+        """Return the largest version of a context, the nulls of a drop counted as versions."""
+        before = self._version_bases.get(context, 0)
+        return max([before, *(content.version + 1 for _, content in self.of_context(context))])
+
+    def drop(self, context: str) -> list[tuple[Slot, Content]]:
+        """Forget all slots of a context with their past, and return them."""
+        gone = list(self.of_context(context))
+        self._version_bases[context] = self.version_base(context)
+        for column in [column for column in self._columns if column.context == context]:
+            del self._columns[column]
+        self.past.drop(context)
+        self.retained.drop(context)
+        self.count -= len(gone)
+        self.bytes -= sum(content.datum.size for _, content in gone if content.datum is not None)
+        return gone
+
+    def versions(self, slot: Slot) -> Iterator[Content]:
+        """Yield all states of a slot that are known, oldest first."""
+        yield from (old for old in self.past.of(slot) if old is not NOTHING)
+        yield self[slot]
+
+    def as_of(self, slot: Slot, at_ns: int) -> Content | int:
+        """Return the state of a slot as of a stamp, or since when it is known if that is later."""
+        versions = list(self.versions(slot))
+        for content in reversed(versions):
+            if content.stamp_ns <= at_ns:
+                return content
+        first = self._version_bases.get(slot.context, 0) + 1
+        return NOTHING if versions[0].version == first else versions[0].stamp_ns
 
     def replace(self, slot: Slot, content: Content, *, retention: int = 1) -> None:
         """Put a newly committed state in place of the old one, which stays known for a while.
@@ -178,6 +232,18 @@ class SlotMap:
         for entity, content in self._columns.get(column, {}).items():
             if pattern_matches(pattern, entity):
                 yield Slot(column.context, entity, column.aspect), content
+
+    def of_context(self, context: str) -> Iterator[tuple[Slot, Content]]:
+        """Yield the slots of a context, null ones too."""
+        for column, contents in self._columns.items():
+            if column.context == context:
+                for entity, content in contents.items():
+                    yield Slot(context, entity, column.aspect), content
+
+    def all(self) -> Iterator[Slot]:
+        """Yield every slot."""
+        for context in dict.fromkeys(column.context for column in self._columns):
+            yield from (slot for slot, _ in self.of_context(context))
 
     def columns(self) -> Iterator[Column]:
         """Yield every (context, aspect) that has slots."""
@@ -266,11 +332,15 @@ class Catalogue:
         *,
         configured: Iterable[AspectEntry],
         recovered: Iterable[AspectEntry],
-        worlds: Iterable[str],
+        worlds: Iterable[WorldEntry],
     ) -> None:
         self._configured = {entry.name: entry for entry in configured}
         self.aspects: dict[str, AspectEntry] = {}
-        self.worlds: dict[str, None] = dict.fromkeys(worlds)
+        self.worlds: dict[str, WorldEntry] = {}
+        for world in worlds:
+            # That it is a fork is known of a context which is also named elsewhere.
+            if world.source or world.name not in self.worlds:
+                self.worlds[world.name] = world
         for entry in recovered:
             self.aspects[entry.name] = self._with_configured(entry)
 
@@ -303,6 +373,10 @@ class Catalogue:
             known = self.aspects[entry.name] = with_larger(known, wanted)
             return known, True
         return known, False
+
+    def forks(self) -> tuple[WorldEntry, ...]:
+        """Return the world contexts that are forks."""
+        return tuple(world for world in self.worlds.values() if world.source)
 
     def retention(self, aspect: str) -> int:
         """Return how many versions of a slot of this aspect stay readable."""

@@ -10,6 +10,7 @@ from itertools import count
 from typing import TYPE_CHECKING
 
 from enact_dist.core.datum import Datum, LockId, Slot, Token
+from enact_dist.core.ledger import Ledger
 from enact_dist.core.messages import (
     Acquire,
     Answer,
@@ -28,27 +29,14 @@ from enact_dist.core.messages import (
     WriteItem,
 )
 from enact_dist.core.records import (
-    AspectRecord,
-    AuditRecord,
     Call,
-    DecisionDone,
-    DecisionRecord,
-    ForcedEnded,
-    ForcedRecord,
-    OutcomeRecord,
     Persist,
     Persisted,
-    PreparedEnded,
-    PreparedRecord,
     Publish,
     Record,
     Recovered,
     Reply,
-    SessionEnded,
-    SessionRecord,
-    SlotRecord,
     Tick,
-    WorldRecord,
 )
 from enact_dist.core.shard import Shard
 from enact_dist.core.shard_state import ShardSettings
@@ -185,40 +173,7 @@ class ShardBench:
 
     def recovered(self, epoch: int) -> Recovered:
         """Return what a store would give back."""
-        sessions: dict[str, SessionRecord] = {}
-        found = Recovered(epoch)
-        slots: dict[Slot, SlotRecord] = {}
-        outcomes: dict[tuple[str, int], OutcomeRecord] = {}
-        for record in self.log:
-            if isinstance(record, SessionRecord):
-                sessions[record.session] = record
-            elif isinstance(record, SessionEnded):
-                sessions.pop(record.session, None)
-            elif isinstance(record, WorldRecord):
-                found.worlds.append(record.name)
-            elif isinstance(record, AspectRecord):
-                found.aspects.append(record.entry)
-            elif isinstance(record, SlotRecord):
-                slots[record.slot] = record
-            elif isinstance(record, PreparedRecord):
-                found.prepared.append(record)
-            elif isinstance(record, PreparedEnded):
-                found.prepared = [p for p in found.prepared if p.lock != record.lock]
-            elif isinstance(record, DecisionRecord):
-                found.decisions.append(record)
-            elif isinstance(record, ForcedRecord):
-                found.forced.append(record)
-            elif isinstance(record, ForcedEnded):
-                found.forced = [f for f in found.forced if f.lock != record.lock]
-            elif isinstance(record, AuditRecord):
-                found.audit.append(record)
-            elif isinstance(record, DecisionDone):
-                found.decisions = [d for d in found.decisions if d.lock != record.lock]
-            elif isinstance(record, OutcomeRecord):
-                outcomes[record.lock.session, record.lock.lane] = record
-        found.sessions = list(sessions.values())
-        found.slots, found.outcomes = list(slots.values()), list(outcomes.values())
-        return found
+        return Ledger(self.log).recovered(epoch)
 
     # ---------------------------------------------------------------- common requests
 

@@ -95,9 +95,12 @@ def shard_picture(bench, sessions):
         "stamp": state.stamps.last_ns,
         "on disk": (
             {record.session for record in kept.sessions} & sessions,
-            sorted(kept.worlds),
+            kept.worlds,
+            kept.dropped,
             sorted(kept.aspects),
             kept.slots,
+            kept.history,
+            kept.kept,
             kept.outcomes,
             kept.prepared,
             kept.decisions,

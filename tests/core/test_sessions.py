@@ -38,7 +38,7 @@ from enact_dist.core.messages import (
     WriteItem,
     WrongShard,
 )
-from enact_dist.core.records import Drain, SessionDied, SessionEnded, SessionSeen
+from enact_dist.core.records import Drain, SessionDied, SessionEnded, SessionSeen, WorldRecord
 from enact_dist.terms import Access
 
 R, W, V = Access.READ, Access.WRITE, Access.VIEW
@@ -167,7 +167,7 @@ class TestCatalogue:
         assert isinstance(bench.answers[first], Registered)
         assert bench.answers[again] == bench.answers[first]
         assert "lab" in bench.answers[hello].worlds
-        assert "lab" in bench.recovered(2).worlds
+        assert WorldRecord("lab") in bench.recovered(2).worlds
 
     def test_refused_registration_leaves_nothing(self, bench):
         """All or none: a type that differs takes the new aspects beside it down."""

@@ -1,0 +1,49 @@
+"""Where versions come from: one `Cause` for all that a lock writes at a shard.
+
+The client says what it has read; who it is and how long it has held the lock, the shard knows
+itself.  All slots of a commit share the object, and it goes with the last version that bears it.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from enact_dist.core.message_parts import CAUSE_COMMIT
+from enact_dist.core.messages import Cause
+
+if TYPE_CHECKING:
+    from enact_dist.core.messages import Commit, Prepare, SlotVersion
+    from enact_dist.core.records import PreparedRecord
+    from enact_dist.core.sessions import Session
+    from enact_dist.core.tenures import Tenure
+
+
+def cause_of(
+    message: Commit | Prepare,
+    tenure: Tenure,
+    session: Session,
+    versions: tuple[SlotVersion, ...],
+    *,
+    stamp_ns: int,
+    now_ns: int,
+) -> Cause:
+    """Return the cause of what a lock is about to write here."""
+    return Cause(
+        message.lock,
+        CAUSE_COMMIT,
+        session.actor,
+        session.host,
+        session.pid,
+        stamp_ns,
+        now_ns - tenure.granted_ns,
+        message.reads,
+        message.reads_left_out,
+        versions,
+    )
+
+
+def decided_cause(record: PreparedRecord, *, stamp_ns: int) -> Cause | None:
+    """Return the cause of what was prepared, now that its stamp and its versions are certain."""
+    if record.cause is None:
+        return None
+    return record.cause._replace(stamp_ns=stamp_ns, writes=record.versions)
