@@ -79,7 +79,7 @@ class LineageDesk:
         versions = [one for one in self._state.slots.versions(slot) if one is not NOTHING]
         for content, after in zip_longest(versions, versions[1:], fillvalue=NOTHING):
             state = state_of(slot, content, with_datum=False)
-            yield VersionEntry(state, after.stamp_ns, False, content.cause)
+            yield VersionEntry(state, after.stamp_ns, (), content.cause)
 
     def _bounded(self, found: Iterator[VersionEntry]) -> Versions:
         entries: list[VersionEntry] = []
