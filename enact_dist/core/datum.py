@@ -5,8 +5,11 @@ The core never looks into a datum: `encoding` and `body` are made and read by `e
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 
 class Slot(NamedTuple):
@@ -72,6 +75,8 @@ class Datum:
             where the actor did not say.
         file: Name of the payload at the slot's shard that holds these bytes, so that they need
             not travel with a message ("": none).
+        fault: Says what is wrong with the bytes, "" where nothing is; to be asked before they are
+            handed out.  None: they are known to be sound.
     """
 
     encoding: bytes
@@ -79,3 +84,4 @@ class Datum:
     size: int
     stamp_ns: int = 0
     file: str = ""
+    fault: Callable[[], str] | None = field(default=None, compare=False, repr=False)

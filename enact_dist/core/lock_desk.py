@@ -33,6 +33,8 @@ ITEMS_MAX: Final = 4096
 """Requests in one lock or view."""
 WAITERS_MAX: Final = 100_000
 """Locks, granted or waiting, at one shard."""
+DAMAGED: Final = "damaged"
+"""The code of a refusal because the stored bytes of a datum are not what was stored."""
 
 
 class LockDesk:
@@ -130,6 +132,11 @@ class LockDesk:
             self._state.count("fetches_gone")
             yield Reply(reply_to, Gone(message.slot, message.version))
             return
+        fault = datum.fault() if datum.fault is not None else ""
+        if fault:
+            self._state.count("fetches_damaged")
+            yield Reply(reply_to, _damaged(message, fault))
+            return
         length = min(message.length, self._state.settings.fetch_bytes_max)
         body = memoryview(datum.body)[message.offset : message.offset + length]
         part = Datum(b"", body, len(body))
@@ -165,3 +172,11 @@ class LockDesk:
             self._prepares.hint(message.lock)
         self._state.pins.pop(message.lock, None)
         yield Reply(reply_to, Released())
+
+
+def _damaged(message: Fetch, fault: str) -> Refused:
+    return Refused(
+        DAMAGED,
+        f"version {message.version} of {message.slot} was asked and cannot be read: {fault};"
+        " restore the folder of its shard from a backup, or do without this version",
+    )

@@ -1,6 +1,6 @@
 """Large bodies as files of their own, beside the database that names them.
 
-A database row names the file, its length and its checksum; a file that no row names is rubbish and
+Database rows name the file, its length and its checksum; a file that no row names is rubbish and
 is swept at the next start.  So the order is: write the file whole, then commit the row, then
 unlink the file that the row named before.  Names tell nothing about the content and are never
 used twice (epoch and counter).
@@ -8,25 +8,21 @@ used twice (epoch and counter).
 
 from __future__ import annotations
 
-import mmap
 import os
-import resource
 import zlib
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from enact_dist.errors import StoreError
 from enact_dist.link.folder_lock import sync_folder
+from enact_dist.link.memory import body_of, map_file
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable
     from pathlib import Path
 
 _SUFFIX: Final = ".blob"
 _DRAFT_SUFFIX: Final = ".tmp"
 _PART_BYTES: Final = 1 << 20
 """Bodies are checksummed and written in parts of this size: the second touch hits the cache."""
-_SPARE_DESCRIPTORS: Final = 256
-"""File descriptors left to the rest of the process beside the mapped blobs."""
 
 
 class Blob(NamedTuple):
@@ -36,6 +32,16 @@ class Blob(NamedTuple):
     size: int
     crc: int
     synced: bool
+
+
+class Mapped(NamedTuple):
+    """A file as it is read: its bytes, and what is still to be asked about them.
+
+    `fault` says what is wrong with the content, "" where nothing is; None: it was checked.
+    """
+
+    body: memoryview
+    fault: Callable[[], str] | None
 
 
 class DamagedBlobError(Exception):
@@ -93,11 +99,14 @@ class BlobFolder:
         """
         (self.folder / name).unlink(missing_ok=True)
 
-    def read(self, blob: Blob) -> memoryview:
-        """Check a file against its row and map it; pages are loaded when they are touched.
+    def map(self, blob: Blob, *, whole: bool) -> Mapped:
+        """Map a file that is there and as long as its row says; pages are loaded when touched.
+
+        The bytes stay, also when the file is unlinked.  With `whole` the content is checked too,
+        which reads all of it.
 
         Raises:
-            DamagedBlobError: It is missing, of another length, or its checksum differs.
+            DamagedBlobError: It is missing, of another length, or (`whole`) its checksum differs.
             OSError: As the system reports it (I/O error).
         """
         path = self.folder / blob.name
@@ -109,11 +118,12 @@ class BlobFolder:
             found_bytes = os.fstat(descriptor).st_size
             if found_bytes != blob.size:
                 raise DamagedBlobError(f"{path} has {found_bytes} bytes, stored were {blob.size}")
-            if _crc_of(descriptor) != blob.crc:
-                raise DamagedBlobError(f"{path} is damaged: its checksum is wrong")
-            return memoryview(mmap.mmap(descriptor, blob.size, access=mmap.ACCESS_READ))
+            if whole and _crc_of(descriptor) != blob.crc:
+                raise DamagedBlobError(_damaged(path))
+            body = body_of(map_file(descriptor, blob.size, writable=False)).toreadonly()
         finally:
             os.close(descriptor)
+        return Mapped(body, None if whole else _Check(path, body, blob.crc))
 
     def sweep(self, keep: Iterable[str]) -> int:
         """Remove blob files and drafts that no row names; return how many there were.
@@ -159,21 +169,38 @@ def _crc_of(descriptor: int) -> int:
     return crc
 
 
-def allow_mapped(count: int) -> None:
-    """Raise this process's limit of open files so that `count` blobs can be mapped.
+class _Check:
+    """Compares mapped bytes with their checksum when it is first asked, and knows it from then."""
 
-    A mapping keeps a descriptor for as long as somebody has the body.
+    __slots__ = ("_body", "_crc", "_fault", "_path")
 
-    Raises:
-        StoreError: The system does not allow so many.
-    """
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    needed = count + _SPARE_DESCRIPTORS
-    if soft == resource.RLIM_INFINITY or soft >= needed:
-        return
-    if hard != resource.RLIM_INFINITY and hard < needed:
-        raise StoreError(
-            f"{count} large data are stored, each needs an open file, and the system allows"
-            f" {hard}: raise the limit (ulimit -Hn, or LimitNOFILE in the service unit) to {needed}"
-        )
-    resource.setrlimit(resource.RLIMIT_NOFILE, (needed, hard))
+    def __init__(self, path: Path, body: memoryview, crc: int) -> None:
+        self._path, self._crc = path, crc
+        self._body: memoryview | None = body
+        self._fault = ""
+
+    def __call__(self) -> str:
+        body = self._body
+        if body is not None:
+            self._fault = self._looked(body)
+            self._body = None
+        return self._fault
+
+    def _looked(self, body: memoryview) -> str:
+        try:
+            # Not through the map: there a disk's error would end the process.
+            descriptor = os.open(self._path, os.O_RDONLY | os.O_CLOEXEC)
+        except FileNotFoundError:
+            return _damaged(self._path) if zlib.crc32(body) != self._crc else ""
+        except OSError as failure:
+            return f"{self._path} cannot be read: {failure.strerror}"
+        try:
+            return _damaged(self._path) if _crc_of(descriptor) != self._crc else ""
+        except OSError as failure:
+            return f"{self._path} cannot be read: {failure.strerror}"
+        finally:
+            os.close(descriptor)
+
+
+def _damaged(path: Path) -> str:
+    return f"{path} is damaged: its checksum is wrong"

@@ -21,10 +21,13 @@ if TYPE_CHECKING:
 
 LOCK_FILE: Final = "lock"
 FORMAT_FILE: Final = "format"
-FORMAT: Final = 2
+FORMAT: Final = 3
 """Version of everything below a data folder; goes up when an older program could misread it.
 
 2: commits over shards are stored (prepared locks, decisions), and the mark is there first.
+3: slots have a row per stored state, with its cause.  A folder of 2 is refused, not upgraded: its
+states have neither, and a history that begins with an unexplained state would look like one that
+was cut.
 """
 
 _FORMAT_WORDS: Final = "enact-dist store"

@@ -26,6 +26,7 @@ from enact_dist.errors import (
     NoRoomError,
     ProtocolError,
     ShardUnreachableError,
+    StoreError,
     UnknownWorldError,
 )
 
@@ -180,5 +181,6 @@ def error_of(refused: Refused | Forgotten) -> EnactError:
         "protocol": ProtocolError,
         "overload": LinkError,
         "no_room": NoRoomError,
+        "damaged": StoreError,
     }
     return classes.get(refused.code, LinkError)(refused.text)

@@ -10,12 +10,20 @@ from __future__ import annotations
 
 import reprlib
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from enact_dist.core.datum import LockId, Position, Slot, Token
-from enact_dist.core.messages import Item, SlotVersion, WriteItem
+from enact_dist.core.datum import LockId, Position, Slot
+from enact_dist.core.messages import Item, WriteItem
 from enact_dist.core.records import DecisionRecord, ForcedRecord, PreparedRecord, SlotRecord
-from enact_dist.link.store_rows import DamagedRowError, Fields, Key, Kind, key_of, pack
+from enact_dist.link.store_fields import (
+    DamagedRowError,
+    Fields,
+    pack,
+    packed_cause,
+    packed_versions,
+    read_cause,
+)
+from enact_dist.link.store_rows import Key, Kind, key_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -30,11 +38,12 @@ def prepared_row(record: PreparedRecord) -> tuple[Key, bytes]:
     """Return the row of a prepared lock, without its data."""
     body = [
         list(record.token),
-        [list(item[:5]) for item in record.items],
-        [[*entry.slot, entry.version] for entry in record.versions],
+        [list(item) for item in record.items],
+        packed_versions(record.versions),
         record.stamp_ns,
         record.primary,
         list(record.primary_token),
+        None if record.cause is None else packed_cause(record.cause),
     ]
     return prepared_key(record.lock), pack(body)
 
@@ -49,38 +58,38 @@ def prepared_writes(record: PreparedRecord) -> Iterator[tuple[Key, SlotRecord]]:
 def read_prepared(key: Key, body: bytes, writes: Mapping[Slot, SlotRecord]) -> PreparedRecord:
     """Read the row of a prepared lock, with the writes that were read of it."""
     fields = Fields(body)
-    token, items = _token(fields.next(list)), fields.next(list)
-    versions = [_slot_version(entry) for entry in fields.next(list)]
+    token, items, versions = fields.token(), fields.next(list), fields.versions()
     if {entry.slot for entry in versions} != set(writes):
         raise DamagedRowError("writes of this prepared lock are missing")
+    stamp_ns, primary, primary_token = fields.next(int), fields.next(str), fields.token()
+    cause = fields.last(object)
     return PreparedRecord(
-        _lock(Fields(key.name)),
+        read_lock(key),
         token,
         tuple(_item(item) for item in items),
         tuple(WriteItem(entry.slot, writes[entry.slot].datum) for entry in versions),
-        tuple(versions),
-        fields.next(int),
-        fields.next(str),
-        _token(fields.last(list)),
+        versions,
+        stamp_ns,
+        primary,
+        primary_token,
+        None if cause is None else read_cause(cause),
     )
 
 
-def read_prepared_lock(key: Key) -> LockId:
-    """Return the lock of a prepared lock's row."""
-    return _lock(Fields(key.name))
-
-
-def lock_of_write(key: Key) -> LockId:
-    """Return the lock that a prepared write belongs to."""
+def read_lock(key: Key) -> LockId:
+    """Return the lock of the row of a prepared one, a decision or an abort by hand."""
     fields = Fields(key.name)
-    return LockId(fields.next(str), fields.next(int), fields.next(int))
+    lock = fields.lock()
+    fields.end()
+    return lock
 
 
-def slot_of_write(key: Key) -> Key:
-    """Return the key that the write's slot has, to read its row by."""
+def read_write_key(key: Key) -> tuple[LockId, Slot]:
+    """Return the lock that a prepared write belongs to, and its slot."""
     fields = Fields(key.name)
-    fields.next(str), fields.next(int), fields.next(int)
-    return key_of(Kind.SLOT, fields.next(str), fields.next(str), fields.last(str))
+    lock, slot = fields.lock(), fields.slot()
+    fields.end()
+    return lock, slot
 
 
 def decision_key(lock: LockId) -> Key:
@@ -100,7 +109,7 @@ def read_decision(key: Key, body: bytes) -> DecisionRecord:
     participants = fields.last(list)
     if not all(isinstance(shard, str) for shard in participants):
         raise DamagedRowError(f"names of shards were expected, found {reprlib.repr(participants)}")
-    return DecisionRecord(_lock(Fields(key.name)), position, tuple(participants))
+    return DecisionRecord(read_lock(key), position, tuple(participants))
 
 
 def forced_key(lock: LockId) -> Key:
@@ -117,32 +126,20 @@ def forced_row(record: ForcedRecord) -> tuple[Key, bytes]:
 def read_forced(key: Key, body: bytes) -> ForcedRecord:
     """Read the row of a lock that was aborted by hand."""
     fields = Fields(body)
-    primary, token = fields.next(str), _token(fields.next(list))
+    primary, token = fields.next(str), fields.token()
     slots = tuple(_slot(entry) for entry in fields.last(list))
-    return ForcedRecord(_lock(Fields(key.name)), primary, token, slots)
+    return ForcedRecord(read_lock(key), primary, token, slots)
 
 
 def _slot(packed: object) -> Slot:
     fields = Fields(packed)
-    return Slot(fields.next(str), fields.next(str), fields.last(str))
-
-
-def _lock(fields: Fields) -> LockId:
-    return LockId(fields.next(str), fields.next(int), fields.last(int))
-
-
-def _token(packed: list[Any]) -> Token:
-    fields = Fields(packed)
-    return Token(fields.next(int), fields.last(int))
+    slot = fields.slot()
+    fields.end()
+    return slot
 
 
 def _item(packed: object) -> Item:
     fields = Fields(packed)
     access, context = fields.next(int), fields.next(str)
-    return Item(access, context, fields.next(str), fields.next(str), fields.last(int))
-
-
-def _slot_version(packed: object) -> SlotVersion:
-    fields = Fields(packed)
-    slot = Slot(fields.next(str), fields.next(str), fields.next(str))
-    return SlotVersion(slot, fields.last(int))
+    entity, aspect, known = fields.next(str), fields.next(str), fields.next(int)
+    return Item(access, context, entity, aspect, known, fields.next(int), fields.last(bool))

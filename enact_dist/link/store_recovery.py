@@ -1,67 +1,68 @@
-"""Reads a data folder at the start of a shard and refuses whatever is not as it was left.
+"""Reads a store at the start of a shard and refuses whatever is not as it was left.
 
-Refusing costs an operator minutes; serving from a damaged store costs trust in every datum.  So
-each check ends in a `StoreError` that names the file and the way out.  What a crash may leave is no
-damage: a torn tail of the log, drafts and orphans among the blobs.  What a power cut may leave in
-addition (only if the system has started anew since) is what was never forced to the disk: holes
-in the log behind the last durable batch, and the bodies of `os` data, which then come back as
-null with the reason `LOST`.
+What a crash may leave is no damage: a torn tail of the log, drafts and orphans among the blobs.
+What a power cut may leave in addition (only if the system has started anew since) is what was never
+forced to the disk: holes in the log behind the last durable batch, and the bodies of `os` data,
+which then come back as null with the reason `LOST`, in history too.
+
+What is checked when: at the start every row; of every file that it is there and as long as it was;
+the content of those that hold newest states or prepared writes, and after a power cut of all that
+were not forced.  History may be much longer than that, so the content of its other files is
+checked when somebody first asks for it (`Datum.fault`).  All files are mapped at the start, which
+reads nothing and keeps no descriptor: a body stays readable when its file is forgotten.
 """
 
 from __future__ import annotations
 
 import logging
-import shutil
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Final, NamedTuple, NoReturn
+from typing import TYPE_CHECKING, Final
 
 import msgpack
 
-from enact_dist.core.records import Recovered, SlotRecord, WorldRecord
-from enact_dist.errors import StoreError
-from enact_dist.link.blobs import Blob, BlobFolder, DamagedBlobError, allow_mapped
+from enact_dist.core.records import Recovered, SlotRecord
+from enact_dist.link.blobs import Blob, BlobFolder, DamagedBlobError, Mapped
 from enact_dist.link.store_database import Database, DatabaseRow, is_damage
-from enact_dist.link.store_mark import Mark, boot_id, read_mark
+from enact_dist.link.store_fields import DamagedRowError, read_cause
+from enact_dist.link.store_folder import DATABASE_FILE, Found, check_reach, has_blobs, refuse
 from enact_dist.link.store_prepared import (
-    lock_of_write,
+    prepared_writes,
     read_decision,
     read_forced,
+    read_lock,
     read_prepared,
-    read_prepared_lock,
-    slot_of_write,
+    read_write_key,
 )
 from enact_dist.link.store_rows import (
     EPOCH_KEY,
-    DamagedRowError,
     Key,
     Kind,
+    Order,
+    StoredSlot,
+    cause_key,
     read_aspect,
     read_audit,
+    read_dropped,
     read_ended,
     read_epoch,
+    read_kept,
+    read_order,
     read_outcome,
     read_session,
     read_slot,
+    read_slot_key,
     read_world,
     row_checksum,
 )
-from enact_dist.link.wal_check import check_wal
+from enact_dist.link.store_states import State, States
 from enact_dist.terms import NullReason
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from enact_dist.core.datum import LockId, Slot
-
-DATABASE_FILE: Final = "store.db"
-LOG_FILE: Final = "store.db-wal"
-BLOB_FOLDER: Final = "blobs"
-_REFUSED_SUFFIX: Final = ".refused"
-
-_RESTORE: Final = (
-    "restore the whole folder from a backup, or give the shard an empty folder and start without"
-    " its data"
-)
+    from enact_dist.core.messages import Cause
+    from enact_dist.core.records import AuditRecord
 
 _UNREADABLE: Final = (
     DamagedRowError,
@@ -83,97 +84,28 @@ class Contents:
     Attributes:
         recovered: The records; `epoch` is the stored one, 0 in a new folder.
         ids: Row ids by key.
-        blobs: Blob files by the key of their slot.
+        states: The rows of states of slots and of prepared writes.
+        records: What these rows say.
+        orders: When the states of a slot were set, and their rows.
+        causes: Causes with rows of their own.
+        acts: What operators did, and when.
         ended: When sessions ended whose outcomes are kept still, wall clock in ns.
-        kept: States of slots, and prepared ones.
         prepared: Rows of prepared locks, still packed.
-        lost: Slots whose unforced body a power cut took, to be stored as null.
+        lost: States whose unforced body a power cut took, to be stored as null.
         batch: Number of the newest batch.
     """
 
     recovered: Recovered = field(default_factory=lambda: Recovered(epoch=0))
     ids: dict[Key, int] = field(default_factory=dict)
-    blobs: dict[Key, Blob] = field(default_factory=dict)
+    states: States = field(default_factory=States)
+    records: dict[Key, SlotRecord] = field(default_factory=dict)
+    orders: dict[Slot, list[tuple[Order, Key]]] = field(default_factory=dict)
+    causes: dict[Key, Cause] = field(default_factory=dict)
+    acts: dict[Order, AuditRecord] = field(default_factory=dict)
     ended: dict[str, int] = field(default_factory=dict)
-    lost: dict[Key, SlotRecord] = field(default_factory=dict)
-    kept: dict[Key, SlotRecord] = field(default_factory=dict)
     prepared: dict[LockId, tuple[Key, bytes]] = field(default_factory=dict)
+    lost: dict[Key, SlotRecord] = field(default_factory=dict)
     batch: int = 0
-
-
-class Found(NamedTuple):
-    """What a folder says of itself before its database is opened."""
-
-    mark: Mark | None
-    is_new: bool
-    power_cut: bool
-    """Whether the system has started anew since the store was last opened."""
-
-    @property
-    def is_first(self) -> bool:
-        """Whether no start before this one ever came to its end: nothing was acknowledged."""
-        return self.mark.is_first if self.mark is not None else self.is_new
-
-
-def refuse(path: Path, found: str, remedy: str = _RESTORE) -> NoReturn:
-    """Raise the `StoreError` of a damaged file.
-
-    Raises:
-        StoreError: Always.
-    """
-    raise StoreError(f"{path} {found}; the shard does not start: {remedy}", path=str(path))
-
-
-def look_at(folder: Path) -> Found:
-    """Find out what kind of folder this is.
-
-    Raises:
-        StoreError: Data are there and their database is not.
-        OSError: As the system reports it.
-    """
-    mark = read_mark(folder)
-    database = folder / DATABASE_FILE
-    is_new = not database.exists() or database.stat().st_size == 0
-    if is_new:
-        log = folder / LOG_FILE
-        has_log = log.exists() and log.stat().st_size > 0
-        has_mark = mark is not None and not mark.is_first
-        if has_mark or has_log or _has_blobs(folder):
-            refuse(database, "is missing or empty, but the folder has been in use")
-    return Found(mark, is_new, mark is not None and mark.boot != boot_id())
-
-
-def _has_blobs(folder: Path) -> bool:
-    blobs = folder / BLOB_FOLDER
-    return blobs.exists() and any(blobs.iterdir())
-
-
-def check_log(folder: Path, *, power_cut: bool) -> None:
-    """Refuse a log that is damaged in its middle.
-
-    Raises:
-        StoreError: It is damaged, and no power cut explains it.
-        OSError: As the system reports it.
-    """
-    log = folder / LOG_FILE
-    verdict = check_wal(log)
-    if verdict.damaged_at is None:
-        return
-    if power_cut:
-        _log.warning(
-            "%s: what was written from byte %d on and not forced to the disk is gone after the"
-            " system's restart",
-            log,
-            verdict.damaged_at,
-        )
-        return
-    refuse(
-        log,
-        f"is damaged at byte {verdict.damaged_at}, and commits that were acknowledged follow",
-        "restore the whole folder from a backup; or, to go on without what was written from there"
-        f" on, keep a copy of the folder, delete its file 'mark', and cut the log with 'truncate -s"
-        f" {verdict.damaged_at} {log}'",
-    )
 
 
 def open_database(folder: Path, found: Found) -> tuple[Database, Contents]:
@@ -194,7 +126,10 @@ def open_database(folder: Path, found: Found) -> tuple[Database, Contents]:
         if found.is_first:
             database.make_table()
         contents = read_contents(database, path)
-        _check_complete(folder, contents, found)
+        in_use = contents.ids or not found.is_first or has_blobs(folder)
+        if EPOCH_KEY not in contents.ids and in_use:
+            refuse(path, "holds no epoch: rows are missing")
+        check_reach(folder, found, batch=contents.batch)
     except BaseException as failure:
         if database is not None:
             database.close()
@@ -204,32 +139,11 @@ def open_database(folder: Path, found: Found) -> tuple[Database, Contents]:
     return database, contents
 
 
-def _check_complete(folder: Path, contents: Contents, found: Found) -> None:
-    """Compare what was read with what the mark says was acknowledged."""
-    in_use = contents.ids or not found.is_first or _has_blobs(folder)
-    if EPOCH_KEY not in contents.ids and in_use:
-        refuse(folder / DATABASE_FILE, "holds no epoch: rows are missing")
-    if found.mark is None or contents.batch >= found.mark.needed():
-        return
-    log = folder / LOG_FILE
-    readable = check_wal(log)
-    if log.exists() and log.stat().st_size:
-        # Closing the database cuts the log to what SQLite could read; the whole is evidence.
-        shutil.copyfile(log, log.with_name(log.name + _REFUSED_SUFFIX))
-    refuse(
-        log,
-        f"is cut or damaged from byte {readable.end} on: batch {found.mark.needed()} was"
-        f" acknowledged, the last one that can be read is {contents.batch}",
-        "restore the whole folder from a backup; or, to go on without the missing commits, keep a"
-        f" copy of the folder and delete {folder / 'mark'}",
-    )
-
-
 def read_contents(database: Database, path: Path) -> Contents:
-    """Read all rows, each checked.
+    """Read all rows, each checked, and tell newest states from history.
 
     Raises:
-        StoreError: A row is damaged.
+        StoreError: A row is damaged, or one is missing that another one names.
     """
     contents = Contents()
     for row in database.rows():
@@ -237,6 +151,15 @@ def read_contents(database: Database, path: Path) -> Contents:
             _read_row(row, contents)
         except _UNREADABLE as damage:
             refuse(path, f"is damaged in row {row.id}: {damage}")
+    try:
+        for slot, rows in contents.orders.items():
+            _sort_states(slot, sorted(rows), contents)
+        for key, cause in contents.states.causes.items():
+            if cause not in contents.causes:
+                raise DamagedRowError(f"the cause of {contents.records[key].slot} is missing")
+            contents.records[key] = replace(contents.records[key], cause=contents.causes[cause])
+    except DamagedRowError as damage:
+        refuse(path, f"is damaged: {damage}")
     return contents
 
 
@@ -257,17 +180,23 @@ def _read_row(row: DatabaseRow, contents: Contents) -> None:
             ended = read_ended(key, row.body)
             contents.ended[ended.session] = ended.wall_ns
         case Kind.WORLD:
-            recovered.worlds.append(WorldRecord(read_world(key)))
+            recovered.worlds.append(read_world(key, row.body))
+        case Kind.DROPPED:
+            recovered.dropped.append(read_dropped(key, row.body))
         case Kind.ASPECT:
             recovered.aspects.append(read_aspect(key, row.body))
-        case Kind.SLOT | Kind.PREPARED_WRITE:
-            of_slot = key if key.kind is Kind.SLOT else slot_of_write(key)
-            slot = read_slot(of_slot, row.body)
-            contents.kept[key] = slot.record
-            if slot.blob is not None:
-                contents.blobs[key] = slot.blob
+        case Kind.KEPT:
+            recovered.kept.append(read_kept(key, row.body))
+        case Kind.SLOT:
+            slot, order = read_slot_key(key)
+            _take_state(key, read_slot(slot, row.body), contents)
+            contents.orders.setdefault(slot, []).append((order, key))
+        case Kind.CAUSE:
+            contents.causes[cause_key(read_order(key))] = read_cause(row.body)
+        case Kind.PREPARED_WRITE:
+            _take_state(key, read_slot(read_write_key(key)[1], row.body), contents)
         case Kind.PREPARED:
-            contents.prepared[read_prepared_lock(key)] = (key, row.body)
+            contents.prepared[read_lock(key)] = (key, row.body)
         case Kind.DECISION:
             recovered.decisions.append(read_decision(key, row.body))
         case Kind.OUTCOME:
@@ -275,51 +204,96 @@ def _read_row(row: DatabaseRow, contents: Contents) -> None:
         case Kind.FORCED:
             recovered.forced.append(read_forced(key, row.body))
         case Kind.AUDIT:
-            recovered.audit.append(read_audit(row.body))
+            contents.acts[read_order(key)] = read_audit(row.body)
+
+
+def _take_state(key: Key, found: StoredSlot, contents: Contents) -> None:
+    contents.records[key] = found.record
+    if found.blob is not None:
+        contents.states.name_blob(key, found.blob)
+    if found.shared_cause is not None:
+        contents.states.name_cause(key, cause_key(found.shared_cause))
+
+
+def _sort_states(slot: Slot, rows: list[tuple[Order, Key]], contents: Contents) -> None:
+    """Note which of a slot's rows, oldest first, is its newest state and which are history."""
+    _, key = rows.pop()
+    newest = contents.records[key]
+    contents.states.newest[slot] = State(key, newest.version, newest.volatile)
+    history = {contents.records[key].version: key for _, key in rows}
+    if len(history) < len(rows) or any(contents.records[key].volatile for _, key in rows):
+        raise DamagedRowError(f"the history of {slot} contradicts itself")
+    if history:
+        contents.states.history[slot] = history
 
 
 def read_blobs(contents: Contents, blobs: BlobFolder, *, power_cut: bool) -> None:
-    """Check every blob file and give the slots their bodies.
+    """Map every blob file and give the states their bodies; see above what is checked.
 
     Raises:
         StoreError: A file is missing or damaged, and no power cut explains it.
         OSError: As the system reports it.
     """
-    allow_mapped(len(contents.blobs))
-    for key, record in contents.kept.items():
-        blob = contents.blobs.get(key)
-        if blob is None or record.datum is None:
+    states = contents.states
+    history = {key for rows in states.history.values() for key in rows.values()}
+    whole = {
+        blob.name
+        for key, blob in states.blobs.items()
+        if key not in history or (power_cut and not blob.synced)
+    }
+    files: dict[str, Mapped | DamagedBlobError] = {}
+    for key, blob in list(states.blobs.items()):
+        record = contents.records[key]
+        if record.datum is None:
             continue
-        try:
-            body = blobs.read(blob)
-        except DamagedBlobError as damage:
-            if blob.synced or not power_cut:
-                refuse(
-                    blobs.folder / blob.name,
-                    f"holds {record.slot}, version {record.version}, and cannot be used: {damage}",
-                )
-            _log.warning("%s is lost with the power: %s", record.slot, damage)
-            lost = replace(record, datum=None, null_reason=NullReason.LOST.name)
-            contents.kept[key] = contents.lost[key] = lost
-        else:
-            contents.kept[key] = replace(record, datum=replace(record.datum, body=body))
+        file = files.get(blob.name)
+        if file is None:
+            file = files[blob.name] = _mapped(blobs, blob, whole=blob.name in whole)
+        if isinstance(file, Mapped):
+            datum = replace(record.datum, body=file.body, fault=file.fault)
+            contents.records[key] = replace(record, datum=datum)
+            continue
+        if blob.synced or not power_cut:
+            refuse(
+                blobs.folder / blob.name,
+                f"holds {record.slot}, version {record.version}, and cannot be used: {file}",
+            )
+        _log.warning("%s is lost with the power: %s", record.slot, file)
+        states.unname(states.blobs.pop(key).name)
+        lost = replace(record, datum=None, null_reason=NullReason.LOST.name)
+        contents.records[key] = contents.lost[key] = lost
+
+
+def _mapped(blobs: BlobFolder, blob: Blob, *, whole: bool) -> Mapped | DamagedBlobError:
+    try:
+        return blobs.map(blob, whole=whole)
+    except DamagedBlobError as damage:
+        return damage
 
 
 def put_together(contents: Contents, path: Path) -> None:
-    """Give back what is kept as the core knows it, bodies included.
+    """Give back states, acts and prepared locks as the core knows them.
 
     Raises:
         StoreError: A prepared lock lacks some of its writes.
     """
+    states, recovered = contents.states, contents.recovered
+    recovered.slots = [contents.records[state.key] for state in states.newest.values()]
+    recovered.history = [
+        contents.records[rows[version]]
+        for _, rows in sorted(states.history.items())
+        for version in sorted(rows)
+    ]
+    recovered.audit = [act for _, act in sorted(contents.acts.items())]
     writes: dict[LockId, dict[Slot, SlotRecord]] = {lock: {} for lock in contents.prepared}
-    for key, record in contents.kept.items():
-        if key.kind is Kind.SLOT:
-            contents.recovered.slots.append(record)
-        else:
-            writes.setdefault(lock_of_write(key), {})[record.slot] = record
+    for key, record in contents.records.items():
+        if key.kind is Kind.PREPARED_WRITE:
+            lock, slot = read_write_key(key)
+            writes.setdefault(lock, {})[slot] = record
     for lock, found in writes.items():
         try:
-            row = contents.prepared[lock]
-            contents.recovered.prepared.append(read_prepared(*row, found))
+            prepared = read_prepared(*contents.prepared[lock], found)
         except (*_UNREADABLE, KeyError) as damage:
             refuse(path, f"is damaged: the prepared lock {lock} cannot be read ({damage})")
+        recovered.prepared.append(prepared)
+        states.prepared[lock] = dict(prepared_writes(prepared))

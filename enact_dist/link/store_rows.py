@@ -1,32 +1,45 @@
 """Records as rows: what is stored of each, as msgpack, under which key.
 
-A row is (kind, key, body); a later row of the same kind and key replaces the one before.  Reading
-is strict: a row that is not exactly what this module writes is damage, not a default.  Changing
-what is written means a new `FORMAT` in `folder_lock`.
+A row is (kind, key, body); a later row of the same kind and key replaces the one before.  Only the
+states of slots have keys of their own each: a state that is replaced and stays as history keeps
+its row as it is, and of a slot's rows the one written last holds its newest state.
+
+A cause goes into the row of the state that it made, or, where it made several, into a row that
+those name: else a commit of n data would store n² versions.
+
+Reading is strict: a row that is not exactly what this module writes is damage, not a default.
+Changing what is written means a new `FORMAT` in `folder_lock`.
 """
 
 from __future__ import annotations
 
 import enum
-import reprlib
 import zlib
-from typing import Final, NamedTuple, TypeVar
-
-import msgpack
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from enact_dist.core.datum import Datum, LockId, Position, Slot
-from enact_dist.core.messages import AspectEntry, SlotVersion
+from enact_dist.core.messages import AspectEntry
 from enact_dist.core.records import (
     AuditRecord,
+    KeptRecord,
     OutcomeRecord,
     SessionEnded,
     SessionRecord,
     SlotRecord,
+    WorldDropped,
     WorldRecord,
 )
 from enact_dist.link.blobs import Blob
+from enact_dist.link.store_fields import (
+    Fields,
+    pack,
+    packed_cause,
+    packed_versions,
+    read_cause,
+)
 
-T = TypeVar("T")
+if TYPE_CHECKING:
+    from enact_dist.core.messages import Cause
 
 INLINE_BYTES_MAX: Final = 64 * 1024
 """Bodies up to this size live in their row, larger ones in a file of their own."""
@@ -47,6 +60,9 @@ class Kind(enum.IntEnum):
     PREPARED_WRITE = 9
     DECISION = 10
     FORCED = 11
+    DROPPED = 12
+    KEPT = 13
+    CAUSE = 14
 
 
 class Key(NamedTuple):
@@ -56,8 +72,11 @@ class Key(NamedTuple):
     name: bytes
 
 
-class DamagedRowError(Exception):
-    """A row is not what this module writes; the message says which and how."""
+class Order(NamedTuple):
+    """When a row was written: in which batch, and as which one of it."""
+
+    batch: int
+    number: int
 
 
 EPOCH_KEY: Final = Key(Kind.EPOCH, b"")
@@ -72,12 +91,6 @@ def row_checksum(key: Key, batch: int, body: bytes) -> int:
     """Return the CRC-32 over everything that a row says."""
     head = b"%d %d %d " % (key.kind, batch, len(key.name))
     return zlib.crc32(body, zlib.crc32(key.name, zlib.crc32(head)))
-
-
-def pack(value: object) -> bytes:
-    """Return a value as it is stored."""
-    packed: bytes = msgpack.packb(value, use_bin_type=True)
-    return packed
 
 
 # ---------------------------------------------------------------- writing
@@ -100,19 +113,30 @@ def ended_row(record: SessionEnded) -> tuple[Key, bytes]:
 
 def world_row(record: WorldRecord) -> tuple[Key, bytes]:
     """Return the row of a world context."""
-    return key_of(Kind.WORLD, record.name), pack([])
+    return key_of(Kind.WORLD, record.name), pack([record.source, record.at_ns])
+
+
+def dropped_row(record: WorldDropped) -> tuple[Key, bytes]:
+    """Return the row of a world context that there was."""
+    return key_of(Kind.DROPPED, record.name), pack([record.version_base])
 
 
 def aspect_row(entry: AspectEntry) -> tuple[Key, bytes]:
     """Return the row of an aspect."""
-    return key_of(Kind.ASPECT, entry.name), pack([entry.fingerprint, entry.durability])
+    return key_of(Kind.ASPECT, entry.name), pack(list(entry[1:]))
+
+
+def kept_row(record: KeptRecord) -> tuple[Key, bytes | None]:
+    """Return the row of the versions that a label keeps, None where there are none."""
+    body = pack([packed_versions(record.versions)]) if record.versions else None
+    return key_of(Kind.KEPT, record.label), body
 
 
 def outcome_row(record: OutcomeRecord) -> tuple[Key, bytes]:
     """Return the row of a lane's newest outcome."""
     lock = record.lock
-    versions = [[*entry.slot, entry.version] for entry in record.versions]
-    return outcome_key(lock.session, lock.lane), pack([lock.seq, *record.position, versions])
+    body = [lock.seq, *record.position, packed_versions(record.versions)]
+    return outcome_key(lock.session, lock.lane), pack(body)
 
 
 def outcome_key(session: str, lane: int) -> Key:
@@ -120,51 +144,68 @@ def outcome_key(session: str, lane: int) -> Key:
     return key_of(Kind.OUTCOME, session, lane)
 
 
-def audit_row(record: AuditRecord, *, batch: int, number: int) -> tuple[Key, bytes]:
-    """Return the row of an operator's act; `batch` and `number` in it keep acts apart."""
-    return key_of(Kind.AUDIT, batch, number), pack([record.wall_ns, record.text, record.kind])
+def audit_row(record: AuditRecord, order: Order) -> tuple[Key, bytes]:
+    """Return the row of an operator's act; `order` keeps acts apart."""
+    return key_of(Kind.AUDIT, *order), pack([record.wall_ns, record.text, record.kind])
 
 
-def slot_key(slot: Slot) -> Key:
-    """Return where a slot's state stands."""
-    return key_of(Kind.SLOT, *slot)
+def slot_key(slot: Slot, order: Order) -> Key:
+    """Return where the state of a slot stands that was set then."""
+    return key_of(Kind.SLOT, *slot, *order)
 
 
-def slot_body(record: SlotRecord, blob: Blob | None) -> bytes:
-    """Return the row of a slot; `blob` is where its body went, None if it goes into the row."""
+def cause_key(order: Order) -> Key:
+    """Return where a cause stands that several states have."""
+    return key_of(Kind.CAUSE, *order)
+
+
+def cause_body(cause: Cause) -> bytes:
+    """Return the row of a cause that several states have."""
+    return pack(packed_cause(cause))
+
+
+def slot_body(record: SlotRecord, blob: Blob | None, shared_cause: Order | None = None) -> bytes:
+    """Return the row of a slot's state.
+
+    Args:
+        record: The state.
+        blob: Where its body went, None if it goes into the row.
+        shared_cause: Which row holds its cause; None where that goes into this one, if there is
+            any.
+    """
     if record.volatile:
         return pack([])
+    cause: object = None
+    if shared_cause is not None:
+        cause = list(shared_cause)
+    elif record.cause is not None:
+        cause = packed_cause(record.cause)
+    place: object = None
     datum = record.datum
-    if datum is None:
-        return pack([record.version, record.stamp_ns, record.null_reason, None])
-    place = bytes(datum.body) if blob is None else list(blob)
-    return pack(
-        [
-            record.version,
-            record.stamp_ns,
-            record.null_reason,
-            [datum.encoding, datum.stamp_ns, place],
-        ]
-    )
+    if datum is not None:
+        bytes_at = bytes(datum.body) if blob is None else list(blob)
+        place = [datum.encoding, datum.stamp_ns, bytes_at]
+    return pack([record.version, record.stamp_ns, record.null_reason, place, cause])
 
 
 # ---------------------------------------------------------------- reading
 
 
 class StoredSlot(NamedTuple):
-    """A slot's row as read: its record, and where its body is if not in the row.
+    """A slot's row as read: its record, and where the rest is if not in the row.
 
-    With a blob the record's datum has an empty body still.
+    With a blob the record's datum has an empty body still, and with a shared cause the record has
+    none.
     """
 
     record: SlotRecord
-    blob: Blob | None
+    blob: Blob | None = None
+    shared_cause: Order | None = None
 
 
 def read_epoch(body: bytes) -> int:
     """Read the row of the epoch."""
-    fields = Fields(body)
-    return fields.last(int)
+    return Fields(body).last(int)
 
 
 def read_session(key: Key, body: bytes) -> SessionRecord:
@@ -177,15 +218,36 @@ def read_ended(key: Key, body: bytes) -> SessionEnded:
     return SessionEnded(Fields(key.name).last(str), Fields(body).last(int))
 
 
-def read_world(key: Key) -> str:
+def read_world(key: Key, body: bytes) -> WorldRecord:
     """Read the row of a world context."""
-    return Fields(key.name).last(str)
+    fields = Fields(body)
+    return WorldRecord(Fields(key.name).last(str), fields.next(str), fields.last(int))
+
+
+def read_dropped(key: Key, body: bytes) -> WorldDropped:
+    """Read the row of a world context that there was."""
+    return WorldDropped(Fields(key.name).last(str), Fields(body).last(int))
 
 
 def read_aspect(key: Key, body: bytes) -> AspectEntry:
     """Read the row of an aspect."""
     fields = Fields(body)
-    return AspectEntry(Fields(key.name).last(str), fields.next(str), fields.last(str))
+    return AspectEntry(
+        Fields(key.name).last(str),
+        fields.next(str),
+        fields.next(str),
+        fields.next(int),
+        fields.next(int),
+        fields.last(int),
+    )
+
+
+def read_kept(key: Key, body: bytes) -> KeptRecord:
+    """Read the row of the versions that a label keeps."""
+    fields = Fields(body)
+    versions = fields.versions()
+    fields.end()
+    return KeptRecord(Fields(key.name).last(str), versions)
 
 
 def read_outcome(key: Key, body: bytes) -> OutcomeRecord:
@@ -193,10 +255,9 @@ def read_outcome(key: Key, body: bytes) -> OutcomeRecord:
     names, fields = Fields(key.name), Fields(body)
     lock = LockId(names.next(str), names.last(int), fields.next(int))
     position = Position(fields.next(int), fields.next(str))
-    versions = [Fields(entry) for entry in fields.last(list)]
-    return OutcomeRecord(
-        lock, position, tuple(SlotVersion(_slot(entry), entry.last(int)) for entry in versions)
-    )
+    versions = fields.versions()
+    fields.end()
+    return OutcomeRecord(lock, position, versions)
 
 
 def read_audit(body: bytes) -> AuditRecord:
@@ -205,70 +266,46 @@ def read_audit(body: bytes) -> AuditRecord:
     return AuditRecord(fields.next(int), fields.next(str), fields.last(str))
 
 
-def read_slot(key: Key, body: bytes) -> StoredSlot:
-    """Read the row of a slot."""
-    names = Fields(key.name)
-    slot = _slot(names)
-    names.end()
+def read_slot_key(key: Key) -> tuple[Slot, Order]:
+    """Return which slot's state a row holds, and when it was set."""
+    fields = Fields(key.name)
+    return fields.slot(), Order(fields.next(int), fields.last(int))
+
+
+def read_order(key: Key) -> Order:
+    """Return when an operator's act or a cause with a row of its own was stored."""
+    fields = Fields(key.name)
+    return Order(fields.next(int), fields.last(int))
+
+
+def read_slot(slot: Slot, body: bytes) -> StoredSlot:
+    """Read the row of a slot's state."""
     fields = Fields(body)
     if fields.empty:
-        return StoredSlot(SlotRecord(slot, 0, 0, None, "", volatile=True), None)
+        return StoredSlot(SlotRecord(slot, 0, 0, None, "", volatile=True))
     version, stamp_ns, reason = fields.next(int), fields.next(int), fields.next(str)
-    packed = fields.last(object)
+    datum, blob = _datum(fields.next(object))
+    cause, shared_cause = _cause(fields.last(object))
+    record = SlotRecord(slot, version, stamp_ns, datum, reason, cause=cause)
+    return StoredSlot(record, blob, shared_cause)
+
+
+def _datum(packed: object) -> tuple[Datum | None, Blob | None]:
     if packed is None:
-        return StoredSlot(SlotRecord(slot, version, stamp_ns, None, reason), None)
+        return None, None
     fields = Fields(packed)
-    encoding, datum_stamp_ns, place = fields.next(bytes), fields.next(int), fields.last(object)
-    blob = None
+    encoding, stamp_ns, place = fields.next(bytes), fields.next(int), fields.last(object)
     if isinstance(place, bytes):
-        datum = Datum(encoding, place, len(place), datum_stamp_ns)
-    else:
-        fields = Fields(place)
-        blob = Blob(fields.next(str), fields.next(int), fields.next(int), fields.last(bool))
-        datum = Datum(encoding, b"", blob.size, datum_stamp_ns)
-    return StoredSlot(SlotRecord(slot, version, stamp_ns, datum, reason), blob)
+        return Datum(encoding, place, len(place), stamp_ns), None
+    fields = Fields(place)
+    blob = Blob(fields.next(str), fields.next(int), fields.next(int), fields.last(bool))
+    return Datum(encoding, b"", blob.size, stamp_ns), blob
 
 
-def _slot(fields: Fields) -> Slot:
-    return Slot(fields.next(str), fields.next(str), fields.next(str))
-
-
-class Fields:
-    """The fields of a packed list, each asked for with its type, in order and to the end."""
-
-    __slots__ = ("_fields", "_next")
-
-    def __init__(self, packed: object) -> None:
-        fields = msgpack.unpackb(packed) if isinstance(packed, bytes) else packed
-        if not isinstance(fields, list):
-            raise DamagedRowError(f"a list was expected, found {reprlib.repr(fields)}")
-        self._fields: list[object] = fields
-        self._next = 0
-
-    @property
-    def empty(self) -> bool:
-        """Whether there is no field at all."""
-        return not self._fields
-
-    def next(self, asked: type[T]) -> T:
-        """Take the next field, which must be of this type."""
-        if self._next >= len(self._fields):
-            raise DamagedRowError(
-                f"field {self._next + 1} of {reprlib.repr(self._fields)} is missing"
-            )
-        found = self._fields[self._next]
-        if not isinstance(found, asked):
-            raise DamagedRowError(f"{asked.__name__} was expected, found {reprlib.repr(found)}")
-        self._next += 1
-        return found
-
-    def last(self, asked: type[T]) -> T:
-        """Take the next field, which must be the last."""
-        found = self.next(asked)
-        self.end()
-        return found
-
-    def end(self) -> None:
-        """Make sure that nothing is left."""
-        if self._next != len(self._fields):
-            raise DamagedRowError(f"{reprlib.repr(self._fields)} has more than {self._next} fields")
+def _cause(packed: object) -> tuple[Cause | None, Order | None]:
+    if packed is None:
+        return None, None
+    if isinstance(packed, list) and len(packed) == len(Order._fields):
+        fields = Fields(packed)
+        return None, Order(fields.next(int), fields.last(int))
+    return read_cause(packed), None

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 class BatchStore(Protocol):
-    """What the thread writes to: a `Store` or `MemoryStore`."""
+    """What the thread writes to: a `Store`."""
 
     def write(self, batch: Sequence[Persist]) -> None:
         """Apply a batch whole; raise when it cannot be kept."""

@@ -1,112 +1,81 @@
-"""What a store must hold: the plainest model of its records, and the comparison with a real one."""
+"""What a store must hold: the core's ledger, and what a power cut may take of it."""
 
-from dataclasses import dataclass, field
+import copy
+from dataclasses import replace
 
-from store_workload import flat_datum, flat_record
+from store_workload import flat_record
 
-from enact_dist.core.records import (
-    AspectRecord,
-    AuditRecord,
-    DecisionDone,
-    DecisionRecord,
-    ForcedEnded,
-    ForcedRecord,
-    OutcomeRecord,
-    PreparedEnded,
-    PreparedRecord,
-    SessionEnded,
-    SessionRecord,
-    SlotRecord,
-    WorldRecord,
-)
+from enact_dist.core.ledger import Ledger
+from enact_dist.core.records import SessionEnded, SessionRecord, SlotRecord
 from enact_dist.terms import Durability
 
 LARGE_BYTES = 64 * 1024
 DAY_NS = 24 * 3600 * 10**9
 
 
-@dataclass
 class State:
     """Everything that is stored after some batch.
 
     Attributes:
-        forced: Slots and prepared locks whose large bodies were forced to the disk.
+        ledger: The records that count.
+        ended: When sessions ended whose outcomes are kept still.
+        forced: Versions of slots and prepared locks whose large bodies were forced to the disk.
     """
 
-    slots: dict = field(default_factory=dict)
-    outcomes: dict = field(default_factory=dict)
-    sessions: dict = field(default_factory=dict)
-    ended: dict = field(default_factory=dict)
-    worlds: set = field(default_factory=set)
-    aspects: dict = field(default_factory=dict)
-    prepared: dict = field(default_factory=dict)
-    decisions: dict = field(default_factory=dict)
-    given_up: dict = field(default_factory=dict)
-    audit: list = field(default_factory=list)
-    forced: set = field(default_factory=set)
+    def __init__(self):
+        self.ledger = Ledger()
+        self.ended = {}
+        self.forced = set()
 
     def copy(self):
-        parts = (getattr(self, name) for name in self.__dataclass_fields__)
-        return State(*(part.copy() for part in parts))
+        state = State()
+        for name, part in vars(self.ledger).items():
+            setattr(state.ledger, name, copy.copy(part))
+        state.ended, state.forced = self.ended.copy(), self.forced.copy()
+        return state
 
     def after(self, batch):
         """Return the state after a batch of (durability, records)."""
         state = self.copy()
-        written = {}
+        durable_in_batch = {}
         for durability, records in batch:
             for record in records:
+                durable = durability is Durability.DURABLE
+                name = None
+                if isinstance(record, SlotRecord):
+                    state._check_version(record)
+                    # A durable state that is replaced in its batch is never written.
+                    durable |= durable_in_batch.get(record.slot, False) and not record.history
+                    durable_in_batch[record.slot] = durable
+                    name = (record.slot, record.version)
+                elif hasattr(record, "writes"):
+                    name = record.lock
+                if name is not None:
+                    (state.forced.add if durable else state.forced.discard)(name)
                 state.apply(record)
-                name = getattr(record, "slot", None) or getattr(record, "lock", None)
-                written[name] = written.get(name, False) or durability is Durability.DURABLE
-        for name, durable in written.items():
-            (state.forced.add if durable else state.forced.discard)(name)
         return state
 
+    def _check_version(self, record):
+        """Assert I2: versions of a slot are a chain without a gap."""
+        before = self.ledger.slots.get(record.slot)
+        if before is not None and not (before.volatile or record.volatile):
+            assert record.version == before.version + 1, record
+
     def apply(self, record):
-        if isinstance(record, SlotRecord):
-            before = self.slots.get(record.slot)
-            if record.volatile:
-                record = SlotRecord(record.slot, 0, 0, None, "", volatile=True)
-            else:
-                # I2: versions of a slot are a chain without a gap.
-                assert record.version == (before.version if before else 0) + 1, record
-            self.slots[record.slot] = record
-        elif isinstance(record, OutcomeRecord):
-            self.outcomes[record.lock[:2]] = record
-        elif isinstance(record, SessionRecord):
+        self.ledger.take(record)
+        if isinstance(record, SessionRecord):
             self.ended.pop(record.session, None)
-            self.sessions[record.session] = record
         elif isinstance(record, SessionEnded):
-            self.sessions.pop(record.session, None)
-            self.ended[record.session] = record.wall_ns
             self.forget(record.wall_ns)
-        elif isinstance(record, WorldRecord):
-            self.worlds.add(record.name)
-        elif isinstance(record, AspectRecord):
-            self.aspects[record.entry.name] = record.entry
-        elif isinstance(record, PreparedRecord):
-            self.prepared[record.lock] = record
-        elif isinstance(record, PreparedEnded):
-            self.prepared.pop(record.lock, None)
-        elif isinstance(record, DecisionRecord):
-            self.decisions[record.lock] = record
-        elif isinstance(record, DecisionDone):
-            self.decisions.pop(record.lock, None)
-        elif isinstance(record, ForcedRecord):
-            self.given_up[record.lock] = record
-        elif isinstance(record, ForcedEnded):
-            self.given_up.pop(record.lock, None)
-        elif isinstance(record, AuditRecord):
-            self.audit.append(record)
-        else:
-            raise AssertionError(record)
+            self.ended[record.session] = record.wall_ns
 
     def forget(self, wall_ns):
         """Forget the outcomes of sessions that ended a day before."""
         for session, ended_ns in list(self.ended.items()):
             if ended_ns <= wall_ns - DAY_NS:
                 del self.ended[session]
-                self.outcomes = {k: v for k, v in self.outcomes.items() if k[0] != session}
+                for lane in [lane for lane in self.ledger.outcomes if lane[0] == session]:
+                    del self.ledger.outcomes[lane]
 
     def opened(self, wall_ns):
         """Return the state after a start of the shard."""
@@ -116,77 +85,78 @@ class State:
 
     # ---------------------------------------------------------------- comparison
 
-    def difference(self, recovered, *, power_cut):
+    def difference(self, recovered, *, power_cut=False):
         """Return what of a recovered state is not this one, "" where nothing is."""
-        pairs = (
-            ("sessions", {r.session: r for r in recovered.sessions}, self.sessions),
-            ("worlds", {record.name for record in recovered.worlds}, self.worlds),
-            ("aspects", {entry.name: entry for entry in recovered.aspects}, self.aspects),
-            ("outcomes", {r.lock[:2]: r for r in recovered.outcomes}, self.outcomes),
-            ("given up", {r.lock: r for r in recovered.forced}, self.given_up),
-            ("audit", recovered.audit, self.audit),
-            ("decisions", {r.lock: r for r in recovered.decisions}, self.decisions),
-        )
-        for name, found, expected in pairs:
-            if found != expected:
-                return f"{name}: {found} instead of {expected}"
-        return self._slots_differ(recovered, power_cut) or self._prepared_differ(
-            recovered, power_cut
-        )
-
-    def _slots_differ(self, recovered, power_cut):
-        found = {record.slot: record for record in recovered.slots}
-        if found.keys() != self.slots.keys():
-            return f"slots {sorted(found)} instead of {sorted(self.slots)}"
-        for slot, record in found.items():
-            expected = self.slots[slot]
-            same = (record.version, record.stamp_ns) == (expected.version, expected.stamp_ns)
-            if record.null_reason == "LOST" and same and power_cut and self.may_lose(slot):
-                continue
-            if not same or flat_record(record) != expected:
-                return f"{slot}: {record!r:.200} instead of {expected!r:.200}"
-        return ""
-
-    def _prepared_differ(self, recovered, power_cut):
-        found = {record.lock: record for record in recovered.prepared}
-        if found.keys() != self.prepared.keys():
-            return f"prepared {sorted(found)} instead of {sorted(self.prepared)}"
-        for lock, record in found.items():
-            expected = self.prepared[lock]
-            rest = (record.items, record.token, record.versions, record.stamp_ns, record.primary)
-            wanted = (
-                expected.items,
-                expected.token,
-                expected.versions,
-                expected.stamp_ns,
-                expected.primary,
-            )
-            if rest != wanted or record.primary_token != expected.primary_token:
-                return f"prepared {lock}: {rest} instead of {wanted}"
-            for write, other in zip(record.writes, expected.writes, strict=True):
-                lost = write.datum is None and other.datum is not None
-                if (
-                    lost
-                    and power_cut
-                    and lock not in self.forced
-                    and other.datum.size > LARGE_BYTES
-                ):
+        wanted = self.ledger.recovered(recovered.epoch)
+        for name, by_name in PARTS.items():
+            found, expected = (by_name(getattr(one, name)) for one in (recovered, wanted))
+            if found.keys() != expected.keys():
+                return f"{name} {sorted(map(str, found))} instead of {sorted(map(str, expected))}"
+            for key, record in found.items():
+                if record == expected[key]:
                     continue
-                if write.slot != other.slot or flat_datum(write.datum) != other.datum:
-                    return f"prepared {lock}: {write!r:.200} instead of {other!r:.200}"
+                if not (power_cut and self._is_lost(record, expected[key])):
+                    return f"{name} {key}: {record!r:.300} instead of {expected[key]!r:.300}"
+        if [r.version for r in recovered.history] != [r.version for r in wanted.history]:
+            return "the history is not in order"
         return ""
 
-    def may_lose(self, slot):
-        """Whether a power cut may take the body of a slot, which then is null."""
-        datum = self.slots[slot].datum
-        return slot not in self.forced and datum is not None and datum.size > LARGE_BYTES
+    def _is_lost(self, record, expected):
+        """Whether a power cut explains the difference: it took a large body, that is now null."""
+        if isinstance(record, SlotRecord):
+            return record == self._without(expected, (expected.slot, expected.version))
+        if hasattr(record, "writes"):
+            if record.lock in self.forced:
+                return False
+            writes = tuple(
+                found if found.datum is None and is_large(wanted.datum) else wanted
+                for found, wanted in zip(record.writes, expected.writes, strict=True)
+            )
+            return record == replace(expected, writes=writes)
+        return False
+
+    def _without(self, expected, name):
+        if name in self.forced or not is_large(expected.datum):
+            return expected
+        return replace(expected, datum=None, null_reason="LOST")
 
     def with_lost(self, recovered):
         """Return this state with what a power cut took."""
         state = self.copy()
         for record in recovered.slots:
-            if record.null_reason == "LOST" and not record.volatile:
-                state.slots[record.slot] = flat_record(record)
+            if not record.volatile:
+                state.ledger.slots[record.slot] = flat_record(record)
+        for record in recovered.history:
+            state.ledger.history[record.slot, record.version] = flat_record(record)
         for record in recovered.prepared:
-            state.prepared[record.lock] = flat_record(record)
+            state.ledger.prepared[record.lock] = flat_record(record)
         return state
+
+
+def is_large(datum):
+    """Whether a datum has a file of its own."""
+    return datum is not None and datum.size > LARGE_BYTES
+
+
+def _stored(record):
+    """Return a state as it comes back: nothing of a volatile one but that it exists."""
+    if record.volatile:
+        return SlotRecord(record.slot, 0, 0, None, "", volatile=True)
+    return flat_record(record)
+
+
+PARTS = {
+    "sessions": lambda records: {record.session: record for record in records},
+    "worlds": lambda records: {record.name: record for record in records},
+    "dropped": lambda records: {record.name: record for record in records},
+    "aspects": lambda entries: {entry.name: entry for entry in entries},
+    "slots": lambda records: {record.slot: _stored(record) for record in records},
+    "history": lambda records: {(r.slot, r.version): _stored(r) for r in records},
+    "kept": lambda records: {record.label: record for record in records},
+    "outcomes": lambda records: {record.lock[:2]: record for record in records},
+    "prepared": lambda records: {record.lock: flat_record(record) for record in records},
+    "decisions": lambda records: {record.lock: record for record in records},
+    "forced": lambda records: {record.lock: record for record in records},
+    "audit": lambda records: dict(enumerate(records)),
+}
+"""What a store gives back, each part by what names its records."""

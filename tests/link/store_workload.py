@@ -68,7 +68,7 @@ FAR_TOKEN = Token(7, 7)
 
 def flat_datum(datum):
     """Return a datum with its body as bytes."""
-    return None if datum is None else replace(datum, body=bytes(datum.body))
+    return None if datum is None else replace(datum, body=bytes(datum.body), fault=None)
 
 
 def flat_record(record):

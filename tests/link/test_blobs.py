@@ -2,11 +2,11 @@
 
 import random
 import resource
+from pathlib import Path
 
 import pytest
 
-from enact_dist.errors import StoreError
-from enact_dist.link.blobs import Blob, BlobFolder, DamagedBlobError, allow_mapped
+from enact_dist.link.blobs import Blob, BlobFolder, DamagedBlobError
 
 BODY = random.Random(1).randbytes(2_500_001)
 
@@ -24,7 +24,7 @@ def test_body_is_read_as_it_was_written(blobs, body, durable):
     blob = blobs.write(body, durable=durable)
     blobs.sync_names()
     assert (blob.size, blob.synced) == (len(body), durable)
-    found = blobs.read(blob)
+    found = read(blobs, blob)
     assert found.readonly
     assert found == body
 
@@ -34,7 +34,7 @@ def test_memoryview_of_other_items_is_written_by_bytes(blobs):
     view = memoryview(bytes(800)).cast("d")
     blob = blobs.write(view, durable=False)
     assert blob.size == 800
-    assert blobs.read(blob) == bytes(800)
+    assert read(blobs, blob) == bytes(800)
 
 
 def test_names_are_unique_and_tell_nothing(blobs, tmp_path):
@@ -51,7 +51,7 @@ def test_used_name_is_never_overwritten(blobs, tmp_path):
     (tmp_path / (first.name + ".tmp")).touch()
     with pytest.raises(FileExistsError):
         BlobFolder(tmp_path, epoch=1700).write(b"other", durable=False)
-    assert blobs.read(first) == BODY
+    assert read(blobs, first) == BODY
 
 
 @pytest.mark.parametrize(
@@ -70,19 +70,20 @@ def test_damaged_file_is_named(blobs, tmp_path, spoil, said):
     blob = blobs.write(BODY, durable=True)
     spoil(tmp_path / blob.name)
     with pytest.raises(DamagedBlobError, match=said) as damaged:
-        blobs.read(blob)
+        read(blobs, blob)
     assert str(tmp_path / blob.name) in str(damaged.value)
 
 
 def test_mapped_body_survives_its_file(blobs):
     """Whoever has the body keeps it when the file is unlinked; unlinking twice is harmless."""
     blob = blobs.write(BODY, durable=False)
-    body = blobs.read(blob)
+    body, unchecked = read(blobs, blob), blobs.map(blob, whole=False)
     blobs.unlink(blob.name)
     blobs.unlink(blob.name)
-    assert body == BODY
+    assert body == unchecked.body == BODY
+    assert unchecked.fault() == ""
     with pytest.raises(DamagedBlobError):
-        blobs.read(blob)
+        blobs.map(blob, whole=False)
 
 
 def test_sweep_removes_drafts_and_orphans_only(blobs, tmp_path):
@@ -107,23 +108,55 @@ def test_failed_write_leaves_only_a_draft(blobs, tmp_path):
     assert [path.suffix for path in tmp_path.iterdir()] == [".tmp"]
 
 
-def test_limit_of_open_files_is_raised_for_many_maps(blobs):
-    """More maps than the soft limit are possible; more than the hard limit are refused by number."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lambda path: path.write_bytes(BODY[:-1] + bytes(1)), "is damaged: its checksum is wrong"),
+        (lambda path: path.write_bytes(BODY), ""),
+    ],
+)
+def test_content_is_checked_when_it_is_asked_for(blobs, tmp_path, spoil, said):
+    """A file that is only mapped is read once, at the first question; the answer stands then."""
+    blob = blobs.write(BODY, durable=False)
+    found = blobs.map(blob, whole=False)
+    spoil(tmp_path / blob.name)
+    assert found.fault().endswith(said)
+    assert (str(tmp_path / blob.name) in found.fault()) == bool(said)
+    blobs.unlink(blob.name)
+    assert found.fault().endswith(said)
+
+
+def test_error_of_the_disk_is_a_fault_of_the_content(blobs, tmp_path, monkeypatch):
+    """Whoever asks is told, and goes on: one bad file is not the end of the shard."""
+    found = blobs.map(blobs.write(BODY, durable=False), whole=False)
+
+    def broken(descriptor, parts):
+        raise OSError(5, "Input/output error")
+
+    monkeypatch.setattr("enact_dist.link.blobs.os.readv", broken)
+    assert "cannot be read: Input/output error" in found.fault()
+
+
+@pytest.mark.parametrize("whole", [False, True])
+def test_maps_keep_no_open_files(blobs, whole):
+    """As many large data as the system maps, however few files may be open."""
     blob = blobs.write(b"x" * 4096, durable=False)
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(
+        resource.RLIMIT_NOFILE, (len(list(Path("/proc/self/fd").iterdir())) + 20, hard)
+    )
     try:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (400, hard))
-        allow_mapped(600)
-        bodies = [blobs.read(blob) for _ in range(600)]
-        assert {bytes(body) for body in bodies} == {b"x" * 4096}
-        del bodies
-        if hard != resource.RLIM_INFINITY:
-            with pytest.raises(StoreError, match=f"allows {hard}"):
-                allow_mapped(hard)
+        bodies = [blobs.map(blob, whole=whole).body for _ in range(600)]
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    assert {bytes(body) for body in bodies} == {b"x" * 4096}
 
 
 def test_row_of_a_blob_is_a_plain_tuple():
     """Rows store it field by field, in this order."""
     assert Blob._fields == ("name", "size", "crc", "synced")
+
+
+def read(blobs, blob):
+    """Return the body of a file whose content is right."""
+    return blobs.map(blob, whole=True).body

@@ -20,7 +20,8 @@ from enact_dist.core.records import (
 )
 from enact_dist.errors import StoreError
 from enact_dist.link.folder_lock import FORMAT
-from enact_dist.link.store import OUTCOMES_KEPT_NS, open_memory_store, open_store
+from enact_dist.link.store import open_store
+from enact_dist.link.store_outcomes import OUTCOMES_KEPT_NS
 from enact_dist.terms import Durability, NullReason
 
 SLOT = Slot("online", "tray/package/1", "surface")
@@ -129,7 +130,7 @@ def test_catalogue_and_sessions_come_back(tmp_path):
     )
     store.close()
     found = reopened(tmp_path)
-    assert (found.worlds, found.aspects) == (["online"], [second])
+    assert (found.worlds, found.aspects) == ([WorldRecord("online")], [second])
     assert found.sessions == [SessionRecord("y", 6)]
 
 
@@ -279,15 +280,6 @@ def test_file_in_the_place_of_the_folder_is_refused_by_name(tmp_path):
     with pytest.raises(StoreError, match="file") as refused:
         open_store(path, unix_s=1)
     assert refused.value.path == str(path)
-
-
-def test_memory_store_keeps_nothing():
-    """The store without a folder takes everything and starts empty."""
-    store, recovered = open_memory_store(unix_s=7)
-    store.write([persist(slot_record("a", 1))])
-    store.rest()
-    store.close()
-    assert recovered == Recovered(epoch=7)
 
 
 def test_other_contents_of_the_folder_are_left_alone(tmp_path):

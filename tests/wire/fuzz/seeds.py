@@ -7,6 +7,7 @@ import shutil
 import sqlite3
 import tempfile
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,8 @@ from wire_samples import CLASSES, sample
 
 from enact_dist.actor_report import ActorStatistics, encode_reports
 from enact_dist.core.datum import Datum
-from enact_dist.core.records import Persist
+from enact_dist.core.messages import SlotVersion
+from enact_dist.core.records import Persist, SlotRecord
 from enact_dist.link.store import open_store
 from enact_dist.link.store_mark import MARK_FILE
 from enact_dist.link.store_rows import Kind
@@ -93,10 +95,11 @@ def rows(rng: random.Random) -> Iterator[bytes]:
     found = connection.execute("SELECT kind, key, body FROM record").fetchall()
     connection.close()
     shutil.rmtree(folder)
-    together = {Kind.PREPARED, Kind.PREPARED_WRITE}
-    yield row_input(*(one for one in found if one[0] in together))
+    groups = [{Kind.PREPARED, Kind.PREPARED_WRITE}, {Kind.SLOT, Kind.CAUSE}]
+    for together in groups:
+        yield row_input(*(one for one in found if one[0] in together))
     for one in found:
-        if one[0] not in together:
+        if not any(one[0] in together for together in groups):
             yield row_input(one)
     assert {Kind(kind) for kind, *_ in found} == set(Kind), "a kind of row without a sample"
 
@@ -127,7 +130,11 @@ def _stored(rng: random.Random) -> Path:
     folder = Path(tempfile.mkdtemp())
     store, _ = open_store(folder, unix_s=1)
     for number, record in enumerate(_records(rng), 1):
-        store.write([Persist(number, (record,), Durability.DURABLE)])
+        together = [record]
+        if isinstance(record, SlotRecord):
+            # Two states with one cause, which then has a row of its own.
+            together += [replace(record, version=record.version + 1, history=True)]
+        store.write([Persist(number, tuple(together), Durability.DURABLE)])
     store.close()
     return folder
 
@@ -139,16 +146,13 @@ def _records(rng: random.Random) -> Iterator[object]:
     from enact_dist.core import records
 
     kinds = get_args(records.Record)
-    for kind in sorted(kinds, key=lambda kind: not kind.__name__.endswith(("Ended", "Done"))):
+    ends = ("Ended", "Done", "Dropped", "Forgotten")
+    for kind in sorted(kinds, key=lambda kind: not kind.__name__.endswith(ends)):
         yield _fitting(kind, rng)
 
 
 def _fitting(kind: type, rng: random.Random) -> object:
     """Return a sample of a record that a shard could write."""
-    from dataclasses import replace
-
-    from enact_dist.core.messages import SlotVersion
-
     record = sample(kind, rng)
     if kind.__name__ == "PreparedRecord":
         versions = tuple(SlotVersion(write.slot, 1) for write in record.writes)
@@ -157,7 +161,11 @@ def _fitting(kind: type, rng: random.Random) -> object:
             return _fitting(kind, rng)
         return replace(record, versions=versions)
     if kind.__name__ == "SlotRecord":
-        return replace(record, volatile=False)
+        while record.cause is None:
+            record = sample(kind, rng)
+        return replace(record, volatile=False, same_as=None)
+    if kind.__name__ == "KeptRecord" and not record.versions:
+        return _fitting(kind, rng)
     if kind.__name__ == "SessionEnded":
         return replace(record, session="ended")  # one that begins again later is not ended
     return record

@@ -236,7 +236,7 @@ def rows(raw: bytes) -> object:
         put_together(contents, Path("store.db"))
     except StoreError:
         return None
-    assert all(isinstance(blob, Blob) for blob in contents.blobs.values())
+    assert all(isinstance(blob, Blob) for blob in contents.states.blobs.values())
     return contents
 
 

@@ -1,0 +1,52 @@
+"""What an operator reads when the system below a store fails."""
+
+from __future__ import annotations
+
+import errno
+import os
+import sqlite3
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.errors import StoreError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+_FULL_ERRNOS: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
+_DENIED_ERRNOS: Final = frozenset({errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR})
+
+
+def store_error(folder: Path, failure: OSError | sqlite3.Error) -> StoreError:
+    """Return what an operator must read about an error of the system."""
+    path = str(getattr(failure, "filename", None) or folder)
+    code = getattr(failure, "sqlite_errorcode", 0) & 0xFF
+    number = failure.errno if isinstance(failure, OSError) else None
+    if number in _FULL_ERRNOS or code == sqlite3.SQLITE_FULL:
+        found = f"no room for the data of {folder}: {_free_bytes(folder)} bytes are free there"
+        remedy = "free space on its disk, or raise its quota"
+    elif number == errno.ENOMEM:
+        found = f"the system gives no room for all large data of {folder} to be mapped"
+        remedy = "raise vm.max_map_count (sysctl), or let fewer versions stay"
+    elif code in {sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED}:
+        found = f"the database in {folder} is open in another program"
+        remedy = "close that one (a database browser, a backup)"
+    elif number in _DENIED_ERRNOS or code in {sqlite3.SQLITE_READONLY, sqlite3.SQLITE_CANTOPEN}:
+        found = f"{folder} cannot be written by this process"
+        remedy = "let the folder and all in it belong to the user that runs the shard"
+    else:
+        found = f"the disk or file system below {folder} fails"
+        remedy = "look at the system's log, make it sound"
+    return StoreError(
+        f"{found} ({failure}): {remedy}, and start the shard again; everything acknowledged before"
+        " is kept",
+        path=path,
+    )
+
+
+def _free_bytes(folder: Path) -> int | str:
+    """Return how many bytes this process may still write below `folder`."""
+    try:
+        found = os.statvfs(folder)
+    except OSError:
+        return "an unknown number of"
+    return found.f_bavail * found.f_frsize

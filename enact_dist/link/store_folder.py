@@ -1,0 +1,134 @@
+"""What a data folder says of itself before its rows are read, and how one is refused.
+
+Refusing costs an operator minutes; serving from a damaged store costs trust in every datum.  So
+each check ends in a `StoreError` that names the file and the way out.
+"""
+
+from __future__ import annotations
+
+import logging
+import shutil
+from typing import TYPE_CHECKING, Final, NamedTuple, NoReturn
+
+from enact_dist.errors import StoreError
+from enact_dist.link.store_mark import Mark, boot_id, read_mark
+from enact_dist.link.wal_check import check_wal
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+DATABASE_FILE: Final = "store.db"
+LOG_FILE: Final = "store.db-wal"
+BLOB_FOLDER: Final = "blobs"
+_REFUSED_SUFFIX: Final = ".refused"
+
+_RESTORE: Final = (
+    "restore the whole folder from a backup, or give the shard an empty folder and start without"
+    " its data"
+)
+
+_log = logging.getLogger("enact.store")
+
+
+class Found(NamedTuple):
+    """What a folder says of itself before its database is opened."""
+
+    mark: Mark | None
+    is_new: bool
+    power_cut: bool
+    """Whether the system has started anew since the store was last opened."""
+
+    @property
+    def is_first(self) -> bool:
+        """Whether no start before this one ever came to its end: nothing was acknowledged."""
+        return self.mark.is_first if self.mark is not None else self.is_new
+
+
+def refuse(path: Path, found: str, remedy: str = _RESTORE) -> NoReturn:
+    """Raise the `StoreError` of a damaged file.
+
+    Raises:
+        StoreError: Always.
+    """
+    raise StoreError(f"{path} {found}; the shard does not start: {remedy}", path=str(path))
+
+
+def look_at(folder: Path) -> Found:
+    """Find out what kind of folder this is.
+
+    Raises:
+        StoreError: Data are there and their database is not.
+        OSError: As the system reports it.
+    """
+    mark = read_mark(folder)
+    database = folder / DATABASE_FILE
+    is_new = not database.exists() or database.stat().st_size == 0
+    if is_new:
+        log = folder / LOG_FILE
+        has_log = log.exists() and log.stat().st_size > 0
+        has_mark = mark is not None and not mark.is_first
+        if has_mark or has_log or has_blobs(folder):
+            refuse(database, "is missing or empty, but the folder has been in use")
+    return Found(mark, is_new, mark is not None and mark.boot != boot_id())
+
+
+def has_blobs(folder: Path) -> bool:
+    """Whether anything lies where large bodies do."""
+    blobs = folder / BLOB_FOLDER
+    return blobs.exists() and any(blobs.iterdir())
+
+
+def check_log(folder: Path, *, power_cut: bool) -> None:
+    """Refuse a log that is damaged in its middle.
+
+    Raises:
+        StoreError: It is damaged, and no power cut explains it.
+        OSError: As the system reports it.
+    """
+    log = folder / LOG_FILE
+    verdict = check_wal(log)
+    if verdict.damaged_at is None:
+        return
+    if power_cut:
+        _log.warning(
+            "%s: what was written from byte %d on and not forced to the disk is gone after the"
+            " system's restart",
+            log,
+            verdict.damaged_at,
+        )
+        return
+    refuse(
+        log,
+        f"is damaged at byte {verdict.damaged_at}, and commits that were acknowledged follow",
+        "restore the whole folder from a backup; or, to go on without what was written from there"
+        f" on, keep a copy of the folder, delete its file 'mark', and cut the log with 'truncate -s"
+        f" {verdict.damaged_at} {log}'",
+    )
+
+
+def check_reach(folder: Path, found: Found, *, batch: int) -> None:
+    """Refuse a database that does not reach as far as the mark says.
+
+    Args:
+        folder: The data folder.
+        found: What it says of itself.
+        batch: Number of the newest batch that was read.
+
+    Raises:
+        StoreError: Batches are missing that were acknowledged.
+        OSError: As the system reports it.
+    """
+    if found.mark is None or batch >= found.mark.needed():
+        return
+    log = folder / LOG_FILE
+    readable = check_wal(log)
+    if log.exists() and log.stat().st_size:
+        # Closing the database cuts the log to what SQLite could read; the whole is evidence.
+        shutil.copyfile(log, log.with_name(log.name + _REFUSED_SUFFIX))
+    refuse(
+        log,
+        f"is cut or damaged from byte {readable.end} on: batch {found.mark.needed()} was"
+        f" acknowledged, the last one that can be read is {batch}",
+        "restore the whole folder from a backup; or, to go on without the missing commits, keep a"
+        f" copy of the folder and delete {folder / 'mark'}",
+    )

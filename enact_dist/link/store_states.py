@@ -1,0 +1,80 @@
+"""Which rows of a store hold the states of slots, and what several rows name together.
+
+A large body and a cause may be named by several rows: a fork has the bytes of its source, a commit
+made several states.  Each is there until the last of these rows is gone.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from enact_dist.core.datum import LockId, Slot
+    from enact_dist.core.records import SlotRecord
+    from enact_dist.link.blobs import Blob
+    from enact_dist.link.store_rows import Key
+
+
+class State(NamedTuple):
+    """The row of a slot's newest state."""
+
+    key: Key
+    version: int
+    volatile: bool
+
+
+class States:
+    """The rows of slots' states and of prepared writes, by what they are about.
+
+    Attributes:
+        newest: The row of each slot's newest state.
+        history: The rows of its replaced states that are kept, by version.
+        prepared: The writes of each prepared lock, by their rows.
+        blobs: The file that a row names, by row.
+        causes: The row of a shared cause that a row names, by row.
+    """
+
+    __slots__ = ("_rows", "blobs", "causes", "history", "newest", "prepared")
+
+    def __init__(self) -> None:
+        self.newest: dict[Slot, State] = {}
+        self.history: dict[Slot, dict[int, Key]] = {}
+        self.prepared: dict[LockId, dict[Key, SlotRecord]] = {}
+        self.blobs: dict[Key, Blob] = {}
+        self.causes: dict[Key, Key] = {}
+        self._rows: Counter[str | Key] = Counter()
+
+    def find(self, slot: Slot, version: int) -> Key | None:
+        """Return the row of one version of a slot, None where it is not stored."""
+        newest = self.newest.get(slot)
+        if newest is not None and newest.version == version and not newest.volatile:
+            return newest.key
+        return self.history.get(slot, {}).get(version)
+
+    def of_context(self, context: str) -> Iterator[Key]:
+        """Yield the rows of all states of a world context, and forget them."""
+        for slot in [slot for slot in self.newest if slot.context == context]:
+            yield self.newest.pop(slot).key
+        for slot in [slot for slot in self.history if slot.context == context]:
+            yield from self.history.pop(slot).values()
+
+    def name_blob(self, key: Key, blob: Blob) -> None:
+        """Note that a row names a file."""
+        self.blobs[key] = blob
+        self._rows[blob.name] += 1
+
+    def name_cause(self, key: Key, cause: Key) -> None:
+        """Note that a row names a shared cause."""
+        self.causes[key] = cause
+        self._rows[cause] += 1
+
+    def unname(self, name: str | Key) -> bool:
+        """Note that one row fewer names a file or a cause; return whether none does any more."""
+        self._rows[name] -= 1
+        if self._rows[name] > 0:
+            return False
+        del self._rows[name]
+        return True
