@@ -20,14 +20,19 @@ from enact_dist.cell_info import SlotInfo, slot_info
 from enact_dist.core.messages import Item
 from enact_dist.errors import MisuseError
 from enact_dist.link.refusals import moment_name
+from enact_dist.lock import refuse_inside_lock
 from enact_dist.snapshot import raw_datum, survey_states, take_readings, take_snapshot
 from enact_dist.terms import Access, Context, Entities, Entity
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from enact_dist.diffing import Diff
     from enact_dist.moments import Moment
     from enact_dist.session import Session
+    from enact_dist.sight import Viewable
     from enact_dist.snapshot import Snapshot
-    from enact_dist.terms import LockRequest
+    from enact_dist.terms import Aspect, LockRequest
 
 
 class PastContext(Context):
@@ -117,6 +122,18 @@ class PastContext(Context):
             MisuseError: No such aspect is registered.
         """
         return raw_datum(self, self.session, entity, aspect)
+
+    def diff(
+        self,
+        other: Viewable,
+        entities: Entities | Entity | str = "**",
+        aspects: Iterable[Aspect[Any] | str] | None = None,
+    ) -> Diff:
+        """Compare this world context as it was (left) with another one; as `WorldContext.diff`."""
+        from enact_dist.diffing import diff
+
+        refuse_inside_lock("diff")
+        return diff(self, other, entities, aspects)
 
     # ---------------------------------------------------------------- what only the present has
 

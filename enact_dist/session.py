@@ -93,6 +93,11 @@ class Session:
             known = self._entries[id(aspect)] = (aspect, entry)
         return known[1]
 
+    def aspect_used(self, name: str) -> Aspect[Any] | None:
+        """Return the aspect of that name that this process used last here, if it used one."""
+        used = (aspect for aspect, _ in reversed(self._entries.values()) if aspect.name == name)
+        return next(used, None)
+
     def shard_of(self, slot: Slot) -> str:
         """Return the name of the shard that owns the slot."""
         return shard_of(slot.entity, self.client.core.placement)

@@ -22,7 +22,10 @@ from enact_dist.watch import Watch
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+    from enact_dist.diff_watch import DiffWatch
+    from enact_dist.diffing import Diff
     from enact_dist.session import Session
+    from enact_dist.sight import Viewable
     from enact_dist.terms import LockRequest
     from enact_dist.together import Together
 
@@ -100,6 +103,66 @@ class WorldContext(Context):
             self.session.register_aspects(aspects)
         names = tuple(aspect.name for aspect in aspects)
         return Watch(self.session.client, (self.name,), tuple(patterns), names)
+
+    def diff(
+        self,
+        other: Viewable,
+        entities: Entities | Entity | str = "**",
+        aspects: Iterable[Aspect[Any] | str] | None = None,
+    ) -> Diff:
+        """Compare this world context (left) with another one (right), datum by datum.
+
+        Both are seen as one cut; one that is past, as it was.  Data are compared by the comparator
+        of their aspect, exactly where it names none; an aspect whose type is not known in this
+        process is compared without it, dataclasses as dicts.  What is one version on both sides
+        is not fetched.
+
+        Args:
+            other: A world context, also a past one; of another cell, too, and then seen as a cut
+                of its own.
+            entities: A pattern or one entity.
+            aspects: Aspects, or their names; None means all.
+
+        Raises:
+            LockHeldError: This thread holds a lock.
+            ForgottenError: A past one has left its retention.
+            MisuseError: An aspect is named that nobody has registered.
+            UnknownWorldError: The cell has one of them no more.
+            DatumTypeError: An aspect is registered with another type.
+            ShardUnreachableError: A shard does not answer.
+        """
+        from enact_dist.diffing import diff
+
+        refuse_inside_lock("diff")
+        return diff(self, other, entities, aspects)
+
+    def watch_diff(
+        self,
+        other: Viewable,
+        entities: Entities | Entity | str = "**",
+        *aspects: Aspect[Any],
+    ) -> DiffWatch:
+        """Follow where this world context and another one of the cell differ: a standing diff.
+
+        First come the slots that differ now, then each whose comparison crosses its tolerance, in
+        either direction, or that comes or goes on one side; see `DiffWatch`.
+
+        Args:
+            other: A world context of the same connection; also a past one, as a reference.
+            entities: A pattern or one entity.
+            aspects: Which aspects; none means all.
+
+        Raises:
+            LockHeldError: This thread holds a lock.
+            ForgottenError: A past one has left its retention.
+            MisuseError: The two cannot be watched together.
+            UnknownWorldError: The cell has one of them no more.
+            ShardUnreachableError: A shard does not answer.
+        """
+        from enact_dist.diff_watch import DiffWatch
+
+        refuse_inside_lock("watch_diff")
+        return DiffWatch(self, other, str(entities), aspects)
 
     def survey(
         self, entities: Entities | str = "**", aspects: tuple[str, ...] = ()

@@ -7,7 +7,7 @@ import pytest
 from enact_dist import connect, local
 
 WORLDS = ("online", "training")
-OVER_A_SOCKET_TOO = ("test_lock", "test_world", "test_watch")
+OVER_A_SOCKET_TOO = ("test_lock", "test_world", "test_watch", "test_diff", "test_diff_watch")
 """What a user may rely on, wherever the shard is."""
 
 

@@ -1,0 +1,268 @@
+"""Slots of one or two world contexts as of one cut: their versions first, their data on demand.
+
+What is in sight stays fetchable until it is let go of, whatever is committed meanwhile; small data
+came with it (up to 8 MiB per shard), large ones are fetched when they are asked for.
+"""
+
+from __future__ import annotations
+
+from contextlib import ExitStack, contextmanager
+from typing import TYPE_CHECKING, Any, Final, Protocol
+
+import numpy as np
+
+from enact_dist.core.datum import Slot
+from enact_dist.core.message_parts import CAUSE_FORK
+from enact_dist.core.messages import Explain, Item, SlotVersion, Versions
+from enact_dist.errors import MisuseError
+from enact_dist.link.fetching import fetch_all
+from enact_dist.past_context import PastContext
+from enact_dist.reading import is_null
+from enact_dist.terms import Access, Aspect
+from enact_dist.wire.limits import ITEMS_MAX
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Sequence
+    from types import TracebackType
+
+    from enact_dist.core.datum import Datum
+    from enact_dist.core.lock_parts import Reading
+    from enact_dist.core.multilock import MultiLock
+    from enact_dist.session import Session
+
+SIGHT_WAIT_S: Final = 10.0
+"""How long a cut waits for its shards before they count as unreachable."""
+GENERATIONS_MAX: Final = 64
+"""How many forks of forks a version is followed through to where it was written."""
+BLOCK_BYTES: Final = 1 << 20
+"""Bytes that are compared in one step."""
+
+Place = tuple[str, str]
+"""Names of an entity and of an aspect."""
+
+
+class Viewable(Protocol):
+    """A `WorldContext`, or a `PastContext`."""
+
+    @property
+    def name(self) -> str:
+        """Its name."""
+
+    @property
+    def session(self) -> Session:
+        """By which it is seen."""
+
+
+class Sight:
+    """What a cut showed, and the way to its data.  Used by one thread.
+
+    Attributes:
+        session: By which it was taken.
+        forked: Whether a context in it is a fork.
+    """
+
+    def __init__(self, session: Session, lock: MultiLock, *, forked: bool) -> None:
+        self.session = session
+        self.forked = forked
+        self._lock = lock
+        self._readings: dict[str, dict[Place, Reading]] = {}
+        for reading in lock.states:
+            if not is_null(reading.state):
+                context, entity, aspect = reading.state.slot
+                self._readings.setdefault(context, {})[entity, aspect] = reading
+
+    def of(self, context: str) -> dict[Place, Reading]:
+        """Return the slots of one context that are not null."""
+        return self._readings.get(context, {})
+
+    def fetch(self, readings: Iterable[Reading]) -> dict[Slot, Datum]:
+        """Return the data of some of its slots.
+
+        Raises:
+            LeaseLostError: A shard restarted, or the session rested too long: look again.
+            ShardUnreachableError: A shard does not answer.
+        """
+        client, lock = self.session.client, self._lock.lock
+        return fetch_all(client, self.session.cache, lock, readings, client.check_usable)
+
+    def close(self) -> None:
+        """Let go of its data; twice is harmless."""
+        self.session.client.release(self._lock)
+
+    def __enter__(self) -> Sight:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+def look(worlds: Sequence[Viewable], places: Iterable[Place], *, each: bool) -> Sight:
+    """Take one cut over world contexts of one cell and one time.
+
+    Args:
+        worlds: One or two.
+        places: Entities (patterns with `each`) and aspects; of an aspect that the cell does not
+            know there is nothing to see.
+        each: Whether these are patterns.
+
+    Raises:
+        ForgottenError: They are of a past that is not known any more.
+        MisuseError: More is asked than one view can hold.
+        ShardUnreachableError: A shard does not answer.
+    """
+    client = worlds[0].session.client
+    known = client.aspect_entries()
+    asked = [place for place in places if place[1] in known]
+    names = dict.fromkeys(world.name for world in worlds)
+    access = int(Access.VIEW_EACH if each else Access.VIEW)
+    items = [Item(access, name, *place) for name in names for place in asked]
+    if len(items) > ITEMS_MAX:
+        raise MisuseError(
+            f"asked {len(asked)} data of each of {len(names)} world contexts at once, found room"
+            f" for {ITEMS_MAX} in all; name fewer aspects"
+        )
+    # A shard may never have held one of these aspects, and would not know its name.
+    client.register(aspects=[known[name] for name in {aspect for _, aspect in asked}])
+    past_ns = past_ns_of(worlds[0])
+    lock = client.acquire(items, wait_s=SIGHT_WAIT_S, hold_s=SIGHT_WAIT_S, past_ns=past_ns)
+    sight = Sight(worlds[0].session, lock, forked=any(map(_is_fork, worlds)))
+    for world in worlds:
+        if not sight.of(world.name):
+            world.session.check_world(world.name)
+    return sight
+
+
+@contextmanager
+def both_in_sight(
+    left: Viewable, right: Viewable, places: Sequence[Place], *, each: bool
+) -> Iterator[tuple[Sight, Sight]]:
+    """Look at two world contexts: as one cut where they are of one cell and one time.
+
+    Raises:
+        ForgottenError: See `look`.
+        ShardUnreachableError: See `look`.
+    """
+    one_cut = left.session is right.session and past_ns_of(left) == past_ns_of(right)
+    with ExitStack() as stack:
+        first = stack.enter_context(look([left, right] if one_cut else [left], places, each=each))
+        second = first
+        if not one_cut:
+            second = stack.enter_context(look([right], places, each=each))
+        yield first, second
+
+
+def past_ns_of(world: Viewable) -> int:
+    """Return the stamp as of which a context is seen (0: the present).
+
+    Raises:
+        MisuseError: It shows data by when they were captured, which are of no one moment.
+    """
+    if not isinstance(world, PastContext):
+        return 0
+    if not world.at_ns:
+        raise MisuseError(
+            f"{world!r} shows data by their capture stamps, which are of no one moment of the world"
+            " context; compare it as of a moment: at(position)"
+        )
+    return world.at_ns
+
+
+def _is_fork(world: Viewable) -> bool:
+    entry = world.session.client.worlds().get(world.name)
+    return entry is not None and bool(entry.source)
+
+
+def aspects_of(
+    worlds: Sequence[Viewable], wanted: Iterable[Aspect[Any] | str] | None
+) -> dict[str, Aspect[Any]]:
+    """Return the aspects to look at by name, each with its type as far as that is known here.
+
+    Args:
+        worlds: Where they are looked at.
+        wanted: Aspects, or names; None stands for all that these cells know.
+
+    Raises:
+        MisuseError: A name that no cell knows.
+        DatumTypeError: An aspect is registered with another type.
+    """
+    sessions = dict.fromkeys(world.session for world in worlds)
+    if wanted is None or not set(_names(wanted := tuple(wanted))) <= _known(sessions):
+        for session in sessions:
+            session.client.greet()
+    known = _known(sessions)
+    typed = {one.name: one for one in wanted or () if isinstance(one, Aspect)}
+    for session in sessions:
+        session.register_aspects(one for one in typed.values() if one.datum_type is not object)
+    unknown = [name for name in _names(wanted or ()) if name not in known and name not in typed]
+    if unknown:
+        raise MisuseError(
+            f"no aspect {unknown[0]!r} is registered; known: {', '.join(sorted(known)) or 'none'}"
+        )
+    names = known if wanted is None else _names(wanted)
+    return {name: typed.get(name) or _type_used(sessions, name) for name in sorted(names)}
+
+
+def _names(aspects: Iterable[Aspect[Any] | str]) -> list[str]:
+    return [str(aspect) for aspect in aspects]
+
+
+def _known(sessions: Iterable[Session]) -> set[str]:
+    """Return the names of all aspects that cells know a type of."""
+    entries = [entry for one in sessions for entry in one.client.aspect_entries().values()]
+    return {entry.name for entry in entries if entry.fingerprint}
+
+
+def _type_used(sessions: Iterable[Session], name: str) -> Aspect[Any]:
+    """Return an aspect as this process has used it, else without a type."""
+    used = [session.aspect_used(name) for session in sessions]
+    return next((aspect for aspect in used if aspect is not None), Aspect(name, object))
+
+
+# ---------------------------------------------------------------- what need not be fetched
+
+
+def origins(session: Session, readings: Iterable[Reading]) -> dict[Slot, tuple[Slot, int]]:
+    """Return by slot where its version was written: in which slot, and with which stamp.
+
+    A version of a fork that nobody has replaced there was written in the context that it was
+    forked from.
+
+    Raises:
+        ShardUnreachableError: A shard does not answer.
+    """
+    client = session.client
+    found = {one.state.slot: (one.state.slot, one.state.stamp_ns) for one in readings}
+    at = {one.state.slot: SlotVersion(one.state.slot, one.state.version) for one in readings}
+    for _ in range(GENERATIONS_MAX):
+        asked: dict[str, list[SlotVersion]] = {}
+        for version in at.values():
+            asked.setdefault(client.shard_of(version.slot.entity), []).append(version)
+        if not asked:
+            break
+        answers = client.call_all([(shard, Explain(tuple(some))) for shard, some in asked.items()])
+        told = [answer.entries for answer in answers if isinstance(answer, Versions)]
+        causes = {entry.state.slot: entry.cause for entries in told for entry in entries}
+        before, at = at, {}
+        for slot, version in before.items():
+            cause = causes.get(version.slot)
+            if cause is not None and cause.kind == CAUSE_FORK and cause.reads:
+                source = cause.reads[0]
+                found[slot] = (source.slot, source.stamp_ns)
+                at[slot] = SlotVersion(source.slot, source.version)
+    return found
+
+
+def same_datum(left: Datum, right: Datum) -> bool:
+    """Whether two data are the same bytes; some equal ones are not (NaN, -0.0, order of keys)."""
+    if left.encoding != right.encoding or left.size != right.size:
+        return False
+    one, other = (np.frombuffer(each.body, np.uint8) for each in (left, right))
+    return all(
+        np.array_equal(one[start : start + BLOCK_BYTES], other[start : start + BLOCK_BYTES])
+        for start in range(0, left.size, BLOCK_BYTES)
+    )
