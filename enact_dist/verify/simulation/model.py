@@ -38,6 +38,7 @@ from enact_dist.core.records import (
     SlotRecord,
 )
 from enact_dist.terms import Durability
+from enact_dist.verify.simulation.cause_judge import CauseJudge
 from enact_dist.verify.simulation.client_judge import ClientJudge
 from enact_dist.verify.simulation.history import TOLD_NOT, History
 from enact_dist.verify.simulation.lock_judge import LockJudge
@@ -63,6 +64,7 @@ class Model:
     def __init__(self, world: World, history: History, aspects: Iterable[AspectEntry]) -> None:
         self._world, self._history = world, history
         self._locks = LockJudge(world)
+        self._causes = CauseJudge(world, history)
         aspects = tuple(aspects)
         self.durabilities = {entry.name: Durability(entry.durability) for entry in aspects}
         self._readers = ReaderJudge(self, {entry.name: entry.retention or 1 for entry in aspects})
@@ -173,6 +175,7 @@ class Model:
             elif before.version and stamp_of(content.datum) != stamp_of(before.datum):
                 self._fail("a datum keeps its capture stamp", slot, content, before)
             picture.restarted_at[slot] = len(picture.chains[slot]) - 1
+        self._causes.booted(host, picture)
         if len(recovered.outcomes) > len(picture.lanes):
             self._fail("I14 one outcome per lane", len(recovered.outcomes), len(picture.lanes))
         picture.arrivals.clear()
@@ -332,6 +335,7 @@ class Model:
         self._put_all(lock, versions, picture, datum_of)
         picture.applied[lock] = persist
         picture.confirmed[lock] = picture.granted_ever[lock]
+        self._causes.applied(host, lock, notice)
         self._world.tally["commits"] += 1
 
     def check_all_or_nothing(self) -> None:

@@ -26,6 +26,7 @@ from enact_dist.core.phase import Phase
 from enact_dist.core.placement import shard_of
 from enact_dist.terms import Access
 from enact_dist.verify.simulation.captures import Captures, drawn_stamp_ns
+from enact_dist.verify.simulation.cause_judge import reads_of
 from enact_dist.verify.simulation.client_host import Calls, ClientHost, Sleep, Steps, Thread
 from enact_dist.verify.simulation.history import Entry, History
 from enact_dist.verify.simulation.payloads import DRAFT_NS, Stager
@@ -360,6 +361,7 @@ class Workload:
             writes,
             give_up_ns=host.local_ns + finish_s * S,
             expects=expects,
+            reads=reads_of(entry),
         )
 
     def _slots_to_write(self, job: Job, data: dict[Slot, Datum | None]) -> list[Slot]:
