@@ -38,13 +38,16 @@ from enact_dist.link.session_client import FINISH_S
 from enact_dist.terms import checked_name
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
 
     from enact_dist.core.messages import Answer
     from enact_dist.session import Session
 
 UNDO_S: Final = 2.0
 """How long taking back a fork may take that cannot be completed; what is left is told."""
+
+PAUSE_S: Final = 0.05
+"""Pause before a shard is asked again that could not do it yet."""
 
 _log = logging.getLogger("enact")
 
@@ -63,20 +66,23 @@ def fork_world(session: Session, source: str, name: str, *, at_ns: int = 0) -> N
         at_ns = _present_ns(session)
     wanted = WorldEntry(name, source, at_ns)
     _refuse_existing(name, {s: entry for s, entry in there.items() if entry != wanted})
+
+    def request_of(_shard: str, epoch: int, count: int) -> Fork:
+        return Fork(client.core.session, name, source, at_ns, epoch, count)
+
     left, refusal = list(client.shards()), ""
     deadline_s = time.monotonic() + FINISH_S
-    request = Fork(client.core.session, name, source, at_ns)
     while left and (left_s := deadline_s - time.monotonic()) > 0.0:
-        answers = client.call_each([(shard, request) for shard in left], timeout_s=left_s)
-        for shard, answer in zip(list(left), answers, strict=True):
+        for shard, answer in client.ask_each(left, request_of, timeout_s=left_s).items():
             if isinstance(answer, Forked):
                 left.remove(shard)
-            elif isinstance(answer, Refused) and answer.code == OVERLOAD:
+            elif isinstance(answer, Refused) and _is_busy(answer):
                 refusal = answer.text  # an undecided commit stands in the way: ask again
             elif answer is not None:
                 _take_back(session, name, [s for s in client.shards() if s not in there])
                 raise _failure(answer)
-        client.rest(0.02 if left else 0.0)
+        if left:
+            client.rest(PAUSE_S)
     _learn_worlds(session)
     if left:
         raise _incomplete(session, wanted, left, refusal)
@@ -117,9 +123,7 @@ def _failure(answer: Answer) -> EnactError:
 
 def _take_back(session: Session, name: str, shards: list[str]) -> None:
     """Drop what has come to be of a fork on shards where there was no such context before."""
-    client = session.client
-    calls = [(shard, DropWorld(client.core.session, name)) for shard in shards]
-    for (shard, _), answer in zip(calls, client.call_each(calls, timeout_s=UNDO_S), strict=True):
+    for shard, answer in _dropped(session, name, shards, timeout_s=UNDO_S).items():
         if not isinstance(answer, Dropped):
             _log.warning("shard %s may have a part of the fork %s: drop it", shard, name)
 
@@ -149,14 +153,37 @@ def drop_world(session: Session, name: str) -> int:
         if not client.worlds_at(name):
             raise session.unknown_world(name)
     _refuse_locked(session, name)
-    shards = client.shards()
-    answers = client.call_each([(s, DropWorld(client.core.session, name)) for s in shards])
+    answers = _dropped(session, name, client.shards(), timeout_s=FINISH_S)
     _learn_worlds(session)
-    done = [s for s, answer in zip(shards, answers, strict=True) if isinstance(answer, Dropped)]
-    for shard, answer in zip(shards, answers, strict=True):
+    done = [shard for shard, answer in answers.items() if isinstance(answer, Dropped)]
+    for shard, answer in answers.items():
         if not isinstance(answer, Dropped):
             raise _not_dropped(session, name, done, shard, answer)
-    return sum(answer.slots for answer in answers if isinstance(answer, Dropped))
+    return sum(answer.slots for answer in answers.values() if isinstance(answer, Dropped))
+
+
+def _dropped(
+    session: Session, name: str, shards: Iterable[str], *, timeout_s: float
+) -> dict[str, Answer | None]:
+    """Ask shards to drop a context, again while one has it in hand for somebody else."""
+    client = session.client
+
+    def request_of(_shard: str, epoch: int, count: int) -> DropWorld:
+        return DropWorld(client.core.session, name, epoch, count)
+
+    answers: dict[str, Answer | None] = dict.fromkeys(shards)
+    left, deadline_s = list(answers), time.monotonic() + timeout_s
+    while left and (left_s := deadline_s - time.monotonic()) > 0.0:
+        answers.update(client.ask_each(left, request_of, timeout_s=left_s))
+        left = [s for s in left if _is_busy(answers[s])]
+        if left:
+            client.rest(PAUSE_S)
+    return answers
+
+
+def _is_busy(answer: Answer | None) -> bool:
+    """Whether a shard cannot do now what it may do if it is asked again."""
+    return isinstance(answer, Refused) and answer.code == OVERLOAD
 
 
 def _refuse_locked(session: Session, name: str) -> None:

@@ -27,6 +27,7 @@ from enact_dist.core.messages import (
 )
 from enact_dist.errors import ForgottenError, MisuseError, ProtocolError
 from enact_dist.link.refusals import error_of, moment_name
+from enact_dist.link.session_client import FINISH_S
 from enact_dist.moments import Moment
 from enact_dist.past_context import PastContext
 from enact_dist.reading import null_error
@@ -179,12 +180,14 @@ def let_go(session: Session, label: str) -> None:
 
 def _all_kept(session: Session, label: str, by_shard: dict[str, list[SlotVersion]]) -> list[Kept]:
     client = session.client
-    calls = [
-        (shard, KeepVersions(client.core.session, label, tuple(versions)))
-        for shard, versions in sorted(by_shard.items())
-    ]
+
+    def request_of(shard: str, _epoch: int, _count: int) -> KeepVersions:
+        return KeepVersions(client.core.session, label, tuple(by_shard[shard]))
+
     answers = []
-    for answer in client.call_all(calls):
+    for shard, answer in client.ask_each(sorted(by_shard), request_of).items():
+        if answer is None:
+            raise client.unreachable(shard, FINISH_S)
         if isinstance(answer, Refused):
             raise error_of(answer)
         if not isinstance(answer, Kept):

@@ -178,6 +178,7 @@ def error_of(refused: Refused | Forgotten) -> EnactError:
         "datum_type": DatumTypeError,
         "unknown_aspect": MisuseError,
         "value": MisuseError,
+        "held": MisuseError,
         "protocol": ProtocolError,
         "overload": LinkError,
         "no_room": NoRoomError,

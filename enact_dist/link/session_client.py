@@ -24,6 +24,7 @@ from enact_dist.core.messages import (
     AspectEntry,
     AwaitStamp,
     Commit,
+    EpochChanged,
     Goodbye,
     Hello,
     KeepAlive,
@@ -173,7 +174,7 @@ class SessionClient:
         answers = self.call_each(calls, timeout_s=timeout_s)
         for (shard, _), answer in zip(calls, answers, strict=True):
             if answer is None:
-                raise self._unreachable(shard, timeout_s)
+                raise self.unreachable(shard, timeout_s)
         return [answer for answer in answers if answer is not None]
 
     def call_each(
@@ -196,7 +197,41 @@ class SessionClient:
             self._rest(pause_s, self._returns)
             pause_s = min(2 * pause_s, 0.3)
 
-    def _unreachable(self, shard: str, waited_s: float) -> ShardUnreachableError:
+    def ask_each(
+        self,
+        shards: Iterable[str],
+        request_of: Callable[[str, int, int], Request],
+        *,
+        timeout_s: float = FINISH_S,
+    ) -> dict[str, Answer | None]:
+        """Make one call to each shard that only a known session may make; greet where needed.
+
+        Args:
+            shards: Whom to ask.
+            request_of: Makes the call to a shard of its name, its epoch and the message counter;
+                anew when the shard has restarted.
+            timeout_s: How long they may take; None stands for no answer then.
+        """
+        answers: dict[str, Answer | None] = dict.fromkeys(shards)
+        deadline_ns = self._now_ns() + int(timeout_s * 1e9)
+        while True:
+            left = [shard for shard, answer in answers.items() if answer is None]
+            left_s = max(0.0, (deadline_ns - self._now_ns()) / 1e9)
+            hellos = [(s, self.core.hello(s)) for s in left if self.core.needs_hello(s)]
+            if hellos:
+                self.call_each(hellos, timeout_s=left_s)
+            with self._mutex:
+                next_count, now_ns = self.core.sendings.next, self._now_ns()
+                calls = [(s, request_of(s, self.core.epoch(s), next_count(now_ns))) for s in left]
+            found = self.call_each(calls, timeout_s=left_s)
+            told = zip(left, found, strict=True)
+            answers.update(
+                (s, answer) for s, answer in told if not isinstance(answer, EpochChanged)
+            )
+            if None not in answers.values() or self._now_ns() >= deadline_ns:
+                return answers
+
+    def unreachable(self, shard: str, waited_s: float) -> ShardUnreachableError:
         """Return the error for a shard without an answer, after a question that needs no disk."""
         runs = self.carrier.request(shard, AwaitStamp(0, 0), timeout_s=CALL_S / 4) is not None
         return unreachable(shard, waited_s, self.carrier.endpoint_of, runs=runs)

@@ -7,7 +7,16 @@ import pytest
 from enact_dist import connect, local
 
 WORLDS = ("online", "training")
-OVER_A_SOCKET_TOO = ("test_lock", "test_world", "test_watch", "test_diff", "test_diff_watch")
+OVER_A_SOCKET_TOO = (
+    "test_lock",
+    "test_world",
+    "test_watch",
+    "test_history",
+    "test_past",
+    "test_forks",
+    "test_diff",
+    "test_diff_watch",
+)
 """What a user may rely on, wherever the shard is."""
 
 
@@ -43,6 +52,78 @@ def cell(request, tmp_path, monkeypatch):
             yield opened
     finally:
         shard.stop(drain_s=0.0)
+
+
+class TwoShards:
+    """Shards "left" and "right" in this process; entities go by the first part of their name."""
+
+    def __init__(self, folder=None):
+        from enact_dist.core.messages import Pin, PlacementMap, ShardEntry
+
+        self._folder = folder
+        self._endpoints = {name: f"tcp/127.0.0.1:{port}" for name, port in _two_ports()}
+        self._placement = PlacementMap(
+            1,
+            tuple(ShardEntry(name, (end,)) for name, end in self._endpoints.items()),
+            (Pin("left/**", "left"), Pin("right/**", "right")),
+        )
+        self._running = {}
+        for name in self._endpoints:
+            self.start(name)
+        self.cell = self.connect()
+
+    def start(self, name):
+        from enact_dist.core.shard_state import ShardSettings
+        from enact_dist.link.shard_daemon import DaemonSettings, start_shard
+
+        settings = ShardSettings(name, self._placement, worlds=WORLDS)
+        folder = self._folder / name if self._folder is not None else None
+        self._running[name] = start_shard(
+            DaemonSettings("cell", settings, (self._endpoints[name],), folder=folder)
+        )
+
+    def stop(self, name):
+        self._running.pop(name).stop(drain_s=0.0)
+
+    def connect(self, **options):
+        return connect(self._endpoints["left"], **options)
+
+    def close(self):
+        self.cell.close()
+        for name in list(self._running):
+            self.stop(name)
+
+
+def _two_ports():
+    probes = [socket.socket() for _ in range(2)]
+    for probe in probes:
+        probe.bind(("127.0.0.1", 0))
+    ports = [probe.getsockname()[1] for probe in probes]
+    for probe in probes:
+        probe.close()
+    return zip(("left", "right"), ports, strict=True)
+
+
+@pytest.fixture
+def two_shards(tmp_path, monkeypatch):
+    """A cell of two shards in memory, connected to over whatever carrier is the usual one."""
+    monkeypatch.setenv("ENACT_SHARED_FOLDER", str(tmp_path))
+    running = TwoShards()
+    try:
+        yield running
+    finally:
+        running.close()
+
+
+@pytest.fixture
+def two_stored(tmp_path, monkeypatch):
+    """The same with a folder for each shard, so that they may be stopped and started again."""
+    monkeypatch.setenv("ENACT_SHARED_FOLDER", str(tmp_path))
+    running = TwoShards(tmp_path)
+    try:
+        yield running
+    finally:
+        running.close()
 
 
 @pytest.fixture
