@@ -16,9 +16,10 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from enact_dist.cli import actor, bench, demo, doctor, lock, shard, up, verify, world
+from enact_dist.cli.times import shielded
 from enact_dist.cli.verbs import DONE, FAILED, UNREACHABLE, USAGE
 from enact_dist.errors import ConfigError, EnactError, ShardUnreachableError
 from enact_dist.supervise import end_with_supervisor
@@ -39,9 +40,17 @@ The cell is ./cell.toml unless --cell or $ENACT_CELL names another file or an en
 Exit status: 0 done, 1 refused or failed, 2 usage or configuration, 3 unreachable."""
 
 
+class _Parser(argparse.ArgumentParser):
+    """Takes words like ``-30s`` for moments: to `argparse` they would be options."""
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Parse words as `argparse` does, moments shielded."""
+        return super().parse_known_args(shielded(sys.argv[1:] if args is None else args), namespace)
+
+
 def build_parser() -> argparse.ArgumentParser:
     """Return the parser of all nouns and verbs."""
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="enact",
         description="Distributed world contexts for robots.",
         epilog=_EPILOG,

@@ -139,6 +139,15 @@ def slot_name(text: str) -> tuple[str, str]:
     return entity, aspect
 
 
+def slot_version(text: str) -> tuple[str, str, int]:
+    """Read ``ENTITY/ASPECT[@VERSION]``, version 0 if none is named; an `argparse` type."""
+    name, at, number = text.partition("@")
+    try:
+        return *slot_name(name), whole(number) if at else 0
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} does not name a version as @12") from None
+
+
 # ---------------------------------------------------------------- the cell
 
 

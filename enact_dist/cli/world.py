@@ -1,19 +1,13 @@
-"""`enact world ls|tree|get|put|watch`."""
+"""`enact world ls|tree|get|put|watch`; what is about time stands in `world_time`."""
 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from enact_dist.cli.output import (
-    print_json,
-    print_json_line,
-    print_table,
-    print_tree,
-    shown_bytes,
-    shown_s,
-)
+from enact_dist.cli import world_time
+from enact_dist.cli.output import print_json, print_json_line, print_table, shown_bytes
+from enact_dist.cli.slots import print_datum, print_slots
 from enact_dist.cli.verbs import (
     DONE,
     add_noun,
@@ -32,7 +26,6 @@ from enact_dist.terms import Entities, Entity
 if TYPE_CHECKING:
     import argparse
 
-    from enact_dist.cell_info import SlotInfo
     from enact_dist.cli.verbs import Verb
     from enact_dist.watch import Change
 
@@ -52,6 +45,7 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
     _add_get(verbs)
     _add_put(verbs)
     _add_watch(verbs)
+    world_time.add_verbs(verbs)
 
 
 def _add_tree(verbs: argparse._SubParsersAction[Verb]) -> None:
@@ -117,41 +111,42 @@ def _add_watch(verbs: argparse._SubParsersAction[Verb]) -> None:
 def list_worlds(arguments: argparse.Namespace) -> int:
     """Print the world contexts with what they hold."""
     with open_cell(arguments) as cell:
-        rows = []
+        rows: list[dict[str, Any]] = []
         for name in cell.worlds():
-            known = [info for info in cell.world(name).survey() if not info.null_reason]
+            world = cell.world(name)
+            known = [info for info in world.survey() if not info.null_reason]
             rows.append(
                 {
                     "world": name,
                     "entities": len({info.entity for info in known}),
                     "data": len(known),
                     "size_bytes": sum(info.size_bytes for info in known),
+                    "forked_from": world_time.fork_facts(world),
                 }
             )
     if arguments.json:
         print_json(rows)
     else:
         print_table(
-            ("world", "entities", "data", "size"),
-            [(*list(row.values())[:3], shown_bytes(int(str(row["size_bytes"])))) for row in rows],
+            ("world", "entities", "data", "size", "fork of"),
+            [_world_row(**row) for row in rows],
             empty="the cell has no world context",
         )
     return DONE
 
 
-@dataclass(slots=True)
-class _Branch:
-    """One segment of an entity's path: its line, and what lies below."""
-
-    label: str
-    children: dict[str, _Branch] = field(default_factory=dict)
-
-    def at(self, segments: list[str]) -> _Branch:
-        """Return the branch at a path below this one, growing it where needed."""
-        branch = self
-        for segment in segments:
-            branch = branch.children.setdefault(segment, _Branch(f"{segment}/"))
-        return branch
+def _world_row(
+    *,
+    world: str,
+    entities: int,
+    data: int,
+    size_bytes: int,
+    forked_from: dict[str, object] | None,
+) -> tuple[object, ...]:
+    origin = ""
+    if forked_from is not None:
+        origin = f"{forked_from['world']} as of {world_time.shown_origin(forked_from)}"
+    return world, entities, data, shown_bytes(size_bytes), origin
 
 
 def show_tree(arguments: argparse.Namespace) -> int:
@@ -162,36 +157,8 @@ def show_tree(arguments: argparse.Namespace) -> int:
             for info in cell.world(arguments.world).survey(Entities(arguments.pattern))
             if arguments.null or not info.null_reason
         ]
-    if arguments.json:
-        print_json([_slot_facts(info) for info in infos])
-        return DONE
-    root = _Branch(f"{arguments.world} ({len(infos)} data)")
-    for info in infos:
-        # A space cannot stand in a segment, so an aspect never hides an entity of its name.
-        leaf = f"{info.aspect}  {_slot_line(info)}"
-        root.at(info.entity.name.split("/")).children[f" {info.aspect}"] = _Branch(leaf)
-    print_tree(root)
+    print_slots(arguments.world, infos, as_json=arguments.json)
     return DONE
-
-
-def _slot_facts(info: SlotInfo) -> dict[str, object]:
-    return {
-        "entity": info.entity.name,
-        "aspect": info.aspect,
-        "version": info.version,
-        "stamp_ns": info.position.stamp_ns,
-        "size_bytes": info.size_bytes,
-        "null_reason": info.null_reason,
-        "shard": info.shard,
-    }
-
-
-def _slot_line(info: SlotInfo) -> str:
-    if info.null_reason:
-        return f"v{info.version}  NULL ({info.null_reason})"
-    ago_s = max(0.0, time.time() - info.position.stamp_ns / 1e9)
-    size = f"  {shown_bytes(info.size_bytes)}" if info.size_bytes else ""
-    return f"v{info.version}{size}  {shown_s(ago_s)} ago"
 
 
 # ---------------------------------------------------------------- get, put
@@ -199,18 +166,10 @@ def _slot_line(info: SlotInfo) -> str:
 
 def get_datum(arguments: argparse.Namespace) -> int:
     """Print or save one datum."""
-    from enact_dist.cli import showing
-
     entity, aspect = arguments.slot
     with open_cell(arguments) as cell:
         datum = cell.world(arguments.world).raw(Entity(entity), aspect)
-    if arguments.out:
-        print(showing.save(datum, arguments.out))
-    elif arguments.json:
-        print_json(showing.plain(datum))
-    else:
-        for line in showing.lines(datum):
-            print(line)
+    print_datum(datum, out=arguments.out, as_json=arguments.json)
     return DONE
 
 

@@ -39,11 +39,11 @@ def test_plain_table_is_aligned(capsys):
 
 def test_table_and_tree_are_drawn_on_a_terminal(capsys, monkeypatch):
     """On a terminal the same content is drawn; brackets in data are no markup."""
-    from enact_dist.cli.world import _Branch
+    from enact_dist.cli.slots import Branch
 
     monkeypatch.setattr(output, "on_terminal", lambda: True)
-    root = _Branch("online")
-    root.at(["tray", "1"]).children[" count"] = _Branch("count [bold]v1[/]")
+    root = Branch("online")
+    root.at(["tray", "1"]).children[" count"] = Branch("count [bold]v1[/]")
 
     output.print_tree(root)
     output.print_table(("name",), [("[red]a[/]",)], empty="none")

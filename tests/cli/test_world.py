@@ -46,7 +46,14 @@ def test_ls_counts_entities_and_data(at):
     assert worlds["online"]["entities"] >= 3
     assert worlds["online"]["size_bytes"] >= 480
     assert worlds["training"]["data"] == 0
-    assert at("ls").out.splitlines()[0].split() == ["world", "entities", "data", "size"]
+    assert at("ls").out.splitlines()[0].split() == [
+        "world",
+        "entities",
+        "data",
+        "size",
+        "fork",
+        "of",
+    ]
 
 
 def test_tree_shows_aspects_below_their_entities(at):
