@@ -53,13 +53,17 @@ shared_bytes_max       none           cap of each shard's large data in the memo
 [[pins]]               none           entities kept on one shard; the first match wins
   entities             required       name pattern, ``tray/**``
   shard                required       name of a shard
-[aspects.NAME]         none           an aspect whose commits differ from the rest
-  durability           "durable"      "durable", "os" or "volatile"
+[aspects.NAME]         none           an aspect about which the cell decides something
+  durability           the actors'    "durable", "os" or "volatile"; where nobody says anything:
+                                      "durable"
   retention            the actors'    how much of each datum's history stays: a number of
                                       versions, the newest included (1: none), or a table of
                                       `versions`, `age_s` (since it was replaced) and `size_bytes`
                                       (replaced data per datum), unlimited where unsaid; where
                                       nobody says anything: 16 versions, 600 s, 16 MiB
+  compare              none           what `enact world diff` compares its data by,
+                                      ``package.module:NAME``: the `Aspect` that says it (then its
+                                      type is known, too), or a comparator
 [actors.NAME]          none           an actor process
   class                required       ``package.module:Class``
   worlds               {}             role of the class = world context of the cell
@@ -117,7 +121,7 @@ __all__ = [
     "parse_config",
 ]
 
-_CLASS_PATH: Final = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*\Z")
+_DOTTED_NAME: Final = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*\Z")
 
 
 def load_config(
@@ -303,9 +307,18 @@ def _pin(table: Table, shards: tuple[ShardConfig, ...]) -> Pin:
 
 
 def _aspect(name: str, table: Table) -> AspectConfig:
-    table.refuse_unknown("durability", "retention")
+    table.refuse_unknown("durability", "retention", "compare")
     _check_title(name, "aspect", table)
-    found = table.take_str("durability", Durability.DURABLE.value)
+    compare = table.take_str("compare", "")
+    if "compare" in table.values and not _DOTTED_NAME.match(compare):
+        table.refuse("compare", f"'compare' is written package.module:NAME, not {compare!r}")
+    return AspectConfig(name, _durability(name, table), _retention(table), compare)
+
+
+def _durability(name: str, table: Table) -> Durability | None:
+    if "durability" not in table.values:
+        return None
+    found = table.take_str("durability")
     known = [durability.value for durability in Durability]
     if found not in known:
         table.refuse(
@@ -313,7 +326,7 @@ def _aspect(name: str, table: Table) -> AspectConfig:
             f"unknown durability {found!r} of aspect {name!r}{suggestion(found, known)}"
             f" (known: {', '.join(known)})",
         )
-    return AspectConfig(name, Durability(found), _retention(table))
+    return Durability(found)
 
 
 def _retention(table: Table) -> Retention | None:
@@ -333,7 +346,7 @@ def _actor(name: str, table: Table, worlds: tuple[str, ...]) -> ActorConfig:
     table.refuse_unknown("class", "worlds", "options", "every_s", "host")
     _check_title(name, "actor", table)
     class_path = table.take_str("class")
-    if not _CLASS_PATH.match(class_path):
+    if not _DOTTED_NAME.match(class_path):
         table.refuse("class", f"'class' is written package.module:Class, not {class_path!r}")
     every_s = None
     if "every_s" in table.values:

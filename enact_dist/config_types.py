@@ -53,17 +53,21 @@ class AspectConfig:
 
     Attributes:
         name: Name of the aspect.
-        durability: What its commits survive; wins over the actors' own word.
+        durability: What its commits survive; wins over the actors' own word.  None leaves it to
+            them.
         retention: How much of each datum's history stays; None leaves it to the actors.
+        compare: What a command line compares its data by, ``package.module:NAME``, or nothing.
     """
 
     name: str
-    durability: Durability
+    durability: Durability | None = None
     retention: Retention | None = None
+    compare: str = ""
 
     def entry(self) -> AspectEntry:
         """Return it as an entry of a catalogue, without a fingerprint: any type may register."""
-        return AspectEntry(self.name, "", self.durability.value, *said(self.retention))
+        durability = self.durability.value if self.durability is not None else ""
+        return AspectEntry(self.name, "", durability, *said(self.retention))
 
 
 @dataclass(frozen=True, slots=True)

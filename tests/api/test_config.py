@@ -41,6 +41,7 @@ durability = "volatile"
 retention = 8
 
 [aspects.flags]
+compare = "vocabulary.flags:FLAGS"
 
 [actors.fusion]
 class = "actors.palletizing.fusion:Fusion"
@@ -80,8 +81,9 @@ def test_config_holds_every_key_when_the_file_gives_all():
     assert (right.folder, right.host) == (Path("/srv/right"), "tray-pc")
     assert config.pins == (Pin("tray/**", "right"), Pin("system", "left"))
     assert [entry.durability for entry in config.aspects] == [
-        Durability.VOLATILE, Durability.DURABLE
+        Durability.VOLATILE, None
     ]  # fmt: skip
+    assert [entry.compare for entry in config.aspects] == ["", "vocabulary.flags:FLAGS"]
     assert (fusion.name, fusion.class_path) == ("fusion", "actors.palletizing.fusion:Fusion")
     assert dict(fusion.worlds) == {"training": "training", "now": "online"}
     assert dict(fusion.options) == {"voxel_m": 0.002, "names": ["a", "b"]}
@@ -97,10 +99,10 @@ def test_config_needs_only_a_name_and_a_shard():
 
 
 def test_config_lists_its_aspects_as_catalogue_entries():
-    """An aspect of the file has a durability and a retention, and lets any type register."""
+    """An aspect of the file lets any type register, and leaves to the actors what it does not say."""
     assert parsed(FULL).aspect_entries() == (
         AspectEntry("depth", "", "volatile", 8),
-        AspectEntry("flags", "", "durable"),
+        AspectEntry("flags", "", ""),
     )
 
 
@@ -111,8 +113,8 @@ def test_config_bounds_history_by_versions_age_and_bytes():
     size = parsed(text.replace("age_s = 60", "size_bytes = 1_000_000"))
 
     assert both.aspects[0].retention == Retention(versions=100, age_s=60.0)
-    assert both.aspect_entries() == (AspectEntry("x", "", "durable", 100, 60_000_000_000),)
-    assert size.aspect_entries() == (AspectEntry("x", "", "durable", 100, 0, 1_000_000),)
+    assert both.aspect_entries() == (AspectEntry("x", "", "", 100, 60_000_000_000),)
+    assert size.aspect_entries() == (AspectEntry("x", "", "", 100, 0, 1_000_000),)
 
 
 def test_placement_map_names_advertised_endpoints_and_pins():
@@ -190,6 +192,7 @@ WRONG = {
     "retention age": ('name = "c"\n' + SHARD + "[aspects.x]\nretention = { age_s = 0 }\n", 5, "'age_s' in [aspects.x.retention] must lie between 0.001 and 1e+09, not 0"),
     "retention bytes": ('name = "c"\n' + SHARD + "[aspects.x]\nretention = { size_bytes = 0.5 }\n", 5, "'size_bytes' in [aspects.x.retention] is a whole number above 0, not a float (0.5)"),
     "retention empty": ('name = "c"\n' + SHARD + "[aspects.x]\nretention = {}\n", 5, "Retention() says nothing"),
+    "compare": ('name = "c"\n' + SHARD + '[aspects.x]\ncompare = "vocabulary"\n', 5, "'compare' is written package.module:NAME, not 'vocabulary'"),
     "aspect key": ('name = "c"\n' + SHARD + "[aspects]\nx = { durable = true }\n", 5, "unknown key 'durable' in [aspects.x]; did you mean 'durability'?"),
     "aspect name": ('name = "c"\n' + SHARD + '[aspects."a/b"]\n', 4, "'a/b' cannot name a aspect"),
     "no class": ('name = "c"\n' + SHARD + "[actors.x]\n", 4, "[actors.x] needs the key 'class'"),

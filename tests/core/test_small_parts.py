@@ -204,6 +204,13 @@ class TestCatalogue:
 
         assert (entry.durability, new) == ("volatile", True)
 
+    def test_cell_that_says_no_durability_leaves_it_to_the_aspect(self):
+        """A line about its history alone makes nothing durable."""
+        catalogue = Catalogue(configured=[AspectEntry("count", "", "", 5)], recovered=(), worlds=())
+        entry, _ = catalogue.register(AspectEntry("count", "int", "volatile"))
+
+        assert (entry.durability, entry.retention) == ("volatile", 5)
+
     def test_unsaid_durability_is_durable(self):
         """Whoever says nothing loses nothing."""
         catalogue = Catalogue(configured=(), recovered=(), worlds=())
