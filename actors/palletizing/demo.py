@@ -21,7 +21,7 @@ from actors.geometry.files import write_whole
 from actors.geometry.picture import png_bytes
 from actors.palletizing.demo_cell import DemoError, RunningCell
 from actors.palletizing.demo_pictures import latest, model_picture, tray_picture
-from actors.palletizing.demo_report import report_bytes, rows_of, score_of, table_of
+from actors.palletizing.demo_report import difference_of, report_bytes, rows_of, score_of, table_of
 from actors.palletizing.simulation.packages import package_sequence
 from actors.palletizing.vocabulary import (
     DEVIATIONS,
@@ -33,6 +33,7 @@ from actors.palletizing.vocabulary import (
     PRODUCTS,
     REGION,
     SCAN,
+    STANDING,
     SURFACE,
     SYSTEM,
     TRAY,
@@ -89,6 +90,8 @@ def run_demo(*, out: Path, packages: int = 12, seed: int = SEED, keep_running: b
             _follow(cell, running, truths, console)
             rows = _outcome(cell, truths)
             console.print("\n", table_of(rows), f"\n{score_of(rows)}", sep="")
+            planned = cell.world("training").diff(cell.world("online"), PLACES, [STANDING])
+            console.print("", difference_of(planned), "", sep="\n")
             _write_files(cell, out, report_bytes(rows, seed=seed))
             console.print(f"pictures in {out}; {time.monotonic() - started_s:.0f} s in all")
             if keep_running:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from actors.palletizing.simulation.packages import VERDICT_OF_KIND
 from actors.palletizing.vocabulary import place_entity
+from enact_dist.diffing import DiffKind
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 
     from actors.palletizing.simulation.packages import Package
     from actors.palletizing.vocabulary import Deviation, Notice
+    from enact_dist.diffing import Diff
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,6 +108,17 @@ def score_of(rows: Sequence[Row]) -> str:
         f"{right} of {len(rows)} verdicts right, {alarms} false alarms on {len(sound)} sound"
         f" packages; frame to feedback median {median(times):.0f} ms, longest {max(times):.0f} ms"
     )
+
+
+def difference_of(diff: Diff) -> str:
+    """Return what is not as planned, a line for each place.
+
+    Args:
+        diff: Of training and online, of the aspect `STANDING`.
+    """
+    judged = diff.equal + diff.within + len(diff.of(DiffKind.CHANGED))
+    lines = [f"  {row.entity.name}: {row.difference}" for row in diff.of(DiffKind.CHANGED)]
+    return "\n".join([f"training against online: {len(lines)} of {judged} places differ", *lines])
 
 
 def report_bytes(rows: Sequence[Row], *, seed: int) -> bytes:

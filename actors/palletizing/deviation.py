@@ -16,9 +16,11 @@ from actors.palletizing.vocabulary import (
     PRODUCTS,
     REGION,
     SIGHTING,
+    STANDING,
     SURFACE,
     SYSTEM,
     Deviation,
+    Standing,
     product_entity,
 )
 from enact_dist import Actor, Entity, View, ViewEach, World, Write
@@ -45,6 +47,7 @@ class DeviationDetection(Actor):
     observed = View(online, PLACES, OBSERVATION)
     flags = Write(online, SYSTEM, DEVIATIONS)
     region = Write(online, PLACES, REGION)
+    standing = Write(online, PLACES, STANDING)
     triggers = (observed,)
 
     def __init__(
@@ -77,5 +80,6 @@ class DeviationDetection(Actor):
             captured_ns=observed.captured_ns,
         )
         lock[self.region] = found.region
+        lock[self.standing] = Standing(plan.product, found.verdict, found.shift_mm, found.turn_deg)
         others: dict[str, Deviation] = lock.get(self.flags, {})
         lock[self.flags] = {**others, lock.entity.name: flag}

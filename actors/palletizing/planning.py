@@ -10,7 +10,9 @@ from actors.palletizing.vocabulary import (
     PLAN,
     PRODUCTS,
     SCAN,
+    STANDING,
     Plan,
+    Standing,
     place_entity,
     product_entity,
 )
@@ -35,6 +37,7 @@ class Planning(Actor):
     training = World("training")
     scans = WriteEach(training, PRODUCTS, SCAN)
     plans = WriteEach(training, PLACES, PLAN)
+    standing = WriteEach(training, PLACES, STANDING)
 
     def __init__(self, packages: int, products: str, views: int = 14) -> None:
         self.packages, self.products, self.views = packages, products.split(), views
@@ -46,5 +49,6 @@ class Planning(Actor):
         for product in self.products:
             lock[self.scans][product_entity(product)] = self.views
         for stop in range(self.packages):
-            product = self.products[stop % len(self.products)]
-            lock[self.plans][place_entity(stop)] = Plan(product, tray_of(stop), planned_pose(stop))
+            place, product = place_entity(stop), self.products[stop % len(self.products)]
+            lock[self.plans][place] = Plan(product, tray_of(stop), planned_pose(stop))
+            lock[self.standing][place] = Standing(product, "ok", shift_mm=0.0, turn_deg=0.0)

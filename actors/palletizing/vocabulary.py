@@ -20,14 +20,18 @@ trays, so that a place has one package for ever.
 
 # The wire reads these annotations: they stay real types, without `from __future__`.
 
+import math
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
+from actors.comparators import CloudDistance, SurfaceDistance
+from actors.geometry.deviation import Limits
 from actors.geometry.shapes import Acquisition, DepthFrame, PointCloud, Surface
 from enact_dist import Aspect, Durability, Entities, Entity
+from enact_dist.comparing import Tolerance
 
 PRODUCTS: Final = Entities("product/*")
 VIEWS: Final = Entities("view/*/*")
@@ -103,6 +107,26 @@ class Sighting:
 
 
 @dataclass(frozen=True, slots=True)
+class Standing:
+    """What stands at a place: in training as planned, in online as judged.
+
+    The one aspect of a place that both world contexts have, so that their difference is what is
+    wrong on the tray.
+
+    Attributes:
+        product: Name of the product.
+        state: "ok" as planned; online the verdict.
+        shift_mm: Distance from the planned position.
+        turn_deg: Turn against the planned pose.
+    """
+
+    product: str
+    state: str
+    shift_mm: float
+    turn_deg: float
+
+
+@dataclass(frozen=True, slots=True)
 class Deviation:
     """The flag of one judged place.
 
@@ -144,11 +168,11 @@ class Notice:
 
 SCAN: Final = Aspect("scan", int)
 """How many views of a product are wanted (product/*)."""
-CLOUD: Final = Aspect("cloud", PointCloud)
+CLOUD: Final = Aspect("cloud", PointCloud, compare=CloudDistance(tolerance_m=0.004))
 """Points: of a view in its camera's frame (view/*), of a package in the tray frame (package/*)."""
 VIEWPOINT: Final = Aspect("viewpoint", Viewpoint)
 """Acquisition pose (view/*)."""
-SURFACE: Final = Aspect("surface", Surface)
+SURFACE: Final = Aspect("surface", Surface, compare=SurfaceDistance(tolerance_m=0.002))
 """Boundary representation: of a view in its camera's frame, of a product in the product frame."""
 NEWEST_VIEW: Final = Aspect("newest_view_ns", int)
 """When the newest view in a product's surface was taken (product/*), ns since 1970."""
@@ -164,6 +188,18 @@ SIGHTING: Final = Aspect("sighting", Sighting, Durability.OS)
 """Where a package was seen (package/*)."""
 REGION: Final = Aspect("region", np.ndarray, Durability.OS)
 """(H, W) bool, the deviating pixels of the observation (place/*, online)."""
+STANDING: Final = Aspect(
+    "standing",
+    Standing,
+    compare=Tolerance(
+        fields={
+            "shift_mm": Tolerance(absolute=1000.0 * Limits().moved_m, unit="mm"),
+            "turn_deg": Tolerance(absolute=math.degrees(Limits().turned_rad), unit="deg"),
+        }
+    ),
+)
+"""What stands there (place/*, both): ``training.diff(online, PLACES, [STANDING])`` names what is
+not as it should be."""
 DEVIATIONS: Final = Aspect("deviations", dict[str, Deviation])
 """The flags, by name of the place (system)."""
 NOTICES: Final = Aspect("notices", dict[str, Notice])

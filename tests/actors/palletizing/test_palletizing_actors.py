@@ -28,6 +28,7 @@ from actors.palletizing.vocabulary import (
     REGION,
     SCAN,
     SIGHTING,
+    STANDING,
     STOP,
     SURFACE,
     SYSTEM,
@@ -88,6 +89,31 @@ def test_cell_judges_a_sequence_of_packages(cell, capsys):
     assert len(online(cell, USER, NOTICES)) == PACKAGE_COUNT
     for stop, kind in enumerate(truths):
         assert (flags[f"place/{stop}"].package == "") == (kind == "missing")
+    diff = cell.world("training").diff(cell.world("online"), PLACES, [STANDING])
+    damaged = {f"place/{stop}": verdict for stop, verdict in enumerate(verdicts) if verdict != "ok"}
+    assert {row.entity.name: row.right is not None for row in diff} == dict.fromkeys(damaged, True)
+    for row in diff:
+        assert f"'ok' against '{damaged[row.entity.name]}'" in row.difference.what
+    assert diff.within + diff.equal == PACKAGE_COUNT - len(damaged)
+
+
+def test_standing_diff_names_a_damaged_package_when_it_is_judged(cell):
+    """Deviation as a standing query: places come, and only what is wrong is told as changed."""
+    actors = [Conveyor(), OnlinePerception(OVERHEAD), DeviationDetection()]
+    training, online_world = cell.world("training"), cell.world("online")
+    truths = [package.truth.kind for package in package_sequence(PACKAGE_COUNT, seed=SEED)]
+    first_bad = next(stop for stop, kind in enumerate(truths) if kind != "ok")
+    with training.watch_diff(online_world, PLACES, STANDING) as watch:
+        planned = [watch.next(0) for _ in range(PACKAGE_COUNT)]
+        assert {row.kind.value for row in planned} == {"only left"}
+        for actor in itertools.chain.from_iterable(itertools.repeat(actors, first_bad + 1)):
+            testing.run_once(actor, cell)
+        told = {row.entity.name: row for row in iter(lambda: watch.next(0), None)}
+    wanted = {f"place/{stop}": "equal" for stop in range(first_bad)} | {
+        f"place/{first_bad}": "changed"
+    }
+    assert {name: row.kind.value for name, row in told.items()} == wanted
+    assert told[f"place/{first_bad}"].difference.where == ".state"
 
 
 def test_training_makes_one_entity_per_view_and_one_surface_per_product():
