@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from enact_dist.actor import Actor
     from enact_dist.actor_runner import run_actor
     from enact_dist.cell import Cell
+    from enact_dist.comparing import Difference, Tolerance
     from enact_dist.connecting import connect, local
     from enact_dist.history import Version
     from enact_dist.lock import Lock
@@ -49,6 +50,7 @@ __all__ = [
     "Aspect",
     "Cell",
     "Change",
+    "Difference",
     "Durability",
     "Entities",
     "Entity",
@@ -61,6 +63,7 @@ __all__ = [
     "Retention",
     "Snapshot",
     "Together",
+    "Tolerance",
     "Version",
     "View",
     "ViewEach",
@@ -79,10 +82,12 @@ _HOME_OF = {
     "Actor": "actor",
     "Cell": "cell",
     "Change": "watch",
+    "Difference": "comparing",
     "Lock": "lock",
     "PastContext": "past_context",
     "Snapshot": "snapshot",
     "Together": "together",
+    "Tolerance": "comparing",
     "Version": "history",
     "Watch": "watch",
     "WorldContext": "world",

@@ -30,8 +30,7 @@ import numpy.typing as npt
 from actors.comparators import CloudDistance, SurfaceDistance
 from actors.geometry.deviation import Limits
 from actors.geometry.shapes import Acquisition, DepthFrame, PointCloud, Surface
-from enact_dist import Aspect, Durability, Entities, Entity
-from enact_dist.comparing import Tolerance
+from enact_dist import Aspect, Durability, Entities, Entity, Tolerance
 
 PRODUCTS: Final = Entities("product/*")
 VIEWS: Final = Entities("view/*/*")

@@ -1,14 +1,15 @@
 """`enact`: reads the command line, runs the verb, turns every error into one line and a status.
 
-====  =======================================================
+====  ==================================================================================
 exit  meaning
-====  =======================================================
+====  ==================================================================================
 0     done
 1     refused or failed
 2     wrong usage, or a configuration that cannot be used
 3     a shard is unreachable
+4     what was compared differs; apart from 1, so that a script can tell it from a failure
 130   interrupted with Ctrl-C
-====  =======================================================
+====  ==================================================================================
 """
 
 from __future__ import annotations
@@ -37,7 +38,8 @@ examples:
   enact demo palletizing              watch actors report damaged packages
 
 The cell is ./cell.toml unless --cell or $ENACT_CELL names another file or an endpoint.
-Exit status: 0 done, 1 refused or failed, 2 usage or configuration, 3 unreachable."""
+Exit status: 0 done, 1 refused or failed, 2 usage or configuration, 3 unreachable, 4 different
+(only of what compares)."""
 
 
 class _Parser(argparse.ArgumentParser):

@@ -20,6 +20,7 @@ DONE: Final = 0
 FAILED: Final = 1
 USAGE: Final = 2
 UNREACHABLE: Final = 3
+DIFFERENT: Final = 4
 
 CELL_VARIABLE: Final = "ENACT_CELL"
 CELL_DEFAULT: Final = "cell.toml"
