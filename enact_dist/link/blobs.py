@@ -83,6 +83,21 @@ class BlobFolder:
         draft.rename(self.folder / name)
         return Blob(name, len(flat), crc, durable)
 
+    def force(self, blob: Blob) -> Blob:
+        """Force a file to the disk that was not when it was written; names need `sync_names` too.
+
+        An error of its writing back is told to whoever forces it first.
+
+        Raises:
+            OSError: As the system reports it.
+        """
+        descriptor = os.open(self.folder / blob.name, os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            os.fdatasync(descriptor)
+        finally:
+            os.close(descriptor)
+        return blob._replace(synced=True)
+
     def sync_names(self) -> None:
         """Make the names of all files written so far durable.
 

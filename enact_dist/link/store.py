@@ -18,8 +18,8 @@ stays one when it is replaced.  Rules that a change must keep:
 - Order: blob files, then the commit of the rows that name them, then the mark, then the unlinking
   of files that no row names any more.  A file that was forced to the disk is unlinked only when
   the batch that took its last row is there too.
-- A durable row never names a file that was not forced: it gets one of its own.  To force the old
-  one would not do, since what its first writing may have lost is not told a second time.
+- A durable row names only files that were forced: one that was not (a fork of an `os` datum) is
+  forced first, which moves what is not on the disk yet and copies nothing.
 - After any error the store is dead: what the disk holds is unknown, and a second `fsync` may
   claim success for what the first one lost.
 """

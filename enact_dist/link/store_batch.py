@@ -279,10 +279,13 @@ class Batch:
             if record.volatile:
                 self.changes[key] = slot_body(record, None)
                 continue
-            blob = self._shared_blob(staged)
-            if blob is None and record.datum is not None and record.datum.size > INLINE_BYTES_MAX:
-                blob = blobs.write(record.datum.body, durable=durable)
+            blob, body = self._shared_blob(staged), record.datum
+            if blob is None and body is not None and body.size > INLINE_BYTES_MAX:
+                blob = blobs.write(body.body, durable=durable)
                 names_to_sync |= durable
+            elif blob is not None and durable and not blob.synced:
+                blob = blobs.force(blob)
+                names_to_sync = True
             if blob is not None:
                 self._states.name_blob(key, blob)
             shared = None
@@ -292,17 +295,18 @@ class Batch:
         if names_to_sync:
             blobs.sync_names()
         for cause in self._unnamed_causes:
-            if self._states.unname(cause):
+            if self._states.unname_cause(cause):
                 self.changes[cause] = None
-        return [blob for blob in self._unnamed_blobs if self._states.unname(blob.name)]
+        gone = [self._states.unname_blob(blob) for blob in self._unnamed_blobs]
+        return [blob for blob in gone if blob is not None]
 
     def _shared_blob(self, staged: _Staged) -> Blob | None:
-        """Return the file that has a state's bytes and outlasts what the state has to."""
+        """Return the file that has a state's bytes already, None where there is none."""
         source, datum = staged.source, staged.record.datum
         blob = self._states.blobs.get(source) if isinstance(source, Key) else source
         if blob is None or datum is None or blob.size != datum.size:
             return None
-        return blob if blob.synced or not staged.durable else None
+        return self._states.as_forced(blob)
 
     def _shared_cause(self, key: Key, cause: Cause, causes: dict[int, Order]) -> Order:
         """Let a row name the row of its cause, which is written with the first that does."""

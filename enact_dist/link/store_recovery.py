@@ -259,7 +259,7 @@ def read_blobs(contents: Contents, blobs: BlobFolder, *, power_cut: bool) -> Non
                 f"holds {record.slot}, version {record.version}, and cannot be used: {file}",
             )
         _log.warning("%s is lost with the power: %s", record.slot, file)
-        states.unname(states.blobs.pop(key).name)
+        states.unname_blob(states.blobs.pop(key))
         lost = replace(record, datum=None, null_reason=NullReason.LOST.name)
         contents.records[key] = contents.lost[key] = lost
 

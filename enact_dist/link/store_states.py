@@ -37,7 +37,7 @@ class States:
         causes: The row of a shared cause that a row names, by row.
     """
 
-    __slots__ = ("_rows", "blobs", "causes", "history", "newest", "prepared")
+    __slots__ = ("_forced", "_rows", "blobs", "causes", "history", "newest", "prepared")
 
     def __init__(self) -> None:
         self.newest: dict[Slot, State] = {}
@@ -46,6 +46,7 @@ class States:
         self.blobs: dict[Key, Blob] = {}
         self.causes: dict[Key, Key] = {}
         self._rows: Counter[str | Key] = Counter()
+        self._forced: set[str] = set()
 
     def find(self, slot: Slot, version: int) -> Key | None:
         """Return the row of one version of a slot, None where it is not stored."""
@@ -65,14 +66,31 @@ class States:
         """Note that a row names a file."""
         self.blobs[key] = blob
         self._rows[blob.name] += 1
+        if blob.synced:
+            self._forced.add(blob.name)
+
+    def as_forced(self, blob: Blob) -> Blob:
+        """Return a file as it is now: one of its rows may have forced it since that one's."""
+        return blob._replace(synced=blob.name in self._forced)
+
+    def unname_blob(self, blob: Blob) -> Blob | None:
+        """Note that a row that is gone named a file; return the file if none does any more."""
+        if not self._last(blob.name):
+            return None
+        blob = self.as_forced(blob)
+        self._forced.discard(blob.name)
+        return blob
 
     def name_cause(self, key: Key, cause: Key) -> None:
         """Note that a row names a shared cause."""
         self.causes[key] = cause
         self._rows[cause] += 1
 
-    def unname(self, name: str | Key) -> bool:
-        """Note that one row fewer names a file or a cause; return whether none does any more."""
+    def unname_cause(self, cause: Key) -> bool:
+        """Note that a row that is gone named a cause; return whether none does any more."""
+        return self._last(cause)
+
+    def _last(self, name: str | Key) -> bool:
         self._rows[name] -= 1
         if self._rows[name] > 0:
             return False

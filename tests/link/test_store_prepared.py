@@ -1,5 +1,7 @@
 """Commits over shards in the store: what was prepared and decided comes back, whole."""
 
+from pathlib import Path
+
 import pytest
 
 from enact_dist.core.datum import Datum, LockId, Position, Slot, Token
@@ -148,18 +150,22 @@ def test_file_taken_over_goes_when_the_same_batch_replaces_its_slot(tmp_path):
     store.close()
 
 
-def test_body_that_was_not_forced_is_written_anew_for_a_durable_end(tmp_path):
+def test_body_that_was_not_forced_is_forced_for_a_durable_end(tmp_path, monkeypatch):
     """Else a power cut could take what was promised to outlast it."""
     store, _ = open_store(tmp_path, unix_s=1)
     record = prepared()
     store.write([Persist(1, (record,), Durability.OS)])
-    promised = blobs(tmp_path)
+    promised, forced = blobs(tmp_path), []
+    monkeypatch.setattr(
+        "enact_dist.link.blobs.os.fdatasync",
+        lambda descriptor: forced.append(Path(f"/proc/self/fd/{descriptor}").readlink()),
+    )
     slot = SlotRecord(LARGE, 10, 80, record.writes[1].datum, "")
     store.write([Persist(2, (slot, PreparedEnded(LOCK)), Durability.DURABLE)])
     store.rest()
 
-    assert len(blobs(tmp_path)) == 1
-    assert blobs(tmp_path) != promised
+    assert blobs(tmp_path) == promised
+    assert forced == promised
     store.close()
 
 
