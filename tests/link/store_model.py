@@ -43,7 +43,6 @@ class State:
                 durable = durability is Durability.DURABLE
                 name = None
                 if isinstance(record, SlotRecord):
-                    state._check_version(record)
                     # A durable state that is replaced in its batch is never written.
                     durable |= durable_in_batch.get(record.slot, False) and not record.history
                     durable_in_batch[record.slot] = durable
@@ -55,11 +54,15 @@ class State:
                 state.apply(record)
         return state
 
-    def _check_version(self, record):
+    def assert_chains(self, batch):
         """Assert I2: versions of a slot are a chain without a gap."""
-        before = self.ledger.slots.get(record.slot)
-        if before is not None and not (before.volatile or record.volatile):
-            assert record.version == before.version + 1, record
+        newest = dict(self.ledger.slots)
+        for record in (record for _, records in batch for record in records):
+            if isinstance(record, SlotRecord):
+                before = newest.get(record.slot)
+                if before is not None and not (before.volatile or record.volatile):
+                    assert record.version == before.version + 1, record
+                newest[record.slot] = record
 
     def apply(self, record):
         self.ledger.take(record)

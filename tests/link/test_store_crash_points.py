@@ -202,6 +202,7 @@ class Life:
             self.epoch = content
             self.first = {"kill": last, "power": last}
         elif kind == "begun":
+            self.states[-1].assert_chains(content)
             self.states.append(self.states[-1].after(content))
             self.forced = any(durability.value == "durable" for durability, _ in content)
             for promises in self.promises.values():

@@ -78,6 +78,11 @@ class Folder:
         return self.recovered
 
     @property
+    def log_bytes(self):
+        """How long the log is that was never begun anew."""
+        return (self.path / "store.db-wal").stat().st_size
+
+    @property
     def files(self):
         """The names of all files of large bodies."""
         return {path.name for path in (self.path / "blobs").iterdir()}
@@ -160,6 +165,26 @@ def test_version_that_is_set_again_replaces_the_one_in_history(folder):
     assert [(record.version, record.stamp_ns) for record in found.history] == [(1, 500)]
     assert [(record.version, record.stamp_ns) for record in found.slots] == [(2, 600)]
     assert folder.files == set()
+
+
+@pytest.mark.parametrize("size", [200, 10_000, 60_000])
+def test_update_with_history_writes_as_many_pages_as_one_without(tmp_path, size):
+    """A new version takes the place of the one that is forgotten with it; nothing is copied."""
+    logs = {}
+    for retention in (1, 16):
+        folder = Folder(tmp_path / str(retention))
+        for version in range(1, 81):
+            if version == 41:
+                folder.reopen()
+                begun = folder.log_bytes
+            for name in "abc":
+                record = state(version, size=size, slot=SLOT._replace(entity=name))
+                old = SlotVersion(record.slot, version - retention)
+                records = (replace(record, history=retention > 1), HistoryForgotten((old,)))
+                folder.store.write([persist(*records, durability=Durability.OS)])
+        logs[retention] = folder.log_bytes - begun
+        folder.store.close()
+    assert logs[16] < 1.1 * logs[1]
 
 
 # ---------------------------------------------------------------- causes
@@ -253,15 +278,29 @@ def test_fork_of_what_is_not_stored_brings_its_bytes(folder, source):
     assert bytes(found.datum.body) == state(1, size=LARGE).datum.body
 
 
-def test_durable_fork_of_an_os_version_has_a_forced_file_of_its_own(folder):
-    """What is durable does not rest on a file that a power cut may take."""
+def test_durable_fork_of_an_os_version_forces_its_file(folder, monkeypatch):
+    """Nothing is copied, and a power cut must not take it from then on, from the source neither."""
+    folder.write(state(1, size=LARGE), durability=Durability.OS)
+    forced = []
+    monkeypatch.setattr("enact_dist.link.blobs.os.fdatasync", forced.append)
+    folder.write(forked(1, 1), forked(2, 1))
+    assert len(forced) == 1
+    (name,) = folder.files
+    end = replace(state(2), history=False)
+    folder.write(WorldDropped("what_if", 2), end, durability=Durability.OS)
+    assert folder.files == {name}, "the rows that a power cut brings back need it"
+    folder.write(WorldRecord("other"))
+    assert folder.files == set()
+
+
+def test_file_that_a_fork_has_forced_must_be_there_after_a_power_cut(folder):
+    """It is refused by the fork's name, although its source may lose it."""
     folder.write(state(1, size=LARGE), durability=Durability.OS)
     folder.write(forked(1, 1))
-    (old,) = [name for name in folder.files if name.endswith("-1.blob")]
-    assert len(folder.files) == 2
-    (folder.path / "blobs" / old).unlink()
-    reasons = {record.slot: record.null_reason for record in folder.reopen(power_cut=True).slots}
-    assert reasons == {SLOT: "LOST", FORK: ""}
+    (path,) = (folder.path / "blobs").iterdir()
+    path.unlink()
+    with pytest.raises(StoreError, match="cannot be used"):
+        folder.reopen(power_cut=True)
 
 
 def test_os_fork_of_a_durable_version_keeps_the_forced_file_until_all_is_forced(folder):
