@@ -17,9 +17,14 @@ from enact_dist.core.messages import (
     AwaitStamp,
     Break,
     Commit,
+    DatumRead,
+    DropWorld,
+    Explain,
     Fetch,
+    FindEffects,
     Finish,
     ForceAbort,
+    Fork,
     Item,
     ListAudit,
     ListLocks,
@@ -329,6 +334,48 @@ def wrong_requests(cell: RepeatingCell) -> None:
     ann.call("s0", Break(999, "no such lock", 1))
 
 
+def world_acts(cell: RepeatingCell) -> None:
+    """Contexts are forked, written, dropped and forked again; where data come from is asked."""
+    near, far = both(cell)
+    ann, bob = cell.client("ann"), cell.client("bob")
+    lock = ann.locked(item(W, near), item(W, far))
+    ann.finish(lock, (slot(near), "1"), (slot(far), "1"))
+    assert lock.position is not None
+    at_ns = lock.position.stamp_ns
+    reads = [DatumRead(slot(name), 1, at_ns) for name in (near, far)]
+    for name in SHARDS:
+        _fork(cell, ann, name, "what_if", at_ns)
+        _fork(cell, bob, name, "what_if", at_ns + 1)
+    copied = [Slot("what_if", name, "count") for name in (near, far)]
+    made = bob.locked(*(Item(W, *one) for one in copied))
+    writes = {s: [WriteItem(one, datum("2"))] for s, one in zip(SHARDS, copied, strict=True)}
+    made.finish(writes, give_up_ns=cell.now_ns + S, reads=reads)
+    bob.drive(made)
+    for name, one in zip(SHARDS, copied, strict=True):
+        ann.call(name, Explain((SlotVersion(one, 0),)))
+        ann.call(name, FindEffects(tuple(reads)))
+    held = ann.locked(Item(R, *copied[0]))
+    _drop(cell, bob, "s0")
+    ann.finish(held)
+    for name in SHARDS:
+        _drop(cell, bob, name)
+    _fork(cell, ann, "s0", "what_if", at_ns)
+    _drop(cell, ann, "s0")
+    _fork(cell, bob, "s0", "what_if", at_ns + 2)
+
+
+def _fork(cell: RepeatingCell, client: RepeatingClient, shard: str, name: str, at_ns: int) -> None:
+    core = client.core
+    count = core.sendings.next(cell.now_ns)
+    client.call(shard, Fork(core.session, name, "online", at_ns, core.epoch(shard), count))
+
+
+def _drop(cell: RepeatingCell, client: RepeatingClient, shard: str) -> None:
+    core = client.core
+    count = core.sendings.next(cell.now_ns)
+    client.call(shard, DropWorld(core.session, "what_if", core.epoch(shard), count))
+
+
 RUNS = (
     updates_on_one_shard,
     lost_halves_on_one_shard,
@@ -345,4 +392,5 @@ RUNS = (
     restarts,
     lost_leases,
     wrong_requests,
+    world_acts,
 )

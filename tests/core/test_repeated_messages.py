@@ -50,6 +50,7 @@ from enact_dist.core.phase import Phase
 from enact_dist.core.records import AuditRecord
 from enact_dist.core.sessions import IDLE_TTLS, Lane
 from enact_dist.core.shard_state import ShardState
+from enact_dist.core.worlds import WorldDesk
 from enact_dist.terms import Access
 
 TWO_SHARDS = PlacementMap(1, (ShardEntry("s0", ()), ShardEntry("s1", ())), ())
@@ -205,8 +206,9 @@ def test_every_kind_of_message_is_repeated():
         (Audit, "may_settle", lambda *_: True, "operators", When.AT_ONCE),
         (ShardState, "numbered", numbered_in_any_epoch, "operators", When.AFTER_A_RESTART),
         (client, "_epoch_of", lambda _: None, "restarts", When.AT_THE_END),
+        (WorldDesk, "_answered_before", lambda *_: None, "world_acts", When.AT_THE_END),
     ],
-    ids=["outcomes", "seqs", "settling", "numbers", "epochs"],
+    ids=["outcomes", "seqs", "settling", "numbers", "epochs", "forks and drops"],
 )
 def test_copy_that_changes_something_is_noticed(owner, name, wrong, run, when, monkeypatch):
     """Without what makes the shard or client indifferent to copies, the comparison says so."""
