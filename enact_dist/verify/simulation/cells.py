@@ -13,6 +13,8 @@ if TYPE_CHECKING:
 
     from enact_dist.verify.simulation.faults import Faults
 
+CONTEXTS = ("training", "online")
+"""The world contexts that every shard is configured with."""
 FAULTS_NS = 20 * S
 """How long faults go on."""
 WORK_NS = 25 * S

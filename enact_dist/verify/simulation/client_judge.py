@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from enact_dist.core.phase import Phase
 from enact_dist.terms import Access, Durability
+from enact_dist.verify.simulation.cells import CONTEXTS
 from enact_dist.verify.simulation.history import TOLD_NOT, Entry, History, conflict
 
 if TYPE_CHECKING:
@@ -112,6 +113,8 @@ class ClientJudge:
             self._check_confirmed(entry)
             epochs = {part.shard: part.token.epoch for part in entry.lock.parts if part.token}
             for slot, _ in entry.lock.versions:
+                if slot.context not in CONTEXTS:
+                    continue  # a fork under that name may be another one by the time it is seen
                 shard, position = entry.lock.shard_of(slot), entry.lock.position
                 if shard in epochs and position is not None:
                     host.own[slot] = (shard, epochs[shard], position.stamp_ns)

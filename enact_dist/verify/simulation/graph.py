@@ -20,6 +20,7 @@ from enact_dist.verify.checker import (
     Told,
 )
 from enact_dist.verify.simulation.history import TOLD_NOT
+from enact_dist.verify.simulation.picture import DROP, NEVER_SET
 from enact_dist.verify.simulation.reader_judge import stamp_of
 
 if TYPE_CHECKING:
@@ -37,6 +38,8 @@ class Graph:
     def __init__(self, history: History, model: Model) -> None:
         self._model = model
         self._positions: dict[Slot, dict[tuple[int, int], list[tuple[int, int]]]] = {}
+        self._drops: dict[Slot, list[tuple[str, int]]] = {}
+        self._events: dict[str, tuple[int, int]] = {}
         chains: dict[Slot, list[State]] = {}
         for picture in model.pictures.values():
             for slot, chain in picture.chains.items():
@@ -45,37 +48,43 @@ class Graph:
                 ]
                 positions = self._positions[slot] = {}
                 for index, state in enumerate(chain):
-                    positions.setdefault(state.name, []).append((state.epoch, index))
+                    if str(state.writer).startswith(DROP):
+                        self._drops.setdefault(slot, []).append((str(state.writer), index))
+                    else:
+                        positions.setdefault(state.name, []).append((state.epoch, index))
         pictures = model.pictures.values()
-        restarts = [restart for picture in pictures for restart in picture.restarts]
+        events = self._events
+        for writer, begun_ns, ended_ns in (one for picture in pictures for one in picture.restarts):
+            begun, ended = events.get(writer, (begun_ns, ended_ns))  # a fork is on several shards
+            events[writer] = min(begun, begun_ns), max(ended, ended_ns)
         self._checker = Checker(
             map(self._story, history.entries.values()),
             chains,
-            events={writer: (begun_ns, ended_ns) for writer, begun_ns, ended_ns in restarts},
+            events=events,
             lost=model.permitted_losses,
             applied={lock for picture in pictures for lock in picture.applied},
         )
 
     def _story(self, entry: Entry) -> LockStory:
-        reads = self._readings(entry.readings())
+        reads = self._readings(entry, entry.readings())
         for (_, slot), (epoch, name) in self._model.absent.get(entry.id, {}).items():
-            reads.append(Reading(slot, self._position(slot, epoch, name)))
+            reads.append(Reading(slot, self._position(entry, slot, epoch, name)))
         return LockStory(
             entry.id,
             entry.begun_ns,
             entry.ended_ns,
             _told(entry.told),
             reads,
-            self._readings(entry.views()),
+            self._readings(entry, entry.views()),
             outlives_restarts=entry.id in self._model.decided,
             captured=self._captured(entry),
         )
 
-    def _readings(self, found: Iterable[lock_parts.Reading]) -> list[Reading]:
+    def _readings(self, entry: Entry, found: Iterable[lock_parts.Reading]) -> list[Reading]:
         readings = []
         for _, epoch, state in found:
             name = (state.version, state.stamp_ns)
-            readings.append(Reading(state.slot, self._position(state.slot, epoch, name)))
+            readings.append(Reading(state.slot, self._position(entry, state.slot, epoch, name)))
         return readings
 
     def _captured(self, entry: Entry) -> list[Captured]:
@@ -84,14 +93,19 @@ class Graph:
             captured_ns = stamps.get(state.slot)
             if captured_ns is not None:
                 gone = state.null_reason == NullReason.OUTSIDE_RETENTION.name
-                name = None if gone else self._position(state.slot, epoch, state[1:3])
+                name = None if gone else self._position(entry, state.slot, epoch, state[1:3])
                 found.append(Captured(state.slot, name, captured_ns))
         return found
 
-    def _position(self, slot: Slot, epoch: int, name: tuple[int, int]) -> int | None:
+    def _position(self, entry: Entry, slot: Slot, epoch: int, name: tuple[int, int]) -> int | None:
         """Return which state of the slot a reader of this epoch knew by this name."""
         found = self._positions.get(slot, {}).get(name, ())
-        return max((index for since, index in found if since <= epoch), default=NOTHING)
+        indices = [index for since, index in found if since <= epoch]
+        if name == NEVER_SET.name:
+            # Nobody has a lock in a context while it is dropped.
+            drops = self._drops.get(slot, ())
+            indices += [index for drop, index in drops if self._events[drop][0] < entry.begun_ns]
+        return max(indices, default=NOTHING)
 
     def check_views(self) -> None:
         """Every view and every set shows all that a commit has written, or nothing of it."""

@@ -47,6 +47,7 @@ from enact_dist.verify.simulation.picture import Picture, State
 from enact_dist.verify.simulation.prefixes import judge_prefixes
 from enact_dist.verify.simulation.reader_judge import ReaderJudge, stamp_of
 from enact_dist.verify.simulation.workload import FILLED, label_of, value_of, writer_of
+from enact_dist.verify.simulation.world_judge import WorldJudge
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -72,6 +73,7 @@ class Model:
         self.of_clients = ClientJudge(world, history, self)
         self.absent: dict[LockId, dict[tuple[str, Slot], tuple[int, tuple[int, int]]]] = {}
         self.labels: dict[tuple[str, str], Slot] = {}
+        self._worlds = WorldJudge(self)
         self.permitted_losses: dict[LockId, None] = {}
         self.decided: dict[LockId, DecisionRecord] = {}
         self.clocks_were_set = False
@@ -87,6 +89,11 @@ class Model:
     def clock_was_set(self) -> None:
         """A wall clock was set: commits may be refused for it from now on."""
         self.clocks_were_set = True
+
+    @property
+    def now_ns(self) -> int:
+        """True time."""
+        return self._world.now_ns
 
     def count(self, name: str, number: int) -> None:
         """Add to a tally of the run."""
@@ -155,6 +162,7 @@ class Model:
         picture.epoch = recovered.epoch
         writer = f"restart {recovered.epoch} of {host.name}"
         picture.restarts.append((writer, crashed_at_ns, self._world.now_ns))
+        self._worlds.booted(host, recovered, picture)
         found = {record.slot: record for record in recovered.slots if not record.volatile}
         prepared = {w.slot: record.lock for record in recovered.prepared for w in record.writes}
         for slot in list(picture.chains):
@@ -204,7 +212,9 @@ class Model:
         ended = isinstance(message, Goodbye | SessionDied)
         if isinstance(message, Hello | Goodbye | SessionDied) and (acknowledged or ended):
             picture.grace_waits_for.pop(message.session, None)
+        self._worlds.judge(host, effects, picture)
         self._check_commits(host, effects, picture)
+        self._worlds.check_told()
         self._locks.judge(host, message, picture)
         for effect in effects:
             if not isinstance(effect, Reply):
@@ -237,6 +247,8 @@ class Model:
                 if effect.notice.number != picture.notices:
                     self._fail("notices have no gap", effect.notice.number, picture.notices)
                 committed = told.get(effect.notice.changes[0].stamp_ns)
+                if self._worlds.explains(effect.notice):
+                    continue
                 if committed is not None:
                     versions = list(committed.versions)
                     self._applied(host, committed.lock, versions, effect.notice, picture)
@@ -391,7 +403,7 @@ class Model:
             self._fail("I5 told not committed, then visible", lock, entry.told)
         for slot, (version, stamp_ns) in versions.items():
             before, datum = picture.now(slot), datum_of.get(slot)
-            if version != before.version + 1:
+            if version != picture.next_version(slot):
                 self._fail("I2 versions are a chain", slot, version, before)
             if before.epoch == picture.epoch and stamp_ns <= before.stamp_ns:
                 self._fail("stamps grow", slot, stamp_ns, before)

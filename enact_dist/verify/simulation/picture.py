@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from enact_dist.core.datum import Datum, LockId, Slot, Token
 
 if TYPE_CHECKING:
+    from enact_dist.core.messages import WorldEntry
     from enact_dist.core.records import Persist, PreparedRecord
 
 
@@ -26,6 +27,8 @@ class State(NamedTuple):
         return self.version, self.stamp_ns
 
 
+DROP = "drop of "
+"""So begins the writer of the state in which a dropped context leaves its slots."""
 NEVER_SET = State(0, 0, "nobody", 0, None)
 
 
@@ -33,7 +36,9 @@ NEVER_SET = State(0, 0, "nobody", 0, None)
 class Picture:
     """What the model knows of one shard.
 
-    `restarted_at` is where in its chain a slot stood when the shard last started.
+    `restarted_at` is where in its chain a slot stood when the shard last started, or its context
+    was dropped; `restarts` are all writers that are no locks, with begin and end; `worlds` the
+    forks, and `bases` from where on the versions of dropped contexts are free.
     """
 
     epoch: int = 0
@@ -56,11 +61,17 @@ class Picture:
     grace_waits_for: dict[str, int] = field(default_factory=dict)
     grace_end_ns: int = 0
     restarts: list[tuple[str, int, int]] = field(default_factory=list)
+    worlds: dict[str, WorldEntry] = field(default_factory=dict)
+    bases: dict[str, int] = field(default_factory=dict)
 
     def now(self, slot: Slot) -> State:
         """Return the newest committed state of a slot."""
         chain = self.chains.get(slot)
         return chain[-1] if chain else NEVER_SET
+
+    def next_version(self, slot: Slot) -> int:
+        """Return the version that the next write of a slot makes."""
+        return (self.now(slot).version or self.bases.get(slot.context, 0)) + 1
 
     def at(self, slot: Slot, stamp_ns: int) -> State:
         """Return the committed state of a slot as of a stamp."""

@@ -49,7 +49,10 @@ def _judge_slots(
         content = shard.state.slots[slot]
         if (content.version, content.stamp_ns) != (record.version, record.stamp_ns):
             host.world.violation("I15 recovery is exact", slot, content, record)
+    dropped = {r.name for r in left.dropped if r.version_base > picture.bases.get(r.name, 0)}
     for slot in picture.chains:
+        if slot.context in dropped:
+            continue  # the shard has not told of it yet
         durability = durabilities[slot.aspect]
         kept = durability is Durability.DURABLE or (durability is Durability.OS and not power_cut)
         version = found[slot].version if slot in found else 0
@@ -60,8 +63,13 @@ def _judge_slots(
 def _judge_outcomes(host: ShardHost, left: Recovered) -> None:
     """An outcome that is kept has all that it tells of."""
     found: dict[Slot, int] = {record.slot: record.version for record in left.slots}
+    gone = {record.name: record.version_base for record in left.dropped}
     for outcome in left.outcomes:
-        missing = [slot for slot, version in outcome.versions if slot not in found]
+        missing = [
+            slot
+            for slot, version in outcome.versions
+            if slot not in found and version > gone.get(slot.context, 0)
+        ]
         kept = {record.slot for record in left.slots if not record.volatile}
         early = [s for s, version in outcome.versions if s in kept and found[s] < version]
         if missing or early:

@@ -17,8 +17,9 @@ from enact_dist.core.records import SessionSeen
 from enact_dist.core.shard_state import ShardSettings
 from enact_dist.verify.simulation import cells
 from enact_dist.verify.simulation import faults as fault_options
-from enact_dist.verify.simulation.cells import WORK_NS
+from enact_dist.verify.simulation.cells import CONTEXTS, WORK_NS
 from enact_dist.verify.simulation.client_host import ClientHost
+from enact_dist.verify.simulation.forks import Forker
 from enact_dist.verify.simulation.graph import Graph
 from enact_dist.verify.simulation.history import History
 from enact_dist.verify.simulation.injector import Injector
@@ -27,7 +28,7 @@ from enact_dist.verify.simulation.network import Network
 from enact_dist.verify.simulation.payloads import DRAFT_NS
 from enact_dist.verify.simulation.schedule import WHOLE, Happening, Part, Schedule
 from enact_dist.verify.simulation.shard_host import ShardHost
-from enact_dist.verify.simulation.workload import ASPECTS, CONTEXTS, Workload
+from enact_dist.verify.simulation.workload import ASPECTS, Workload
 from enact_dist.verify.simulation.world import MS, S, SimulationError, World
 
 if TYPE_CHECKING:
@@ -94,6 +95,7 @@ class Scenario:
         for host in self.shards.values():
             host.asserts = asserts
         self.workload = Workload(world, self.history, self.model, entities=cell.entities)
+        self.forker = Forker(world, self.model, self.workload)
         self.injector = Injector(
             world, cell, self.network, self.shards, until_ns=self._faults_end_ns
         )
@@ -138,6 +140,8 @@ class Scenario:
             host.keep_alive()
             for lane in range(self.cell.lanes):
                 host.start(self.workload.thread(host, lane))
+            if self.forker.takes_place:
+                host.start(self.forker.thread(host, self.cell.lanes))
 
         host.start(host.open(ASPECTS, work))
 

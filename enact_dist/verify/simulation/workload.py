@@ -27,6 +27,7 @@ from enact_dist.core.placement import shard_of
 from enact_dist.terms import Access
 from enact_dist.verify.simulation.captures import Captures, drawn_stamp_ns
 from enact_dist.verify.simulation.cause_judge import reads_of
+from enact_dist.verify.simulation.cells import CONTEXTS
 from enact_dist.verify.simulation.client_host import Calls, ClientHost, Sleep, Steps, Thread
 from enact_dist.verify.simulation.history import Entry, History
 from enact_dist.verify.simulation.payloads import DRAFT_NS, Stager
@@ -36,7 +37,6 @@ if TYPE_CHECKING:
     from enact_dist.verify.simulation.model import Model
     from enact_dist.verify.simulation.world import World
 
-CONTEXTS = ("training", "online")
 ASPECTS = (
     AspectEntry("count", "int", "durable"),
     AspectEntry("note", "int", "os", 3),
@@ -227,7 +227,7 @@ class Workload:
 
     def _once(self, host: ClientHost, job: Job) -> Thread:
         if self._world.schedule.begins(job.name):
-            yield from self._do(host, 0, job)
+            yield from self.do(host, 0, job)
 
     # ---------------------------------------------------------------- doing
 
@@ -240,11 +240,12 @@ class Workload:
             job = self.job(f"{host.name}/{lane}.{number}", Random(random.getrandbits(64)))
             number += 1
             if schedule.begins(job.name):
-                yield from self._do(host, lane, job)
+                yield from self.do(host, lane, job)
             else:
                 yield Sleep(job.work_ns + MS)
 
-    def _do(self, host: ClientHost, lane: int, job: Job, *, lock_views: bool = False) -> Thread:
+    def do(self, host: ClientHost, lane: int, job: Job, *, lock_views: bool = False) -> Thread:
+        """Do one job under one lock; where its views were of no moment, again with them locked."""
         client = host.client
         items = tuple(self._with_known(host, item) for item in job.items)
         if job.kind in SETS:
@@ -278,7 +279,7 @@ class Workload:
         self._model.of_clients.told(host, entry)
         if lock.no_cut:
             self._world.tally["views that became reads"] += 1
-            yield from self._do(host, lane, job, lock_views=True)
+            yield from self.do(host, lane, job, lock_views=True)
 
     @staticmethod
     def _with_known(host: ClientHost, item: Item) -> Item:
