@@ -49,11 +49,15 @@ class States:
         self._forced: set[str] = set()
 
     def find(self, slot: Slot, version: int) -> Key | None:
-        """Return the row of one version of a slot, None where it is not stored."""
+        """Return the row of one version of a slot, None where it is not stored.
+
+        Nor where two are: versions start again after an aspect was volatile for a while.
+        """
         newest = self.newest.get(slot)
-        if newest is not None and newest.version == version and not newest.volatile:
-            return newest.key
-        return self.history.get(slot, {}).get(version)
+        old = self.history.get(slot, {}).get(version)
+        if newest is None or newest.version != version or newest.volatile:
+            return old
+        return newest.key if old is None else None
 
     def of_context(self, context: str) -> Iterator[Key]:
         """Yield the rows of all states of a world context, and forget them."""

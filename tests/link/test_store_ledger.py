@@ -47,10 +47,17 @@ CAUSES = (
 _numbers = itertools.count()
 
 
+class Body(bytes):
+    """Bytes that are short to tell."""
+
+    def __repr__(self):
+        return f"Body of {len(self)}"
+
+
 def datum(size):
     """Return a datum like no other."""
     number = next(_numbers)
-    return Datum(b"e", number.to_bytes(4, "little") + bytes(size), size + 4, number)
+    return Datum(b"e", Body(number.to_bytes(4, "little") + bytes(size)), size + 4, number)
 
 
 DATA = st.sampled_from((None, 10, LARGE)).map(lambda size: None if size is None else datum(size))
