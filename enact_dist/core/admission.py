@@ -34,6 +34,8 @@ def wrong_access(items: Iterable[Item]) -> Refused | None:
     for item in items:
         if item.captured_ns and item.access not in _ACCESSES_BY_STAMP:
             return _refused(f"{item.entity}/{item.aspect} was asked by stamp; only a View can be")
+        if item.nearest and not item.captured_ns:
+            return _refused(f"{item.entity}/{item.aspect} was asked nearest to no stamp")
         if item.access not in _ACCESSES:
             return _refused(f"access {item.access} was asked; there are {sorted(_ACCESSES)}")
     return None
@@ -68,6 +70,11 @@ def wrong_aspect(entry: AspectEntry) -> Refused | None:
                 f" lies outside 0 to {NO_LIMIT}"
             )
     return wrong_name("aspect", entry.name, slashes=False)
+
+
+def wrong_label(label: str) -> Refused | None:
+    """Refuse a label that nobody could name again."""
+    return wrong_name("label", label, slashes=True)
 
 
 def wrong_writes(writes: Collection[WriteItem]) -> Refused | None:

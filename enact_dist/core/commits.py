@@ -69,16 +69,18 @@ from enact_dist.core.records import (
     SlotRecord,
 )
 from enact_dist.core.sessions import Lane
-from enact_dist.core.slots import Catalogue, Content, SlotMap
+from enact_dist.core.slots import Content
 from enact_dist.terms import Durability, NullReason
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator
 
+    from enact_dist.core.catalogue import Catalogue
     from enact_dist.core.datum import LockId, Token
     from enact_dist.core.decisions import Decisions
     from enact_dist.core.messages import Cause, Prepare
     from enact_dist.core.sessions import SessionTable
+    from enact_dist.core.slots import SlotMap
     from enact_dist.core.stamps import Stamps
     from enact_dist.core.tenures import Tenure, Tenures
 
@@ -265,7 +267,8 @@ class Commits:
         commit.tenure.committing = True
         self._in_flight[ticket] = commit
         decision = (commit.decision,) if commit.decision is not None else ()
-        yield Persist(ticket, (*records, commit.outcome, *decision), durability)
+        forgotten = self._slots.history.take_forgotten()
+        yield Persist(ticket, (*records, commit.outcome, *decision, *forgotten), durability)
 
     def _strictest(self, commit: _InFlight) -> Durability:
         """Return what a commit must survive: the most that one of its data asks for.
@@ -322,7 +325,7 @@ class Commits:
         changes, size = [], 0
         for (_, datum), (slot, version) in zip(writes, versions, strict=True):
             content = Content(version, stamp_ns, datum, _DELETED, cause)
-            self._slots.replace(slot, content, retention=self._catalogue.retention(slot.aspect))
+            self._slots.replace(slot, content)
             captured_ns = 0
             if datum is not None:
                 captured_ns, size = datum.stamp_ns, size + datum.size
@@ -353,8 +356,12 @@ class Commits:
             if volatile:
                 records.append(SlotRecord(slot, version, stamp_ns, None, reason, volatile=True))
             else:
-                record = SlotRecord(slot, version, stamp_ns, write.datum, reason, cause=cause)
-                records.append(record)
+                stays = self._slots.history.will_hold(slot, self._slots[slot])
+                records.append(
+                    SlotRecord(
+                        slot, version, stamp_ns, write.datum, reason, history=stays, cause=cause
+                    )
+                )
         return tuple(records)
 
     # ---------------------------------------------------------------- fence

@@ -15,7 +15,6 @@ from enact_dist.core.messages import (
     Surveyed,
 )
 from enact_dist.core.slots import state_of
-from enact_dist.terms import pattern_matches
 
 if TYPE_CHECKING:
     from enact_dist.core.shard_state import ShardState
@@ -91,11 +90,11 @@ def sessions(state: ShardState) -> Sessions:
 
 def _counted(state: ShardState) -> dict[str, int]:
     """Return the statistics, retention, and alarms nobody has seen to, of earlier epochs too."""
-    retained = state.slots.retained
+    history = state.slots.history
     others = {
         "alarms": state.audit.alarms,
-        "retained_bytes": retained.bytes,
-        "retained_dropped": retained.dropped,
+        "retained_bytes": history.bytes,
+        "retained_dropped": history.dropped,
     }
     return state.counters | {name: count for name, count in others.items() if count}
 
@@ -103,16 +102,9 @@ def _counted(state: ShardState) -> dict[str, int]:
 def surveyed(state: ShardState, message: Survey, *, stamp_ns: int) -> Surveyed:
     """List the slots that match, null ones too, without their data; retained versions if asked."""
     states: list[SlotState] = []
-    for column in state.slots.columns():
-        if message.contexts and column.context not in message.contexts:
-            continue
-        if message.aspects and column.aspect not in message.aspects:
-            continue
-        for slot, content in state.slots.matching(column, "**"):
-            if not message.patterns or any(
-                pattern_matches(pattern, slot.entity) for pattern in message.patterns
-            ):
-                retained = state.slots.retained.of(slot) if message.retained else ()
-                states += [state_of(slot, older, with_datum=False) for older in retained]
-                states.append(state_of(slot, content, with_datum=False))
+    for slot, newest in state.slots.selected(message.contexts, message.patterns, message.aspects):
+        replaced = state.slots.history.of(slot) if message.retained else None
+        if replaced is not None:
+            states += [state_of(slot, older, with_datum=False) for older, _ in replaced.known()]
+        states.append(state_of(slot, newest, with_datum=False))
     return Surveyed(state.epoch, state.commits.notice_number, stamp_ns, tuple(states))

@@ -6,25 +6,21 @@ as the history does, and no further index is kept up to date by every commit.
 
 from __future__ import annotations
 
-from itertools import zip_longest
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.core.messages import Explain, FindEffects, Refused, VersionEntry, Versions
+from enact_dist.core.messages import Explain, FindEffects, Refused
 from enact_dist.core.records import Reply
-from enact_dist.core.slots import NOTHING, state_of
+from enact_dist.core.version_list import bounded, entries_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from enact_dist.core.datum import Slot
-    from enact_dist.core.message_parts import Cause
+    from enact_dist.core.message_parts import Cause, VersionEntry
     from enact_dist.core.records import Effect
     from enact_dist.core.shard_state import ShardState
 
 ASKED_MAX: Final = 4096
 """Versions or data that one question names."""
-NAMED_MAX: Final = 50_000
-"""Data that the causes of one answer name together; further entries are left out and counted."""
 
 
 class LineageDesk:
@@ -38,19 +34,20 @@ class LineageDesk:
         if len(message.versions) > ASKED_MAX:
             yield Reply(reply_to, _too_many(len(message.versions)))
             return
-        yield Reply(reply_to, self._bounded(self._explained(message)))
+        yield Reply(reply_to, bounded(self._state, self._explained(message)))
 
     def _explained(self, message: Explain) -> Iterator[VersionEntry]:
         for slot, version in message.versions:
             wanted = version or self._state.slots[slot].version
-            yield from (e for e in self._entries(slot) if e.state.version == wanted)
+            found = entries_of(self._state.slots, slot)
+            yield from (entry for entry in found if entry.state.version == wanted)
 
     def on_find_effects(self, message: FindEffects, reply_to: int) -> Iterator[Effect]:
         """Return every known version whose cause names one of these data."""
         if len(message.reads) > ASKED_MAX:
             yield Reply(reply_to, _too_many(len(message.reads)))
             return
-        yield Reply(reply_to, self._bounded(self._effects(message)))
+        yield Reply(reply_to, bounded(self._state, self._effects(message)))
 
     def _effects(self, message: FindEffects) -> Iterator[VersionEntry]:
         wanted = {(read.slot, read.stamp_ns) for read in message.reads}
@@ -70,29 +67,9 @@ class LineageDesk:
         slots = self._state.slots
         for slot in slots.all():
             if slots[slot].stamp_ns >= since_ns and any(
-                is_effect(content.cause) for content in slots.versions(slot)
+                is_effect(content.cause) for content, _ in slots.versions(slot)
             ):
-                yield from (entry for entry in self._entries(slot) if is_effect(entry.cause))
-
-    def _entries(self, slot: Slot) -> Iterator[VersionEntry]:
-        """Yield all that is known of a slot, oldest first."""
-        versions = [one for one in self._state.slots.versions(slot) if one is not NOTHING]
-        for content, after in zip_longest(versions, versions[1:], fillvalue=NOTHING):
-            state = state_of(slot, content, with_datum=False)
-            yield VersionEntry(state, after.stamp_ns, (), content.cause)
-
-    def _bounded(self, found: Iterator[VersionEntry]) -> Versions:
-        entries: list[VersionEntry] = []
-        named = left_out = 0
-        for entry in found:
-            cause = entry.cause
-            named += 1 + (len(cause.reads) + len(cause.writes) if cause is not None else 0)
-            if named <= NAMED_MAX:
-                entries.append(entry)
-            else:
-                left_out += 1
-        state = self._state
-        return Versions(state.epoch, state.stamp(), tuple(entries), left_out)
+                yield from (entry for entry in entries_of(slots, slot) if is_effect(entry.cause))
 
 
 def _too_many(count: int) -> Refused:

@@ -158,7 +158,8 @@ class PrepareDesk:
         work.tenure.committing = True
         ticket = self._state.commits.new_ticket()
         self._at_store[ticket] = work
-        return Persist(ticket, records, Durability.DURABLE)
+        forgotten = self._state.slots.history.take_forgotten()
+        return Persist(ticket, (*records, *forgotten), Durability.DURABLE)
 
     def _at_store_of(self, lock: LockId) -> _AtStore | None:
         return next((work for work in self._at_store.values() if work.record.lock == lock), None)

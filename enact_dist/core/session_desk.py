@@ -89,13 +89,13 @@ class SessionDesk:
             # A session that a restart would not know could lose its grants without the grace, so
             # it may do nothing before its record is durable.
             record = SessionRecord(session.session, session.ttl_ns)
-            yield from self._answer_when_durable(reply_to, welcome, (record,))
+            yield from self.answer_when_durable(reply_to, welcome, (record,))
             self._recording[session.session] = self._ticket
         else:
             session.present = session.present or not unrecorded
-            yield from self._answer_when_durable(reply_to, welcome, ())
+            yield from self.answer_when_durable(reply_to, welcome, ())
 
-    def _answer_when_durable(
+    def answer_when_durable(
         self, reply_to: int, answer: Answer, records: tuple[Record, ...]
     ) -> Iterator[Effect]:
         """Answer when `records` are durable, and all before them that the answer may tell of."""
@@ -136,7 +136,7 @@ class SessionDesk:
             if isinstance(registered, str):
                 registered = Refused("datum_type", registered)
             if isinstance(registered, Refused):
-                catalogue.aspects = before
+                catalogue.put_back(before)
                 yield Reply(reply_to, registered)
                 return
             if registered[1]:
@@ -145,7 +145,7 @@ class SessionDesk:
         answer = Registered(
             tuple(catalogue.worlds), tuple(catalogue.aspects.values()), catalogue.forks()
         )
-        yield from self._answer_when_durable(reply_to, answer, tuple(records))
+        yield from self.answer_when_durable(reply_to, answer, tuple(records))
 
     def on_keep_alive(self, message: KeepAlive, reply_to: int) -> Iterator[Effect]:
         """Renew a session and free what it does not want any more."""

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 
 from enact_dist.core import inspection
 from enact_dist.core.forced import BROKEN, SETTLED
+from enact_dist.core.history_desk import HistoryDesk
 from enact_dist.core.lineage_desk import LineageDesk
 from enact_dist.core.lock_desk import LockDesk
 from enact_dist.core.messages import (
@@ -37,7 +38,9 @@ from enact_dist.core.messages import (
     Goodbye,
     Hello,
     KeepAlive,
+    KeepVersions,
     ListAudit,
+    ListHistory,
     ListLocks,
     ListSessions,
     Locks,
@@ -66,7 +69,6 @@ from enact_dist.core.records import (
     Reply,
     SessionDied,
     SessionSeen,
-    Story,
     Tick,
 )
 from enact_dist.core.session_desk import SessionDesk
@@ -94,6 +96,7 @@ class Shard:
         self._sessions = SessionDesk(self.state)
         self._prepares = PrepareDesk(self.state, recovered.prepared, recovered.forced)
         self._locks = LockDesk(self.state, self._prepares)
+        self._history = HistoryDesk(self.state, self._sessions, self._prepares)
         self._views = ViewDesk(self.state, self._locks, self._prepares)
         self._worlds = WorldDesk(self.state, self._prepares)
         lineage = LineageDesk(self.state)
@@ -132,7 +135,9 @@ class Shard:
             Persisted: self._on_persisted,
             Tick: self._on_tick,
             Drain: self._on_drain,
-            MakeRoom: self._on_make_room,
+            ListHistory: self._history.on_list_history,
+            KeepVersions: self._history.on_keep_versions,
+            MakeRoom: self._history.on_make_room,
         }
 
     # ---------------------------------------------------------------- the one mutator
@@ -273,7 +278,7 @@ class Shard:
         yield from self._answer_reached()
         yield from self._prepares.ask()
         yield from self.state.decisions.tell(now_ns)
-        self._views.forget_past()
+        yield from self._history.tidy()
 
     def _expire(self, session: str) -> Iterator[Effect]:
         found = self.state.sessions.by_id.get(session)
@@ -301,12 +306,6 @@ class Shard:
         for reply_to in list(self._parked_stamps):
             self._parked_stamp_ends[reply_to] = self.state.now_ns
         yield from self._answer_reached()
-
-    def _on_make_room(self, message: MakeRoom, _: int) -> Iterator[Effect]:
-        gone, size = self.state.slots.make_room(message.bytes)
-        if gone:
-            self.state.count("history_dropped", gone)
-            yield Story("history.dropped", f"{gone} replaced versions of {size} bytes at the cap")
 
     # ---------------------------------------------------------------- people
 
@@ -355,7 +354,7 @@ class Shard:
         self._prepares.assert_invariants()
         self.state.tenures.assert_invariants()
         self._worlds.assert_invariants()
-        self.state.slots.retained.assert_invariants()
+        self.state.slots.assert_invariants()
         if self.state.sessions.in_grace(self.state.now_ns):
             granted = [t for t in self.state.tenures.by_lock.values() if t.token is not None]
             assert all(t.prepared is not None for t in granted), "grant in grace"

@@ -10,12 +10,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core import inspection
+from enact_dist.core.catalogue import Catalogue
 from enact_dist.core.commits import Commits
 from enact_dist.core.decisions import Decisions
 from enact_dist.core.forced import Audit
 from enact_dist.core.messages import AspectEntry, PlacementMap, Refused, WorldEntry
 from enact_dist.core.sessions import Session, SessionTable
-from enact_dist.core.slots import Catalogue, SlotMap
+from enact_dist.core.slots import SlotMap
 from enact_dist.core.stamps import Stamps
 from enact_dist.core.tenures import Tenure, Tenures
 
@@ -83,11 +84,6 @@ class ShardState:
         self.busy_worlds: dict[str, str] = {}
         names = {shard.name for shard in settings.placement.shards}
         self.peers = frozenset(names - {settings.name})
-        self.slots = SlotMap(
-            recovered.slots,
-            answer_bytes_max=ANSWER_FETCHES * settings.fetch_bytes_max,
-            version_bases={record.name: record.version_base for record in recovered.dropped},
-        )
         self.catalogue = Catalogue(
             configured=settings.aspects,
             recovered=recovered.aspects,
@@ -98,14 +94,22 @@ class ShardState:
                 *map(WorldEntry, dict.fromkeys(r.slot.context for r in recovered.slots)),
             ),
         )
-        self.sessions = SessionTable(recovered.sessions, outcomes=recovered.outcomes, now_ns=now_ns)
-        self.shortest_ttl_ns = min(
-            (session.ttl_ns for session in self.sessions), default=settings.ttl_ns_max
-        )
         stamps = [record.stamp_ns for record in recovered.slots]
         stamps += [record.position.stamp_ns for record in recovered.outcomes]
         stamps += [record.position.stamp_ns for record in recovered.decisions]
         self.stamps = Stamps(max(stamps, default=0))
+        self.slots = SlotMap(
+            recovered.slots,
+            policies=self.catalogue.policies,
+            since_ns=max(self.stamps.last_ns, wall_ns),
+            answer_bytes_max=ANSWER_FETCHES * settings.fetch_bytes_max,
+            version_bases={record.name: record.version_base for record in recovered.dropped},
+        )
+        self.slots.recover_history(recovered.history, recovered.kept)
+        self.sessions = SessionTable(recovered.sessions, outcomes=recovered.outcomes, now_ns=now_ns)
+        self.shortest_ttl_ns = min(
+            (session.ttl_ns for session in self.sessions), default=settings.ttl_ns_max
+        )
         self.tenures = Tenures(
             epoch=self.epoch, slots=self.slots, sessions=self.sessions, count=self.count
         )

@@ -1,4 +1,4 @@
-"""The world contexts of one shard: slots, their newest committed states, and the catalogue.
+"""The world contexts of one shard: slots, their newest committed states and their history.
 
 The map itself (ENACT 3.2) is `SlotMap`: (context, entity, aspect) to a version and a datum or
 null.  Every committed write adds one to the version; a deleted slot keeps its version and never
@@ -13,17 +13,17 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from enact_dist.core.datum import Column, Datum, Slot
-from enact_dist.core.messages import AspectEntry, Cause, SlotState, WorldEntry
-from enact_dist.core.past import Past
-from enact_dist.core.retained import Retained
-from enact_dist.core.retaining import covers, with_larger
-from enact_dist.terms import ACCESSES, Durability, NullReason, pattern_matches
+from enact_dist.core.history import History
+from enact_dist.core.messages import Cause, Forgotten, SlotState, SlotVersion
+from enact_dist.core.payload_names import PayloadNames
+from enact_dist.terms import ACCESSES, NullReason, pattern_matches
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Collection, Iterable, Iterator, Mapping
 
+    from enact_dist.core.history import Policy
     from enact_dist.core.messages import Item
-    from enact_dist.core.records import SlotRecord
+    from enact_dist.core.records import KeptRecord, SlotRecord
 
 INLINE_BYTES_MAX: Final = 64 * 1024
 """Data up to this size travel with the grant; larger ones are fetched when they are read."""
@@ -43,6 +43,7 @@ class Content:
 
 
 NOTHING: Final = Content(0, 0, None, NullReason.NEVER_SET)
+_LOST: Final = Content(0, 0, None, NullReason.LOST)
 _OUTSIDE: Final = Content(0, 0, None, NullReason.OUTSIDE_RETENTION)
 
 
@@ -61,43 +62,62 @@ class Shown(NamedTuple):
 
 
 class SlotMap:
-    """All slots of one shard by context and aspect."""
+    """All slots of one shard by context and aspect, and their history.
+
+    Args:
+        recovered: The newest states that the store has kept.
+        policies: How much of its history each aspect retains; may change.
+        since_ns: Stamp of the start of this epoch: what is lost is lost from then on.
+        answer_bytes_max: So many bytes of small data travel with one answer.
+        version_bases: The largest version of each context that was dropped.
+    """
 
     __slots__ = (
         "_answer_bytes_max",
         "_columns",
+        "_lost",
+        "_payloads",
+        "_since_ns",
         "_version_bases",
         "bytes",
         "count",
-        "past",
-        "retained",
+        "history",
     )
 
     def __init__(
         self,
         recovered: Iterable[SlotRecord],
         *,
+        policies: Mapping[str, Policy] | None = None,
+        since_ns: int = 0,
         answer_bytes_max: int = ANSWER_BYTES_MAX,
         version_bases: Mapping[str, int] | None = None,
     ) -> None:
-        self._answer_bytes_max = answer_bytes_max
         self._version_bases = dict(version_bases or {})
+        self._answer_bytes_max = answer_bytes_max
+        self._since_ns = since_ns
         self._columns: dict[Column, dict[str, Content]] = {}
+        self._lost: set[Slot] = set()
         self.count = 0
         self.bytes = 0
-        self.past = Past()
-        self.retained = Retained()
+        self._payloads = PayloadNames()
+        self.history = History({} if policies is None else policies, self._payloads)
         for record in recovered:
+            self.set(record.slot, content_of(record))
             if record.volatile:
-                self.set(record.slot, Content(0, 0, None, NullReason.LOST))
-            else:
-                reason = (
-                    NullReason[record.null_reason] if record.null_reason else NullReason.DELETED
-                )
-                self.set(
-                    record.slot,
-                    Content(record.version, record.stamp_ns, record.datum, reason, record.cause),
-                )
+                self._lost.add(record.slot)
+
+    def recover_history(self, replaced: Iterable[SlotRecord], kept: Iterable[KeptRecord]) -> None:
+        """Take over what the store has kept of replaced states, oldest first within each slot."""
+        labels: dict[SlotVersion, list[str]] = {}
+        for record in kept:
+            for version in record.versions:
+                labels.setdefault(version, []).append(record.label)
+        states: dict[Slot, list[Content]] = {slot: [] for slot, _ in labels}
+        for row in replaced:
+            states.setdefault(row.slot, []).append(content_of(row))
+        for slot, contents in states.items():
+            self.history.recover(slot, self[slot], contents, labels)
 
     def __getitem__(self, slot: Slot) -> Content:
         context, entity, aspect = slot
@@ -125,81 +145,131 @@ class SlotMap:
         """Forget all slots of a context with their past, and return them."""
         gone = list(self.of_context(context))
         self._version_bases[context] = self.version_base(context)
+        self.history.drop(slot for slot, _ in gone)
+        for slot, content in gone:
+            self._lost.discard(slot)
+            self._payloads.count(content.datum, stays=-1)
+            self.bytes -= content.datum.size if content.datum is not None else 0
         for column in [column for column in self._columns if column.context == context]:
             del self._columns[column]
-        self.past.drop(context)
-        self.retained.drop(context)
         self.count -= len(gone)
-        self.bytes -= sum(content.datum.size for _, content in gone if content.datum is not None)
         return gone
 
-    def versions(self, slot: Slot) -> Iterator[Content]:
-        """Yield all states of a slot that are known, oldest first."""
-        yield from (old for old in self.past.of(slot) if old is not NOTHING)
-        yield self[slot]
+    def replace(self, slot: Slot, content: Content) -> None:
+        """Put a newly committed state in place of the old one, which becomes history."""
+        old = self.set(slot, content)
+        self.history.replaced(slot, old, until_ns=content.stamp_ns)
+
+    # ---------------------------------------------------------------- the past
+
+    def at(self, slot: Slot, newest: Content, at_ns: int) -> Content:
+        """Return the state of a slot as of a stamp (0: now), or `newest` where that is gone."""
+        if not at_ns or newest.stamp_ns <= at_ns:
+            return newest
+        found = self.history.of(slot)
+        old = found.at(at_ns) if found is not None else None
+        if old is not None:
+            return old
+        if self._oldest(slot, newest).version != self._first_version(slot):
+            return newest
+        return _LOST if slot in self._lost else NOTHING
 
     def as_of(self, slot: Slot, at_ns: int) -> Content | int:
         """Return the state of a slot as of a stamp, or since when it is known if that is later."""
-        versions = list(self.versions(slot))
-        for content in reversed(versions):
-            if content.stamp_ns <= at_ns:
-                return content
-        first = self._version_bases.get(slot.context, 0) + 1
-        return NOTHING if versions[0].version == first else versions[0].stamp_ns
+        newest = self[slot]
+        since_ns = self.known_since_ns(slot, newest)
+        if since_ns <= at_ns:
+            return self.at(slot, newest, at_ns)
+        found = self.history.of(slot)
+        kept = found.kept_at(at_ns) if found is not None else None
+        return kept if kept is not None else since_ns
 
-    def replace(self, slot: Slot, content: Content, *, retention: int = 1) -> None:
-        """Put a newly committed state in place of the old one, which stays known for a while.
+    def known_since_ns(self, slot: Slot, newest: Content) -> int:
+        """Return the stamp from which on all states of a slot are known, 0: from ever."""
+        oldest = self._oldest(slot, newest)
+        if oldest.version > self._first_version(slot):
+            return oldest.stamp_ns
+        return self._since_ns if slot in self._lost else 0
 
-        Args:
-            slot: The slot.
-            content: Its new state.
-            retention: How many versions stay readable, the new one included.
+    def _oldest(self, slot: Slot, newest: Content) -> Content:
+        """Return the oldest state of a slot from which on all are known."""
+        found = self.history.of(slot)
+        return found.states[0] if found is not None and found.states else newest
+
+    def _first_version(self, slot: Slot) -> int:
+        return self._version_bases.get(slot.context, 0) + 1
+
+    def forgotten(self, items: Iterable[Item], at_ns: int) -> Forgotten | None:
+        """Return what is asked and not known any more as of a stamp, None if all is known."""
+        latest, unknown = Forgotten(Slot("", "", ""), 0), False
+        for item in items:
+            for slot, newest in self._asked(item):
+                since_ns = self.known_since_ns(slot, newest)
+                if since_ns > latest.oldest_ns:
+                    latest = Forgotten(slot, since_ns)
+                unknown |= since_ns > at_ns and isinstance(self.as_of(slot, at_ns), int)
+        return latest if unknown else None
+
+    def captured(
+        self, slot: Slot, newest: Content, captured_ns: int, *, nearest: bool = False
+    ) -> Content:
+        """Return the latest version up to `newest` with a capture stamp, null if none is left.
+
+        With `nearest`, the one whose capture stamp lies nearest; of two as near, the later one.
         """
-        old = self.set(slot, content)
-        self.past.keep(slot, old, until_ns=content.stamp_ns)
-        if retention > 1:
-            self.retained.keep(slot, old, count=retention - 1)
-
-    def at(self, slot: Slot, content: Content, at_ns: int) -> Content:
-        """Return the state of a slot as of a stamp (0: now), or `content` where that is gone."""
-        if not at_ns or content.stamp_ns <= at_ns:
-            return content
-        return self.past.at(slot, at_ns) or content
-
-    def captured(self, slot: Slot, newest: Content, captured_ns: int) -> Content:
-        """Return the newest version up to `newest` with a capture stamp, null if none is left."""
-        if newest.datum is not None and newest.datum.stamp_ns == captured_ns:
+        datum, history = newest.datum, self.history.of(slot)
+        if datum is not None and datum.stamp_ns == captured_ns:
             return newest
-        found = self.retained.captured(slot, captured_ns, version_max=newest.version)
+        found: list[Content] = []
+        if nearest:
+            found = [newest] if datum is not None and datum.stamp_ns else []
+            if history is not None:
+                found += history.nearest(captured_ns, version_max=newest.version)
+        elif history is not None:
+            exact = history.captured(captured_ns, version_max=newest.version)
+            found = [exact] if exact is not None else []
+        if found:
+            return min(found, key=lambda one: _distance(one, captured_ns))
+        return newest if datum is None else _OUTSIDE
+
+    def versions(self, slot: Slot) -> Iterator[tuple[Content, int]]:
+        """Yield all versions of a slot that are known, oldest first, and until when each was.
+
+        The stamp is 0 for the newest one, and the version's own where no later one is known of.
+        What a restart has lost shows as version 0.
+        """
+        found, newest = self.history.of(slot), self[slot]
         if found is not None:
-            return found
-        return newest if newest.datum is None else _OUTSIDE
+            yield from found.known()
+        if newest is not NOTHING:
+            yield newest, 0
+
+    def is_stored(self, slot: Slot, version: int) -> bool:
+        """Whether the store has a version of a slot: the newest one, or one of its history."""
+        found = self.history.of(slot)
+        here = self[slot].version == version or (
+            found is not None and found.find(version) is not None
+        )
+        return here and self.history.is_stored(slot)
 
     def make_room(self, size: int) -> tuple[int, int]:
-        """Forget the oldest replaced states until so many bytes of payloads are named no more.
+        """Forget the oldest replaced states until so many bytes of payloads are named no more."""
+        return self.history.make_room(size)
 
-        What is kept to answer as of a recent stamp goes first: the present stands in for it.
-        Where all of them would not do, they stay.
+    # ---------------------------------------------------------------- the present
 
-        Returns:
-            How many versions went, and the bytes of payloads that only they named.
-        """
-        named = {
-            old.datum.file: old.datum.size
-            for old in (*self.past.states(), *self.retained.states())
-            if old.datum is not None and old.datum.file
-        }
-        gone = freed = 0
-        if sum(named.values()) < size:
-            return 0, 0
-        while self.past:
-            slot, old = self.past.forget_oldest()
-            freed_now = 0 if (slot, old.version) in self.retained else _payload_bytes(old)
-            freed, gone = freed + freed_now, gone + bool(freed_now)
-        while self.retained and freed < size:
-            freed += _payload_bytes(self.retained.forget_oldest())
-            gone += 1
-        return gone, freed
+    def assert_invariants(self) -> None:
+        """Assert the bookkeeping of histories and payloads.  For tests and simulation."""
+        self.history.assert_invariants()
+        for found in self.history:
+            newest = self[found.slot]
+            if found.states:
+                assert found.states[-1].version + 1 == newest.version, found.slot
+                assert found.until_ns == newest.stamp_ns, found.slot
+        stay = [content.datum for column in self._columns.values() for content in column.values()]
+        stay += [kept.content.datum for found in self.history for kept in found.kept.values()]
+        may_go = [state.datum for found in self.history for state in found.states]
+        self._payloads.assert_counts(stay, may_go)
 
     def biggest(self, count: int) -> list[tuple[str, int]]:
         """Return the slots whose newest data are the largest, with their bytes."""
@@ -222,8 +292,12 @@ class SlotMap:
             self.count += 1
         elif old.datum is not None:
             self.bytes -= old.datum.size
+            if old.datum.file:
+                self._payloads.count(old.datum, stays=-1)
         if content.datum is not None:
             self.bytes += content.datum.size
+            if content.datum.file:
+                self._payloads.count(content.datum, stays=1)
         column[entity] = content
         return old
 
@@ -249,6 +323,26 @@ class SlotMap:
         """Yield every (context, aspect) that has slots."""
         yield from self._columns
 
+    def selected(
+        self, contexts: Collection[str], patterns: Collection[str], aspects: Collection[str]
+    ) -> Iterator[tuple[Slot, Content]]:
+        """Yield the slots of these contexts, entities and aspects, null ones too; empty: of all."""
+        for column in self._columns:
+            if contexts and column.context not in contexts:
+                continue
+            if aspects and column.aspect not in aspects:
+                continue
+            for slot, content in self.matching(column, "**"):
+                if not patterns or any(pattern_matches(one, slot.entity) for one in patterns):
+                    yield slot, content
+
+    def _asked(self, item: Item) -> list[tuple[Slot, Content]]:
+        """Return the slots that an item names, or that match its pattern."""
+        if ACCESSES[item.access].each:
+            return list(self.matching(Column(item.context, item.aspect), item.entity))
+        slot = Slot(item.context, item.entity, item.aspect)
+        return [(slot, self[slot])]
+
     def shown(self, items: Iterable[Item], at_ns: int = 0) -> Shown:
         """Return what a grant or view shows of `items` as of a stamp (0: now).
 
@@ -259,19 +353,13 @@ class SlotMap:
         from_ns, left = 0, self._answer_bytes_max
         for item in items:
             each = ACCESSES[item.access].each
-            if each:
-                column = Column(item.context, item.aspect)
-                found = list(self.matching(column, item.entity))
-            else:
-                slot = Slot(item.context, item.entity, item.aspect)
-                found = [(slot, self[slot])]
-            for slot, newest in found:
+            for slot, newest in self._asked(item):
                 content = self.at(slot, newest, at_ns) if at_ns else newest
                 # Of the newest one as of then, too, where an older version is asked: what was
                 # captured when is certain only from its commit on.
                 from_ns = max(from_ns, content.stamp_ns)
                 if item.captured_ns:
-                    content = self.captured(slot, content, item.captured_ns)
+                    content = self.captured(slot, content, item.captured_ns, nearest=item.nearest)
                 if content.datum is None and each:
                     continue
                 state = state_of(slot, content, known=item.known, inline_max=left)
@@ -282,9 +370,18 @@ class SlotMap:
         return Shown(states, pins, from_ns)
 
 
-def _payload_bytes(content: Content) -> int:
-    datum = content.datum
-    return datum.size if datum is not None and datum.file else 0
+def content_of(record: SlotRecord) -> Content:
+    """Return the state that a record has kept; of a volatile slot, that it is lost."""
+    if record.volatile:
+        return _LOST
+    reason = NullReason[record.null_reason] if record.null_reason else NullReason.DELETED
+    return Content(record.version, record.stamp_ns, record.datum, reason, record.cause)
+
+
+def _distance(content: Content, captured_ns: int) -> tuple[int, int, int]:
+    """Return a key that puts what was captured next to a stamp first, the later of two."""
+    stamp_ns = content.datum.stamp_ns if content.datum is not None else 0
+    return abs(stamp_ns - captured_ns), -stamp_ns, -content.version
 
 
 def state_of(
@@ -320,72 +417,3 @@ def state_of(
         "",
         datum.stamp_ns,
     )
-
-
-class Catalogue:
-    """World contexts and aspects that this shard knows."""
-
-    __slots__ = ("_configured", "aspects", "worlds")
-
-    def __init__(
-        self,
-        *,
-        configured: Iterable[AspectEntry],
-        recovered: Iterable[AspectEntry],
-        worlds: Iterable[WorldEntry],
-    ) -> None:
-        self._configured = {entry.name: entry for entry in configured}
-        self.aspects: dict[str, AspectEntry] = {}
-        self.worlds: dict[str, WorldEntry] = {}
-        for world in worlds:
-            # That it is a fork is known of a context which is also named elsewhere.
-            if world.source or world.name not in self.worlds:
-                self.worlds[world.name] = world
-        for entry in recovered:
-            self.aspects[entry.name] = self._with_configured(entry)
-
-    def _with_configured(self, entry: AspectEntry) -> AspectEntry:
-        """Let the cell's configuration decide the durability, and the larger retention count."""
-        configured = self._configured.get(entry.name)
-        durability = configured.durability if configured else ""
-        durability = durability or entry.durability or Durability.DURABLE.value
-        entry = entry._replace(durability=durability)
-        return with_larger(entry, configured) if configured else entry
-
-    def register(self, entry: AspectEntry) -> tuple[AspectEntry, bool] | str:
-        """Register an aspect; return its entry and whether it changed, or why it is refused."""
-        wanted = self._with_configured(entry)
-        known = self.aspects.get(entry.name)
-        if known is None:
-            self.aspects[entry.name] = wanted
-            return wanted, True
-        if known.fingerprint != wanted.fingerprint:
-            return (
-                f"aspect {entry.name!r} is registered with datum type {known.fingerprint}, and was"
-                f" now asked with {wanted.fingerprint}; use the registered type or another name"
-            )
-        if entry.durability and known.durability != wanted.durability:
-            return (
-                f"aspect {entry.name!r} is registered as {known.durability}, and was now asked as"
-                f" {wanted.durability}; state one durability in cell.toml or in Aspect(…)"
-            )
-        if not covers(known, wanted):
-            known = self.aspects[entry.name] = with_larger(known, wanted)
-            return known, True
-        return known, False
-
-    def forks(self) -> tuple[WorldEntry, ...]:
-        """Return the world contexts that are forks."""
-        return tuple(world for world in self.worlds.values() if world.source)
-
-    def retention(self, aspect: str) -> int:
-        """Return how many versions of a slot of this aspect stay readable."""
-        entry = self.aspects.get(aspect)
-        return max(1, entry.retention) if entry is not None else 1
-
-    def durability(self, aspect: str) -> Durability:
-        """Return what a commit of this (registered) aspect survives."""
-        return _DURABILITIES[self.aspects[aspect].durability]
-
-
-_DURABILITIES: Final = {durability.value: durability for durability in Durability}

@@ -6,6 +6,10 @@ interval ends before the stamp of any commit that is prepared or under way on th
 because such a commit may still become visible with a stamp from there on.  Asked *at* T, a shard
 first moves its clock past T, so that whatever is prepared later gets a larger stamp, and then
 waits for those that are undecided and stamped up to T.
+
+A strict view as of T is about history: it is answered with the data as of T, or with what is
+forgotten of them, and never with the present.  Where an undecided commit still stands in the way
+after the wait, its interval ends before T, and it is to be asked again.
 """
 
 from __future__ import annotations
@@ -13,8 +17,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.datum import Column, Slot
-from enact_dist.core.messages import EpochChanged, TakeView, Viewed
-from enact_dist.core.past import PAST_NS
+from enact_dist.core.messages import EpochChanged, Forgotten, Refused, TakeView, Viewed
 from enact_dist.core.records import Reply
 from enact_dist.terms import ACCESSES, pattern_matches
 
@@ -53,6 +56,9 @@ class ViewDesk:
         if refusal is not None or session is None:
             yield Reply(reply_to, refusal or EpochChanged(state.epoch))
             return
+        if message.strict and state.stamps.too_far_ahead(message.at_ns, wall_ns=state.wall_ns):
+            yield Reply(reply_to, self._in_the_future(message.at_ns))
+            return
         # Whatever is counted renews: the client believes from the newest counter that was seen.
         session.renewed_ns = max(session.renewed_ns, state.now_ns)
         session.count_seen = max(session.count_seen, message.count)
@@ -62,6 +68,14 @@ class ViewDesk:
             self._parked[reply_to] = (message, state.now_ns + VIEW_WAIT_NS)
         else:
             yield Reply(reply_to, self._viewed(message))
+
+    def _in_the_future(self, at_ns: int) -> Refused:
+        ahead_s = (at_ns - self._state.wall_ns) / 1e9
+        return Refused(
+            "clock_skew",
+            f"the data were asked as of a time {ahead_s:.1f} s ahead of the clock of shard"
+            f" {self._state.settings.name}; at most 1 s is accepted; ask for a time that has come",
+        )
 
     def _undecided_ns(self, items: tuple[Item, ...]) -> int:
         """Return the smallest stamp that an undecided commit on these items may get."""
@@ -80,8 +94,13 @@ class ViewDesk:
             default=_NEVER_NS,
         )
 
-    def _viewed(self, message: TakeView) -> Viewed:
+    def _viewed(self, message: TakeView) -> Viewed | Forgotten:
         state = self._state
+        if message.strict and message.at_ns:
+            forgotten = state.slots.forgotten(message.items, message.at_ns)
+            if forgotten is not None:
+                state.count("views_forgotten")
+                return forgotten
         states, pins, from_ns = state.slots.shown(message.items, message.at_ns)
         if pins:
             # Added to: the client may have taken an answer to an earlier one of these.
@@ -100,10 +119,6 @@ class ViewDesk:
             if waited or self._undecided_ns(message.items) > message.at_ns:
                 del self._parked[reply_to]
                 yield Reply(reply_to, self._viewed(message))
-
-    def forget_past(self) -> None:
-        """Forget replaced states that nobody asks for any more."""
-        self._state.slots.past.forget(self._state.stamps.last_ns - PAST_NS)
 
     def next_deadline_ns(self) -> int | None:
         """Return when a view has waited enough."""

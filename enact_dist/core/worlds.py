@@ -215,7 +215,8 @@ class WorldDesk:
         if state.catalogue.durability(slot.aspect) is Durability.VOLATILE:
             record = SlotRecord(slot, version, at_ns, None, told, volatile=True)
         else:
-            same_as = SlotVersion(source, content.version) if datum is not None else None
+            stored = datum is not None and state.slots.is_stored(source, content.version)
+            same_as = SlotVersion(source, content.version) if stored else None
             record = SlotRecord(slot, version, at_ns, datum, told, cause=cause, same_as=same_as)
         return (slot, Content(version, at_ns, datum, reason, cause)), record
 

@@ -84,7 +84,15 @@ _ANSWERS = {
 _FACTS = {
     records.SessionRecord: lambda r: ("session", r.session),
     records.SessionEnded: lambda r: ("session over", r.session),
-    records.SlotRecord: lambda r: ("slot", r.slot, r.version, _text(r.datum), r.volatile),
+    records.SlotRecord: lambda r: (
+        "slot",
+        r.slot,
+        r.version,
+        _text(r.datum),
+        r.volatile,
+        r.history,
+    ),
+    records.HistoryForgotten: lambda r: ("forgotten", tuple(sorted(r.versions))),
     records.OutcomeRecord: lambda r: ("outcome", r.lock, _pairs(r.versions)),
     records.PreparedRecord: lambda r: ("prepared", r.lock, _pairs(r.versions)),
     records.PreparedEnded: lambda r: ("prepared over", r.lock),

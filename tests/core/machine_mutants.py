@@ -10,11 +10,11 @@ from dataclasses import replace
 
 from enact_dist.core.commits import Commits
 from enact_dist.core.decisions import Decisions
+from enact_dist.core.history import History
 from enact_dist.core.lock_desk import LockDesk
 from enact_dist.core.messages import Fenced, Finished, Prepared
 from enact_dist.core.prepares import PrepareDesk
 from enact_dist.core.records import Persist, Reply
-from enact_dist.core.retained import Retained
 from enact_dist.core.session_desk import SessionDesk
 from enact_dist.core.sessions import Session, SessionTable
 from enact_dist.core.slots import Content, SlotMap
@@ -237,7 +237,7 @@ def shows_before_it_is_kept(patch):
 
 def welcomes_early(patch):
     """A session is welcomed before its record is on disk."""
-    answer_when_durable = SessionDesk._answer_when_durable
+    answer_when_durable = SessionDesk.answer_when_durable
 
     def wrong(self, reply_to, answer, records):
         for effect in answer_when_durable(self, reply_to, answer, records):
@@ -245,25 +245,26 @@ def welcomes_early(patch):
             if isinstance(effect, Persist):
                 yield Reply(*self._answers_after[effect.ticket].pop())
 
-    patch(SessionDesk, "_answer_when_durable", wrong)
+    patch(SessionDesk, "answer_when_durable", wrong)
 
 
 def retains_one_version_more(patch):
     """A version stays readable for one commit too long."""
-    keep = Retained.keep
+    append = History._append
 
-    def wrong(self, slot, old, *, count):
-        keep(self, slot, old, count=count + 1)
+    def wrong(self, found, old, limits):
+        more = limits.versions + (limits.versions > 1)
+        append(self, found, old, limits._replace(versions=more))
 
-    patch(Retained, "keep", wrong)
+    patch(History, "_append", wrong)
 
 
 def shows_another_stamp(patch):
     """Where nothing of a stamp is retained, the newest version is shown."""
     captured = SlotMap.captured
 
-    def wrong(self, slot, newest, captured_ns):
-        found = captured(self, slot, newest, captured_ns)
+    def wrong(self, slot, newest, captured_ns, **options):
+        found = captured(self, slot, newest, captured_ns, **options)
         return found if found.datum is not None else newest
 
     patch(SlotMap, "captured", wrong)

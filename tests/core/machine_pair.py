@@ -16,6 +16,7 @@ from reference_parts import DURABILITY, RETENTION
 from shard_bench import ShardBench
 
 from enact_dist.core.datum import Slot, Token
+from enact_dist.core.ledger import Ledger
 from enact_dist.core.messages import (
     AspectEntry,
     AwaitStamp,
@@ -25,27 +26,7 @@ from enact_dist.core.messages import (
     Viewed,
     Waiting,
 )
-from enact_dist.core.records import (
-    AspectRecord,
-    AuditRecord,
-    Call,
-    DecisionDone,
-    DecisionRecord,
-    ForcedEnded,
-    ForcedRecord,
-    OutcomeRecord,
-    Persist,
-    Persisted,
-    PreparedEnded,
-    PreparedRecord,
-    Publish,
-    Recovered,
-    Reply,
-    SessionEnded,
-    SessionRecord,
-    SlotRecord,
-    WorldRecord,
-)
+from enact_dist.core.records import Call, Persist, Persisted, Publish, Recovered, Reply
 
 if TYPE_CHECKING:
     from enact_dist.core.datum import LockId
@@ -55,15 +36,6 @@ ENTITIES = ("a", "tray/1", "tray/2")
 ASPECTS = ("count", "note", "frame")
 SLOTS = [Slot("online", entity, aspect) for entity in ENTITIES for aspect in ASPECTS]
 STORY_LINES = 40
-ENDED = {PreparedEnded: PreparedRecord, DecisionDone: DecisionRecord, ForcedEnded: ForcedRecord}
-KINDS = {
-    "sessions": SessionRecord,
-    "slots": SlotRecord,
-    "outcomes": OutcomeRecord,
-    "prepared": PreparedRecord,
-    "decisions": DecisionRecord,
-    "forced": ForcedRecord,
-}
 
 
 class Pair:
@@ -74,7 +46,7 @@ class Pair:
         reported: How many of these were reported (or need no report): a kill keeps them.
         synced: How many of these a power cut keeps, too.
         floor_ns: Largest stamp that the shard has told in this epoch.
-        history: All states of each slot with their stamps, since the last restart.
+        history: All states of each slot with their stamps, but of what restarts have lost.
     """
 
     def __init__(self) -> None:
@@ -154,7 +126,7 @@ class Pair:
         self.now_ns += down_ns
         self.wall_ns += down_ns
         epoch = self.shard.epoch + 1
-        recovered = recovered_from(self._base.log, self.kept, epoch)
+        recovered = self._recovered(epoch)
         self.shard = type(self.shard)(
             self._settings, recovered, now_ns=self.now_ns, wall_ns=self.wall_ns
         )
@@ -162,11 +134,17 @@ class Pair:
         for slot in SLOTS:
             content = self.shard.state.slots[slot]
             version, text = self.reference.slots.get(slot, (0, None))
-            self.history[slot] = [(content.stamp_ns, version, text)]
+            known = [entry for entry in self.history[slot] if entry[1] < version]
+            self.history[slot] = [*known, (content.stamp_ns, version, text)]
         self.floor_ns = self.reached_ns = 0
         self.promised_ns.clear()
         self.awaited.clear()
         self._compare_state()
+
+    def _recovered(self, epoch: int) -> Recovered:
+        """Return what a store gives back of all that it has kept."""
+        records = (record for persist in self.kept for record in persist.records)
+        return Ledger((*self._base.log, *records)).recovered(epoch)
 
     # ---------------------------------------------------------------- comparisons
 
@@ -354,35 +332,6 @@ class Pair:
                 for number, lane in reference.lanes.get(session, {}).items()
             }
             self.same(f"lanes of {session}", lanes, wanted)
-
-
-def recovered_from(base: list, kept: list[Persist], epoch: int) -> Recovered:
-    """Return what a store gives back of all that it has kept."""
-    found = Recovered(epoch)
-    newest: dict[tuple, object] = {}
-    for record in [*base, *(record for persist in kept for record in persist.records)]:
-        match record:
-            case WorldRecord():
-                found.worlds.append(record.name)
-            case AspectRecord():
-                found.aspects.append(record.entry)
-            case AuditRecord():
-                found.audit.append(record)
-            case OutcomeRecord():
-                newest[OutcomeRecord, record.lock.session, record.lock.lane] = record
-            case SlotRecord():
-                newest[SlotRecord, record.slot] = record
-            case SessionRecord():
-                newest[SessionRecord, record.session] = record
-            case PreparedRecord() | DecisionRecord() | ForcedRecord():
-                newest[type(record), record.lock] = record
-            case SessionEnded():
-                newest.pop((SessionRecord, record.session), None)
-            case _:
-                newest.pop((ENDED[type(record)], record.lock), None)
-    for name, kind in KINDS.items():
-        getattr(found, name).extend(r for r in newest.values() if isinstance(r, kind))
-    return found
 
 
 def _told(fact: tuple) -> tuple:

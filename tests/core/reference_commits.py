@@ -5,7 +5,7 @@ from __future__ import annotations
 from copy import copy
 from typing import TYPE_CHECKING
 
-from reference_parts import DURABILITY, Decision, Lane, Life
+from reference_parts import DURABILITY, RETENTION, Decision, Lane, Life
 from reference_shard import EACH, MS, ReferenceSessions
 
 from enact_dist.core.messages import Finish, Resolve
@@ -48,8 +48,13 @@ class ReferenceShard(ReferenceSessions):
         super().recall(fact)
         kind, name = fact[:2]
         if kind == "slot":
-            _, slot, version, text, volatile = fact
+            _, slot, version, text, volatile, history = fact
+            if history:
+                self.replaced.setdefault(slot, []).append(self.slots[slot])
             self.slots[slot] = (0, None) if volatile else (version, text)
+        elif kind == "forgotten":
+            for slot, version in name:
+                self.replaced[slot] = [old for old in self.replaced[slot] if old[0] != version]
         elif kind == "outcome":
             lane = Lane(top=name.seq, outcome=(name, fact[2]))
             self.lanes.setdefault(name.session, {})[name.lane] = lane
@@ -69,6 +74,8 @@ class ReferenceShard(ReferenceSessions):
 
     def restored(self):
         """What was prepared is held again before anything else is granted."""
+        for slot in self.replaced:
+            self.forget(slot)
         self.views: dict[int, tuple] = {}
         self.alarms: dict[LockId, list[int]] = {}
         for life in self.lives.values():
@@ -134,8 +141,22 @@ class ReferenceShard(ReferenceSessions):
         for slot, version in life.versions:
             volatile = DURABILITY[slot.aspect] == "volatile"
             if not (volatile and slot in self.slots):
-                facts.append(("slot", slot, version, None if volatile else texts[slot], volatile))
+                text = None if volatile else texts[slot]
+                facts.append(("slot", slot, version, text, volatile, self.retains(slot)))
         return tuple(facts)
+
+    def retains(self, slot) -> bool:
+        """Whether the disk keeps the version of a slot that is replaced now."""
+        stored = DURABILITY[slot.aspect] != "volatile"
+        return stored and RETENTION[slot.aspect] > 1 and self.slots.get(slot, (0, None))[0] > 0
+
+    def forget(self, slot) -> None:
+        """Let go of what is outside retention."""
+        kept = self.replaced[slot]
+        gone = kept[: max(0, len(kept) - RETENTION[slot.aspect] + 1)]
+        del kept[: len(gone)]
+        if DURABILITY[slot.aspect] != "volatile":
+            self.forgotten |= {(slot, version) for version, _ in gone if RETENTION[slot.aspect] > 1}
 
     def apply(self, life: Life) -> None:
         """Make the writes visible."""
@@ -143,6 +164,7 @@ class ReferenceShard(ReferenceSessions):
         for slot, version in life.versions:
             if slot in self.slots and self.slots[slot][0]:
                 self.replaced.setdefault(slot, []).append(self.slots[slot])
+                self.forget(slot)
             self.slots[slot] = (version, texts[slot])
             self.out.changes.append((slot, version, texts[slot]))
 

@@ -23,6 +23,8 @@ EACH = (Access.READ_EACH, Access.WRITE_EACH, Access.VIEW_EACH)
 GRACE_PER_CENT = 102
 IDLE_TTLS = 4
 MS = 1_000_000
+TELLS = ("commit", "prepare", "finish", "abort")
+"""What is persisted with a word about history that has gone."""
 
 
 class ReferenceSessions:
@@ -43,6 +45,7 @@ class ReferenceSessions:
         self.table = ReferenceTable()
         self.slots: dict[Slot, tuple[int, str | None]] = {}
         self.replaced: dict[Slot, list[tuple[int, str | None]]] = {}
+        self.forgotten: set[tuple[Slot, int]] = set()
         self.decisions: dict[LockId, Decision] = {}
         self.forced: dict[LockId, int] = {}
         self.tokens_elsewhere: set[str] = set()
@@ -115,10 +118,18 @@ class ReferenceSessions:
 
     def persist(self, durability: str, facts: tuple, work: tuple | None = None) -> None:
         """Ask the disk to keep facts; `work` is what is to be done then."""
+        if work is not None and work[0] in TELLS:
+            facts += self.forgotten_facts()
         self.disk.append(facts)
         self.out.persists.append((durability, work is not None, facts))
         if work is not None:
             self.works.append(work)
+
+    def forgotten_facts(self) -> tuple:
+        """Return what the disk need not keep any more, once."""
+        facts = (("forgotten", tuple(sorted(self.forgotten))),) if self.forgotten else ()
+        self.forgotten.clear()
+        return facts
 
     def on_persisted(self, _: Persisted, __: int) -> None:
         """The oldest write that was to be reported is kept."""
@@ -379,6 +390,9 @@ class ReferenceSessions:
             if life.parked is not None and life.slice_end_ns <= self.now_ns:
                 self.unpark(life)
         self.ask_and_tell()
+        facts = self.forgotten_facts()
+        if facts:
+            self.persist("os", facts)
 
     def ask_and_tell(self) -> None:
         """Ask primaries, tell participants."""

@@ -26,7 +26,9 @@ from enact_dist.core.messages import (
     ForceAbort,
     Fork,
     Item,
+    KeepVersions,
     ListAudit,
+    ListHistory,
     ListLocks,
     ListSessions,
     Outcome,
@@ -376,6 +378,29 @@ def _drop(cell: RepeatingCell, client: RepeatingClient, shard: str) -> None:
     client.call(shard, DropWorld(core.session, "what_if", core.epoch(shard), count))
 
 
+def histories(cell: RepeatingCell) -> None:
+    """Versions are listed, kept and let go of, and asked for as of a stamp, in vain too."""
+    near, _ = both(cell)
+    ann = cell.client("ann")
+    ann.call("s0", Register("ann", (), (AspectEntry("count", "int", "", 2),)))
+    stamps = []
+    for value in ("1", "2", "3", "4"):
+        lock = ann.locked(item(W, near))
+        ann.finish(lock, (slot(near), value))
+        assert lock.position is not None
+        stamps.append(lock.position.stamp_ns)
+    ann.call("s0", ListHistory((), (), ()))
+    ann.call("s0", KeepVersions("ann", "look/here", (SlotVersion(slot(near), 3),)))
+    ann.call("s0", KeepVersions("ann", "gone", (SlotVersion(slot(near), 4),)))
+    ann.call("s0", KeepVersions("ann", "gone", ()))
+    cell.wait(3 * S)
+    ann.keep_alive()
+    for seq, at_ns in enumerate((stamps[3], stamps[0]), 1):
+        count, seen_ns = ann.core.sendings.count, ann.core.seen_stamp_ns
+        view = TakeView(lock_id("ann", 5, seq), 1, 1, count, (item(V, near),), seen_ns, at_ns, True)
+        ann.call("s0", view)
+
+
 RUNS = (
     updates_on_one_shard,
     lost_halves_on_one_shard,
@@ -393,4 +418,5 @@ RUNS = (
     lost_leases,
     wrong_requests,
     world_acts,
+    histories,
 )

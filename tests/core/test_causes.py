@@ -205,7 +205,7 @@ def test_effects_of_what_was_replaced_since_are_found():
 
 def test_answer_about_effects_is_bounded_and_says_so(monkeypatch):
     """What does not fit is counted."""
-    monkeypatch.setattr("enact_dist.core.lineage_desk.NAMED_MAX", 10)
+    monkeypatch.setattr("enact_dist.core.version_list.NAMED_MAX", 10)
     bench = ShardBench()
     bench.hello("ann")
     for seq in range(1, 8):

@@ -4,6 +4,8 @@ import pytest
 from shard_bench import slot
 
 from enact_dist.core.datum import Datum
+from enact_dist.core.history import Policy
+from enact_dist.core.retaining import NO_LIMIT, Limits
 from enact_dist.core.slots import Content, SlotMap
 from enact_dist.terms import NullReason
 
@@ -18,14 +20,20 @@ def content(version, *, size=MB, file=True):
 @pytest.fixture
 def slots():
     """A slot whose versions 1 to 5 are payloads, all retained; 6 is the newest."""
-    found = SlotMap(())
-    for version in range(1, 7):
-        found.replace(slot("cam", "frame"), content(version), retention=10)
+    return filled(range(1, 7), retention=10)
+
+
+def filled(versions, *, retention):
+    """Return slots that retain so many versions, after these."""
+    policy = Policy(Limits(retention, NO_LIMIT, NO_LIMIT), stored=False)
+    found = SlotMap((), policies={"frame": policy})
+    for version in versions:
+        found.replace(slot("cam", "frame"), content(version))
     return found
 
 
 def kept(slots, name="cam"):
-    return [old.version for old in slots.retained.of(slot(name, "frame"))]
+    return [old.version for old, until_ns in slots.versions(slot(name, "frame")) if until_ns]
 
 
 @pytest.mark.parametrize(("size", "left"), [(1, 4), (MB, 4), (MB + 1, 3), (5 * MB, 0)])
@@ -36,7 +44,7 @@ def test_oldest_history_goes_and_no_more_than_needed(slots, size, left):
     assert kept(slots) == [2, 3, 4, 5][4 - left :]
     assert (gone, freed) == (5 - left, (5 - left) * MB)
     assert slots[slot("cam", "frame")].version == 6
-    slots.retained.assert_invariants()
+    slots.assert_invariants()
 
 
 def test_history_that_would_not_do_stays(slots):
@@ -47,9 +55,7 @@ def test_history_that_would_not_do_stays(slots):
 
 def test_history_that_is_not_retained_makes_room_too():
     """What is kept for a moment to answer as of a stamp holds its payload as well."""
-    slots = SlotMap(())
-    for version in (1, 2, 3):
-        slots.replace(slot("cam", "frame"), content(version))
+    slots = filled((1, 2, 3), retention=1)
 
     assert slots.make_room(2 * MB) == (2, 2 * MB)
 
@@ -57,8 +63,8 @@ def test_history_that_is_not_retained_makes_room_too():
 def test_history_outside_shared_memory_counts_for_nothing(slots):
     """It goes by its age with the rest, and frees no file."""
     for version in (7, 8):
-        slots.replace(slot("arm", "frame"), content(version, file=False), retention=10)
+        slots.replace(slot("arm", "frame"), content(version, file=False))
 
-    assert slots.retained.bytes == MB
+    assert slots.history.bytes == MB
     assert slots.make_room(5 * MB) == (5, 5 * MB)
     assert kept(slots, "arm") == [7]

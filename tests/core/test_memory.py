@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import pytest
 from shard_bench import ASPECTS, MS, TTL_NS, WALL_NS, S, datum, item, slot
 
-from enact_dist.core import past, sessions, tenures
+from enact_dist.core import history, sessions, tenures
 from enact_dist.core.client import Client
 from enact_dist.core.messages import (
     Commit,
@@ -143,7 +143,7 @@ class FastClient:
 def test_nothing_grows_with_the_number_of_commits(commits, monkeypatch):
     """Over two shards, with clients that die before and after they have prepared."""
     monkeypatch.setattr(sessions, "SESSIONS_MAX", 4)
-    monkeypatch.setattr(past, "PAST_NS", 0)
+    monkeypatch.setattr(history, "LOOSE_NS", 0)
     monkeypatch.setattr(tenures, "STALE_ENDS_MAX", 16)
     cell = FastCell()
     survivor = FastClient(cell, "survivor")
@@ -173,7 +173,7 @@ def test_nothing_grows_with_the_number_of_commits(commits, monkeypatch):
 
 def test_past_is_bounded_where_the_clock_stands_still(monkeypatch):
     """A wall clock that was set back lets the stamps count by one: nothing gets old."""
-    monkeypatch.setattr(past, "PAST_STATES_MAX", 100)
+    monkeypatch.setattr(history, "LOOSE_STATES_MAX", 100)
     cell = FastCell()
     client = FastClient(cell, "ann")
     client.commit()
@@ -181,7 +181,6 @@ def test_past_is_bounded_where_the_clock_stands_still(monkeypatch):
     for _ in range(300):
         client.commit()
 
-    kept = cell.shards["a"].state.slots.past
-    oldest = kept._order[0][0]
-    assert len(kept._order) == 100
-    assert kept.at(slot(client.entities[0]), oldest + 50) is not None
+    kept = cell.shards["a"].state.slots.history.of(slot(client.entities[0]))
+    assert len(kept.states) == 100
+    assert kept.at(kept.states[0].stamp_ns + 50) is not None

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import pytest
-from shard_bench import TTL_NS, ShardBench, datum, item, lock_id, slot
+from shard_bench import TTL_NS, ShardBench, item, lock_id, slot
 
 from enact_dist.core.client import Client
-from enact_dist.core.datum import Datum, Slot
+from enact_dist.core.datum import Datum
 from enact_dist.core.messages import (
     AspectEntry,
     Commit,
@@ -29,9 +29,8 @@ from enact_dist.core.messages import (
     Viewed,
     WriteItem,
 )
-from enact_dist.core.retained import Retained
 from enact_dist.core.retaining import NO_LIMIT
-from enact_dist.core.slots import INLINE_BYTES_MAX, Content
+from enact_dist.core.slots import INLINE_BYTES_MAX
 from enact_dist.terms import Access, NullReason
 
 W, V = Access.WRITE, Access.VIEW
@@ -54,6 +53,11 @@ def capture(bench: ShardBench, seq: int, stamp_ns: int, *, size: int = 1) -> Non
     grant = bench.granted(lock, item(W, "cam", "mask"))
     write = WriteItem(slot("cam", "mask"), Datum(b"t", body, size, stamp_ns))
     bench.ask(Commit(lock, grant.token, (write,), 0))
+
+
+def retained(bench: ShardBench, aspect: str = "mask") -> int:
+    """Return how many versions an aspect retains."""
+    return bench.shard.state.catalogue.policies[aspect].limits.versions
 
 
 def viewed(bench: ShardBench, stamp_ns: int, *, seq: int = 1, at_ns: int = 0) -> SlotState:
@@ -80,7 +84,8 @@ def test_last_versions_are_found_by_their_capture_stamp(cameras):
 
 
 def test_aspect_that_retains_nothing_shows_only_its_newest_version(cameras):
-    """Retention costs memory, so nobody gets it unasked."""
+    """Whoever says so gets no history."""
+    cameras.ask(Register("admin", (), (AspectEntry("frame", "int", "volatile", 1),)))
     for seq in (1, 2):
         grant = cameras.granted(lock_id("ann", 1, seq), item(W, "cam", "frame"))
         write = WriteItem(slot("cam", "frame"), Datum(b"t", b"x", 1, 100 * seq))
@@ -92,7 +97,7 @@ def test_aspect_that_retains_nothing_shows_only_its_newest_version(cameras):
     ]
 
     assert [a.states[0].version for a in answers] == [0, 2]
-    assert cameras.shard.state.slots.retained.bytes == 0
+    assert cameras.shard.state.slots.history.bytes == 0
 
 
 def test_never_set_and_deleted_slots_keep_their_reason(cameras):
@@ -220,7 +225,7 @@ def test_largest_retention_that_anybody_asks_for_counts(cameras):
             Register("admin", (), (AspectEntry("mask", "int", "volatile", asked),))
         )
         assert isinstance(answer, Registered)
-        assert cameras.shard.state.catalogue.retention("mask") == counts
+        assert retained(cameras) == counts
 
 
 def test_larger_retention_outlives_a_restart(cameras):
@@ -230,47 +235,18 @@ def test_larger_retention_outlives_a_restart(cameras):
 
     cameras.restart()
 
-    assert cameras.shard.state.catalogue.retention("mask") == 5
+    assert retained(cameras) == 5
 
 
-@pytest.mark.parametrize("retention", [-1, NO_LIMIT + 1])
-def test_retention_without_bound_is_refused(cameras, retention):
-    """A shard's memory is nobody's to fill."""
-    entry = AspectEntry("other", "int", "volatile", retention)
+@pytest.mark.parametrize("figures", [(-1, 0, 0), (0, -1, 0), (0, 0, -1), (NO_LIMIT + 1, 0, 0)])
+def test_retention_that_is_none_is_refused(cameras, figures):
+    """No figure means *no limit*, and the limits of the shard come before all of them."""
+    entry = AspectEntry("other", "int", "volatile", *figures)
 
     answer = cameras.ask(Register("admin", (), (entry,)))
 
     assert isinstance(answer, Refused)
     assert str(NO_LIMIT) in answer.text
-
-
-def test_restart_leaves_the_newest_version(cameras):
-    """Retained versions live in memory, those of durable aspects too."""
-    cameras.ask(Register("admin", (), (AspectEntry("count", "int", "durable", KEPT),)))
-    for seq in (1, 2, 3):
-        cameras.write("ann", seq, str(seq))
-    assert len(list(cameras.shard.state.slots.retained.of(slot()))) == 2
-
-    cameras.restart()
-
-    assert (cameras.value(), list(cameras.shard.state.slots.retained.of(slot()))) == ("3", [])
-
-
-def test_memory_stays_within_its_limit_and_what_had_to_go_is_counted():
-    """The oldest of all slots goes first, whatever its aspect retains."""
-    retained = Retained(bytes_max=10)
-    for version in range(1, 8):
-        for entity in ("a", "b"):
-            old = Content(version, version, datum("xyz"), NullReason.DELETED)
-            retained.keep(Slot("w", entity, "mask"), old, count=5)
-            retained.assert_invariants()
-            assert retained.bytes <= 10
-
-    left = {
-        entity: [old.version for old in retained.of(Slot("w", entity, "mask"))] for entity in "ab"
-    }
-    assert left == {"a": [7], "b": [6, 7]}
-    assert retained.dropped == 11
 
 
 def test_retention_shows_in_the_counters(cameras):

@@ -8,12 +8,13 @@ from hypothesis import strategies as st
 from shard_bench import S, datum, slot
 
 from enact_dist.core.beliefs import SENDINGS_KEPT, Sendings, shortened_ns
+from enact_dist.core.catalogue import Catalogue
 from enact_dist.core.datum import Column, Datum, Position, Slot
 from enact_dist.core.messages import AspectEntry, Item, Pin, PlacementMap, ShardEntry
 from enact_dist.core.placement import shard_of
 from enact_dist.core.records import SlotRecord
 from enact_dist.core.sessions import Session
-from enact_dist.core.slots import INLINE_BYTES_MAX, NOTHING, Catalogue, Content, SlotMap
+from enact_dist.core.slots import INLINE_BYTES_MAX, NOTHING, Content, SlotMap
 from enact_dist.core.stamps import AHEAD_NS_MAX, Stamps
 from enact_dist.terms import Access, NullReason
 

@@ -10,6 +10,7 @@ from shard_bench import ASPECTS, MS, S, ShardBench, item, lock_id, slot
 from enact_dist.core.datum import Position, Token
 from enact_dist.core.message_parts import CAUSE_FORK
 from enact_dist.core.messages import (
+    AspectEntry,
     Commit,
     DatumRead,
     Dropped,
@@ -252,6 +253,7 @@ def test_fork_before_which_a_commit_stays_undecided_is_refused_and_may_be_asked_
 
 def test_fork_as_of_a_forgotten_stamp_says_since_when_its_source_is_known(bench):
     """It never gets the present in place of the past."""
+    bench.ask(Register("ann", (), (AspectEntry("count", "int", "", 1),)))
     first_ns = write(bench, "1")
     write(bench, "2")
     bench.wait(10 * S, keep=("ann",))
@@ -436,7 +438,7 @@ def test_history_of_a_dropped_context_is_gone_when_it_is_made_again(bench):
     bench.ask(Register("ann", ("plan",), ()))
     write(bench, "new", of("plan"))
 
-    assert [c.version for c in bench.shard.state.slots.versions(of("plan"))] == [4]
+    assert [c.version for c, _ in bench.shard.state.slots.versions(of("plan"))] == [4]
     assert isinstance(fork(bench, "late", "plan", old_ns), Forked)
     assert not bench.shard.state.slots.exists(of("late"))
 

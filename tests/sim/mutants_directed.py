@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+from enact_dist.core.retained import Retained
 from mutant_parts import forgets_what_ended
 
 from enact_dist.core.commits import Commits
@@ -16,7 +17,6 @@ from enact_dist.core.lock_desk import LockDesk
 from enact_dist.core.messages import Granted
 from enact_dist.core.multilock import MultiLock
 from enact_dist.core.records import Persist, PreparedEnded
-from enact_dist.core.retained import Retained
 from enact_dist.core.sessions import Session, SessionTable
 from enact_dist.core.slots import SlotMap
 from enact_dist.core.tenures import Tenures

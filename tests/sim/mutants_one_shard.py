@@ -215,7 +215,7 @@ def welcomes_early(patch: Patch) -> None:
         if records:
             yield Persist(0, records, Durability.DURABLE)
 
-    patch(SessionDesk, "_answer_when_durable", wrong)
+    patch(SessionDesk, "answer_when_durable", wrong)
 
 
 def stamps_follow_the_wall_clock(patch: Patch) -> None:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from enact_dist.core.client import Client
 from enact_dist.core.retained import Retained
+
+from enact_dist.core.client import Client
 from enact_dist.core.slots import Shown, SlotMap
 from enact_dist.core.unsettled import Unsettled
 

@@ -163,8 +163,10 @@ def _shown(shard: Shard) -> Iterator[Datum | None]:
     for column in slots.columns():
         for slot, content in slots.matching(column, "**"):
             yield content.datum
-            yield from (old.datum for old in slots.retained.of(slot))
-            yield from (old.datum for old in slots.past.of(slot))
+            found = slots.history.of(slot)
+            if found is not None:
+                yield from (old.datum for old in found.states)
+                yield from (kept.content.datum for kept in found.kept.values())
     for pins in shard.state.pins.values():
         yield from pins.values()
 

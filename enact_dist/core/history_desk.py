@@ -1,0 +1,134 @@
+"""History at the shard's door: which versions are known, and which of them labels keep."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.core.admission import wrong_label
+from enact_dist.core.messages import (
+    EpochChanged,
+    KeepVersions,
+    Kept,
+    ListHistory,
+    Refused,
+)
+from enact_dist.core.records import KeptRecord, Persist, Reply, Story
+from enact_dist.core.version_list import bounded, entries_of
+from enact_dist.terms import Durability
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from enact_dist.core.messages import SlotVersion, VersionEntry
+    from enact_dist.core.prepares import PrepareDesk
+    from enact_dist.core.records import Effect, MakeRoom, Record
+    from enact_dist.core.session_desk import SessionDesk
+    from enact_dist.core.shard_state import ShardState
+
+KEPT_MAX: Final = 10_000
+"""Most versions that labels keep at one shard: nothing else lets go of them."""
+KEPT_BYTES_MAX: Final = 256 << 20
+"""Bytes of kept data at most, payloads left out, which have a cap of their own."""
+
+
+class HistoryDesk:
+    """Everything about replaced versions, but views of them."""
+
+    def __init__(self, state: ShardState, sessions: SessionDesk, prepares: PrepareDesk) -> None:
+        self._state = state
+        self._sessions = sessions
+        self._prepares = prepares
+
+    # ---------------------------------------------------------------- listing
+
+    def on_list_history(self, message: ListHistory, reply_to: int) -> Iterator[Effect]:
+        """List the known versions of slots, oldest first, without their data."""
+        yield Reply(reply_to, bounded(self._state, self._listed(message)))
+
+    def _listed(self, message: ListHistory) -> Iterator[VersionEntry]:
+        slots = self._state.slots
+        for slot, _ in slots.selected(message.contexts, message.patterns, message.aspects):
+            found = [
+                entry
+                for entry in entries_of(slots, slot)
+                if not 0 < entry.until_ns <= message.since_ns and (entry.kept or not message.kept)
+            ]
+            yield from found[-message.count_max :] if message.count_max else found
+
+    # ---------------------------------------------------------------- labels
+
+    def on_keep_versions(self, message: KeepVersions, reply_to: int) -> Iterator[Effect]:
+        """Keep versions under a label, or let go of all that it keeps."""
+        state, label = self._state, message.label
+        if state.sessions.known(message.session) is None:
+            yield Reply(reply_to, EpochChanged(state.epoch))
+            return
+        refusal = wrong_label(label) or self._too_much(message)
+        if refusal is not None:
+            yield Reply(reply_to, refusal)
+            return
+        history = state.slots.history
+        before = tuple(history.labels.get(label, ()))
+        if not message.versions:
+            history.let_go(label)
+        forgotten = tuple(version for version in message.versions if not self._keep(label, version))
+        kept = tuple(history.labels.get(label, ()))
+        records: tuple[Record, ...] = ()
+        if kept != before:
+            records = (self._record(label), *history.take_forgotten())
+        yield from self._sessions.answer_when_durable(reply_to, Kept(kept, forgotten), records)
+
+    def _keep(self, label: str, version: SlotVersion) -> bool:
+        """Keep a version; False where it is forgotten, or is about to be."""
+        slots = self._state.slots
+        if self._is_going(version):
+            return False
+        return slots.history.keep(label, version, slots[version.slot])
+
+    def _record(self, label: str) -> KeptRecord:
+        """Return what a restart must know of a label: nothing of what it would not find."""
+        history = self._state.slots.history
+        versions = history.labels.get(label, ())
+        return KeptRecord(label, tuple(v for v in versions if history.is_stored(v.slot)))
+
+    def _too_much(self, message: KeepVersions) -> Refused | None:
+        """Refuse to keep more than there is room for."""
+        history = self._state.slots.history
+        kept = sum(map(len, history.labels.values())) + len(message.versions)
+        if not message.versions or (kept <= KEPT_MAX and history.kept_bytes <= KEPT_BYTES_MAX):
+            return None
+        return Refused(
+            "no_room",
+            f"{len(message.versions)} versions were to be kept as {message.label!r}; with them"
+            f" {kept} would be kept here, now of {history.kept_bytes} bytes; at most {KEPT_MAX} of"
+            f" {KEPT_BYTES_MAX} bytes can be; let go of labels that are not needed",
+        )
+
+    def _is_going(self, version: SlotVersion) -> bool:
+        """Whether a commit under way replaces this version, and the store does not keep it."""
+        newest = self._state.slots[version.slot]
+        if newest.version != version.version:
+            return False
+        history = self._state.slots.history
+        if history.will_hold(version.slot, newest) or not history.is_stored(version.slot):
+            return False
+        undecided = [writes for _, writes in self._state.commits.undecided()]
+        undecided += [record.writes for record in self._prepares.undecided()]
+        return any(write.slot == version.slot for writes in undecided for write in writes)
+
+    # ---------------------------------------------------------------- what goes
+
+    def on_make_room(self, message: MakeRoom, _: int) -> Iterator[Effect]:
+        """Let go of the oldest history at the cap of shared memory."""
+        gone, size = self._state.slots.make_room(message.bytes)
+        if gone:
+            self._state.count("history_dropped", gone)
+            yield Story("history.dropped", f"{gone} replaced versions of {size} bytes at the cap")
+
+    def tidy(self) -> Iterator[Effect]:
+        """Let go of what is too old, and tell the store if no commit has done so."""
+        history = self._state.slots.history
+        history.grow_old(self._state.stamps.last_ns)
+        forgotten = history.take_forgotten()
+        if forgotten:
+            yield Persist(0, forgotten, Durability.OS)
