@@ -181,8 +181,8 @@ def let_go(session: Session, label: str) -> None:
 def _all_kept(session: Session, label: str, by_shard: dict[str, list[SlotVersion]]) -> list[Kept]:
     client = session.client
 
-    def request_of(shard: str, _epoch: int, _count: int) -> KeepVersions:
-        return KeepVersions(client.core.session, label, tuple(by_shard[shard]))
+    def request_of(shard: str, epoch: int, count: int) -> KeepVersions:
+        return KeepVersions(client.core.session, label, tuple(by_shard[shard]), epoch, count)
 
     answers = []
     for shard, answer in client.ask_each(sorted(by_shard), request_of).items():

@@ -11,7 +11,10 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "enact_dist"
 LAYERS = ("errors", "comparing", "retention", "terms", "core", "wire", "link", "api")  # low to high
 PURE = {
-    "core": {"__future__", "collections", "dataclasses", "enum", "hashlib", "heapq", "itertools", "typing"},
+    "core": {
+        "__future__", "bisect", "collections", "dataclasses", "enum", "hashlib", "heapq", "itertools",
+        "operator", "typing",
+    },
     "wire": {
         "__future__", "collections", "dataclasses", "enum", "functools", "hashlib", "itertools",
         "math", "msgpack", "numpy", "operator", "re", "reprlib", "types", "typing", "urllib",

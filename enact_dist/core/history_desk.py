@@ -19,7 +19,7 @@ from enact_dist.terms import Durability
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from enact_dist.core.messages import SlotVersion, VersionEntry
+    from enact_dist.core.messages import Answer, SlotVersion, VersionEntry
     from enact_dist.core.prepares import PrepareDesk
     from enact_dist.core.records import Effect, MakeRoom, Record
     from enact_dist.core.session_desk import SessionDesk
@@ -59,24 +59,29 @@ class HistoryDesk:
 
     def on_keep_versions(self, message: KeepVersions, reply_to: int) -> Iterator[Effect]:
         """Keep versions under a label, or let go of all that it keeps."""
-        state, label = self._state, message.label
-        if state.sessions.known(message.session) is None:
-            yield Reply(reply_to, EpochChanged(state.epoch))
-            return
+        answer = self._state.answered_before(message)
+        records: tuple[Record, ...] = ()
+        if answer is None:
+            answer, records = self._kept(message)
+            self._state.remember_answer(message, answer)
+        yield from self._sessions.answer_when_durable(reply_to, answer, records)
+
+    def _kept(self, message: KeepVersions) -> tuple[Answer, tuple[Record, ...]]:
+        """Carry out what is asked; return the answer and what the store must keep before it."""
+        label, history = message.label, self._state.slots.history
+        if self._state.sessions.known(message.session) is None:
+            return EpochChanged(self._state.epoch), ()
         refusal = wrong_label(label) or self._too_much(message)
         if refusal is not None:
-            yield Reply(reply_to, refusal)
-            return
-        history = state.slots.history
+            return refusal, ()
         before = tuple(history.labels.get(label, ()))
         if not message.versions:
             history.let_go(label)
         forgotten = tuple(version for version in message.versions if not self._keep(label, version))
         kept = tuple(history.labels.get(label, ()))
-        records: tuple[Record, ...] = ()
-        if kept != before:
-            records = (self._record(label), *history.take_forgotten())
-        yield from self._sessions.answer_when_durable(reply_to, Kept(kept, forgotten), records)
+        if kept == before:
+            return Kept(kept, forgotten), ()
+        return Kept(kept, forgotten), (self._record(label), *history.take_forgotten())
 
     def _keep(self, label: str, version: SlotVersion) -> bool:
         """Keep a version; False where it is forgotten, or is about to be."""

@@ -364,9 +364,12 @@ class DropWorld:
 class KeepVersions:
     """Keep versions from being forgotten under a label; no versions: let go of the label's.
 
-    Answer: `Kept`.  Asked again with the same label, versions are added.
+    Answer: `Kept`.  Asked again with the same label, versions are added.  `epoch` and `count` are
+    those of `Fork`: a late copy keeps nothing that was let go of since.
     """
 
     session: str
     label: str
     versions: tuple[SlotVersion, ...]
+    epoch: int = 0
+    count: int = 0

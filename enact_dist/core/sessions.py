@@ -56,8 +56,8 @@ class Session:
 
     `acknowledged` says that it has dropped all grants of earlier epochs; until every recovered
     session has, or their leases must have run out, a restarted shard grants nothing.
-    `present` says that it has said hello in this epoch.  `world_act` is the count of the newest
-    fork or drop that it has asked for, and its answer once there is one.
+    `present` says that it has said hello in this epoch.  `act` is the count of the newest
+    `Fork`, `DropWorld` or `KeepVersions` that it has asked for, and its answer once there is one.
     """
 
     session: str
@@ -75,7 +75,7 @@ class Session:
     token_present: bool = False
     token_seen_ns: int | None = None
     lanes: dict[int, Lane] = field(default_factory=dict)
-    world_act: tuple[int, Answer | None] = (0, None)
+    act: tuple[int, Answer | None] = (0, None)
 
     def lease_end_ns(self, now_ns: int) -> int:
         """Return when the lease ends if no further sign of life comes."""

@@ -14,7 +14,7 @@ from enact_dist.core.catalogue import Catalogue
 from enact_dist.core.commits import Commits
 from enact_dist.core.decisions import Decisions
 from enact_dist.core.forced import Audit
-from enact_dist.core.messages import AspectEntry, PlacementMap, Refused, WorldEntry
+from enact_dist.core.messages import AspectEntry, EpochChanged, PlacementMap, Refused, WorldEntry
 from enact_dist.core.sessions import Session, SessionTable
 from enact_dist.core.slots import SlotMap
 from enact_dist.core.stamps import Stamps
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from enact_dist.core.datum import Datum, LockId, Slot
-    from enact_dist.core.messages import Holder
+    from enact_dist.core.messages import Answer, DropWorld, Fork, Holder, KeepVersions
     from enact_dist.core.records import Effect, Recovered
 
 FETCH_BYTES_MAX: Final = 4 << 20
@@ -139,6 +139,32 @@ class ShardState:
             self.count("epoch_refusals")
             return None
         return self.sessions.known(session)
+
+    def answered_before(self, message: Fork | DropWorld | KeepVersions) -> Answer | None:
+        """Return what a copy of an earlier request is answered, None to what is new or under way.
+
+        A session asks for one after the other, each with a larger count (0 with its epoch: unsaid).
+        """
+        if not message.epoch:
+            return None
+        session = self.session_in_epoch(message.session, message.epoch)
+        if session is None:
+            return EpochChanged(self.epoch)
+        session.renewed_ns = max(session.renewed_ns, self.now_ns)
+        session.count_seen = max(session.count_seen, message.count)
+        count, answer = session.act
+        if message.count > count:
+            session.act = (message.count, None)
+            return None
+        if message.count == count:
+            return answer
+        return Refused("overload", "the request came after a newer one of its session; ask again")
+
+    def remember_answer(self, message: Fork | DropWorld | KeepVersions, answer: Answer) -> None:
+        """Let a copy of a request be answered as the request was."""
+        session = self.sessions.by_id.get(message.session)
+        if session is not None and session.act[0] == message.count:
+            session.act = (message.count, answer)
 
     def grant_ready(self) -> Iterator[Effect]:
         """Grant whatever may be granted now."""

@@ -33,7 +33,6 @@ from enact_dist.core.messages import (
     DatumRead,
     Dropped,
     DropWorld,
-    EpochChanged,
     Forgotten,
     Fork,
     Forked,
@@ -100,7 +99,7 @@ class WorldDesk:
 
     def on_fork(self, message: Fork, reply_to: int) -> Iterator[Effect]:
         """Make a context with the data of another one as of a stamp, or say why not."""
-        answer = self._answered_before(message)
+        answer = self._state.answered_before(message)
         under_way = self._under_way(message.world)
         if answer is None and under_way is not None and _same(under_way.message, message):
             under_way.asked.append((message, reply_to))
@@ -228,7 +227,7 @@ class WorldDesk:
 
     def on_drop(self, message: DropWorld, reply_to: int) -> Iterator[Effect]:
         """Forget a context with all that is in it, or say why not."""
-        answer = self._answered_before(message)
+        answer = self._state.answered_before(message)
         under_way = self._under_way(message.world)
         if answer is None and under_way is not None and _same(under_way.message, message):
             under_way.asked.append((message, reply_to))
@@ -315,33 +314,10 @@ class WorldDesk:
         self._waiting.pop(act.message.world, None)
         del self._state.busy_worlds[act.message.world]
 
-    def _answered_before(self, message: Fork | DropWorld) -> Answer | None:
-        """Return what a copy of an earlier request is answered, None to what is new or under way.
-
-        A session asks for one after the other, each with a larger count.
-        """
-        if not message.epoch:
-            return None
-        session = self._state.session_in_epoch(message.session, message.epoch)
-        if session is None:
-            return EpochChanged(self._state.epoch)
-        session.renewed_ns = max(session.renewed_ns, self._state.now_ns)
-        session.count_seen = max(session.count_seen, message.count)
-        count, answer = session.world_act
-        if message.count > count:
-            session.world_act = (message.count, None)
-            return None
-        if message.count == count:
-            return answer
-        text = f"the request about {message.world!r} came after a newer one of its session"
-        return Refused("overload", f"{text}; ask again")
-
     def _told(self, act: _Act, answer: Answer) -> Iterator[Effect]:
         """Answer everybody who has asked for it, and whoever asks again."""
         for message, reply_to in act.asked:
-            session = self._state.sessions.by_id.get(message.session)
-            if session is not None and session.world_act[0] == message.count:
-                session.world_act = (message.count, answer)
+            self._state.remember_answer(message, answer)
             yield Reply(reply_to, answer)
 
     def next_deadline_ns(self) -> int | None:

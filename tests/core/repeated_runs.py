@@ -390,9 +390,10 @@ def histories(cell: RepeatingCell) -> None:
         assert lock.position is not None
         stamps.append(lock.position.stamp_ns)
     ann.call("s0", ListHistory((), (), ()))
-    ann.call("s0", KeepVersions("ann", "look/here", (SlotVersion(slot(near), 3),)))
-    ann.call("s0", KeepVersions("ann", "gone", (SlotVersion(slot(near), 4),)))
-    ann.call("s0", KeepVersions("ann", "gone", ()))
+    for label, versions in (("look/here", (3, 4)), ("gone", (4, 9)), ("gone", ())):
+        asked = tuple(SlotVersion(slot(near), version) for version in versions)
+        count = ann.core.sendings.next(cell.now_ns)
+        ann.call("s0", KeepVersions("ann", label, asked, 1, count))
     cell.wait(3 * S)
     ann.keep_alive()
     for seq, at_ns in enumerate((stamps[3], stamps[0]), 1):

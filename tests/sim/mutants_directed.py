@@ -8,7 +8,6 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from enact_dist.core.retained import Retained
 from mutant_parts import forgets_what_ended
 
 from enact_dist.core.commits import Commits
@@ -18,6 +17,7 @@ from enact_dist.core.messages import Granted
 from enact_dist.core.multilock import MultiLock
 from enact_dist.core.records import Persist, PreparedEnded
 from enact_dist.core.sessions import Session, SessionTable
+from enact_dist.core.slot_history import SlotHistory
 from enact_dist.core.slots import SlotMap
 from enact_dist.core.tenures import Tenures
 from enact_dist.core.unsettled import Unsettled
@@ -126,12 +126,12 @@ def mixes_past_and_present(patch: Patch) -> None:
 
 def shows_the_future_by_stamp(patch: Patch) -> None:
     """A view by stamp shows a version that came after the moment of the view."""
-    captured = Retained.captured
+    captured = SlotHistory.captured
 
-    def wrong(self: Retained, slot: Any, captured_ns: int, **_options: Any) -> Any:
-        return captured(self, slot, captured_ns, version_max=1 << 62)
+    def wrong(self: SlotHistory, captured_ns: int, **_options: Any) -> Any:
+        return captured(self, captured_ns, version_max=1 << 62)
 
-    patch(Retained, "captured", wrong)
+    patch(SlotHistory, "captured", wrong)
 
 
 def forgets_a_later_commit_of_its_own(patch: Patch) -> None:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from enact_dist.core import lock_table, multilock, tenures
 from enact_dist.core.beliefs import Sendings
+from enact_dist.core.catalogue import Catalogue
 from enact_dist.core.client import Client
 from enact_dist.core.commits import Commits
 from enact_dist.core.datum import Token
@@ -22,7 +23,7 @@ from enact_dist.core.records import Persist, Reply
 from enact_dist.core.session_desk import SessionDesk
 from enact_dist.core.sessions import Lane, Session, SessionTable
 from enact_dist.core.shard_state import ShardState
-from enact_dist.core.slots import Catalogue, Content, SlotMap
+from enact_dist.core.slots import Content, SlotMap
 from enact_dist.core.stamps import Stamps
 from enact_dist.core.tenures import Tenure, Tenures
 from enact_dist.terms import Durability, NullReason

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from enact_dist.core.retained import Retained
-
 from enact_dist.core.client import Client
+from enact_dist.core.history import History
+from enact_dist.core.slot_history import SlotHistory
 from enact_dist.core.slots import Shown, SlotMap
 from enact_dist.core.unsettled import Unsettled
 
@@ -19,22 +19,22 @@ if TYPE_CHECKING:
 def shows_the_first_of_a_stamp(patch: Patch) -> None:
     """Of two versions with one stamp the older one is shown."""
 
-    def wrong(self: Retained, slot: Any, captured_ns: int, *, version_max: int) -> Any:
-        for old in self.of(slot):
+    def wrong(self: SlotHistory, captured_ns: int, *, version_max: int) -> Any:
+        for old, _ in self.known():
             stamp_ns = old.datum.stamp_ns if old.datum is not None else 0
             if stamp_ns == captured_ns and old.version <= version_max:
                 return old
         return None
 
-    patch(Retained, "captured", wrong)
+    patch(SlotHistory, "captured", wrong)
 
 
 def shows_the_newest_for_what_is_gone(patch: Patch) -> None:
     """What is outside retention shows as the newest version."""
     captured = SlotMap.captured
 
-    def wrong(self: SlotMap, slot: Any, newest: Any, captured_ns: int) -> Any:
-        found = captured(self, slot, newest, captured_ns)
+    def wrong(self: SlotMap, slot: Any, newest: Any, captured_ns: int, **options: Any) -> Any:
+        found = captured(self, slot, newest, captured_ns, **options)
         return found if found.datum is not None else newest
 
     patch(SlotMap, "captured", wrong)
@@ -42,20 +42,21 @@ def shows_the_newest_for_what_is_gone(patch: Patch) -> None:
 
 def retains_one_version_less(patch: Patch) -> None:
     """A version leaves retention one commit too early."""
-    keep = Retained.keep
+    append = History._append
 
-    def wrong(self: Retained, slot: Any, old: Any, *, count: int) -> None:
-        keep(self, slot, old, count=count - 1)
+    def wrong(self: History, found: Any, old: Any, limits: Any) -> None:
+        append(self, found, old, limits._replace(versions=limits.versions - 1))
 
-    patch(Retained, "keep", wrong)
+    patch(History, "_append", wrong)
 
 
 def shows_what_was_deleted_outside_retention(patch: Patch) -> None:
     """A slot that is null now shows nothing of what it retains."""
     captured = SlotMap.captured
 
-    def wrong(self: SlotMap, slot: Any, newest: Any, captured_ns: int) -> Any:
-        return newest if newest.datum is None else captured(self, slot, newest, captured_ns)
+    def wrong(self: SlotMap, slot: Any, newest: Any, captured_ns: int, **options: Any) -> Any:
+        null = newest.datum is None
+        return newest if null else captured(self, slot, newest, captured_ns, **options)
 
     patch(SlotMap, "captured", wrong)
 

@@ -37,6 +37,7 @@ from enact_dist.core.records import (
     SessionDied,
     SlotRecord,
 )
+from enact_dist.core.retaining import limits_of
 from enact_dist.terms import Durability
 from enact_dist.verify.simulation.cause_judge import CauseJudge
 from enact_dist.verify.simulation.client_judge import ClientJudge
@@ -68,7 +69,8 @@ class Model:
         self._causes = CauseJudge(world, history)
         aspects = tuple(aspects)
         self.durabilities = {entry.name: Durability(entry.durability) for entry in aspects}
-        self._readers = ReaderJudge(self, {entry.name: entry.retention or 1 for entry in aspects})
+        versions = {entry.name: limits_of(entry).versions for entry in aspects}
+        self._readers = ReaderJudge(self, versions)
         self.pictures: dict[str, Picture] = {}
         self.of_clients = ClientJudge(world, history, self)
         self.absent: dict[LockId, dict[tuple[str, Slot], tuple[int, tuple[int, int]]]] = {}
@@ -81,6 +83,10 @@ class Model:
     def fail(self, rule: str, *facts: object) -> None:
         """Stop the run: a rule is broken."""
         self._fail(rule, *facts)
+
+    def is_volatile(self, slot: Slot) -> bool:
+        """Whether a restart loses the data of a slot."""
+        return self.durabilities[slot.aspect] is Durability.VOLATILE
 
     def entry(self, lock: LockId) -> Entry | None:
         """Return what a client knows of its lock."""

@@ -80,6 +80,18 @@ class Picture:
                 return state
         return NEVER_SET
 
+    def line(self, slot: Slot, *, volatile: bool) -> list[State]:
+        """Return the versions that led to the newest one, oldest first, without what is lost.
+
+        A power cut may take versions of class `os` back; of a volatile slot a restart leaves none.
+        """
+        chain = self.chains.get(slot, [])
+        found: list[State] = []
+        for state in reversed(chain[self.restarted_at.get(slot, 0) if volatile else 0 :]):
+            if state.version and (not found or state.version == found[-1].version - 1):
+                found.append(state)
+        return found[::-1]
+
     def put(self, slot: Slot, state: State) -> None:
         """Add a state to the chain of a slot."""
         self.chains.setdefault(slot, []).append(state)

@@ -114,12 +114,11 @@ class ReaderJudge:
     def _retained(self, picture: Picture, slot: Slot) -> list[State]:
         """Return the replaced versions that a shard still has, oldest first.
 
-        It forgets them when it restarts, all but the one that is current then.
+        A restart leaves what is on the disk, and of volatile slots nothing.
         """
-        since = picture.restarted_at.get(slot, 0)
-        replaced = [old for old in picture.chains.get(slot, [])[since:-1] if old.version]
+        line = picture.line(slot, volatile=self._model.is_volatile(slot))
         count = self._retentions[slot.aspect] - 1
-        return replaced[-count:] if count > 0 else []
+        return line[:-1][-count:] if count > 0 else []
 
     def check_survey(self, message: Survey, answer: Surveyed, picture: Picture) -> None:
         """A survey names every version that is retained, oldest first, and then the newest."""
