@@ -50,7 +50,6 @@ from enact_dist.core.phase import Phase
 from enact_dist.core.records import AuditRecord
 from enact_dist.core.sessions import IDLE_TTLS, Lane
 from enact_dist.core.shard_state import ShardState
-from enact_dist.core.worlds import WorldDesk
 from enact_dist.terms import Access
 
 TWO_SHARDS = PlacementMap(1, (ShardEntry("s0", ()), ShardEntry("s1", ())), ())
@@ -206,7 +205,7 @@ def test_every_kind_of_message_is_repeated():
         (Audit, "may_settle", lambda *_: True, "operators", When.AT_ONCE),
         (ShardState, "numbered", numbered_in_any_epoch, "operators", When.AFTER_A_RESTART),
         (client, "_epoch_of", lambda _: None, "restarts", When.AT_THE_END),
-        (WorldDesk, "_answered_before", lambda *_: None, "world_acts", When.AT_THE_END),
+        (ShardState, "answered_before", lambda *_: None, "world_acts", When.AT_THE_END),
     ],
     ids=["outcomes", "seqs", "settling", "numbers", "epochs", "forks and drops"],
 )
