@@ -64,6 +64,9 @@ shared_bytes_max       none           cap of each shard's large data in the memo
   compare              none           what `enact world diff` compares its data by,
                                       ``package.module:NAME``: the `Aspect` that says it (then its
                                       type is known, too), or a comparator
+  shows                guessed        what a recording shows the data as, one kind or several, with
+  frame, parent,                      their coordinate frames: see `enact_dist.config_shows`
+  of, encoding
 [actors.NAME]          none           an actor process
   class                required       ``package.module:Class``
   worlds               {}             role of the class = world context of the cell
@@ -88,6 +91,7 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.config_environment import with_environment
 from enact_dist.config_lines import LineLocator
+from enact_dist.config_shows import SHOWS_KEYS, take_shows
 from enact_dist.config_table import Source, Table, suggestion
 from enact_dist.config_types import (
     CARRIER_DEFAULT,
@@ -307,12 +311,13 @@ def _pin(table: Table, shards: tuple[ShardConfig, ...]) -> Pin:
 
 
 def _aspect(name: str, table: Table) -> AspectConfig:
-    table.refuse_unknown("durability", "retention", "compare")
+    table.refuse_unknown("durability", "retention", "compare", *SHOWS_KEYS)
     _check_title(name, "aspect", table)
     compare = table.take_str("compare", "")
     if "compare" in table.values and not _DOTTED_NAME.match(compare):
         table.refuse("compare", f"'compare' is written package.module:NAME, not {compare!r}")
-    return AspectConfig(name, _durability(name, table), _retention(table), compare)
+    durability, retention = _durability(name, table), _retention(table)
+    return AspectConfig(name, durability, retention, compare, take_shows(table))
 
 
 def _durability(name: str, table: Table) -> Durability | None:

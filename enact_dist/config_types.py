@@ -10,6 +10,7 @@ import zlib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+from enact_dist.config_shows import GUESSED, Shows
 from enact_dist.core.messages import AspectEntry, Pin, PlacementMap, ShardEntry
 from enact_dist.core.retaining import said
 from enact_dist.errors import ConfigError
@@ -57,12 +58,14 @@ class AspectConfig:
             them.
         retention: How much of each datum's history stays; None leaves it to the actors.
         compare: What a command line compares its data by, ``package.module:NAME``, or nothing.
+        shows: What a recording shows its data as.
     """
 
     name: str
     durability: Durability | None = None
     retention: Retention | None = None
     compare: str = ""
+    shows: Shows = GUESSED
 
     def entry(self) -> AspectEntry:
         """Return it as an entry of a catalogue, without a fingerprint: any type may register."""

@@ -1,0 +1,58 @@
+"""Recordings: every version of chosen slots in a file that others can open, and back into a cell.
+
+A recording is an MCAP file.  Each version stands in it exactly, for `replay`, and once more as a
+message that Foxglove shows and Rerun converts.
+
+==============================  =======================  =========================================
+topic                           encoding                 one message is
+==============================  =======================  =========================================
+``/enact/<world>/<aspect>``     msgpack                  one version, exact: see `exact`
+``/enact/gaps``                 json                     versions that the recording does not have
+``/<world>/<entity>/<aspect>``  protobuf or json         the same version to look at: see `pictures`
+==============================  =======================  =========================================
+
+The log time of a message is the stamp of the commit, its publish time the capture stamp (that of
+the commit where the writer gave none), its sequence number the version.  What was there when the
+recording began has the begin as its log time; its own stamp stands in the exact message.  The data
+of one commit follow one another and lie in one chunk.
+
+A metadata record ``enact`` opens the file (format, cell, what is recorded, begin), another one,
+``enact.end``, closes it (how much, what is missing).  Chunks are bounded in size and time and each
+is forced to the disk before the next one is begun, so a recording that was cut off is good up to
+its last whole chunk.
+
+==============  ==================================================================================
+module          what it does
+==============  ==================================================================================
+`exact`         a version ↔ the bytes of its exact message
+`pictures`      a datum as messages of Foxglove's schemas (`geometry`: of arrays) or as JSON
+`file`          the MCAP file, chunk by chunk; `disk` is the thread that writes it
+`reading`       a file back, as far as it is whole
+`fetching`      the data of given versions from their shards
+`recorder`      follows a cell and records it
+`replaying`     commits a recording again
+`exporting`     one world context as of one moment, into a file
+==============  ==================================================================================
+
+What the data of an aspect look like is said in `cell.toml` (`enact_dist.config_shows`).  The
+packages that all this needs are those of the extra ``record``.
+"""
+
+from enact_dist.config_shows import Shows
+from enact_dist.recording.libraries import require_libraries
+
+require_libraries()
+
+from enact_dist.recording.exporting import ExportSummary, export_world  # noqa: E402
+from enact_dist.recording.recorder import Recorder, RecordingSummary  # noqa: E402
+from enact_dist.recording.replaying import Replay, ReplaySummary  # noqa: E402
+
+__all__ = [
+    "ExportSummary",
+    "Recorder",
+    "RecordingSummary",
+    "Replay",
+    "ReplaySummary",
+    "Shows",
+    "export_world",
+]

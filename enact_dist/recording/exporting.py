@@ -1,0 +1,134 @@
+"""One world context as of one moment, every datum of it: read, or written into a recording."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.config_shows import GUESSED
+from enact_dist.core.messages import Item
+from enact_dist.recording.exact import Recorded
+from enact_dist.recording.fetching import viewed
+from enact_dist.recording.file import RecordingFile
+from enact_dist.terms import Access
+
+if TYPE_CHECKING:
+    import os
+    from collections.abc import Iterator, Mapping
+
+    from enact_dist.config_shows import Shows
+    from enact_dist.core.lock_parts import Reading
+    from enact_dist.world import WorldContext
+
+PORTION_BYTES: Final = 64 << 20
+"""How much is fetched at once."""
+
+
+@dataclass(frozen=True, slots=True)
+class ExportSummary:
+    """What an export holds.
+
+    Attributes:
+        path: The file.
+        at_ns: The stamp as of which it is.
+        versions: Data in it.
+        size_bytes: Bytes on the disk.
+        counts: What else happened, by name (see `file.RecordingFile`).
+    """
+
+    path: str
+    at_ns: int
+    versions: int
+    size_bytes: int
+    counts: dict[str, int] = field(default_factory=dict)
+
+
+def world_as_of(world: WorldContext, at_ns: int = 0) -> Iterator[Recorded]:
+    """Yield every datum of a world context, all of one moment, over all shards.
+
+    Not more than `PORTION_BYTES` are in memory at once, or the largest datum; the shards keep the
+    rest meanwhile.
+
+    Args:
+        world: The world context.
+        at_ns: The stamp as of which; 0: now.
+
+    Raises:
+        ForgottenError: A state as of `at_ns` has left its retention.
+        ShardUnreachableError: A shard does not answer.
+    """
+    session = world.session
+    session.client.greet()
+    aspects = session.client.aspect_entries()
+    items = [Item(int(Access.VIEW_EACH), world.name, "**", aspect) for aspect in sorted(aspects)]
+    if not items:
+        return
+    # A pattern goes to all shards, and one may never have held some aspect.
+    session.client.register(aspects=aspects.values())
+    with viewed(session, items, at_ns=at_ns) as view:
+        states = [reading for reading in view.states if not reading.state.null_reason]
+        for portion in _portions(sorted(states, key=lambda reading: reading.state.slot)):
+            data = view.fetch(portion)
+            for shard, _, state in portion:
+                datum = data.pop(state.slot)
+                yield Recorded(state.slot, state.version, state.stamp_ns, shard, 0, datum)
+
+
+def _portions(readings: list[Reading]) -> Iterator[list[Reading]]:
+    portion: list[Reading] = []
+    size = 0
+    for reading in readings:
+        if portion and size + reading.state.size > PORTION_BYTES:
+            yield portion
+            portion, size = [], 0
+        portion.append(reading)
+        size += reading.state.size
+    if portion:
+        yield portion
+
+
+def export_world(
+    world: WorldContext,
+    path: str | os.PathLike[str],
+    *,
+    at_ns: int = 0,
+    shows: Mapping[str, Shows] | None = None,
+    compression: str = "lz4",
+) -> ExportSummary:
+    """Write a world context as of one moment into a recording; `replay` makes it again.
+
+    Args:
+        world: The world context.
+        path: The file; it must not exist.
+        at_ns: The stamp as of which; 0: now.
+        shows: What the data of an aspect look like; what it does not name is guessed.
+        compression: "none", "lz4" or "zstd".
+
+    Raises:
+        ForgottenError: A state as of `at_ns` has left its retention.
+        ConfigError: The file exists, or cannot be made.
+        OSError: The disk refuses.
+    """
+    declared = dict(shows or {})
+    log_ns = at_ns or time.time_ns()
+    versions = world_as_of(world, at_ns)
+    first = next(versions, None)  # what is forgotten is told before there is a file
+    file = RecordingFile(
+        path,
+        {"worlds": world.name, "entities": "**", "aspects": "", "begin_ns": str(log_ns)},
+        aspects=lambda name: world.session.client.aspect_entries().get(name),
+        shows=lambda name: declared.get(name, GUESSED),
+        compression=compression,
+    )
+    count = 0
+    try:
+        while first is not None:
+            file.add_commit((first,), log_ns)
+            count += 1
+            first = next(versions, None)
+        file.close({"versions": str(count), "commits": "0", "missing": "0"})
+    except BaseException:
+        file.abandon()
+        raise
+    return ExportSummary(str(path), log_ns, count, file.size, dict(file.counts))

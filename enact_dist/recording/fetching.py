@@ -1,0 +1,192 @@
+"""The data of given versions from their shards, as far as these still know them.
+
+Who committed a version, and how large it is, its shard explains; the datum comes by a view as of a
+stamp.  As of the largest stamp of a batch each slot shows its newest version of the batch, so there
+are as many views as the busiest slot has versions, and one for a batch of different slots.
+"""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from enact_dist.core.messages import (
+    AwaitStamp,
+    Explain,
+    Item,
+    ListHistory,
+    Reached,
+    Refused,
+    SlotVersion,
+    Versions,
+)
+from enact_dist.errors import ForgottenError, LeaseLostError, ProtocolError
+from enact_dist.link.fetching import fetch_all
+from enact_dist.link.refusals import error_of
+from enact_dist.terms import Access
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Sequence
+
+    from enact_dist.core.datum import Datum, Slot
+    from enact_dist.core.lock_parts import Reading
+    from enact_dist.core.messages import Request, VersionEntry
+    from enact_dist.core.multilock import MultiLock
+    from enact_dist.session import Session
+
+VIEW_S: Final = 10.0
+"""How long a view may wait for undecided commits."""
+EXPLAINED_MAX: Final = 64
+"""So many versions are explained by one answer: each cause may name a thousand reads."""
+
+
+class Wanted(NamedTuple):
+    """One version that is to be recorded; sorted by stamp."""
+
+    stamp_ns: int
+    slot: Slot
+    version: int
+    shard: str
+
+
+class View:
+    """States as of one moment, whose data can be fetched.
+
+    Attributes:
+        states: What was asked for, with the shard and epoch that each comes from.
+    """
+
+    def __init__(self, session: Session, lock: MultiLock) -> None:
+        self._session, self._lock = session, lock.lock
+        self.states: tuple[Reading, ...] = tuple(lock.states)
+
+    def fetch(self, readings: Sequence[Reading]) -> dict[Slot, Datum]:
+        """Return the data of some of the states that are not null.
+
+        Raises:
+            LeaseLostError: A shard restarted since; the view is over.
+            ShardUnreachableError: A shard does not answer.
+        """
+        return fetch_all(self._session.client, self._session.cache, self._lock, readings)
+
+
+@contextmanager
+def viewed(session: Session, items: Iterable[Item], *, at_ns: int = 0) -> Iterator[View]:
+    """View data, as of a stamp if one is given; they can be fetched while the block runs.
+
+    Raises:
+        ForgottenError: A state as of `at_ns` has left its retention.
+        LockTimeoutError: A commit stamped before is not decided yet.
+        ShardUnreachableError: A shard does not answer.
+    """
+    client = session.client
+    lock = client.acquire(items, wait_s=VIEW_S, hold_s=VIEW_S, past_ns=at_ns)
+    try:
+        yield View(session, lock)
+    finally:
+        client.release(lock)
+
+
+def now_ns(session: Session) -> int:
+    """Return the stamp that the latest of the shards' clocks shows.
+
+    Raises:
+        ShardUnreachableError: A shard does not answer.
+    """
+    client = session.client
+    answers = client.call_all([(shard, AwaitStamp(0, 0)) for shard in client.shards()])
+    return max((a.stamp_ns for a in answers if isinstance(a, Reached)), default=0)
+
+
+def explained(session: Session, wanted: Sequence[Wanted]) -> dict[Wanted, VersionEntry]:
+    """Return what the shards still know of these versions, without their data.
+
+    Raises:
+        ShardUnreachableError: A shard does not answer.
+    """
+    by_shard: dict[str, list[SlotVersion]] = {}
+    for each in wanted:
+        by_shard.setdefault(each.shard, []).append(SlotVersion(each.slot, each.version))
+    calls: list[tuple[str, Request]] = [
+        (shard, Explain(tuple(versions[first : first + EXPLAINED_MAX])))
+        for shard, versions in by_shard.items()
+        for first in range(0, len(versions), EXPLAINED_MAX)
+    ]
+    found = {
+        (state.slot, state.version, state.stamp_ns): entry
+        for entry in _asked(session, calls)
+        for state in (entry.state,)
+    }
+    keys = {each: (each.slot, each.version, each.stamp_ns) for each in wanted}
+    return {each: found[key] for each, key in keys.items() if key in found}
+
+
+def between(session: Session, slot: Slot, shard: str, first: int, last: int) -> list[Wanted]:
+    """Return the versions of a slot from `first` to `last` that its history still has.
+
+    Raises:
+        ShardUnreachableError: The shard does not answer.
+    """
+    request = ListHistory((slot.context,), (slot.entity,), (slot.aspect,))
+    states = [entry.state for entry in _asked(session, [(shard, request)])]
+    return [
+        Wanted(state.stamp_ns, slot, state.version, shard)
+        for state in states
+        if state.slot == slot and first <= state.version <= last
+    ]
+
+
+def _asked(session: Session, calls: Sequence[tuple[str, Request]]) -> list[VersionEntry]:
+    entries: list[VersionEntry] = []
+    for answer in session.client.call_all(calls):
+        if isinstance(answer, Refused):
+            raise error_of(answer)
+        if not isinstance(answer, Versions):
+            raise ProtocolError(f"{type(answer).__name__} came where versions were asked for")
+        entries += answer.entries
+    return entries
+
+
+def data_of(session: Session, wanted: Sequence[Wanted]) -> dict[Wanted, Datum]:
+    """Return the data of versions that are not null; what is forgotten meanwhile is left out.
+
+    Raises:
+        ShardUnreachableError: A shard does not answer.
+    """
+    found: dict[Wanted, Datum] = {}
+    by_slot: dict[Slot, list[Wanted]] = {}
+    for each in sorted(wanted):
+        by_slot.setdefault(each.slot, []).append(each)
+    while by_slot:
+        newest = [versions.pop() for versions in by_slot.values()]
+        by_slot = {slot: versions for slot, versions in by_slot.items() if versions}
+        found |= _together(session, newest)
+    return found
+
+
+def _together(session: Session, wanted: Sequence[Wanted]) -> dict[Wanted, Datum]:
+    """Return the data of versions of different slots with one view, or else one by one."""
+    if len(wanted) > 1:
+        try:
+            found = _as_of(session, wanted, max(wanted).stamp_ns)
+        except (ForgottenError, LeaseLostError):
+            found = {}
+    else:
+        found = {}
+    for each in wanted:
+        if each not in found:
+            try:
+                found |= _as_of(session, [each], each.stamp_ns)
+            except (ForgottenError, LeaseLostError):
+                continue
+    return found
+
+
+def _as_of(session: Session, wanted: Sequence[Wanted], at_ns: int) -> dict[Wanted, Datum]:
+    items = [Item(int(Access.VIEW), *each.slot) for each in wanted]
+    with viewed(session, items, at_ns=at_ns) as view:
+        by_state = {(r.state.slot, r.state.version, r.state.stamp_ns): r for r in view.states}
+        found = {each: by_state.get((each.slot, each.version, each.stamp_ns)) for each in wanted}
+        held = {each: r for each, r in found.items() if r is not None and not r.state.null_reason}
+        data = view.fetch(tuple(held.values()))
+        return {each: data[each.slot] for each in held}

@@ -1,0 +1,102 @@
+"""Arrays as the bytes and numbers that Foxglove's schemas want; units stay metres and pixels."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+RIGID_TOLERANCE: Final = 1e-3
+"""How far from orthonormal the rotation of a pose may be; float32 chains reach 1e-5."""
+
+_POINT: Final = np.dtype(
+    [("x_tag", "u1"), ("x", "<f8"), ("y_tag", "u1"), ("y", "<f8"), ("z_tag", "u1"), ("z", "<f8")]
+)
+"""A `foxglove.Point3` on the wire: three doubles, each behind its tag."""
+_COORDINATE_TAGS: Final = (0x09, 0x11, 0x19)
+
+
+def is_rigid(matrix: NDArray[Any]) -> bool:
+    """Say whether a (4, 4) array is a rigid transform."""
+    if matrix.shape != (4, 4) or matrix.dtype.kind != "f" or not np.isfinite(matrix).all():
+        return False
+    rotation = np.asarray(matrix[:3, :3], np.float64)
+    return bool(
+        np.allclose(matrix[3], (0.0, 0.0, 0.0, 1.0), atol=RIGID_TOLERANCE)
+        and np.allclose(rotation @ rotation.T, np.eye(3), atol=RIGID_TOLERANCE)
+        and np.linalg.det(rotation) > 0.0
+    )
+
+
+def quaternion(rotation: NDArray[Any]) -> tuple[float, float, float, float]:
+    """Return (x, y, z, w), unit length, w not negative, of a rotation matrix (3, 3).
+
+    The largest of the four is computed first, so that nothing is divided by a small number.
+    """
+    m = np.asarray(rotation, np.float64)
+    squares = np.array(
+        [
+            1.0 + m[0, 0] - m[1, 1] - m[2, 2],
+            1.0 - m[0, 0] + m[1, 1] - m[2, 2],
+            1.0 - m[0, 0] - m[1, 1] + m[2, 2],
+            1.0 + m[0, 0] + m[1, 1] + m[2, 2],
+        ]
+    )
+    products = np.array(
+        [
+            [squares[0], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0], m[2, 1] - m[1, 2]],
+            [m[0, 1] + m[1, 0], squares[1], m[1, 2] + m[2, 1], m[0, 2] - m[2, 0]],
+            [m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], squares[2], m[1, 0] - m[0, 1]],
+            [m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1], squares[3]],
+        ]
+    )
+    found = products[int(np.argmax(squares))]
+    found = found / np.linalg.norm(found)
+    x, y, z, w = (found if found[3] >= 0.0 else -found).tolist()
+    return x, y, z, w
+
+
+def packed_points(
+    points_m: NDArray[Any], colours: NDArray[Any] | None
+) -> tuple[bytes, int, tuple[tuple[str, int, bool], ...]]:
+    """Return points as packed little-endian elements.
+
+    Args:
+        points_m: (N, 3), metres.
+        colours: (N, 3) uint8, red, green, blue; or None.
+
+    Returns:
+        The bytes, the bytes of one point, and (name, offset, is a float32) of each field.
+    """
+    names: list[tuple[str, int, bool]] = [("x", 0, True), ("y", 4, True), ("z", 8, True)]
+    points = np.ascontiguousarray(points_m, "<f4")
+    if colours is None:
+        return points.tobytes(), 12, tuple(names)
+    packed = np.empty(len(points), [("xyz", "<f4", 3), ("rgba", "u1", 4)])
+    packed["xyz"], packed["rgba"][:, :3], packed["rgba"][:, 3] = points, colours, 255
+    names += [("red", 12, False), ("green", 13, False), ("blue", 14, False), ("alpha", 15, False)]
+    return packed.tobytes(), 16, tuple(names)
+
+
+def encoded_points(points_m: NDArray[Any], field_number: int) -> bytes:
+    """Return (N, 3) points as the repeated field of `foxglove.Point3` of that number.
+
+    A message object per vertex would take a second for a surface of 300,000.
+    """
+    head = field_number << 3 | 2
+    assert head < 0x80, "a tag of one byte"
+    rows = np.empty(len(points_m), [("tag", "u1"), ("length", "u1"), ("point", _POINT)])
+    rows["tag"], rows["length"] = head, _POINT.itemsize
+    for name, tag, column in zip("xyz", _COORDINATE_TAGS, points_m.T, strict=True):
+        rows["point"][f"{name}_tag"] = tag
+        rows["point"][name] = column
+    return rows.tobytes()
+
+
+def image_bytes(pixels: NDArray[Any]) -> tuple[bytes, int]:
+    """Return an image's rows, little-endian, without padding, and the bytes of one row."""
+    whole = np.ascontiguousarray(pixels, pixels.dtype.newbyteorder("<"))
+    return whole.tobytes(), whole.nbytes // max(1, len(whole))

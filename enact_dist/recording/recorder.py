@@ -1,0 +1,438 @@
+"""Follows slots of a cell and records every version of them, each commit whole, in order.
+
+A watch tells of commits.  They rest for `SETTLE_S`, so that the notices of all
+shards have come and commits can be put in the order of their stamps; then their data are fetched
+and handed to the thread that writes.  While that one has no room nothing is fetched: the data stay
+with their shards, as long as their history keeps them.  What is not to be had any more is a gap:
+counted, and written into the recording by name and reason.
+"""
+
+from __future__ import annotations
+
+import bisect
+import itertools
+import threading
+import time
+from collections import deque
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.config_shows import GUESSED
+from enact_dist.core.datum import Slot
+from enact_dist.errors import ConfigError, LinkError, LockTimeoutError
+from enact_dist.recording.disk import QUEUE_BYTES_MAX, DiskThread
+from enact_dist.recording.exact import Recorded
+from enact_dist.recording.fetching import Wanted, between, data_of, explained, now_ns
+from enact_dist.recording.file import CHUNK_BYTES, CHUNK_S, RecordingFile
+from enact_dist.terms import Entities
+from enact_dist.watch import Watch
+
+if TYPE_CHECKING:
+    import os
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+
+    from enact_dist.cell import Cell
+    from enact_dist.config_shows import Shows
+    from enact_dist.core.datum import Datum, LockId
+    from enact_dist.core.messages import AspectEntry, VersionEntry
+    from enact_dist.watch import Change
+
+SETTLE_S: Final = 0.25
+"""How long a commit rests before it is recorded; below the 2 s for which all is remembered."""
+POLL_S: Final = 0.05
+HEARD_MAX: Final = 1000
+"""Changes that are taken before some are recorded."""
+BATCH_MAX: Final = 256
+BATCH_BYTES_MAX: Final = 64 << 20
+"""How many versions, and of how many bytes together, are fetched at once."""
+WANTED_MAX: Final = 65_536
+"""Versions that wait to be fetched; beyond, the oldest are given up, counted and named."""
+
+FINISH_S: Final = 30.0
+"""How long the end of a recording may take."""
+GAP_SLOTS_MAX: Final = 1000
+"""Slots that a summary names; the file names all."""
+
+FORGOTTEN: Final = "forgotten before it was fetched"
+DISK_SLOW: Final = "disk too slow"
+UNSEEN: Final = "forgotten before it was noticed"
+UNREACHABLE: Final = "its shard did not answer"
+
+
+@dataclass(slots=True)
+class RecordingSummary:
+    """What a recording holds, and what it does not.
+
+    Attributes:
+        path: The file.
+        seconds: How long it was recorded.
+        commits: Commits in it, whole; what was there at its begin does not count as one.
+        versions: Versions in it.
+        initial: … of which were there when it began.
+        size_bytes: Bytes on the disk.
+        chunks: Whole chunks on the disk.
+        gaps: Versions that are missing, by reason.
+        gap_slots: Versions that are missing, by slot.
+        out_of_order: Commits whose notice came so late that they stand behind later ones.
+        counts: What else happened, by name (see `file.RecordingFile`).
+    """
+
+    path: str
+    seconds: float = 0.0
+    commits: int = 0
+    versions: int = 0
+    initial: int = 0
+    size_bytes: int = 0
+    chunks: int = 0
+    gaps: dict[str, int] = field(default_factory=dict)
+    gap_slots: dict[str, int] = field(default_factory=dict)
+    out_of_order: int = 0
+    counts: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def missing(self) -> int:
+        """Return how many versions are missing, for whatever reason."""
+        return sum(self.gaps.values())
+
+
+class Recorder:
+    """Records chosen slots of a cell into a file.
+
+    Args:
+        cell: The cell.
+        path: The file; it must not exist.
+        worlds: Names of the world contexts; all that there are at the begin unless given.
+        entities: Pattern of the entities.
+        aspects: Names of the aspects; all unless given.
+        shows: What the data of an aspect look like; what it does not name is guessed.
+        pictures: False writes the exact messages only, for `replay` alone.
+        compression: "none", "lz4" or "zstd".
+        chunk_bytes: Size from which a chunk ends.
+        chunk_s: Age from which a chunk ends.
+        queue_bytes: How much may wait for the disk.
+
+    Raises:
+        UnknownWorldError: The cell has no world context of a given name.
+        ConfigError: There is nothing to record.
+    """
+
+    def __init__(
+        self,
+        cell: Cell,
+        path: str | os.PathLike[str],
+        *,
+        worlds: Iterable[str] = (),
+        entities: Entities | str = "**",
+        aspects: Iterable[str] = (),
+        shows: Mapping[str, Shows] | None = None,
+        pictures: bool = True,
+        compression: str = "lz4",
+        chunk_bytes: int = CHUNK_BYTES,
+        chunk_s: float = CHUNK_S,
+        queue_bytes: int = QUEUE_BYTES_MAX,
+    ) -> None:
+        self._cell, self._path = cell, path
+        self._worlds = tuple(worlds) or cell.worlds()
+        if not self._worlds:
+            raise ConfigError(f"cell {cell.name!r} has no world context to record")
+        self._session = [cell.world(name) for name in self._worlds][-1].session
+        self._entities, self._only = Entities(str(entities)), tuple(aspects)
+        self._shows, self._pictures = dict(shows or {}), pictures
+        self._compression = compression
+        self._chunk = (chunk_bytes, chunk_s)
+        self._queue_bytes = queue_bytes
+        self._aspects: dict[str, AspectEntry] = {}
+        self._pending: list[Wanted] = []
+        self._arrived: deque[tuple[float, int]] = deque()
+        self._settled_ns = self._stalled_ns = self._last_ns = 0
+        self._begin_ns = 0
+        self._initial: set[Wanted] = set()
+        self._disk: DiskThread
+        self.summary = RecordingSummary(str(path))
+
+    def run(
+        self,
+        stop: threading.Event | None = None,
+        *,
+        seconds: float | None = None,
+        tell: Callable[[RecordingSummary], None] = lambda _: None,
+    ) -> RecordingSummary:
+        """Record until `stop` is set or the time is over, and end the file whole.
+
+        Args:
+            stop: Ends the recording.
+            seconds: How long to record; None: until `stop`.
+            tell: Called with what is recorded so far, some 20 times per second.
+
+        Raises:
+            ConfigError: The file exists, or cannot be made.
+            StoreError: The disk refuses; the file is good up to its last whole chunk.
+            MisuseError: The cell was closed.
+        """
+        stop = stop or threading.Event()
+        client = self._session.client
+        with Watch(client, self._worlds, (str(self._entities),), self._only) as watch:
+            self._begin_ns = now_ns(self._session)
+            file = self._new_file()
+            self._disk = DiskThread(file, bytes_max=self._queue_bytes)
+            begun_s = time.monotonic()
+            try:
+                self._begin(watch)
+                while not stop.is_set():
+                    self.summary.seconds = time.monotonic() - begun_s
+                    if seconds is not None and self.summary.seconds >= seconds:
+                        break
+                    self._listen(watch)
+                    self._record_settled()
+                    self._look_at(file)
+                    tell(self.summary)
+                self._finish(watch)
+            finally:
+                self.summary.seconds = time.monotonic() - begun_s
+                try:
+                    self._disk.close(self._end_facts())
+                finally:
+                    self._look_at(file)
+        tell(self.summary)
+        return self.summary
+
+    def _new_file(self) -> RecordingFile:
+        facts = {
+            "cell": self._cell.name,
+            "worlds": " ".join(self._worlds),
+            "entities": str(self._entities),
+            "aspects": " ".join(self._only),
+            "begin_ns": str(self._begin_ns),
+        }
+        chunk_bytes, chunk_s = self._chunk
+        return RecordingFile(
+            self._path,
+            facts,
+            aspects=self._aspects.get,
+            shows=(lambda name: self._shows.get(name, GUESSED)) if self._pictures else None,
+            compression=self._compression,
+            chunk_bytes=chunk_bytes,
+            chunk_s=chunk_s,
+        )
+
+    def _look_at(self, file: RecordingFile) -> None:
+        summary = self.summary
+        summary.size_bytes, summary.chunks = file.size, file.chunks
+        summary.counts = dict(file.counts)
+
+    def _end_facts(self) -> dict[str, str]:
+        summary = self.summary
+        return {
+            "end_ns": str(time.time_ns()),
+            "commits": str(summary.commits),
+            "versions": str(summary.versions),
+            "missing": str(summary.missing),
+        }
+
+    # ---------------------------------------------------------------- what is told
+
+    def _begin(self, watch: Watch) -> None:
+        """Take what is there; of each slot the newest version is what the recording begins with."""
+        self._listen_until_settled(watch)
+        newest = {w.slot: w for w in self._pending if w.stamp_ns <= self._begin_ns}
+        self._initial = set(newest.values())
+        later = [w for w in self._pending if w.stamp_ns > self._begin_ns]
+        self._pending = sorted(newest.values()) + later
+
+    def _listen_until_settled(self, watch: Watch) -> None:
+        ends_s = time.monotonic() + SETTLE_S
+        while time.monotonic() < ends_s:
+            self._listen(watch)
+
+    def _listen(self, watch: Watch) -> None:
+        """Take what the watch tells; wait a little where there is nothing else to do."""
+        wait_s = 0.0 if self._settled() else POLL_S
+        for _ in range(HEARD_MAX):
+            change = watch.next(wait_s)
+            wait_s = 0.0
+            if change is None:
+                break
+            self._note(change)
+
+    def _note(self, change: Change) -> None:
+        stamp_ns, shard = change.position
+        if not stamp_ns:
+            return  # a volatile slot that ended with its shard: there is no version of that
+        slot = Slot(change.world, change.entity.name, change.aspect)
+        self._know(change.aspect)
+        if change.gap:
+            self._fill(slot, shard, change)
+        self._want(Wanted(stamp_ns, slot, change.version, shard))
+
+    def _know(self, aspect: str) -> None:
+        """Learn of an aspect from the catalogue, before its first datum is written."""
+        if aspect not in self._aspects:
+            client = self._session.client
+            if aspect not in client.aspect_entries():
+                client.greet()
+            if aspect in client.aspect_entries():
+                self._aspects[aspect] = client.aspect_entries()[aspect]
+
+    def _fill(self, slot: Slot, shard: str, change: Change) -> None:
+        """Look in the history for versions of which no notice came."""
+        first, last = change.version - change.gap, change.version - 1
+        try:
+            found = between(self._session, slot, shard, first, last) if first <= last else []
+        except LinkError:
+            found = []
+        for wanted in found:
+            self._want(wanted)
+        if len(found) < change.gap:
+            self._miss(slot, first, last, change.gap - len(found), UNSEEN, change.position.stamp_ns)
+
+    def _want(self, wanted: Wanted) -> None:
+        bisect.insort(self._pending, wanted)
+        self._arrived.append((time.monotonic(), wanted.stamp_ns))
+        while len(self._pending) > WANTED_MAX:
+            self._miss_one(self._pending.pop(0), DISK_SLOW)
+
+    def _miss_one(self, wanted: Wanted, reason: str) -> None:
+        version = wanted.version
+        self._miss(wanted.slot, version, version, 1, reason, wanted.stamp_ns)
+
+    def _miss(
+        self, slot: Slot, first: int, last: int, count: int, reason: str, stamp_ns: int
+    ) -> None:
+        """Count versions that cannot be recorded, and write down which."""
+        gaps, slots = self.summary.gaps, self.summary.gap_slots
+        gaps[reason] = gaps.get(reason, 0) + count
+        if str(slot) in slots or len(slots) < GAP_SLOTS_MAX:
+            slots[str(slot)] = slots.get(str(slot), 0) + count
+        facts = {
+            "world": slot.context,
+            "entity": slot.entity,
+            "aspect": slot.aspect,
+            "first_version": first,
+            "last_version": last,
+            "missing": count,
+            "reason": reason,
+        }
+        self._disk.put_gap(facts, max(stamp_ns, self._begin_ns))
+
+    # ---------------------------------------------------------------- what is recorded
+
+    def _settled(self) -> bool:
+        """Whether commits have rested long enough to be recorded."""
+        settled_s = time.monotonic() - SETTLE_S
+        while self._arrived and self._arrived[0][0] <= settled_s:
+            self._settled_ns = max(self._settled_ns, self._arrived.popleft()[1])
+        return bool(self._pending) and self._pending[0].stamp_ns <= self._settled_ns
+
+    def _record_settled(self) -> None:
+        """Record one batch of what has settled, if the disk has room."""
+        if not self._settled():
+            return
+        if not self._disk.wait_for_room(POLL_S):
+            self._stalled_ns = max(self._stalled_ns, self._pending[-1].stamp_ns)
+            return
+        count = bisect.bisect_right(self._pending, self._settled_ns, key=_stamp)
+        batch = self._pending[: min(count, BATCH_MAX)]
+        rest = bisect.bisect_right(self._pending, batch[-1].stamp_ns, key=_stamp)
+        self._record(self._pending[:rest])
+
+    def _record(self, batch: list[Wanted]) -> None:
+        """Fetch a prefix of what is pending, commits whole, and hand it to the disk."""
+        try:
+            entries = explained(self._session, batch)
+            batch = _fitting(batch, entries)
+            held = [w for w in batch if w in entries and not entries[w].state.null_reason]
+            data = data_of(self._session, held)
+        except (LinkError, LockTimeoutError):
+            self._session.client.check_usable()
+            return  # a shard is away; its history will say what it still has
+        del self._pending[: len(batch)]
+        for wanted in batch:
+            if wanted not in entries or (wanted in held and wanted not in data):
+                stalled = wanted.stamp_ns <= self._stalled_ns
+                self._miss_one(wanted, DISK_SLOW if stalled else FORGOTTEN)
+        known = [w for w in batch if w in data or _is_null(w, entries)]
+        initial = [w for w in known if w in self._initial]
+        if initial:
+            self.summary.initial += len(initial)
+            self._write(initial, 0, self._begin_ns, entries, data)
+        for group in _commits([w for w in known if w not in self._initial], entries):
+            stamp_ns = group[0].stamp_ns
+            self.summary.commits += 1
+            self.summary.out_of_order += stamp_ns < self._last_ns
+            self._last_ns = max(self._last_ns, stamp_ns)
+            self._write(group, self.summary.commits, stamp_ns, entries, data)
+
+    def _write(
+        self,
+        group: Sequence[Wanted],
+        commit: int,
+        log_ns: int,
+        entries: Mapping[Wanted, VersionEntry],
+        data: Mapping[Wanted, Datum],
+    ) -> None:
+        self.summary.versions += len(group)
+        versions = tuple(_recorded(w, entries[w], data.get(w), commit) for w in group)
+        self._disk.put(versions, log_ns)
+
+    def _finish(self, watch: Watch) -> None:
+        """Record what was committed until now."""
+        self._listen_until_settled(watch)
+        self._settled_ns = max((w.stamp_ns for w in self._pending), default=0)
+        gives_up_s = time.monotonic() + FINISH_S
+        while self._pending and time.monotonic() < gives_up_s:
+            self._record_settled()
+        for wanted in self._pending:
+            self._miss_one(wanted, DISK_SLOW if not self._disk.has_room else UNREACHABLE)
+        self._pending.clear()
+
+
+def _stamp(wanted: Wanted) -> int:
+    return wanted.stamp_ns
+
+
+def _is_null(wanted: Wanted, entries: Mapping[Wanted, VersionEntry]) -> bool:
+    return wanted in entries and bool(entries[wanted].state.null_reason)
+
+
+def _fitting(batch: list[Wanted], entries: Mapping[Wanted, VersionEntry]) -> list[Wanted]:
+    """Return as many of the first as have `BATCH_BYTES_MAX` together, commits whole."""
+    size = 0
+    for index, wanted in enumerate(batch):
+        size += entries[wanted].state.size if wanted in entries else 0
+        if size > BATCH_BYTES_MAX and index and wanted.stamp_ns != batch[index - 1].stamp_ns:
+            return batch[:index]
+    return batch
+
+
+def _commits(
+    batch: Sequence[Wanted], entries: Mapping[Wanted, VersionEntry]
+) -> Iterator[list[Wanted]]:
+    """Yield the versions of one commit after another.
+
+    The data of a commit bear one stamp on all shards.  Two commits that bear the same one are told
+    apart by their locks; where one of these is not known they count as one.
+    """
+    for _, same in itertools.groupby(batch, _stamp):
+        group = list(same)
+        causes = [entries[wanted].cause for wanted in group]
+        by_lock: dict[LockId | None, list[Wanted]] = {}
+        for wanted, cause in zip(group, causes, strict=True):
+            lock = cause.lock if cause is not None and None not in causes else None
+            by_lock.setdefault(lock, []).append(wanted)
+        yield from by_lock.values()
+
+
+def _recorded(wanted: Wanted, entry: VersionEntry, datum: Datum | None, commit: int) -> Recorded:
+    cause = entry.cause
+    return Recorded(
+        wanted.slot,
+        wanted.version,
+        wanted.stamp_ns,
+        wanted.shard,
+        commit,
+        datum,
+        entry.state.null_reason,
+        cause.actor if cause is not None else "",
+        cause.host if cause is not None else "",
+        cause.pid if cause is not None else 0,
+    )

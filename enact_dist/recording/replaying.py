@@ -1,0 +1,263 @@
+"""Commits a recording again: the same data in the same groups and order, at their pace.
+
+Encoded data go as they are, so no type has to be known here; worlds and aspects are made as the
+recording names them.  Versions and stamps are those of the new commits; capture stamps stay.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.core.messages import AspectEntry, Item
+from enact_dist.errors import ConfigError, MisuseError
+from enact_dist.recording.reading import Commit, Recording
+from enact_dist.terms import Access
+from enact_dist.wire.limits import BODY_BYTES_MAX, ITEMS_MAX
+from enact_dist.wire.payload import Encoded
+from enact_dist.writing import Writing
+
+if TYPE_CHECKING:
+    import os
+    from collections.abc import Callable, Iterator, Mapping, Sequence
+
+    from enact_dist.cell import Cell
+    from enact_dist.core.datum import Datum, Slot
+    from enact_dist.recording.exact import Recorded
+    from enact_dist.session import Session
+
+WAIT_S: Final = 10.0
+HOLD_S: Final = 60.0
+LATE_S: Final = 0.05
+"""A commit that comes later than this counts as late."""
+BYTES_PER_LOCK: Final = BODY_BYTES_MAX
+
+
+@dataclass(slots=True)
+class ReplaySummary:
+    """What a replay has done.
+
+    Attributes:
+        path: The recording.
+        seconds: How long it took.
+        commits: Commits made; what was there at the recording's begin does not count as one.
+        versions: Data set, nulls too.
+        late: Commits that came more than `LATE_S` after their time.
+        late_s_max: How late the latest one was.
+        rounds: How often the recording was gone through whole.
+        missing_bytes: What follows its last whole chunk; 0 where it was ended whole.
+        gaps: Versions that the recording itself does not have, where it was ended whole.
+        whole: Whether it was ended whole.
+    """
+
+    path: str
+    seconds: float = 0.0
+    commits: int = 0
+    versions: int = 0
+    late: int = 0
+    late_s_max: float = 0.0
+    rounds: int = 0
+    missing_bytes: int = 0
+    gaps: int = 0
+    whole: bool = False
+
+
+class Replay:
+    """Commits a recording into a cell.
+
+    Args:
+        cell: The cell.
+        path: The recording.
+        worlds: Names of world contexts of the recording, and what each is called in the cell;
+            what is not named keeps its name.
+        speed: How much faster than it was recorded; 0: as fast as possible.
+        overwrite: Also write into world contexts that have data.
+
+    Raises:
+        ConfigError: The file is no recording, or `speed` makes no sense.
+    """
+
+    def __init__(
+        self,
+        cell: Cell,
+        path: str | os.PathLike[str],
+        *,
+        worlds: Mapping[str, str] | None = None,
+        speed: float = 1.0,
+        overwrite: bool = False,
+    ) -> None:
+        if not 0.0 <= speed < float("inf"):
+            raise ConfigError(f"speed {speed!r} is none; 0 means as fast as possible")
+        self._cell = cell
+        self.recording = Recording(path)
+        self._worlds = dict(worlds or {})
+        self._speed = speed
+        self._from_ns = self._to_ns = 0
+        self._overwrite = overwrite
+        self._sessions: dict[str, Session] = {}
+        self._registered: set[str] = set()
+        self.summary = ReplaySummary(str(path))
+        known = self.recording.facts.get("worlds", "").split()
+        for name in self._worlds:
+            if name not in known:
+                raise ConfigError(
+                    f"{path} has no world context {name!r}; it has {', '.join(known) or 'none'}"
+                )
+
+    def between(self, from_ns: int, to_ns: int = 0) -> None:
+        """Take a part of the recording only.
+
+        Args:
+            from_ns: Where to begin, with the state as of that stamp; 0: at the begin.
+            to_ns: Stamp of the last commit; 0: at the end.
+        """
+        self._from_ns, self._to_ns = from_ns, to_ns
+
+    def run(
+        self,
+        stop: threading.Event | None = None,
+        *,
+        loop: bool = False,
+        tell: Callable[[ReplaySummary], None] = lambda _: None,
+    ) -> ReplaySummary:
+        """Commit all of it, or until `stop` is set; a commit is made whole or not at all.
+
+        Args:
+            stop: Ends the replay.
+            loop: Begin anew at the end.
+            tell: Called after each commit.
+
+        Raises:
+            MisuseError: A world context has data, and `overwrite` was not asked.
+            ProtocolError: The recording holds what this version cannot read.
+            LockTimeoutError: Somebody else holds the data.
+            DatumTypeError: The cell knows an aspect with another type.
+        """
+        stop = stop or threading.Event()
+        begun_s = time.monotonic()
+        while not stop.is_set():
+            self._once(stop, tell)
+            if not stop.is_set():
+                self.summary.rounds += 1
+            if not loop or not self.summary.versions:
+                break
+        summary, recording = self.summary, self.recording
+        summary.seconds = time.monotonic() - begun_s
+        if summary.rounds:
+            summary.missing_bytes, summary.whole = recording.missing_bytes, recording.whole
+            summary.gaps = int(recording.end.get("missing", "0"))
+        return summary
+
+    def _once(self, stop: threading.Event, tell: Callable[[ReplaySummary], None]) -> None:
+        begun_s = first_ns = 0.0
+        for commit in self._chosen():
+            if commit.number and not first_ns:
+                begun_s, first_ns = time.monotonic(), self._from_ns or commit.log_ns
+            if self._speed and commit.number:
+                due_s = begun_s + (commit.log_ns - first_ns) / 1e9 / self._speed
+                if stop.wait(max(0.0, due_s - time.monotonic())):
+                    return
+                late_s = time.monotonic() - due_s
+                self.summary.late += late_s > LATE_S
+                self.summary.late_s_max = max(self.summary.late_s_max, late_s)
+            elif stop.is_set():
+                return
+            for part in _parts(commit.versions):
+                self._commit(part)
+            self.summary.commits += commit.number > 0
+            tell(self.summary)
+
+    def _chosen(self) -> Iterator[Commit]:
+        """Yield what is to be committed; first the state as of the begin, where one is named."""
+        before: dict[Slot, Recorded] = {}
+        for commit in self.recording.commits():
+            if commit.log_ns < self._from_ns:
+                before.update((recorded.slot, recorded) for recorded in commit.versions)
+                continue
+            if before:
+                yield Commit(0, self._from_ns, tuple(before.values()))
+                before = {}
+            if self._to_ns and commit.log_ns > self._to_ns:
+                continue  # a later one may stand before it in the file
+            yield commit
+        if before:
+            yield Commit(0, self._from_ns, tuple(before.values()))
+
+    # ---------------------------------------------------------------- one commit
+
+    def _commit(self, versions: Sequence[Recorded]) -> None:
+        """Commit data under one lock."""
+        slots = [self._slot(recorded.slot) for recorded in versions]
+        session = next(iter(self._sessions.values()))
+        self._register(session, versions)
+        client = session.client
+        items = [Item(int(Access.WRITE), *slot) for slot in slots]
+        writing = Writing(client.payloads)
+        lock = client.acquire(items, wait_s=WAIT_S, hold_s=HOLD_S)
+        committed = False
+        try:
+            for slot, recorded in zip(slots, versions, strict=True):
+                if recorded.datum is None:
+                    writing.delete(slot)
+                else:
+                    writing.put(slot, _encoded(recorded.datum), lock.shard_of)
+            client.finish(lock, writing.by_shard(lock.shard_of))
+            committed = True
+        finally:
+            client.release(lock)
+            writing.end(committed=committed)
+        self.summary.versions += len(versions)
+
+    def _slot(self, slot: Slot) -> Slot:
+        name = self._worlds.get(slot.context, slot.context)
+        if name not in self._sessions:
+            self._sessions[name] = self._opened(name)
+        return slot._replace(context=name)
+
+    def _opened(self, name: str) -> Session:
+        """Return the session of a world context, made if there is none; refuse one with data."""
+        world = self._cell.create_world(name)
+        if not self._overwrite:
+            found = [info for info in world.survey() if not info.null_reason]
+            if found:
+                raise MisuseError(
+                    f"world context {name!r} of cell {self._cell.name!r} has {len(found)} data"
+                    f" ({found[0].entity}/{found[0].aspect} …), which a replay would change; take"
+                    f" another one (--world {name}=OTHER), or say that they may be overwritten"
+                    " (--overwrite)"
+                )
+        return world.session
+
+    def _register(self, session: Session, versions: Sequence[Recorded]) -> None:
+        """Let the cell know the aspects, with the types that they were recorded with."""
+        names = {recorded.slot.aspect for recorded in versions} - self._registered
+        facts = {name: self.recording.aspects.get(name) for name in names}
+        entries = [AspectEntry(name, f.fingerprint, f.durability) for name, f in facts.items() if f]
+        if entries:
+            session.client.greet()
+            known = session.client.aspect_entries()
+            # What the cell says of durability holds here; the type must be the same.
+            entries = [e._replace(durability="") if e.name in known else e for e in entries]
+            session.client.register(aspects=entries)
+        self._registered |= names
+
+
+def _encoded(datum: Datum) -> Encoded:
+    return Encoded(datum.encoding, [datum.body], datum.size, datum.stamp_ns)
+
+
+def _parts(versions: Sequence[Recorded]) -> Iterator[Sequence[Recorded]]:
+    """Yield what one lock may write; only a whole context's first state is ever more than that."""
+    part: dict[Slot, Recorded] = {}
+    size = 0
+    for recorded in versions:
+        is_full = len(part) >= ITEMS_MAX or size + recorded.size > BYTES_PER_LOCK
+        if part and (is_full or recorded.slot in part):
+            yield tuple(part.values())
+            part, size = {}, 0
+        part[recorded.slot] = recorded
+        size += recorded.size
+    if part:
+        yield tuple(part.values())

@@ -1,0 +1,296 @@
+"""A recording has every version of what it follows, commits whole and in order, or names the gap."""
+
+import errno
+import os
+import threading
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+from enact_dist import Aspect, Durability, Entity, Lock, Write
+from enact_dist.errors import ConfigError, StoreError, UnknownWorldError
+from enact_dist.recording import Recorder, Replay, Shows, export_world, recorder
+from enact_dist.recording.exporting import world_as_of
+from enact_dist.recording.reading import Recording
+
+COUNT = Aspect("count", int)
+CLOUD = Aspect("cloud", np.ndarray, Durability.VOLATILE)
+bench, piece = Entity("bench"), Entity("piece")
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    points_m: np.ndarray
+    label: str
+
+
+SCAN = Aspect("scan", Scan)
+
+
+def put(*pairs):
+    """Set (request, datum) pairs in one commit; None deletes."""
+    with Lock(*(request for request, _ in pairs)) as lock:
+        for request, value in pairs:
+            if value is None:
+                del lock[request]
+            else:
+                lock[request] = value
+    return lock.position
+
+
+class Running:
+    """A recorder in a thread of its own, begun when its block begins."""
+
+    def __init__(self, cell, path, **options):
+        self.recorder = Recorder(cell, path, **options)
+        self.stop, self.begun = threading.Event(), threading.Event()
+        self.error = None
+        self.thread = threading.Thread(target=self._run)
+
+    def _run(self):
+        try:
+            self.recorder.run(self.stop, tell=lambda _: self.begun.set())
+        except Exception as error:
+            self.error = error
+            self.begun.set()
+
+    def __enter__(self):
+        self.thread.start()
+        assert self.begun.wait(20)
+        return self.recorder.summary
+
+    def __exit__(self, *_):
+        self.stop.set()
+        self.thread.join(60)
+        assert not self.thread.is_alive()
+        if self.error is not None:
+            raise self.error
+
+
+def commits_of(path):
+    return list(Recording(path).commits())
+
+
+# ---------------------------------------------------------------- what is in it
+
+
+def test_it_begins_with_what_is_there(cell, online, tmp_path):
+    """The newest version of each slot, of all contexts, as the state before the first commit."""
+    online.init(piece, COUNT, 1)
+    put((Write(online, piece, COUNT), 2))
+    cell.world("training").init(bench, COUNT, 7)
+    with Running(cell, tmp_path / "run.mcap") as summary:
+        pass
+    (first,) = commits_of(tmp_path / "run.mcap")
+    assert first.number == 0
+    assert [(v.slot.context, v.version) for v in first.versions] == [("online", 2), ("training", 1)]
+    assert (summary.initial, summary.commits, summary.missing) == (2, 0, 0)
+
+
+def test_every_commit_of_concurrent_writers_is_whole_and_in_order(cell, online, tmp_path):
+    """Stamps rise, versions follow each other, and what was set together stands together."""
+    rounds, path = 60, tmp_path / "run.mcap"
+    requests = [Write(online, entity, COUNT) for entity in (bench, piece)]
+
+    def work():
+        for _ in range(rounds):
+            with Lock(*requests) as lock:
+                for request in requests:
+                    lock[request] = lock.get(request, 0) + 1
+
+    with Running(cell, path) as summary:
+        workers = [threading.Thread(target=work) for _ in range(3)]
+        for worker in workers:
+            worker.start()
+        for worker in workers:
+            worker.join()
+    commits = [commit for commit in commits_of(path) if commit.number]
+    assert [commit.number for commit in commits] == list(range(1, 3 * rounds + 1))
+    assert all(len(commit.versions) == 2 for commit in commits)
+    assert [c.versions[0].version for c in commits] == list(range(1, 3 * rounds + 1))
+    stamps = [commit.log_ns for commit in commits]
+    assert stamps == sorted(set(stamps))
+    assert (summary.commits, summary.missing, summary.out_of_order) == (3 * rounds, 0, 0)
+
+
+def test_a_version_names_its_stamp_shard_and_actor(cell, online, tmp_path):
+    """What the shard knows of its commit."""
+    with Running(cell, tmp_path / "run.mcap"):
+        position = put((Write(online, piece, COUNT), 1))
+    (commit,) = commits_of(tmp_path / "run.mcap")
+    (version,) = commit.versions
+    assert (version.stamp_ns, version.shard) == position
+    assert version.pid == os.getpid()
+    assert version.actor
+
+
+def test_a_commit_over_two_contexts_is_one(cell, online, tmp_path):
+    """Groups are those of the locks, not of the contexts."""
+    training = cell.world("training")
+    with Running(cell, tmp_path / "run.mcap"):
+        put((Write(online, piece, COUNT), 1), (Write(training, piece, COUNT), 2))
+    (commit,) = commits_of(tmp_path / "run.mcap")
+    assert [version.slot.context for version in commit.versions] == ["online", "training"]
+
+
+def test_null_is_a_version(cell, online, tmp_path):
+    """A deletion is recorded with its reason."""
+    with Running(cell, tmp_path / "run.mcap"):
+        put((Write(online, piece, COUNT), 1))
+        put((Write(online, piece, COUNT), None))
+    last = commits_of(tmp_path / "run.mcap")[-1].versions[0]
+    assert (last.version, last.datum, last.null_reason) == (2, None, "DELETED")
+
+
+def test_only_what_is_chosen_is_recorded(cell, online, tmp_path):
+    """By context, pattern of entities and aspect."""
+    options = {"worlds": ["online"], "entities": "piece*", "aspects": ["count"]}
+    with Running(cell, tmp_path / "run.mcap", **options):
+        put((Write(online, piece, COUNT), 1), (Write(online, bench, COUNT), 1))
+        put((Write(online, piece, Aspect("name", str)), "x"))
+        put((Write(cell.world("training"), piece, COUNT), 1))
+        put((Write(online, Entity("piece2"), COUNT), 1))
+    found = [str(v.slot) for commit in commits_of(tmp_path / "run.mcap") for v in commit.versions]
+    assert found == ["online:piece/count", "online:piece2/count"]
+
+
+def test_what_is_declared_is_shown(cell, online, tmp_path):
+    """The declaration of an aspect decides over its shape, and a misfit is counted."""
+    path = tmp_path / "run.mcap"
+    shows = {"scan": Shows(("point_cloud",), frame="tray"), "count": Shows(("image",))}
+    with Running(cell, path, shows=shows) as summary:
+        put((Write(online, piece, SCAN), Scan(np.zeros((2, 3), np.float32), "x")))
+        put((Write(online, piece, COUNT), 1))
+    with path.open("rb") as stream:
+        found = {c.topic: s.name for s, c, _ in make_reader(stream).iter_messages() if s}
+    assert found["/online/piece/scan"] == "foxglove.PointCloud"
+    assert found["/online/piece/count/json"] == "enact.Datum"
+    assert summary.counts == {"unfit count image": 1}
+
+
+# ---------------------------------------------------------------- round trip
+
+
+def same_data(one, other):
+    def facts(world):
+        return {
+            (v.slot.entity, v.slot.aspect): (v.datum.encoding, bytes(v.datum.body), v.captured_ns)
+            for v in world_as_of(world)
+        }
+
+    return facts(one) == facts(other)
+
+
+def test_record_and_replay_give_the_same_context(cell, online, tmp_path):
+    """Bit for bit, large and small, deleted ones not there."""
+    path = tmp_path / "run.mcap"
+    scan, count, cloud = (Write(online, piece, aspect) for aspect in (SCAN, COUNT, CLOUD))
+    put((count, 1))
+    with Running(cell, path, compression="zstd"):
+        for number in range(5):
+            points = np.full((30_000, 3), number, np.float32)
+            put((scan, Scan(points, f"scan {number}")), (cloud, points.astype(">f8")))
+        put((count, None))
+    Replay(cell, path, worlds={"online": "copy"}, speed=0.0).run()
+    assert same_data(online, cell.world("copy"))
+    assert len(cell.world("copy").survey()) == 3
+
+
+def test_recording_of_a_replay_is_the_recording(cell, online, tmp_path):
+    """The same versions, groups and bytes again."""
+    requests = [Write(online, entity, COUNT) for entity in (bench, piece)]
+    with Running(cell, tmp_path / "one.mcap", worlds=["online"]):
+        for number in range(20):
+            put(*((request, number) for request in requests[: 1 + number % 2]))
+    copy = cell.create_world("copy")
+    with Running(cell, tmp_path / "two.mcap", worlds=["copy"]):
+        Replay(cell, tmp_path / "one.mcap", worlds={"online": "copy"}, speed=0.0).run()
+
+    def facts(path):
+        return [
+            (c.number, [(v.slot.entity, v.version, v.datum.encoding) for v in c.versions])
+            for c in commits_of(path)
+        ]
+
+    assert facts(tmp_path / "one.mcap") == facts(tmp_path / "two.mcap")
+    assert same_data(online, copy)
+
+
+# ---------------------------------------------------------------- what is missing
+
+
+def test_too_many_that_wait_are_dropped_by_name(cell, online, tmp_path, monkeypatch):
+    """The oldest go, and the reason says why."""
+    monkeypatch.setattr(recorder, "WANTED_MAX", 5)
+    monkeypatch.setattr(recorder, "SETTLE_S", 1.0)
+    with Running(cell, tmp_path / "run.mcap") as summary:
+        for number in range(20):
+            put((Write(online, piece, COUNT), number))
+    assert summary.gaps == {recorder.DISK_SLOW: 15}
+    assert [v.version for c in commits_of(tmp_path / "run.mcap") for v in c.versions] == list(
+        range(16, 21)
+    )
+
+
+def test_disk_that_refuses_ends_the_recording_and_says_what_is_good(
+    cell, online, tmp_path, monkeypatch
+):
+    """The file has its whole chunks."""
+    path = tmp_path / "run.mcap"
+    sync, left = os.fdatasync, [3]
+
+    def full(descriptor):
+        left[0] -= 1
+        if left[0] < 0:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        sync(descriptor)
+
+    monkeypatch.setattr(os, "fdatasync", full)
+    with (
+        pytest.raises(StoreError, match=r"No space left.*last whole chunk"),
+        Running(cell, path, chunk_bytes=1) as summary,
+    ):
+        for number in range(10):
+            put((Write(online, piece, COUNT), number))
+            threading.Event().wait(0.05)
+    assert summary.chunks == 2
+    assert len(commits_of(path)) >= 2
+
+
+def test_nothing_to_record_is_told(cell, tmp_path):
+    """A context that does not exist, and a file that does."""
+    with pytest.raises(UnknownWorldError, match="attic"):
+        Recorder(cell, tmp_path / "run.mcap", worlds=["attic"])
+    (tmp_path / "there.mcap").touch()
+    with pytest.raises(ConfigError, match="exists"):
+        Recorder(cell, tmp_path / "there.mcap").run(seconds=0.0)
+
+
+# ---------------------------------------------------------------- export
+
+
+def test_export_is_a_recording_of_one_moment(cell, online, tmp_path):
+    """All data of a context, and replaying it makes the context again."""
+    path = tmp_path / "now.mcap"
+    put((Write(online, piece, COUNT), 1), (Write(online, bench, COUNT), 2))
+    put((Write(online, bench, COUNT), None))
+    put((Write(online, piece, SCAN), Scan(np.ones((40_000, 3), np.float32), "x")))
+    summary = export_world(online, path)
+    assert summary.versions == 2
+    Replay(cell, path, worlds={"online": "copy"}).run()
+    assert same_data(online, cell.world("copy"))
+
+
+def test_export_of_the_past_is_of_the_past(cell, online, tmp_path):
+    """As of a stamp: every commit up to it, none after."""
+    old = put((Write(online, piece, COUNT), 1), (Write(online, bench, COUNT), 1))
+    put((Write(online, piece, COUNT), 2))
+    put((Write(online, bench, COUNT), None))
+    export_world(online, tmp_path / "old.mcap", at_ns=old.stamp_ns)
+    found = commits_of(tmp_path / "old.mcap")
+    assert [(v.slot.entity, v.version) for c in found for v in c.versions] == [
+        ("bench", 1),
+        ("piece", 1),
+    ]
