@@ -19,7 +19,7 @@ import os
 import sys
 from typing import TYPE_CHECKING, Any, Final
 
-from enact_dist.cli import actor, bench, demo, doctor, lock, shard, up, verify, world
+from enact_dist.cli import actor, bench, demo, doctor, lock, record, shard, up, verify, world
 from enact_dist.cli.times import shielded
 from enact_dist.cli.verbs import DONE, FAILED, UNREACHABLE, USAGE
 from enact_dist.errors import ConfigError, EnactError, ShardUnreachableError
@@ -61,7 +61,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--debug", action="store_true", help="show tracebacks of errors")
     parser.add_argument("--version", action="store_true", help="print the version and leave")
     nouns = parser.add_subparsers(metavar="COMMAND", title="commands", dest="noun")
-    for noun in (up, shard, actor, world, lock, doctor, bench, verify, demo):
+    for noun in (up, shard, actor, world, record, lock, doctor, bench, verify, demo):
         noun.add_to(nouns)
     return parser
 

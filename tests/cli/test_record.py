@@ -1,0 +1,129 @@
+"""`enact record` and `enact replay`: a running cell into a file and back, ends and errors."""
+
+import json
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from enact_dist import Aspect, Entity, Lock, Write, connect
+
+COUNT = Aspect("count", int)
+
+
+@pytest.fixture
+def put(cell_file):
+    """Set data in the running cell in one commit."""
+    with connect(cell_file) as cell:
+
+        def set_them(world, **data):
+            context = cell.create_world(world)
+            requests = {Write(context, Entity(name), COUNT): n for name, n in data.items()}
+            with Lock(*requests) as lock:
+                for request, number in requests.items():
+                    lock[request] = number
+
+        yield set_them
+
+
+def test_record_and_replay(enact, cell_file, put, tmp_path):
+    """Two shards into a file and from there into a context of another name."""
+    put("one", a=1, b=2, c=3, d=4)
+    out = tmp_path / "run.mcap"
+    done = enact("record", cell_file, "--out", out, "--world", "one", "--seconds", "0.1", "--json")
+    assert (done.status, done.json["initial"], done.json["versions"]) == (0, 4, 4)
+    assert (done.json["gaps"], done.err) == ({}, "")
+    words = ("replay", out, "--into", cell_file, "--world", "one=two", "--speed", "0")
+    done = enact(*words, "--json")
+    assert (done.status, done.json["versions"], done.json["whole"]) == (0, 4, True)
+    found = enact("world", "tree", "two", "--cell", cell_file, "--json").json
+    assert [(slot["entity"], slot["version"]) for slot in found] == [
+        ("a", 1), ("b", 1), ("c", 1), ("d", 1),
+    ]  # fmt: skip
+    again = enact(*words)
+    assert again.status == 1
+    assert "--overwrite" in again.err
+    again = enact(*words, "--overwrite")
+    assert "4 data" in again.out
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_recording_whole(enact, spawn, cell_file, put, tmp_path, until, number):
+    """What was committed before it is in the file, which has its end."""
+    world = f"signals{number}"
+    put(world, a=1)
+    out = tmp_path / "run.mcap"
+    process = spawn("record", cell_file, "--out", out, "--world", world, "--json")
+    while not (out.exists() and out.stat().st_size):
+        assert process.poll() is None
+    put(world, a=2, b=2)
+    process.send_signal(number)
+    text = process.stdout.read()
+    assert process.wait(20) == 0, text
+    summary = json.loads(text)
+    done = enact("replay", out, "--into", cell_file, "--world", f"{world}=copy{number}", "--json")
+    assert (done.json["whole"], done.json["versions"]) == (True, summary["versions"])
+    assert summary["versions"] == 3
+
+
+def test_cut_recording_is_said_to_be_cut(enact, cell_file, put, tmp_path):
+    """With how much of it is not used."""
+    put("cutting", a=1)
+    out = tmp_path / "run.mcap"
+    enact("record", cell_file, "--out", out, "--world", "cutting", "--seconds", "0.1")
+    content = out.read_bytes()
+    out.write_bytes(content[: content.index(b"enact.end")])
+    done = enact("replay", out, "--into", cell_file, "--world", "cutting=cut")
+    assert done.status == 0
+    assert "CUT OFF" in done.out
+
+
+def test_part_of_a_recording_by_time(enact, cell_file, put, tmp_path):
+    """Seconds count from the begin; a word that is no time is refused."""
+    put("timing", a=1)
+    out = tmp_path / "run.mcap"
+    enact("record", cell_file, "--out", out, "--world", "timing", "--seconds", "0.1")
+    words = ("replay", out, "--into", cell_file, "--world", "timing=timed", "--json")
+    assert enact(*words, "--from", "60").json["versions"] == 1
+    assert enact(*words, "--from", "2001-01-01T00:00:00", "--overwrite").json["versions"] == 1
+    with pytest.raises(SystemExit):
+        enact(*words, "--from", "yesterday", "--overwrite")
+
+
+def test_what_it_shows_can_be_said(enact, cell_file, put, tmp_path):
+    """On the command line, or in the cell.toml; an unknown kind is a usage error."""
+    put("shown", a=1)
+    out = tmp_path / "run.mcap"
+    words = ("record", cell_file, "--world", "shown", "--seconds", "0.1", "--out", out)
+    refused = enact(*words, "--shows", "count=film")
+    assert (refused.status, out.exists()) == (2, False)
+    assert "point_cloud" in refused.err
+    done = enact(*words, "--shows", "count=image")
+    assert "unfit count image: 1" in done.out
+
+
+def test_missing_library_is_named_with_its_extra(cell_file, tmp_path):
+    """Who has not installed it is told what to install."""
+    code = (
+        "import importlib.util as util, sys\n"
+        "find = util.find_spec\n"
+        "util.find_spec = lambda name, *more: None if name == 'mcap' else find(name, *more)\n"
+        "from enact_dist.cli.main import main\n"
+        "sys.exit(main(sys.argv[1:]))"
+    )
+    words = ("record", cell_file, "--out", tmp_path / "run.mcap")
+    done = subprocess.run(
+        [sys.executable, "-c", code, *map(str, words)], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 2, done.stderr
+    assert "mcap" in done.stderr
+    assert "enact-dist[record]" in done.stderr
+
+
+def test_file_that_is_there_is_kept(enact, cell_file, tmp_path):
+    """A recording never takes the place of another one."""
+    out = tmp_path / "run.mcap"
+    out.write_text("precious")
+    done = enact("record", cell_file, "--out", out, "--seconds", "0.1")
+    assert (done.status, out.read_text()) == (2, "precious")
