@@ -11,7 +11,7 @@ One `Client` per process, one lane per thread.  Rules a change must keep:
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.beliefs import Sendings
@@ -275,7 +275,9 @@ class Client:
                 if len(self._plans) >= PLANS_MAX:
                     self._plans.clear()
                 self._plans[items] = plan
-        return replace(plan, past_ns=past_ns) if past_ns else plan
+        if past_ns:
+            return Plan(plan.locks, plan.views, plan.placement, plan.floor_ns, past_ns)
+        return plan
 
     def _planned(self, items: Iterable[Item], *, lock_views: bool) -> Plan:
         locks: dict[str, list[Item]] = {}

@@ -88,12 +88,17 @@ class ClientBench:
             self.call(shard, self.core.keep_alive(shard, self.cell.now_ns))
 
     def begin(
-        self, *items: Item, lane: int = 0, wait_s: float = 5.0, hold_s: float = 60.0
+        self,
+        *items: Item,
+        lane: int = 0,
+        wait_s: float = 5.0,
+        hold_s: float = 60.0,
+        past_ns: int = 0,
     ) -> MultiLock:
-        """Start a lock without making its calls."""
+        """Start a lock, or a view of the past, without making its calls."""
         return self.core.begin(
             lane,
-            self.core.plan(items),
+            self.core.plan(items, past_ns=past_ns),
             now_ns=self.cell.now_ns,
             wait_ns=int(wait_s * S),
             hold_ns=int(hold_s * S),
