@@ -74,4 +74,5 @@ def _wall_ns(when: datetime | float) -> int:
         raise MisuseError(
             f"{when!r} is no moment; give a Position, an aware datetime or seconds since 1970"
         )
-    return round(when * 1e9) if isinstance(when, float) else when * 1_000_000_000
+    seconds = math.floor(when)
+    return seconds * 1_000_000_000 + round((when - seconds) * 1e9)

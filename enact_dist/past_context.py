@@ -71,7 +71,8 @@ class PastContext(Context):
 
         Raises:
             ForgottenError: A state of then has left its retention; never shown as another one.
-            MisuseError: A request locks, or names another moment; the moment lies in the future.
+            MisuseError: A request locks, or names another moment.
+            ClockSkewError: The moment lies in the future of a shard's clock.
             LockTimeoutError: A commit stamped before stays undecided.
             ShardUnreachableError: A shard does not answer.
         """

@@ -58,12 +58,18 @@ class DatumCache:
             return known.datum
 
     def put(self, slot: Slot, shard: str, epoch: int, version: int, datum: Datum) -> None:
-        """Remember a datum; forget older ones beyond the cap."""
+        """Remember a datum; forget older ones beyond the cap.
+
+        What was seen of the past stands in for nothing newer.
+        """
         if not CACHED_BYTES_MIN <= datum.size <= self._bytes_max:
             return
         with self._mutex:
-            old = self._known.pop(slot, None)
+            old = self._known.get(slot)
             if old is not None:
+                if (old.shard, old.epoch) == (shard, epoch) and version < old.version:
+                    return
+                del self._known[slot]
                 self._bytes -= old.datum.size
             self._known[slot] = _Known(shard, epoch, version, datum)
             self._bytes += datum.size

@@ -1,0 +1,184 @@
+"""The versions of a datum that are still known, and those that labels keep."""
+
+import time
+
+import numpy as np
+import pytest
+
+from enact_dist import Aspect, Durability, Entity, Lock, Write
+from enact_dist.errors import ForgottenError, MisuseError, NullDatumError, UnknownWorldError
+
+COUNT = Aspect("count", int)
+CLOUD = Aspect("cloud", np.ndarray, Durability.VOLATILE)
+FLEETING = Aspect("fleeting", int, Durability.VOLATILE, retention=2)
+ARM, LEG = Entity("arm"), Entity("leg")
+LEFT, RIGHT = Entity("left/arm"), Entity("right/arm")
+
+
+def put(world, entity, value, aspect=COUNT, *, stamp_ns=0):
+    request = Write(world, entity, aspect)
+    with Lock(request) as lock:
+        lock.put(request, value, stamp_ns=stamp_ns)
+    return lock.position
+
+
+def test_history_lists_versions_oldest_first_with_where_they_stand(online):
+    """Each says when it came, when it went, who made it; its datum is fetched when asked."""
+    positions = [put(online, ARM, 10 * number, stamp_ns=number + 1) for number in range(3)]
+
+    versions = online.history(ARM, COUNT)
+
+    assert [version.version for version in versions] == [1, 2, 3]
+    assert [version.position for version in versions] == positions
+    ends = [position.stamp_ns for position in positions[1:]]
+    assert [version.until_ns for version in versions] == [*ends, 0]
+    assert [version.stamp_ns for version in versions] == [1, 2, 3]
+    assert [version.datum() for version in versions] == [0, 10, 20]
+    assert all(version.cause is not None and version.cause.actor for version in versions)
+    assert (versions[0].world, versions[0].entity, versions[0].aspect) == (online, ARM, COUNT)
+
+
+def test_history_is_limited_by_count_and_time(online):
+    """The newest few, or what was current after a moment, the one current at it included."""
+    positions = [put(online, ARM, number) for number in range(5)]
+
+    assert [v.version for v in online.history(ARM, COUNT, count=2)] == [4, 5]
+    assert [v.version for v in online.history(ARM, COUNT, since=positions[2])] == [3, 4, 5]
+    for wrong in (0, -1, True, 1.5):
+        with pytest.raises(MisuseError, match=r"count is"):
+            online.history(ARM, COUNT, count=wrong)
+    with pytest.raises(MisuseError, match=r"in the future"):
+        online.history(ARM, COUNT, since=time.time() + 9.0)
+
+
+def test_deleted_state_is_a_version(online):
+    """It has no datum, and says why."""
+    put(online, ARM, 1)
+    request = Write(online, ARM, COUNT)
+    with Lock(request) as lock:
+        del lock[request]
+
+    versions = online.history(ARM, COUNT)
+
+    assert [version.null_reason for version in versions] == ["", "deleted"]
+    with pytest.raises(NullDatumError, match=r"deleted"):
+        versions[1].datum()
+
+
+def test_large_datum_of_a_version_is_its_own(online):
+    """Whatever was written since."""
+    clouds = [np.full(40_000, number, np.float64) for number in range(3)]
+    for cloud in clouds:
+        put(online, ARM, cloud, CLOUD)
+
+    versions = online.history(ARM, CLOUD)
+
+    assert [version.size_bytes for version in versions] == [320_000] * 3
+    for version, cloud in zip(versions, clouds, strict=True):
+        assert np.array_equal(version.datum(), cloud)
+
+
+def test_nothing_is_known_of_what_was_never_set(online):
+    """An empty history is no error where the context exists."""
+    assert online.history(ARM, Aspect("never", int)) == ()
+
+
+def test_history_of_a_dropped_context_is_gone(cell, online):
+    """Its versions do not come back under another one's number."""
+    what_if = online.fork("what_if")
+    put(what_if, ARM, 1)
+    (version,) = what_if.history(ARM, COUNT)
+    cell.drop_world("what_if")
+
+    with pytest.raises(UnknownWorldError, match=r"what_if"):
+        what_if.history(ARM, COUNT)
+    with pytest.raises(UnknownWorldError, match=r"what_if"):
+        version.datum()
+    put(cell.create_world("what_if"), ARM, 2)
+    with pytest.raises(ForgottenError):
+        version.datum()
+
+
+def test_history_of_a_fork_begins_with_what_it_was_forked_from(online):
+    """Its first version is caused by the fork."""
+    put(online, ARM, 1)
+    what_if = online.fork("what_if")
+    put(what_if, ARM, 2)
+
+    versions = what_if.history(ARM, COUNT)
+
+    assert [version.cause.kind for version in versions] == ["fork", "commit"]
+    assert [version.datum() for version in versions] == [1, 2]
+
+
+def test_datum_without_its_type_is_readable(online):
+    """As `raw` gives it."""
+    put(online, ARM, 1)
+
+    (version,) = online.history(ARM, Aspect("count", object))
+
+    assert version.datum() == 1
+
+
+# ---------------------------------------------------------------- kept
+
+
+def test_kept_version_outlives_its_retention(cell, online):
+    """It is listed, readable and named under its label; let go of, it is forgotten."""
+    put(online, ARM, 1, FLEETING)
+    (first,) = online.history(ARM, FLEETING)
+    cell.keep("drop-17", [first])
+    for number in range(2, 6):
+        put(online, ARM, number, FLEETING)
+    time.sleep(2.1)  # what is replaced stays for cuts for two seconds
+    put(online, ARM, 6, FLEETING)
+
+    versions = online.history(ARM, FLEETING)
+    assert [version.version for version in versions] == [1, 5, 6]
+    assert [version.kept for version in versions] == [("drop-17",), (), ()]
+    assert first.datum() == 1
+    kept = cell.kept()
+    assert [(version.slot, version.datum()) for version in kept["drop-17"]] == [(first.slot, 1)]
+
+    cell.let_go("drop-17")
+
+    assert cell.kept() == {}
+    with pytest.raises(ForgottenError):
+        first.datum()
+    with pytest.raises(ForgottenError, match=r"1 of the versions to keep under 'again' had left"):
+        cell.keep("again", [first])
+
+
+def test_labels_are_added_to_and_checked(cell, online):
+    """A label collects; what is no label or no version is refused."""
+    put(online, ARM, 1)
+    put(online, LEG, 2)
+    cell.keep("both", online.history(ARM, COUNT))
+
+    cell.keep("both", online.history(LEG, COUNT))
+
+    assert [version.entity for version in cell.kept()["both"]] == [ARM, LEG]
+    for label, versions, told in (
+        ("a b", online.history(ARM, COUNT), r"cannot name a label"),
+        ("empty", [], r"nothing to keep under 'empty'"),
+        ("wrong", [1], r"1 is no version"),
+    ):
+        with pytest.raises(MisuseError, match=told):
+            cell.keep(label, versions)
+    cell.let_go("nobody-has-used-this")
+
+
+def test_versions_of_several_shards_are_kept_under_one_label(two_stored):
+    """And outlive a restart of their shard."""
+    cell, online = two_stored.cell, two_stored.cell.world("online")
+    put(online, LEFT, 1)
+    put(online, RIGHT, 2)
+    cell.keep("both", [*online.history(LEFT, COUNT), *online.history(RIGHT, COUNT)])
+
+    two_stored.stop("right")
+    two_stored.start("right")
+
+    kept = cell.kept()["both"]
+    assert [(version.entity, version.datum()) for version in kept] == [(LEFT, 1), (RIGHT, 2)]
+    cell.let_go("both")
+    assert cell.kept() == {}

@@ -1,0 +1,71 @@
+"""Moments on a command line: written in five ways, printed in one that can be read again."""
+
+import time
+from argparse import ArgumentTypeError
+from datetime import UTC, datetime
+
+import pytest
+
+from enact_dist.cli.main import build_parser
+from enact_dist.cli.times import moment, shown_position
+from enact_dist.core.datum import Position
+from enact_dist.moments import stamp_of
+
+NOON_NS = 1_763_726_400_000_000_000
+
+
+@pytest.mark.parametrize(
+    ("text", "stamp_ns"),
+    [
+        ("2025-11-21T12:00:00Z", NOON_NS),
+        ("2025-11-21 13:00:00.5+01:00", NOON_NS + 500_000_000),
+        ("1763726400", NOON_NS),
+        ("1763726400.25", NOON_NS + 250_000_000),
+        (str(NOON_NS + 1), NOON_NS + 1),
+        (f"{NOON_NS + 1}@left", NOON_NS + 1),
+    ],
+)
+def test_moment_is_read_in_each_way_it_is_written(text, stamp_ns):
+    """A date, seconds, a stamp, a position."""
+    assert stamp_of(moment(text)) == stamp_ns
+
+
+@pytest.mark.parametrize(
+    ("text", "ago_s"), [("-30s", 30.0), ("-500ms", 0.5), ("-2.5min", 150.0), ("-1h", 3600.0)]
+)
+def test_moment_may_be_so_long_ago(text, ago_s):
+    """By this host's clock."""
+    assert moment(text) == pytest.approx(time.time() - ago_s, abs=1.0)
+
+
+def test_time_without_a_zone_is_that_of_this_host():
+    """As the tables print it."""
+    here = datetime.fromtimestamp(NOON_NS / 1e9, UTC).astimezone().replace(tzinfo=None)
+
+    assert stamp_of(moment(here.isoformat())) == NOON_NS
+
+
+@pytest.mark.parametrize("text", ["yesterday", "-30", "-3x", "12:00", "@left", ""])
+def test_what_is_no_moment_is_refused(text):
+    """With the ways it can be written."""
+    if text == "-30":
+        assert moment(text) == -30.0  # seconds since 1970, refused where it is used
+        return
+    with pytest.raises(ArgumentTypeError, match=r"is no moment; give a moment: -30s"):
+        moment(text)
+
+
+def test_printed_position_is_read_back():
+    """From a table to the next command."""
+    position = Position(NOON_NS + 7, "left")
+
+    assert moment(shown_position(position)) == position
+
+
+def test_moment_ago_is_no_option():
+    """Neither as an argument nor behind an option."""
+    arguments = build_parser().parse_args(["world", "fork", "online", "new", "--at", "-30s"])
+    past = build_parser().parse_args(["world", "at", "online", "-5min", "get", "a/b"])
+
+    assert arguments.at == pytest.approx(time.time() - 30.0, abs=1.0)
+    assert past.moment == pytest.approx(time.time() - 300.0, abs=1.0)
