@@ -24,6 +24,7 @@ from enact_dist.errors import (
     MisuseError,
     ReadonlyError,
 )
+from enact_dist.lock_reads import reads_of
 from enact_dist.lock_statistics import LockStatistics
 from enact_dist.reading import EachData, Readings, check_requested, null_error, slot_of
 from enact_dist.session import session_of
@@ -199,7 +200,8 @@ class Lock:
                 client.check_usable()
                 self._writing.fix()
                 writes = self._writing.by_shard(lock.shard_of)
-                client.finish(lock, writes, tuple(self._expects.values()))
+                reads = reads_of(self._readings, self._requests, self._each) if writes else ((), 0)
+                client.finish(lock, writes, tuple(self._expects.values()), *reads)
                 self.position = lock.position
         finally:
             # After a commit this is nothing; after an exception, an interrupt too, nothing is held.

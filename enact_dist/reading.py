@@ -11,13 +11,14 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Final, TypeVar, cast
 
 from enact_dist.core.datum import Slot
+from enact_dist.core.messages import DatumRead
 from enact_dist.errors import MisuseError, NotRequestedError, NullDatumError
 from enact_dist.link.fetching import fetch_all
 from enact_dist.terms import Access, Aspect, Entity, LockRequest, NullReason, pattern_matches
 from enact_dist.wire.payload import decode_datum
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable, Collection, Iterable
 
     from enact_dist.core.datum import Datum, LockId
     from enact_dist.core.lock_parts import Reading
@@ -29,7 +30,8 @@ T = TypeVar("T")
 
 UNSET: Any = object()
 _slot_at: Final = partial(tuple.__new__, Slot)
-"""Makes a slot of an address without looking at it again: in a third of the time."""
+_read_of: Final = partial(tuple.__new__, DatumRead)
+"""Make them of parts that were looked at before, in a third of the time."""
 AHEAD_BYTES_MAX: Final = 64 << 20
 """So many bytes are fetched before somebody has asked for each of the data."""
 
@@ -46,6 +48,7 @@ class Readings:
 
     Attributes:
         decoded: How many data were decoded so far.
+        looked_at: Those that are here still.
         asked: The requests they were asked for with, where not all may be read.
     """
 
@@ -61,7 +64,7 @@ class Readings:
         self._cache = cache
         self._lock = lock
         self._readings = {reading.state.slot: reading for reading in readings}
-        self._values: dict[Slot, object] = {}
+        self.looked_at: dict[Slot, object] = {}
         self._kept: dict[Slot, Datum] = {}
         self._fetched_alone = 0
         self.asked: Iterable[LockRequest[Any]] = ()
@@ -72,7 +75,7 @@ class Readings:
         """Forget all data: the lock is over, which `usable` says from now on."""
         self.usable = usable
         self._readings.clear()
-        self._values.clear()
+        self.looked_at.clear()
         self._kept.clear()
 
     def state(self, slot: Slot) -> SlotState | None:
@@ -85,6 +88,11 @@ class Readings:
         for reading in self._readings.values():
             if not is_null(reading.state):
                 yield reading.shard, reading.state
+
+    def versions(self, slots: Iterable[Slot]) -> list[DatumRead]:
+        """Return which version of each of these slots was shown, of those that were."""
+        shown = self._readings
+        return [_read_of(shown[slot].state[:3]) for slot in slots if slot in shown]
 
     def shard(self, slot: Slot) -> str:
         """Return the shard that showed the slot."""
@@ -143,12 +151,12 @@ class Readings:
             NullDatumError: The slot is null.
         """
         self.usable()
-        value = self._values.get(slot, UNSET)
+        value = self.looked_at.get(slot, UNSET)
         if value is UNSET:
             state = self.state(slot)
             if state is None or is_null(state):
                 raise null_error(slot, state)
-            value = self._values[slot] = decode_datum(self.datum(slot), aspect.datum_type)
+            value = self.looked_at[slot] = decode_datum(self.datum(slot), aspect.datum_type)
             self.decoded += 1
         return cast("T", value)
 
@@ -219,6 +227,10 @@ class EachData(Mapping[Entity, T]):
             self._fetch(slot)
         return self._data.value(slot, self._request.aspect)
 
+    def __contains__(self, entity: object) -> bool:
+        """Say whether there is a datum, without looking at it."""
+        return entity in self._slots
+
     def _fetch(self, slot: Slot) -> None:
         """Fetch a datum, and those behind it where the one before it was fetched last."""
         order = list(self._slots.values())
@@ -227,6 +239,10 @@ class EachData(Mapping[Entity, T]):
         slots = ahead(slot, order[at + 1 :], to_come) if in_order else [slot]
         self._data.fetch(slots)
         self._next = at + len(slots)
+
+    def slots(self) -> Collection[Slot]:
+        """Return the slots that hold the data."""
+        return self._slots.values()
 
     def values(self) -> ValuesView[T]:
         """Return the data in the order of their entities; large ones come together."""

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
     from enact_dist.core.datum import Position
-    from enact_dist.core.messages import Item, SlotVersion, WriteItem
+    from enact_dist.core.messages import DatumRead, Item, SlotVersion, WriteItem
 
 INTERRUPTIBLE_SLICE_NS: Final = 120_000_000
 """How long one call of a lock that may be told to stop waiting is parked."""
@@ -195,8 +195,17 @@ class CellClient(SessionClient):
         lock: MultiLock,
         writes: Mapping[str, Sequence[WriteItem]],
         expects: Sequence[SlotVersion] = (),
+        reads: tuple[DatumRead, ...] = (),
+        reads_left_out: int = 0,
     ) -> None:
         """Publish `writes` and give the lock back.
+
+        Args:
+            lock: What is held.
+            writes: What each shard has to set.
+            expects: What was viewed and must still be the newest.
+            reads: What went into the writes, for their lineage.
+            reads_left_out: How many further data did.
 
         Raises:
             ChangedError: An expected slot has moved on; nothing was written.
@@ -216,7 +225,13 @@ class CellClient(SessionClient):
                     self._check_open(lock)
                     finish_s = FINISH_S + bytes_with(named.values()) / BYTES_PER_S_MIN
                     give_up_ns = started_ns + int(finish_s * 1e9)
-                    lock.finish(named, give_up_ns=give_up_ns, expects=expects)
+                    lock.finish(
+                        named,
+                        give_up_ns=give_up_ns,
+                        expects=expects,
+                        reads=reads,
+                        reads_left_out=reads_left_out,
+                    )
             try:
                 self._drive(lock)
             except EnactError as error:
