@@ -29,6 +29,7 @@ from enact_dist.core.messages import (
 from enact_dist.errors import EnactError, MisuseError
 from enact_dist.forking import drop_world
 from enact_dist.history import keep_versions, kept_versions, let_go
+from enact_dist.lineage import causes_of, effects_of
 from enact_dist.lock import refuse_inside_lock
 from enact_dist.session import Session
 from enact_dist.terms import checked_name
@@ -39,7 +40,9 @@ if TYPE_CHECKING:
     from types import TracebackType
 
     from enact_dist.history import Version
+    from enact_dist.lineage import CauseTree, EffectTree, Made
     from enact_dist.link.client import CellClient
+    from enact_dist.terms import Aspect, Entity
 
 _open: set[Cell] = set()
 """Held strongly: handles made by a cell work on when nobody keeps the cell itself."""
@@ -122,7 +125,7 @@ class Cell:
 
     # ---------------------------------------------------------------- kept versions
 
-    def keep(self, label: str, versions: Iterable[Version[Any]]) -> None:
+    def keep(self, label: str, versions: Iterable[Version[Any] | Made]) -> None:
         """Keep versions from being forgotten, whatever their retention, until `let_go`.
 
         They stay listed and readable (`Version.datum`), and count in the shard's room.  Asked again
@@ -130,7 +133,8 @@ class Cell:
 
         Args:
             label: Letters, digits, ``_ . -``, slashes between.
-            versions: As `WorldContext.history` or `kept` returns them.
+            versions: As `WorldContext.history` or `kept` returns them, or those of a tree of
+                `why` or `impact` (`tree.walk()`) that are `known`.
 
         Raises:
             ForgottenError: Some had gone before; the others are kept.
@@ -207,6 +211,55 @@ class Cell:
         """
         refuse_inside_lock("outcome")
         return self._client.outcome(lock_id, timeout_s=timeout_s)
+
+    # ---------------------------------------------------------------- lineage
+
+    def why(
+        self,
+        world: WorldContext | str,
+        entity: Entity | str,
+        aspect: Aspect[Any] | str,
+        version: int = 0,
+        *,
+        depth: int | None = None,
+    ) -> CauseTree:
+        """Return where a datum comes from: who committed it, what went in, and so on.
+
+        Args:
+            world: Its world context.
+            entity: Its entity.
+            aspect: Its aspect.
+            version: Which version of it; 0 is the newest.
+            depth: How many steps to go back; None: as far as it is known, at most
+                `lineage.DEPTH_MAX`.
+
+        Returns:
+            A tree; what has left its retention stands in it as "forgotten".
+
+        Raises:
+            NullDatumError: Nothing was ever set there.
+            ForgottenError: The version itself has left its retention.
+            MisuseError: There is no such version yet, or no such entity or aspect can be.
+            UnknownWorldError: The cell has no world context of that name.
+            ShardUnreachableError: A shard does not answer.
+        """
+        return causes_of(self._session, (world, entity, aspect), version, depth)
+
+    def impact(
+        self,
+        world: WorldContext | str,
+        entity: Entity | str,
+        aspect: Aspect[Any] | str,
+        version: int = 0,
+        *,
+        depth: int | None = None,
+    ) -> EffectTree:
+        """Return what came of a datum: which versions it went into, and these, and so on.
+
+        Arguments and errors are those of `why`.  Effects that have left their retention cannot be
+        found any more.
+        """
+        return effects_of(self._session, (world, entity, aspect), version, depth)
 
     # ---------------------------------------------------------------- people
 

@@ -26,6 +26,7 @@ from enact_dist.core.messages import (
     Versions,
 )
 from enact_dist.errors import ForgottenError, MisuseError, ProtocolError
+from enact_dist.lineage import Made
 from enact_dist.link.refusals import error_of, moment_name
 from enact_dist.link.session_client import FINISH_S
 from enact_dist.moments import Moment
@@ -146,12 +147,12 @@ def kept_versions(
     }
 
 
-def keep_versions(session: Session, label: str, versions: Iterable[Version[Any]]) -> None:
+def keep_versions(session: Session, label: str, versions: Iterable[Version[Any] | Made]) -> None:
     """Keep versions under a label; see `Cell.keep`."""
     _check_label(label)
     by_shard: dict[str, list[SlotVersion]] = {}
     for version in versions:
-        if not isinstance(version, Version):
+        if not isinstance(version, Version | Made):
             raise MisuseError(
                 f"{version!r} is no version; keep what world.history(entity, aspect) returns"
             )
