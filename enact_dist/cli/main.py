@@ -19,7 +19,19 @@ import os
 import sys
 from typing import TYPE_CHECKING, Any, Final
 
-from enact_dist.cli import actor, bench, demo, doctor, lock, record, shard, up, verify, world
+from enact_dist.cli import (
+    actor,
+    bench,
+    demo,
+    doctor,
+    lineage,
+    lock,
+    record,
+    shard,
+    up,
+    verify,
+    world,
+)
 from enact_dist.cli.times import shielded
 from enact_dist.cli.verbs import DONE, FAILED, UNREACHABLE, USAGE
 from enact_dist.errors import ConfigError, EnactError, ShardUnreachableError
@@ -34,6 +46,7 @@ _EPILOG: Final = """\
 examples:
   enact up cell.toml                  run every shard and actor of a cell on this machine
   enact world tree online             what a world context knows
+  enact why online system/deviation   where a datum comes from, back to what was measured
   enact lock ls                       who holds what, and who waits for whom
   enact demo palletizing              watch actors report damaged packages
 
@@ -61,7 +74,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--debug", action="store_true", help="show tracebacks of errors")
     parser.add_argument("--version", action="store_true", help="print the version and leave")
     nouns = parser.add_subparsers(metavar="COMMAND", title="commands", dest="noun")
-    for noun in (up, shard, actor, world, record, lock, doctor, bench, verify, demo):
+    for noun in (up, shard, actor, world, lineage, record, lock, doctor, bench, verify, demo):
         noun.add_to(nouns)
     return parser
 

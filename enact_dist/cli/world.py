@@ -63,7 +63,7 @@ def _add_tree(verbs: argparse._SubParsersAction[Verb]) -> None:
 def _add_get(verbs: argparse._SubParsersAction[Verb]) -> None:
     get = add_verb(
         verbs, "get", "print or save one datum, as last committed", run=get_datum,
-        example="enact world get online system/deviations\n"
+        example="enact world get online system/deviation\n"
         "enact world get training product/surface --out surface.npz",
     )  # fmt: skip
     get.add_argument("world", metavar="WORLD", help="name of the world context")
