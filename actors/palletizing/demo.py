@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Final
 from actors.geometry.files import write_whole
 from actors.geometry.picture import png_bytes
 from actors.palletizing.demo_cell import DemoError, RunningCell
+from actors.palletizing.demo_lineage import show_lineage
 from actors.palletizing.demo_pictures import latest, model_picture, tray_picture
 from actors.palletizing.demo_report import difference_of, report_bytes, rows_of, score_of, table_of
 from actors.palletizing.simulation.packages import package_sequence
@@ -92,6 +93,7 @@ def run_demo(*, out: Path, packages: int = 12, seed: int = SEED, keep_running: b
             console.print("\n", table_of(rows), f"\n{score_of(rows)}", sep="")
             planned = cell.world("training").diff(cell.world("online"), PLACES, [STANDING])
             console.print("", difference_of(planned), "", sep="\n")
+            show_lineage(cell, rows[-1].product, console)
             _write_files(cell, out, report_bytes(rows, seed=seed))
             console.print(f"pictures in {out}; {time.monotonic() - started_s:.0f} s in all")
             if keep_running:

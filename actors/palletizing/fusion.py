@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from actors.geometry.fusion import fuse_views
 from actors.palletizing.vocabulary import (
@@ -15,35 +15,43 @@ from actors.palletizing.vocabulary import (
     product_entity,
     product_of_view,
 )
-from enact_dist import Actor, ViewEach, World, WriteEach
+from enact_dist import Actor, Entities, View, ViewEach, World, WriteEach
 
 if TYPE_CHECKING:
-    from enact_dist import Entity, Lock
+    from enact_dist import Lock
+
+EACH_VIEW: Final = Entities("view/**")
+"""The views one by one; a class names a datum by one pattern in one way, by `VIEWS` all."""
 
 
 class Fusion(Actor):
-    """Combine all views of a product into one surface, once the last one is there (ENACT 4.2)."""
+    """Combine all views of a product into one surface, once the last one is there (ENACT 4.2).
+
+    One update per view, which looks at the views of its product alone: whatever an update looks at
+    counts as a cause of the surface.
+    """
 
     training = World("training")
+    new = View(training, EACH_VIEW, SURFACE)
     scans = ViewEach(training, PRODUCTS, SCAN)
     viewpoints = ViewEach(training, VIEWS, VIEWPOINT)
     surfaces = ViewEach(training, VIEWS, SURFACE)
     models = WriteEach(training, PRODUCTS, SURFACE)
     newest = WriteEach(training, PRODUCTS, NEWEST_VIEW)
-    triggers = (surfaces,)
+    triggers = (new,)
 
     def update(self, lock: Lock) -> None:
-        """Fuse every product whose scan is complete and newer than its surface."""
+        """Fuse the product of the view, if its scan is complete and newer than its surface."""
+        name = product_of_view(lock.entity)
+        product = product_entity(name)
         surfaces, viewpoints = lock[self.surfaces], lock[self.viewpoints]
-        views: dict[Entity, list[Entity]] = {}
-        for view in sorted(surfaces):
-            views.setdefault(product_entity(product_of_view(view)), []).append(view)
-        for product, seen in views.items():
-            newest_ns = max(viewpoints[view].captured_ns for view in seen)
-            complete = len(seen) >= lock[self.scans].get(product, len(seen) + 1)
-            if complete and lock[self.newest].get(product, 0) < newest_ns:
-                lock[self.models][product] = fuse_views(
-                    [surfaces[view] for view in seen],
-                    [viewpoints[view].acquisition for view in seen],
-                )
-                lock[self.newest][product] = newest_ns
+        seen = sorted(view for view in surfaces if product_of_view(view) == name)
+        if len(seen) < lock[self.scans].get(product, len(seen) + 1):
+            return
+        newest_ns = max(viewpoints[view].captured_ns for view in seen)
+        if lock[self.newest].get(product, 0) < newest_ns:
+            lock[self.models][product] = fuse_views(
+                [surfaces[view] for view in seen],
+                [viewpoints[view].acquisition for view in seen],
+            )
+            lock[self.newest][product] = newest_ns

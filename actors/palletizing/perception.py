@@ -60,7 +60,7 @@ class TrainingPerception(Actor):
 
     def update(self, lock: Lock) -> None:
         """Take the next missing image, if one is missing."""
-        if lock.get(self.empty) is None:
+        if lock.is_null(self.empty):
             lock[self.empty] = self.tray_sensor.capture_empty()
             return
         done = lock[self.viewpoints].keys()
@@ -69,9 +69,10 @@ class TrainingPerception(Actor):
             for number in range(wanted):
                 view = view_entity(name, number)
                 if view not in done:
-                    frame = self.sensor.capture(name, number, wanted)
-                    lock[self.clouds][view] = product_on_plate(frame)
-                    lock[self.viewpoints][view] = Viewpoint(frame.acquisition, time.time_ns())
+                    frame, now_ns = self.sensor.capture(name, number, wanted), time.time_ns()
+                    cloud, viewpoint = product_on_plate(frame), Viewpoint(frame.acquisition, now_ns)
+                    lock[self.clouds].put(view, cloud, stamp_ns=now_ns)
+                    lock[self.viewpoints].put(view, viewpoint, stamp_ns=now_ns)
                     return
 
 
@@ -109,9 +110,8 @@ class OnlinePerception(Actor):
             before = lock[self.empty]
         else:
             before = lock[self.observations][last].frame
-        lock[self.observations][place_entity(stop)] = Observation(
-            frame, before.depth_mm, tuple(new), captured_ns
-        )
+        seen = Observation(frame, before.depth_mm, tuple(new), captured_ns)
+        lock[self.observations].put(place_entity(stop), seen, stamp_ns=captured_ns)
 
     def _update_packages(self, lock: Lock, frame: DepthFrame, stop: int, tray: int) -> list[str]:
         """Match all pieces on the tray to package entities; return the names of this stop's."""

@@ -199,7 +199,7 @@ STANDING: Final = Aspect(
 )
 """What stands there (place/*, both): ``training.diff(online, PLACES, [STANDING])`` names what is
 not as it should be."""
-DEVIATIONS: Final = Aspect("deviations", dict[str, Deviation])
+DEVIATIONS: Final = Aspect("deviation", dict[str, Deviation])
 """The flags, by name of the place (system)."""
 NOTICES: Final = Aspect("notices", dict[str, Notice])
 """What was told, by name of the place (user)."""

@@ -1,0 +1,46 @@
+"""What a demonstration shows of lineage: where its last verdict comes from, what came of a view."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from actors.palletizing.vocabulary import CLOUD, DEVIATIONS, SYSTEM, view_entity
+from enact_dist.cli.lineage import drawn
+from enact_dist.cli.output import print_tree
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from enact_dist import Cell
+    from enact_dist.lineage import CauseTree, EffectTree
+
+CAUSES_DEPTH: Final = 3
+"""Verdict, model, surfaces of the views, their clouds."""
+EFFECTS_DEPTH: Final = 3
+"""Cloud of a view, its surface, the model, the verdicts."""
+
+
+def verdict_causes(cell: Cell) -> CauseTree:
+    """Return where the newest verdict comes from, back to the depth frame and to the views."""
+    return cell.why("online", SYSTEM, DEVIATIONS, depth=CAUSES_DEPTH)
+
+
+def view_effects(cell: Cell, product: str) -> EffectTree:
+    """Return what came of the first view of a product, on to the verdicts that rest on it."""
+    return cell.impact("training", view_entity(product, 0), CLOUD, depth=EFFECTS_DEPTH)
+
+
+def show_lineage(cell: Cell, product: str, console: Console) -> None:
+    """Print both trees under the commands that print them.
+
+    Args:
+        cell: The cell, after its last verdict.
+        product: The product whose first view is followed.
+        console: Where progress and table were printed.
+    """
+    slot = f"{SYSTEM}/{DEVIATIONS}"
+    console.print(f"\nenact why online {slot}", style="bold")
+    print_tree(drawn(verdict_causes(cell)))
+    slot = f"{view_entity(product, 0)}/{CLOUD}"
+    console.print(f"\nenact impact training {slot}", style="bold")
+    print_tree(drawn(view_effects(cell, product)))
