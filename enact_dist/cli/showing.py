@@ -122,6 +122,11 @@ def save(datum: object, name: str) -> str:
     raise ConfigError(f"{path}: the ending says how to save: .npz, .npy or .json")
 
 
+def has_arrays(datum: object) -> bool:
+    """Say whether an array is some part of a datum."""
+    return next(_arrays(datum, ""), None) is not None
+
+
 def _arrays(datum: object, where: str) -> Iterator[tuple[str, NDArray[Any]]]:
     """Yield every array of a datum with its path in it."""
     if isinstance(datum, np.ndarray):

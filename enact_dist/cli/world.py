@@ -1,11 +1,11 @@
-"""`enact world ls|tree|get|put|watch`; what is about time, or compares, stands beside it."""
+"""`enact world ls|tree|get|put|watch`; what is about time, compares or exports stands beside."""
 
 from __future__ import annotations
 
 import time
 from typing import TYPE_CHECKING, Any
 
-from enact_dist.cli import world_diff, world_time
+from enact_dist.cli import world_diff, world_export, world_time
 from enact_dist.cli.output import print_json, print_json_line, print_table, shown_bytes
 from enact_dist.cli.slots import print_datum, print_slots
 from enact_dist.cli.verbs import (
@@ -47,6 +47,7 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
     _add_watch(verbs)
     world_time.add_verbs(verbs)
     world_diff.add_diff(verbs)
+    world_export.add_export(verbs)
 
 
 def _add_tree(verbs: argparse._SubParsersAction[Verb]) -> None:

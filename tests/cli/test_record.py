@@ -103,6 +103,39 @@ def test_what_it_shows_can_be_said(enact, cell_file, put, tmp_path):
     assert "unfit count image: 1" in done.out
 
 
+def test_export_into_a_file_and_a_folder(enact, cell_file, put, tmp_path):
+    """A recording that replays, or files of common formats with an index."""
+    put("exported", a=1)
+    put("exported", a=2, b=3)
+    words = ("world", "export", "exported", "--cell", cell_file, "--json", "--out")
+    done = enact(*words, tmp_path / "now.mcap")
+    assert (done.status, done.json["data"]) == (0, 2)
+    done = enact("replay", tmp_path / "now.mcap", "--into", cell_file, "--world", "exported=again")
+    assert (done.status, enact("world", "get", "again", "a/count", "--cell", cell_file).out) == (
+        0,
+        "2\n",
+    )
+    done = enact(*words, tmp_path / "folder")
+    assert json.loads((tmp_path / "folder" / "b" / "count.json").read_text()) == 3
+    index = json.loads((tmp_path / "folder" / "index.json").read_text())
+    assert [(each["entity"], each["version"], each["files"]) for each in index] == [
+        ("a", 2, ["a/count.json"]),
+        ("b", 1, ["b/count.json"]),
+    ]
+    refused = enact(*words, tmp_path / "folder")
+    assert (refused.status, "exists" in refused.err) == (2, True)
+
+
+def test_export_as_of_a_position(enact, cell_file, put, tmp_path):
+    """What was committed later is not in it."""
+    put("past", a=1)
+    position = enact("world", "history", "past", "a/count", "--cell", cell_file, "--json").json
+    stamp_ns = position[-1]["stamp_ns"]
+    put("past", a=2, b=2)
+    words = ("world", "export", "past", "--at", stamp_ns, "--cell", cell_file, "--json")
+    assert enact(*words, "--out", tmp_path / "past.mcap").json["data"] == 1
+
+
 def test_missing_library_is_named_with_its_extra(cell_file, tmp_path):
     """Who has not installed it is told what to install."""
     code = (

@@ -10,9 +10,12 @@ import pytest
 from mcap.reader import make_reader
 
 from enact_dist import Aspect, Durability, Entity, Lock, Write
+from enact_dist.core import history
 from enact_dist.errors import ConfigError, StoreError, UnknownWorldError
+from enact_dist.link import notices
 from enact_dist.recording import Recorder, Replay, Shows, export_world, recorder
 from enact_dist.recording.exporting import world_as_of
+from enact_dist.recording.file import RecordingFile
 from enact_dist.recording.reading import Recording
 
 COUNT = Aspect("count", int)
@@ -219,6 +222,61 @@ def test_recording_of_a_replay_is_the_recording(cell, online, tmp_path):
 
 
 # ---------------------------------------------------------------- what is missing
+
+
+def test_versions_without_a_notice_come_from_the_history(cell, online, tmp_path, monkeypatch):
+    """A recorder whose queue of notices overflows still has every version that is kept."""
+    monkeypatch.setattr(notices.NoticeQueue.__init__, "__kwdefaults__", {"notices_max": 4})
+    keeping = Aspect("kept", int, retention=100)
+    path = tmp_path / "run.mcap"
+    entered, go_on = threading.Event(), threading.Event()
+    listen = Recorder._listen
+
+    def paused(self, watch):
+        if self.summary.commits:
+            entered.set()
+            assert go_on.wait(20)
+        listen(self, watch)
+
+    monkeypatch.setattr(Recorder, "_listen", paused)
+    with Running(cell, path) as summary:
+        put((Write(online, piece, keeping), 0))
+        assert entered.wait(20)
+        for number in range(1, 30):
+            put((Write(online, piece, keeping), number))
+        put((Write(online, bench, keeping), 0))
+        go_on.set()
+    assert summary.gaps == {}
+    versions = [v.version for c in commits_of(path) for v in c.versions if v.slot.entity == "piece"]
+    assert versions == list(range(1, 31))
+
+
+def test_disk_that_is_too_slow_costs_no_memory_and_is_named(cell, online, tmp_path, monkeypatch):
+    """What its shard forgets meanwhile is counted, and stands by name in summary and file."""
+    monkeypatch.setattr(history, "LOOSE_NS", 0)
+    go_on, write = threading.Event(), RecordingFile.add_commit
+
+    def slow(self, versions, log_ns):
+        assert go_on.wait(60)
+        write(self, versions, log_ns)
+
+    monkeypatch.setattr(RecordingFile, "add_commit", slow)
+    fleeting = Aspect("fleeting", int, retention=1)
+    path = tmp_path / "run.mcap"
+    with Running(cell, path, queue_bytes=1) as summary:
+        for number in range(40):
+            put((Write(online, piece, fleeting), number))
+        go_on.set()
+    commits = commits_of(path)
+    recorded = [v.version for c in commits for v in c.versions]
+    assert recorded[-1] == 40
+    assert len(recorded) + summary.missing == 40
+    assert summary.missing
+    assert summary.gap_slots == {"online:piece/fleeting": summary.missing}
+    with path.open("rb") as stream:
+        gaps = list(make_reader(stream).iter_messages(topics=["/enact/gaps"]))
+    assert len(gaps) == summary.missing
+    assert Recording(path).facts["cell"] == "local"
 
 
 def test_too_many_that_wait_are_dropped_by_name(cell, online, tmp_path, monkeypatch):
