@@ -103,7 +103,7 @@ class DiffWatch:
         change = self._watch.next(wait_s)
         while change is not None:
             place = change.entity.name, change.aspect
-            if change.null or self._seen.get((change.world, place)) != change.position.stamp_ns:
+            if self._seen.get((change.world, place)) != change.position.stamp_ns:
                 self._changed[place] = None
             if change.aspect not in self._types:
                 self._types |= aspects_of(self._worlds, (change.aspect,))

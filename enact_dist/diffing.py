@@ -234,14 +234,18 @@ def _batches(pairs: Iterable[Pair]) -> Iterator[list[Pair]]:
 def _same_versions(pairs: Sequence[_Whole], first: Sight, second: Sight) -> set[Place]:
     """Return the slots whose two sides are one version, so that their data are the same.
 
-    Two versions are one if slot and stamp agree.  Where a context is a fork, large data that could
-    be the same are followed to where they were written; small ones have come already.
+    Two versions are one if slot and stamp agree.  Where a context is a fork, data that could be the
+    same are followed to where they were written.
     """
     if first.session is not second.session:
         return set()  # another cell may have the same names and stamps
     same = {pair.place for pair in pairs if _written(pair.left) == _written(pair.right)}
     if first.forked or second.forked:
-        asked = [pair for pair in pairs if pair.place not in same and _may_share(pair)]
+        asked = [
+            pair
+            for pair in pairs
+            if pair.place not in same and pair.left.state.size == pair.right.state.size
+        ]
         left = origins(first.session, [pair.left for pair in asked])
         right = origins(first.session, [pair.right for pair in asked])
         same |= {
@@ -254,12 +258,6 @@ def _same_versions(pairs: Sequence[_Whole], first: Sight, second: Sight) -> set[
 
 def _written(reading: Reading) -> tuple[object, int]:
     return reading.state.slot, reading.state.stamp_ns
-
-
-def _may_share(pair: _Whole) -> bool:
-    states = pair.left.state, pair.right.state
-    to_come = any(state.large or state.same for state in states)
-    return to_come and states[0].size == states[1].size
 
 
 def _difference(place: Place, aspect: Aspect[Any], left: Datum, right: Datum) -> Difference:

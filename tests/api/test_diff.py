@@ -333,3 +333,32 @@ def test_context_that_is_gone_is_named(online, cell):
 
     with pytest.raises(UnknownWorldError, match="no world context 'gone'"):
         online.diff(WorldContext("gone", online.session))
+
+
+def test_what_a_fork_has_not_written_is_not_fetched(online, fetched):
+    """A fork shares its versions with its source, and a fork of a fork with both."""
+    put(online, bench, LARGE, np.zeros(100_000))
+    put(online, piece, LARGE, np.zeros(100_000))
+    put(online, piece, COUNT, 1)
+    first = online.fork("what_if")
+    second = first.fork("what_then")
+    assert not online.diff(first)
+    assert fetched == []
+    put(second, piece, LARGE, np.ones(100_000))
+
+    for source in (online, first):
+        diff = source.diff(second)
+        assert shown(diff) == [("piece", "large", "changed")]
+        assert (diff.equal, diff.same) == (2, 2)
+        assert {(slot.entity, slot.aspect) for slot in fetched} == {("piece", "large")}
+    assert shown(first.diff(second, bench)) == []
+
+
+def test_fork_is_compared_with_what_its_source_has_become(online, fetched):
+    """The version that both had is not the newest of the source any more."""
+    put(online, piece, LARGE, np.zeros(100_000))
+    fork = online.fork("what_if")
+    put(online, piece, LARGE, np.ones(100_000))
+    (row,) = online.diff(fork)
+    assert row.difference.distance == 1.0
+    assert not fork.diff(online.at(row.right.position))

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from datetime import datetime
 from typing import assert_type
 
 from enact_dist import (
@@ -11,12 +10,9 @@ from enact_dist import (
     Entities,
     Entity,
     Lock,
-    PastContext,
     Read,
     ReadEach,
-    Version,
     View,
-    ViewEach,
     World,
     Write,
     WriteEach,
@@ -58,25 +54,6 @@ def count_contacts() -> None:
         snapshot = online.view(view)
         assert_type(snapshot[view], int)
         assert_type(snapshot.get(view, 0), int)
-
-
-def travel(when: datetime) -> None:
-    with connect("cell.toml") as cell:
-        online = cell.world("online")
-        versions = online.history(bench, COUNT, since=when, count=5)
-        assert_type(versions, tuple[Version[int], ...])
-        assert_type(versions[0].datum(), int)
-        past = online.at(versions[0].position)
-        mesh, each = View(past, piece, MESH), ViewEach(past, Entities("view/*"), MESH)
-        snapshot = past.view(mesh, each)
-        assert_type(snapshot[mesh], Mesh)
-        assert_type(snapshot[each], Mapping[Entity, Mesh])
-        assert_type(online.at(when), PastContext)
-        assert_type(online.at(1763719200.5), PastContext)
-        assert_type(online.at(stamp_ns=17, nearest=True), PastContext)
-        assert_type(online.fork("what_if", at=when).forked_from, tuple[str, int] | None)
-        cell.keep("label", [*versions, *online.history(piece, MESH)])
-        assert_type(cell.drop_world("what_if"), int)
 
 
 class Inspect(Actor):

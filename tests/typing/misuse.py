@@ -47,7 +47,3 @@ Read(bench, COUNT, world)  # wrong: argument order
 ReadEach(world, bench, COUNT)  # wrong: an entity is no pattern
 Lock(bench)  # wrong: no request
 world.view(bench)  # wrong: no request
-world.at("yesterday")  # wrong: no moment
-world.at()  # wrong: neither a moment nor a capture stamp
-world.history(bench, COUNT)[0].datum().upper()  # wrong: datum type
-Lock(world.at(1.0))  # wrong: no request
