@@ -1,0 +1,118 @@
+"""A recorder that is killed at any moment leaves a recording that is good up to its last chunk."""
+
+import os
+import random
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from mcap.exceptions import McapError
+from mcap.records import Message
+from mcap.stream_reader import StreamReader
+
+from enact_dist.recording.reading import Recording
+
+HERE = Path(__file__).parent
+ENVIRONMENT = {**os.environ, "PYTHONPATH": str(HERE.parents[1]), "PYTHONUNBUFFERED": "1"}
+ROUNDS = 8
+
+
+@pytest.fixture
+def started():
+    """Start a process, which is killed with the test; it may be told to be ready by a line."""
+    processes = []
+
+    def start(*words, ready):
+        process = subprocess.Popen(
+            [sys.executable, *map(str, words)],
+            env=ENVIRONMENT,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        processes.append(process)
+        for line in process.stdout if ready else ():
+            if ready in line:
+                break
+        return process
+
+    yield start
+    for process in processes:
+        process.kill()
+        process.wait()
+        process.stdout.close()
+
+
+@pytest.fixture
+def endpoint(tmp_path, started):
+    """One shard that commits are made at all the time."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        address = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    file = tmp_path / "cell.toml"
+    file.write_text(f'name = "killed"\n[shards.only]\nlisten = "{address}"\n')
+    started("-m", "enact_dist.cli.main", "shard", "run", "only", "--cell", file, ready="ready")
+    started(HERE / "loaded_cell.py", address, 0.002, ready="committing")
+    return address
+
+
+@pytest.mark.slow
+def test_killed_recorder_leaves_whole_commits_without_a_hole(endpoint, started, tmp_path):
+    """Commits are whole, follow each other, and end at most a chunk before the kill."""
+    seeds = random.Random(7)
+    held = []
+    for turn in range(ROUNDS):
+        path = tmp_path / f"{turn}.mcap"
+        recorder = started(
+            "-m", "enact_dist.cli.main", "record", endpoint, "--out", path, "--world", "online",
+            ready="",
+        )  # fmt: skip
+        while not (path.exists() and path.stat().st_size > 5_000):
+            assert recorder.poll() is None, recorder.stdout.read()
+            time.sleep(0.01)
+        time.sleep(seeds.uniform(0.0, 2.5))
+        recorder.send_signal(signal.SIGKILL)
+        killed_ns = time.time_ns()
+        recorder.wait()
+
+        recording = Recording(path)
+        commits = list(recording.commits())
+        numbered = [commit for commit in commits if commit.number]
+        assert not recording.whole
+        assert [commit.number for commit in numbered] == list(range(1, len(numbered) + 1))
+        for commit in numbered:
+            assert [v.slot.entity for v in commit.versions] == ["left", "right"]
+            left, right = commit.versions
+            assert bytes(left.datum.body) == bytes(right.datum.body)
+        if not commits:
+            continue  # killed in its first chunk
+        versions = [commit.versions[0].version for commit in commits]
+        assert versions == list(range(versions[0], versions[0] + len(versions)))
+        assert killed_ns - commits[-1].log_ns < 4e9
+        assert _publicly_readable(path) == 4 * len(commits)
+        held.append(len(numbered))
+    assert max(held) > 50, "under load"
+
+
+def _publicly_readable(path):
+    """Count the messages that the public library reads before it meets the cut."""
+    count = 0
+    try:
+        with path.open("rb") as stream:
+            for record in StreamReader(stream, validate_crcs=True).records:
+                count += isinstance(record, Message)
+    except (McapError, ValueError, RuntimeError, OSError, *_library_errors()):
+        return count
+    raise AssertionError("a killed recorder's file has no end")
+
+
+def _library_errors():
+    import struct
+
+    import zstandard
+
+    return struct.error, zstandard.ZstdError
