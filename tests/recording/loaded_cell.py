@@ -12,7 +12,7 @@ import numpy as np
 
 from enact_dist import Aspect, Entity, Lock, Write, connect
 
-NUMBER = Aspect("number", np.ndarray)
+NUMBER = Aspect("number", np.ndarray, retention=400)
 
 
 def main():
