@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 import numpy as np
 
 from enact_dist.core.datum import Slot
-from enact_dist.core.message_parts import CAUSE_FORK
+from enact_dist.core.message_parts import CAUSE_FORK, DatumRead
 from enact_dist.core.messages import Explain, Item, SlotVersion, Versions
 from enact_dist.errors import MisuseError
 from enact_dist.link.fetching import fetch_all
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from enact_dist.core.datum import Datum
     from enact_dist.core.lock_parts import Reading
     from enact_dist.core.multilock import MultiLock
+    from enact_dist.link.client import CellClient
     from enact_dist.session import Session
 
 SIGHT_WAIT_S: Final = 10.0
@@ -226,35 +227,48 @@ def _type_used(sessions: Iterable[Session], name: str) -> Aspect[Any]:
 # ---------------------------------------------------------------- what need not be fetched
 
 
-def origins(session: Session, readings: Iterable[Reading]) -> dict[Slot, tuple[Slot, int]]:
-    """Return by slot where its version was written: in which slot, and with which stamp.
+def origins(session: Session, readings: Iterable[Reading]) -> dict[Slot, DatumRead]:
+    """Return by slot where its version was written: a fork's copy was in what it was forked from.
 
-    A version of a fork that nobody has replaced there was written in the context that it was
-    forked from.
+    Copies bear the stamp of their fork, so nothing else is asked about.  One whose source is not
+    known any more counts as written where it is.
 
     Raises:
         ShardUnreachableError: A shard does not answer.
     """
     client = session.client
-    found = {one.state.slot: (one.state.slot, one.state.stamp_ns) for one in readings}
-    at = {one.state.slot: SlotVersion(one.state.slot, one.state.version) for one in readings}
+    forked_ns = {name: entry.at_ns for name, entry in client.worlds().items() if entry.source}
+    found = {
+        one.state.slot: DatumRead(one.state.slot, one.state.version, one.state.stamp_ns)
+        for one in readings
+    }
+    moved = dict(found)
     for _ in range(GENERATIONS_MAX):
-        asked: dict[str, list[SlotVersion]] = {}
-        for version in at.values():
-            asked.setdefault(client.shard_of(version.slot.entity), []).append(version)
-        if not asked:
+        copies = {
+            slot: at for slot, at in moved.items() if forked_ns.get(at.slot.context) == at.stamp_ns
+        }
+        if not copies:
             break
-        answers = client.call_all([(shard, Explain(tuple(some))) for shard, some in asked.items()])
-        told = [answer.entries for answer in answers if isinstance(answer, Versions)]
-        causes = {entry.state.slot: entry.cause for entries in told for entry in entries}
-        before, at = at, {}
-        for slot, version in before.items():
-            cause = causes.get(version.slot)
-            if cause is not None and cause.kind == CAUSE_FORK and cause.reads:
-                source = cause.reads[0]
-                found[slot] = (source.slot, source.stamp_ns)
-                at[slot] = SlotVersion(source.slot, source.version)
+        sources = _sources(client, copies.values())
+        moved = {slot: sources[at.slot] for slot, at in copies.items() if at.slot in sources}
+        found |= moved
     return found
+
+
+def _sources(client: CellClient, copies: Iterable[DatumRead]) -> dict[Slot, DatumRead]:
+    """Return by slot what these copies were made of, as far as that is known."""
+    asked: dict[str, list[SlotVersion]] = {}
+    for copy in copies:
+        shard = client.shard_of(copy.slot.entity)
+        asked.setdefault(shard, []).append(SlotVersion(copy.slot, copy.version))
+    answers = client.call_all([(shard, Explain(tuple(some))) for shard, some in asked.items()])
+    return {
+        entry.state.slot: entry.cause.reads[0]
+        for answer in answers
+        if isinstance(answer, Versions)
+        for entry in answer.entries
+        if entry.cause is not None and entry.cause.kind == CAUSE_FORK and entry.cause.reads
+    }
 
 
 def same_datum(left: Datum, right: Datum) -> bool:

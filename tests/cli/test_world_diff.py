@@ -193,3 +193,42 @@ def test_equal_contexts_exit_with_0_and_unknown_ones_with_1(diff):
     assert diff("online", "online").status == 0
     failed = diff("online", "no_such_world")
     assert (failed.status, "no world context 'no_such_world'" in failed.err) == (1, True)
+
+
+def test_contexts_are_seen_at_one_moment_over_both_shards(cell):
+    """What one lock writes to both contexts, on both shards, never differs in between."""
+    import threading
+
+    training, online = cell.world("training"), cell.world("online")
+    requests = [
+        Write(world, Entity(f"sum/{number}"), COUNT)
+        for world in (training, online)
+        for number in range(4)
+    ]
+    assert len({cell._session.shard_of(_slot(one)) for one in requests}) == 2
+    stop = threading.Event()
+
+    def write(value=0):
+        while True:
+            with Lock(*requests) as lock:
+                for one in requests:
+                    lock[one] = value
+            if stop.is_set():
+                return
+            value += 1
+
+    write_once = threading.Thread(target=write)
+    write_once.start()
+    try:
+        diffs = [training.diff(online, "sum/*", [COUNT]) for _ in range(40)]
+    finally:
+        stop.set()
+        write_once.join()
+    assert [len(diff) for diff in diffs] == [0] * 40
+    assert diffs[-1].equal == 4
+
+
+def _slot(request):
+    from enact_dist.reading import slot_of
+
+    return slot_of(request)
