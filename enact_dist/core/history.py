@@ -193,7 +193,7 @@ class History:
                 found.unindex(old)
             if found.stored:
                 self._forgotten.append(SlotVersion(found.slot, old.version))
-        if len(found.states) > max(found.held, found.young):
+        if found.young < len(found.states) > found.held:
             self._trim(found)
 
     def _trim(self, found: SlotHistory) -> None:
@@ -224,13 +224,10 @@ class History:
             or self._loose_bytes > LOOSE_BYTES_MAX
             or len(recent) > LOOSE_STATES_MAX
         ):
-            self._end_oldest_recent()
-
-    def _end_oldest_recent(self) -> None:
-        _, found = self._recent.popleft()
-        found.young -= 1
-        if len(found.states) > max(found.held, found.young):
-            self._trim(found)
+            found = recent.popleft()[1]
+            found.young -= 1
+            if found.young < len(found.states) > found.held:
+                self._trim(found)
 
     def grow_old(self, now_ns: int) -> None:
         """Forget what has become too old by a stamp."""
@@ -289,7 +286,7 @@ class History:
             return 0, 0
         states = self.count + self._loose
         while self._recent and before - self._payloads.spare < size:
-            self._end_oldest_recent()
+            self._end_recent(self._recent[0][0] + 1)
         while before - self._payloads.spare < size and self._drop_oldest():
             pass
         return states - self.count - self._loose, before - self._payloads.spare

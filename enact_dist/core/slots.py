@@ -353,7 +353,9 @@ class SlotMap:
         from_ns, left = 0, self._answer_bytes_max
         for item in items:
             each = ACCESSES[item.access].each
-            for slot, newest in self._asked(item):
+            slot = Slot(item.context, item.entity, item.aspect)
+            found = self._asked(item) if each else ((slot, self[slot]),)
+            for slot, newest in found:
                 content = self.at(slot, newest, at_ns) if at_ns else newest
                 # Of the newest one as of then, too, where an older version is asked: what was
                 # captured when is certain only from its commit on.
