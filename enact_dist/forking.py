@@ -70,17 +70,19 @@ def fork_world(session: Session, source: str, name: str, *, at_ns: int = 0) -> N
     def request_of(_shard: str, epoch: int, count: int) -> Fork:
         return Fork(client.core.session, name, source, at_ns, epoch, count)
 
+    done: list[str] = []
     left, refusal = list(client.shards()), ""
     deadline_s = time.monotonic() + FINISH_S
     while left and (left_s := deadline_s - time.monotonic()) > 0.0:
-        for shard, answer in client.ask_each(left, request_of, timeout_s=left_s).items():
-            if isinstance(answer, Forked):
-                left.remove(shard)
-            elif isinstance(answer, Refused) and _is_busy(answer):
+        answers = client.ask_each(left, request_of, timeout_s=left_s)
+        done += [shard for shard, answer in answers.items() if isinstance(answer, Forked)]
+        for answer in answers.values():
+            if isinstance(answer, Refused) and _is_busy(answer):
                 refusal = answer.text  # an undecided commit stands in the way: ask again
-            elif answer is not None:
-                _take_back(session, name, [s for s in client.shards() if s not in there])
+            elif answer is not None and not isinstance(answer, Forked):
+                _take_back(session, name, [shard for shard in done if shard not in there])
                 raise _failure(answer)
+        left = [shard for shard in left if shard not in done]
         if left:
             client.rest(PAUSE_S)
     _learn_worlds(session)
@@ -122,7 +124,7 @@ def _failure(answer: Answer) -> EnactError:
 
 
 def _take_back(session: Session, name: str, shards: list[str]) -> None:
-    """Drop what has come to be of a fork on shards where there was no such context before."""
+    """Drop a fork on shards that have just made it; elsewhere the name may be somebody else's."""
     for shard, answer in _dropped(session, name, shards, timeout_s=UNDO_S).items():
         if not isinstance(answer, Dropped):
             _log.warning("shard %s may have a part of the fork %s: drop it", shard, name)
