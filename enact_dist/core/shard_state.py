@@ -95,6 +95,8 @@ class ShardState:
             ),
         )
         stamps = [record.stamp_ns for record in recovered.slots]
+        # A fork without slots here was made as of then, too: nothing may be committed before.
+        stamps += [record.at_ns for record in recovered.worlds]
         stamps += [record.position.stamp_ns for record in recovered.outcomes]
         stamps += [record.position.stamp_ns for record in recovered.decisions]
         self.stamps = Stamps(max(stamps, default=0))

@@ -334,6 +334,17 @@ def test_fork_survives_a_restart_of_its_shard(bench):
     assert isinstance(fork(bench, at_ns=at_ns), Forked)
 
 
+def test_nothing_is_committed_before_a_fork_after_a_restart(bench):
+    """Other shards fork as of the same stamp, though this one has no slot to remember it by."""
+    at_ns = bench.wall_ns + S // 2
+    assert isinstance(fork(bench, source="training", at_ns=at_ns), Forked)
+
+    bench.restart()
+    bench.hello("ann", known_epoch=bench.shard.epoch)
+
+    assert write(bench, "5") > at_ns
+
+
 def test_stored_bytes_are_named_and_not_written_again(bench):
     """The record of a slot says of which version its bytes are."""
     write(bench, "1")
