@@ -42,6 +42,13 @@ OF_A_SHARD: Final[dict[str, Counter]] = {
     "decisions": Counter("commits over several shards that were decided here"),
     "commits_finished": Counter("prepared commits that were applied"),
     "views_waited": Counter("views that waited for a commit over several shards to be decided"),
+    "views_forgotten": Counter(
+        "views of a past that has left its retention",
+        "retain more: Aspect(…, retention=…) or cell.toml",
+    ),
+    "worlds_forked": Counter("world contexts that were forked"),
+    "worlds_dropped": Counter("world contexts that were dropped"),
+    "forks_waited": Counter("forks that waited for a commit over several shards to be decided"),
     # Things that happen where messages are lost
     "commits_repeated": Counter("commits that came again and got their first answer", _NETWORK),
     "prepares_repeated": Counter("prepares that came again and got their first answer", _NETWORK),
@@ -94,6 +101,10 @@ OF_A_SHARD: Final[dict[str, Counter]] = {
     "answers_dropped": Counter("answers to clients that did not read them", _SLOW_READER),
     "notices_dropped": Counter(
         "notices to watchers that did not read them; a watch tells its gap", _SLOW_READER
+    ),
+    "fetches_damaged": Counter(
+        "data asked for whose bytes on the disk are not those that were written",
+        "check the disk; see the shard's log for which",
     ),
     # History
     "retained_bytes": Counter("bytes of older versions that are kept now"),

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.cli.output import print_json, print_tree, shown_s
-from enact_dist.cli.verbs import DONE, add_reader, add_verb, open_cell, slot_name, whole
+from enact_dist.cli.verbs import DONE, add_reader, add_verb, open_cell, slot_version, whole
 from enact_dist.lineage import FORGOTTEN, NULL, UNKNOWN
 
 if TYPE_CHECKING:
@@ -62,15 +62,6 @@ def _add_arguments(verb: Verb, what: str) -> None:
     )
     verb.add_argument("--all", action="store_true", help=f"show {what} that are alike one by one")
     add_reader(verb)
-
-
-def slot_version(text: str) -> tuple[str, str, int]:
-    """Read ``ENTITY/ASPECT[@VERSION]``, version 0 if none is named; an `argparse` type."""
-    name, at, number = text.partition("@")
-    try:
-        return *slot_name(name), whole(number) if at else 0
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} does not name a version as @12") from None
 
 
 def show_causes(arguments: argparse.Namespace) -> int:
