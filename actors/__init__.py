@@ -1,1 +1,4 @@
-"""Applications of enact_dist, one folder each; `geometry` holds the mathematics they share."""
+"""Applications of enact_dist, one folder each; what they share stands beside them.
+
+`geometry` holds the mathematics, `comparators` what its data types are compared by.
+"""

@@ -57,6 +57,9 @@ class Viewable(Protocol):
 class Sight:
     """What a cut showed, and the way to its data.  Used by one thread.
 
+    Holds no lock, but where shards could show no cut for all the commits: then read locks stand in
+    for it, for `SIGHT_WAIT_S` at most.
+
     Attributes:
         session: By which it was taken.
         forked: Whether a context in it is a fork.
@@ -133,7 +136,7 @@ def look(worlds: Sequence[Viewable], places: Iterable[Place], *, each: bool) -> 
     lock = client.acquire(items, wait_s=SIGHT_WAIT_S, hold_s=SIGHT_WAIT_S, past_ns=past_ns)
     sight = Sight(worlds[0].session, lock, forked=any(map(_is_fork, worlds)))
     for world in worlds:
-        if not sight.of(world.name):
+        if each and not sight.of(world.name):
             world.session.check_world(world.name)
     return sight
 
@@ -195,11 +198,11 @@ def aspects_of(
     if wanted is None or not set(_names(wanted := tuple(wanted))) <= _known(sessions):
         for session in sessions:
             session.client.greet()
-    known = _known(sessions)
     typed = {one.name: one for one in wanted or () if isinstance(one, Aspect)}
     for session in sessions:
         session.register_aspects(one for one in typed.values() if one.datum_type is not object)
-    unknown = [name for name in _names(wanted or ()) if name not in known and name not in typed]
+    known = _known(sessions)
+    unknown = [name for name in _names(wanted or ()) if name not in known]
     if unknown:
         raise MisuseError(
             f"no aspect {unknown[0]!r} is registered; known: {', '.join(sorted(known)) or 'none'}"

@@ -10,6 +10,7 @@ fusion                  all views of a product -> one complete surface
 registration            where a known surface lies in a cloud of the tray
 segmentation            what is new on the tray, piece by piece
 deviation               render and compare: missing, extra, moved, deformed
+surface_distance        how far two surfaces or clouds are apart
 ======================  ==========================================================
 
 Rules a change must keep: metres, right-handed, z up (cameras: z forward, x right, y down);

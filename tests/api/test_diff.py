@@ -237,6 +237,8 @@ def test_unknown_aspect_and_another_type_are_refused(training, online):
     put(online, piece, COUNT, 1)
     with pytest.raises(MisuseError, match="no aspect 'cuont' is registered; known: count"):
         training.diff(online, aspects=["cuont"])
+    with pytest.raises(MisuseError, match="no aspect 'cuont'"):
+        training.diff(online, aspects=[Aspect("cuont", object)])
     with pytest.raises(DatumTypeError):
         training.diff(online, aspects=[Aspect("count", str)])
 

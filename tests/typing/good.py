@@ -7,11 +7,13 @@ from typing import assert_type
 from enact_dist import (
     Actor,
     Aspect,
+    Difference,
     Entities,
     Entity,
     Lock,
     Read,
     ReadEach,
+    Tolerance,
     View,
     World,
     Write,
@@ -25,8 +27,13 @@ class Mesh:
     lowest_z_m: float
 
 
-MESH = Aspect("mesh", Mesh)
-COUNT = Aspect("contact_count", int)
+def lower(left: Mesh, right: Mesh, /) -> Difference:
+    apart_m = abs(left.lowest_z_m - right.lowest_z_m)
+    return Difference(apart_m, tolerance=0.001, crossed=apart_m > 0.001, unit="m")
+
+
+MESH = Aspect("mesh", Mesh, compare=lower)
+COUNT = Aspect("contact_count", int, compare=Tolerance(absolute=1.0))
 FLAGS = Aspect("flags", dict[str, bool])
 piece, bench = Entity("work_piece"), Entity("work_bench")
 
@@ -54,6 +61,10 @@ def count_contacts() -> None:
         snapshot = online.view(view)
         assert_type(snapshot[view], int)
         assert_type(snapshot.get(view, 0), int)
+        for row in online.diff(cell.world("training"), "work_*", [MESH, "contact_count"]):
+            assert_type(row.difference, Difference | None)
+        with online.watch_diff(online.at(-1.0), bench, COUNT) as watch:
+            assert_type([row.entity for row in watch], list[Entity])
 
 
 class Inspect(Actor):

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from enact_dist import (
     Aspect,
+    Difference,
     Entities,
     Entity,
     Lock,
@@ -19,6 +20,10 @@ from enact_dist import (
 @dataclass(frozen=True)
 class Mesh:
     lowest_z_m: float
+
+
+def lower(left: Mesh, right: Mesh, /) -> Difference:
+    return Difference(0.0)
 
 
 MESH = Aspect("mesh", Mesh)
@@ -47,3 +52,5 @@ Read(bench, COUNT, world)  # wrong: argument order
 ReadEach(world, bench, COUNT)  # wrong: an entity is no pattern
 Lock(bench)  # wrong: no request
 world.view(bench)  # wrong: no request
+Aspect("label", str, compare=lower)  # wrong: comparator of another type
+world.diff("training")  # wrong: a name is no world context
