@@ -117,6 +117,7 @@ def look(worlds: Sequence[Viewable], places: Iterable[Place], *, each: bool) -> 
     Raises:
         ForgottenError: They are of a past that is not known any more.
         MisuseError: More is asked than one view can hold.
+        UnknownWorldError: The cell has one of them no more; told where patterns show nothing.
         ShardUnreachableError: A shard does not answer.
     """
     client = worlds[0].session.client
@@ -135,9 +136,13 @@ def look(worlds: Sequence[Viewable], places: Iterable[Place], *, each: bool) -> 
     past_ns = past_ns_of(worlds[0])
     lock = client.acquire(items, wait_s=SIGHT_WAIT_S, hold_s=SIGHT_WAIT_S, past_ns=past_ns)
     sight = Sight(worlds[0].session, lock, forked=any(map(_is_fork, worlds)))
-    for world in worlds:
-        if each and not sight.of(world.name):
-            world.session.check_world(world.name)
+    try:
+        for world in worlds:
+            if each and not sight.of(world.name):
+                world.session.check_world(world.name)
+    except BaseException:
+        sight.close()
+        raise
     return sight
 
 
