@@ -14,7 +14,7 @@ from enact_dist import (
     Write,
     WriteEach,
 )
-from enact_dist.errors import MisuseError, NullDatumError, UnknownWorldError
+from enact_dist.errors import ForgottenError, MisuseError, NullDatumError, UnknownWorldError
 from enact_dist.lineage import DEPTH_MAX, EffectTree
 from enact_dist.testing import ManualClock, worlds
 
@@ -226,6 +226,35 @@ def test_forgotten_cause_stands_in_the_tree_by_name():
     (cause,) = tree.children
     assert (cause.version, cause.kind, cause.actor, cause.known) == (1, "forgotten", "", False)
     assert 0 < cause.position.stamp_ns < tree.position.stamp_ns
+
+
+def test_forgotten_version_cannot_be_explained_itself():
+    """The error says from when on the datum is known."""
+    clock = ManualClock()
+    with worlds("online", clock=clock) as cell:
+        replaced(cell.world("online"), clock, times=4)
+
+        with pytest.raises(ForgottenError, match="the oldest that is known is 3") as raised:
+            cell.why("online", here, FEW, 1)
+
+        third = cell.why("online", here, FEW, 3)
+    assert raised.value.oldest_ns == third.position.stamp_ns
+
+
+def test_kept_tree_outlives_the_retention():
+    """What `cell.keep` takes of a tree is explained later, too, with what went into it."""
+    clock = ManualClock()
+    with worlds("online", clock=clock) as cell:
+        online = cell.world("online")
+        replaced(online, clock, times=1)
+        added(online, Read(online, here, FEW))
+        cell.keep("incident", cell.why("online", total, SUM).walk())
+        replaced(online, clock, times=3)
+
+        tree = cell.why("online", total, SUM)
+
+        assert [one.kind for one in tree.walk()] == ["commit", "commit"]
+        assert [version.version for version in cell.kept()["incident"]] == [1, 1]
 
 
 def test_deletion_is_a_version_with_a_cause(cell, online):
