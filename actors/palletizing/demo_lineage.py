@@ -14,10 +14,10 @@ if TYPE_CHECKING:
     from enact_dist import Cell
     from enact_dist.lineage import CauseTree, EffectTree
 
-CAUSES_DEPTH: Final = 3
-"""Verdict, model, surfaces of the views, their clouds."""
+CAUSES_DEPTH: Final = 2
+"""From the verdict over its depth frame and the model to the views."""
 EFFECTS_DEPTH: Final = 3
-"""Cloud of a view, its surface, the model, the verdicts."""
+"""From the cloud of a view over its surface and the model to the verdicts."""
 
 
 def verdict_causes(cell: Cell) -> CauseTree:
@@ -38,9 +38,9 @@ def show_lineage(cell: Cell, product: str, console: Console) -> None:
         product: The product whose first view is followed.
         console: Where progress and table were printed.
     """
-    slot = f"{SYSTEM}/{DEVIATIONS}"
-    console.print(f"\nenact why online {slot}", style="bold")
+    verdict, view = f"{SYSTEM}/{DEVIATIONS}", f"{view_entity(product, 0)}/{CLOUD}"
+    console.print(f"enact why online {verdict} --depth {CAUSES_DEPTH}", style="bold")
     print_tree(drawn(verdict_causes(cell)))
-    slot = f"{view_entity(product, 0)}/{CLOUD}"
-    console.print(f"\nenact impact training {slot}", style="bold")
+    console.print(f"\nenact impact training {view} --depth {EFFECTS_DEPTH}", style="bold")
     print_tree(drawn(view_effects(cell, product)))
+    console.print()

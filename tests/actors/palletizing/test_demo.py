@@ -122,12 +122,18 @@ def test_demo_refuses_to_run_without_packages(tmp_path, capsys):
 
 @pytest.mark.slow
 def test_demo_runs_from_training_to_table(tmp_path, capsys):
-    """Ten processes train two products and judge three packages; table, pictures and report."""
+    """Ten processes train two products and judge three packages; table, lineage and pictures."""
     status = run_demo(out=tmp_path, packages=3)
 
     printed = capsys.readouterr().out
     assert status == 0
     assert "3 of 3 verdicts right" in " ".join(printed.split())
+    why, impact = printed.split("enact why online system/deviation")[1].split("enact impact")
+    assert "online:place/2/observation v1" in why
+    assert "training:view/milk_carton/0…13/surface v1  14 versions" in why
+    assert "forgotten" not in why
+    assert "training:product/milk_carton/surface v1" in impact
+    assert "online:system/deviation v3" in impact
     report = json.loads((tmp_path / "report.json").read_text())
     assert [row["correct"] for row in report["packages"]] == [True] * 3
     for name in ("model_milk_carton.png", "model_meal_tray.png", "tray_1.png"):
