@@ -167,5 +167,6 @@ def _nested(value: object) -> bool:
 def _value(value: object) -> str:
     """Write one value; strings, numbers, truth values and lists of them look as in JSON."""
     if isinstance(value, dict):
-        return "{ " + ", ".join(f"{key} = {_value(item)}" for key, item in value.items()) + " }"
+        items = (f"{json.dumps(key)} = {_value(item)}" for key, item in value.items())
+        return "{ " + ", ".join(items) + " }"
     return json.dumps(value)
