@@ -57,9 +57,6 @@ class Viewable(Protocol):
 class Sight:
     """What a cut showed, and the way to its data.  Used by one thread.
 
-    Holds no lock, but where shards could show no cut for all the commits: then read locks stand in
-    for it, for `SIGHT_WAIT_S` at most.
-
     Attributes:
         session: By which it was taken.
         forked: Whether a context in it is a fork.
@@ -135,6 +132,12 @@ def look(worlds: Sequence[Viewable], places: Iterable[Place], *, each: bool) -> 
     client.register(aspects=[known[name] for name in {aspect for _, aspect in asked}])
     past_ns = past_ns_of(worlds[0])
     lock = client.acquire(items, wait_s=SIGHT_WAIT_S, hold_s=SIGHT_WAIT_S, past_ns=past_ns)
+    if lock.parts:
+        # For all the commits there was no cut to be had, and read locks stand in for it; nobody
+        # shall wait for a comparison, so what they show is looked at as the past that it is now.
+        client.release(lock)
+        past_ns = client.core.seen_stamp_ns
+        lock = client.acquire(items, wait_s=SIGHT_WAIT_S, hold_s=SIGHT_WAIT_S, past_ns=past_ns)
     sight = Sight(worlds[0].session, lock, forked=any(map(_is_fork, worlds)))
     try:
         for world in worlds:

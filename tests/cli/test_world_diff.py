@@ -1,11 +1,14 @@
 """`enact world diff` against two real shards: a table for people, JSON and exit status for scripts."""
 
+import itertools
+import threading
 from dataclasses import dataclass
 
 import numpy as np
 import pytest
 
-from enact_dist import Aspect, Entity, Lock, Write, connect
+from enact_dist import Aspect, Difference, Entity, Lock, Write, connect
+from enact_dist.reading import slot_of
 
 VOCABULARY = """\
 from dataclasses import dataclass
@@ -195,40 +198,57 @@ def test_equal_contexts_exit_with_0_and_unknown_ones_with_1(diff):
     assert (failed.status, "no world context 'no_such_world'" in failed.err) == (1, True)
 
 
-def test_contexts_are_seen_at_one_moment_over_both_shards(cell):
-    """What one lock writes to both contexts, on both shards, never differs in between."""
-    import threading
-
-    training, online = cell.world("training"), cell.world("online")
+@pytest.fixture
+def writer(cell):
+    """Eight slots of both contexts, on both shards, that one lock after another sets alike."""
     requests = [
-        Write(world, Entity(f"sum/{number}"), COUNT)
-        for world in (training, online)
+        Write(cell.world(name), Entity(f"sum/{number}"), COUNT)
+        for name in ("training", "online")
         for number in range(4)
     ]
-    assert len({cell._session.shard_of(_slot(one)) for one in requests}) == 2
-    stop = threading.Event()
+    assert len({cell._session.shard_of(slot_of(one)) for one in requests}) == 2
+    begun, stop = threading.Event(), threading.Event()
 
-    def write(value=0):
-        while True:
+    def write():
+        for value in itertools.count():
             with Lock(*requests) as lock:
                 for one in requests:
                     lock[one] = value
+            begun.set()
             if stop.is_set():
                 return
-            value += 1
 
-    write_once = threading.Thread(target=write)
-    write_once.start()
-    try:
-        diffs = [training.diff(online, "sum/*", [COUNT]) for _ in range(40)]
-    finally:
-        stop.set()
-        write_once.join()
-    assert [len(diff) for diff in diffs] == [0] * 40
-    assert diffs[-1].equal == 4
+    thread = threading.Thread(target=write)
+    thread.start()
+    assert begun.wait(10.0)
+    yield
+    stop.set()
+    thread.join()
 
 
-def _slot(request):
-    from enact_dist.reading import slot_of
+def test_contexts_are_seen_at_one_moment_over_both_shards(cell, writer):
+    """What one lock writes to both contexts, on both shards, never differs in between."""
+    training, online = cell.world("training"), cell.world("online")
+    diffs = [training.diff(online, "sum/*", [COUNT]) for _ in range(40)]
+    assert [(len(diff), diff.equal) for diff in diffs] == [(0, 4)] * 40
 
-    return slot_of(request)
+
+def test_comparing_holds_no_lock_where_there_is_no_cut(cell, cell_file, writer, monkeypatch):
+    """Locks that stand in for a cut are given back before the first datum is compared."""
+    monkeypatch.setattr("enact_dist.core.multilock.ROUNDS_MAX", 0)
+    held = []
+
+    def looked_at(left, right):
+        held.extend(one for one in cell.locks() if one.actor == "watcher")
+        return Difference(0.0)
+
+    put(cell.world("training"), "sum/text", NAME, "a")
+    put(cell.world("online"), "sum/text", NAME, "b")
+    with connect(cell_file, actor="watcher") as other:
+        one, two = other.world("training"), other.world("online")
+        own = Aspect("name", str, compare=looked_at)
+        diffs = [one.diff(two, "sum/*", [COUNT, own]) for _ in range(20)]
+        locked = other.statistics().get("views_locked", 0)
+    assert locked > 0
+    assert [(len(diff), diff.equal) for diff in diffs] == [(0, 5)] * 20
+    assert held == []
