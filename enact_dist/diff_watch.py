@@ -57,6 +57,7 @@ class DiffWatch:
         self._seen: dict[tuple[str, Place], int] = {}
         self._changed: dict[Place, None] = {}
         self._pending: deque[Comparison] = deque()
+        self._past_world = next((world for world in self._worlds if past_ns_of(world)), None)
         self._past: Sight | None = None
         self._closed = False
         names = tuple(dict.fromkeys(world.name for world in present))
@@ -105,8 +106,6 @@ class DiffWatch:
             place = change.entity.name, change.aspect
             if self._seen.get((change.world, place)) != change.position.stamp_ns:
                 self._changed[place] = None
-            if change.aspect not in self._types:
-                self._types |= aspects_of(self._worlds, (change.aspect,))
             change = self._watch.next(0.0) if len(self._changed) < PLACES_MAX else None
 
     # ---------------------------------------------------------------- looking
@@ -131,6 +130,9 @@ class DiffWatch:
 
     def _compare_changed(self) -> None:
         places = list(self._changed)[:PLACES_MAX]
+        new = {aspect for _, aspect in places} - self._types.keys()
+        if new:
+            self._types |= aspects_of(self._worlds, new)
         with self._in_sight(places, each=False) as (first, second):
             left, right = first.of(self._left.name), second.of(self._right.name)
             pairs = [Pair(place, left.get(place), right.get(place)) for place in places]
@@ -141,7 +143,7 @@ class DiffWatch:
     @contextmanager
     def _in_sight(self, places: Sequence[Place], *, each: bool) -> Iterator[tuple[Sight, Sight]]:
         """Look at both sides; at one that is past once and for all."""
-        past = next((world for world in self._worlds if past_ns_of(world)), None)
+        past = self._past_world
         if past is None:
             with both_in_sight(*self._worlds, places, each=each) as sights:
                 yield sights
@@ -158,7 +160,9 @@ class DiffWatch:
         for row, _ in found:
             place = row.entity.name, row.aspect
             for world, side in zip(self._worlds, (row.left, row.right), strict=True):
-                self._seen[world.name, place] = side.position.stamp_ns if side is not None else 0
+                if world is not self._past_world:
+                    stamp_ns = side.position.stamp_ns if side is not None else 0
+                    self._seen[world.name, place] = stamp_ns
             if row.kind is self._told.get(place, DiffKind.EQUAL):
                 continue
             self._pending.append(row)

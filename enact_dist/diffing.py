@@ -67,7 +67,7 @@ class Comparison:
     difference: Difference | None
 
     def to_json(self) -> dict[str, object]:
-        """Return it as JSON can carry it; an infinite distance is null there."""
+        """Return it as JSON can carry it; what is infinite is null there."""
         found = self.difference or EQUAL
         return {
             "entity": self.entity.name,
@@ -75,8 +75,8 @@ class Comparison:
             "kind": self.kind.value,
             "left": _side_json(self.left),
             "right": _side_json(self.right),
-            "distance": found.distance if math.isfinite(found.distance) else None,
-            "tolerance": found.tolerance,
+            "distance": _finite(found.distance),
+            "tolerance": _finite(found.tolerance),
             "unit": found.unit,
             "where": found.where,
             "what": found.what,
@@ -288,6 +288,10 @@ def _comparison(pair: Pair, found: Difference | None) -> Comparison:
 
 def _side(reading: Reading | None) -> SlotInfo | None:
     return slot_info(reading.shard, reading.state) if reading is not None else None
+
+
+def _finite(number: float) -> float | None:
+    return number if math.isfinite(number) else None
 
 
 def _side_json(side: SlotInfo | None) -> dict[str, object] | None:

@@ -238,6 +238,14 @@ def test_structured_arrays_are_compared_by_field():
     assert (found.where, found.distance) == (".x_m[2]", 0.25)
 
 
+def test_bytes_without_a_meaning_are_equal_or_not():
+    """Raw items of a dtype without fields have no distance."""
+    one = np.array([b"abc", b"def"], "V3")
+    other = np.array([b"abc", b"dex"], "V3")
+    assert EXACT(one, one.copy()) == EQUAL
+    assert (EXACT(one, other).where, EXACT(one, other).distance) == ("[1]", INF)
+
+
 def test_dicts_are_compared_key_by_key():
     """The path tells which value it is."""
     found = EXACT({"a": [1, 2], "b": [3]}, {"a": [1, 5], "b": [3]})

@@ -94,7 +94,8 @@ def test_standing_diff_follows_only_what_it_names(training, online):
         assert told(watch, 0) is None
 
 
-def test_what_was_told_is_compared_once(training, online, monkeypatch):
+@pytest.mark.parametrize("against", ["present", "past"])
+def test_what_was_told_is_compared_once(training, online, monkeypatch, against):
     """The first look covers what the watch lists; it is not fetched and compared again."""
     from enact_dist import diff_watch
 
@@ -109,7 +110,10 @@ def test_what_was_told_is_compared_once(training, online, monkeypatch):
     monkeypatch.setattr(diff_watch, "compared", counted)
     put(training, piece, COUNT, 1)
     put(online, piece, COUNT, 1)
-    with training.watch_diff(online) as watch:
+    with Lock(Write(online, piece, COUNT)) as lock:
+        lock[Write(online, piece, COUNT)] = 1
+    other = training if against == "present" else online.at(lock.position)
+    with online.watch_diff(other) as watch:
         assert told(watch, 0) is None
         put(online, piece, COUNT, 1)
         assert told(watch, 0.2) is None
@@ -207,6 +211,9 @@ def test_past_context_is_a_reference_that_stays(online):
         assert told(watch) == ("bench", "only left")
         put(online, piece, SHIFT, 1.25)
         assert told(watch) == ("piece", "equal")
+    with online.watch_diff(before, "**", SHIFT) as watch:
+        assert told(watch, 0) == ("bench", "only left")
+        assert told(watch, 0) is None
     with pytest.raises(MisuseError, match="never change"):
         from enact_dist.diff_watch import DiffWatch
 
