@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from enact_dist.moments import When
     from enact_dist.recording import RecordingSummary, ReplaySummary
 
-COMPRESSIONS: Final = ("lz4", "zstd", "none")
+COMPRESSIONS: Final = ("zstd", "lz4", "none")
 TOLD_EVERY_S: Final = 0.2
 OFFSET_S_MAX: Final = 1e8
 """A larger number is a time in seconds since 1970, a smaller one counts from the begin."""
@@ -72,7 +72,7 @@ def _add_record(nouns: argparse._SubParsersAction[Verb]) -> None:
         "--exact-only", action="store_true", help="only what replay needs, nothing to look at"
     )
     record.add_argument(
-        "--compress", choices=COMPRESSIONS, default="lz4", help="of chunks (default: lz4)"
+        "--compress", choices=COMPRESSIONS, default="zstd", help="of chunks (default: zstd)"
     )
     _add_json(record)
 

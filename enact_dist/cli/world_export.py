@@ -40,7 +40,7 @@ def add_export(verbs: argparse._SubParsersAction[Verb]) -> None:
     export.add_argument(
         "--shows", action="append", type=pair, metavar="ASPECT=KIND", help="as for enact record"
     )
-    export.add_argument("--compress", choices=COMPRESSIONS, default="lz4", help="of an .mcap file")
+    export.add_argument("--compress", choices=COMPRESSIONS, default="zstd", help="of an .mcap file")
     add_reader(export)
 
 

@@ -94,7 +94,7 @@ def export_world(
     *,
     at_ns: int = 0,
     shows: Mapping[str, Shows] | None = None,
-    compression: str = "lz4",
+    compression: str = "zstd",
 ) -> ExportSummary:
     """Write a world context as of one moment into a recording; `replay` makes it again.
 

@@ -77,7 +77,7 @@ class RecordingFile:
         *,
         aspects: Callable[[str], AspectEntry | None],
         shows: Callable[[str], Shows] | None,
-        compression: str = "lz4",
+        compression: str = "zstd",
         chunk_bytes: int = CHUNK_BYTES,
         chunk_s: float = CHUNK_S,
     ) -> None:

@@ -96,6 +96,17 @@ def encoded_points(points_m: NDArray[Any], field_number: int) -> bytes:
     return rows.tobytes()
 
 
+def encoded_indices(triangles: NDArray[Any], field_number: int) -> bytes:
+    """Return (M, 3) vertex numbers as the packed field of `fixed32` of that number."""
+    packed = np.ascontiguousarray(triangles, "<u4").tobytes()
+    length, digits = len(packed), bytearray()
+    while length >= 0x80:
+        digits.append(length & 0x7F | 0x80)
+        length >>= 7
+    digits.append(length)
+    return bytes([field_number << 3 | 2]) + bytes(digits) + packed
+
+
 def image_bytes(pixels: NDArray[Any]) -> tuple[bytes, int]:
     """Return an image's rows, little-endian, without padding, and the bytes of one row."""
     whole = np.ascontiguousarray(pixels, pixels.dtype.newbyteorder("<"))

@@ -23,6 +23,7 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from foxglove_schemas_protobuf.TriangleListPrimitive_pb2 import TriangleListPrimitive
 
 from enact_dist.recording.geometry import (
+    encoded_indices,
     encoded_points,
     image_bytes,
     is_rigid,
@@ -263,13 +264,14 @@ def _mesh(recorded: Recorded, shows: Shows, part: object) -> Message | None:
 
 
 def _triangles(vertices_m: NDArray[Any], triangles: NDArray[Any]) -> TriangleListPrimitive:
-    number = TriangleListPrimitive.DESCRIPTOR.fields_by_name["points"].number
+    fields = TriangleListPrimitive.DESCRIPTOR.fields_by_name
+    points = encoded_points(vertices_m, fields["points"].number)
+    indices = encoded_indices(triangles, fields["indices"].number)
     primitive = TriangleListPrimitive()
-    primitive.ParseFromString(encoded_points(vertices_m, number))
+    primitive.ParseFromString(points + indices)
     primitive.pose.orientation.w = 1.0
     colour = primitive.color
     colour.r, colour.g, colour.b, colour.a = SURFACE_COLOUR
-    primitive.indices.extend(np.ascontiguousarray(triangles, np.uint32).reshape(-1).tolist())
     return primitive
 
 
