@@ -64,6 +64,41 @@ def refused(text, **environment):
     return caught.value
 
 
+def test_what_an_aspect_shows_is_read_with_its_frames():
+    """One kind or several, a frame for all entities or one per pattern."""
+    text = MINIMAL_SHOWS.format(
+        'shows = ["image", "transform"]\nparent = "tray"\nframe = { "view/*" = "{entity}" }'
+    )
+    (aspect,) = parse_config(text, Path("cell.toml"), environment={}).aspects
+    assert aspect.shows.kinds == ("image", "transform")
+    assert aspect.shows.frame_of("view/3") == "view/3"
+    assert aspect.shows.parent_of("view/3") == "tray"
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ('shows = "film"', "line 5.*film.*known: image"),
+        ('shows = "transform"', "line 5.*parent"),
+        ('show = "image"', "line 5.*did you mean"),
+        ('shows = "pose"\nframe = "{x}"', "names no frame"),
+    ],
+)
+def test_what_an_aspect_cannot_show_is_refused(words, said):
+    """With its line, and what it may be."""
+    with pytest.raises(ConfigError, match=said):
+        parse_config(MINIMAL_SHOWS.format(words), Path("cell.toml"), environment={})
+
+
+MINIMAL_SHOWS = """\
+name = "c"
+[shards.s]
+listen = "tcp/127.0.0.1:7447"
+[aspects.seen]
+{}
+"""
+
+
 def test_config_holds_every_key_when_the_file_gives_all():
     """Each key of the table in the module docstring arrives in its field."""
     config = parsed(FULL)
