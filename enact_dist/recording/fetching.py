@@ -1,13 +1,14 @@
 """The data of given versions from their shards, as far as these still know them.
 
-Who committed a version, and how large it is, its shard explains; the datum comes by a view as of a
-stamp.  As of the largest stamp of a batch each slot shows its newest version of the batch, so there
-are as many views as the busiest slot has versions, and one for a batch of different slots.
+The datum comes by a view as of a stamp: of what is retained, or was replaced within the last 2 s.
+Who committed a version, and how large it is, its shard explains as long as it is retained.  As of
+the largest stamp of a batch each slot shows its newest version of the batch, so there are as many
+views as the busiest slot has versions, and one for a batch of different slots.
 """
 
 from __future__ import annotations
 
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from enact_dist.core.messages import (
@@ -70,6 +71,13 @@ class View:
         return fetch_all(self._session.client, self._session.cache, self._lock, readings)
 
 
+class Found(NamedTuple):
+    """What a version is: a datum, or null for a reason."""
+
+    null_reason: str
+    datum: Datum | None
+
+
 @contextmanager
 def viewed(session: Session, items: Iterable[Item], *, at_ns: int = 0) -> Iterator[View]:
     """View data, as of a stamp if one is given; they can be fetched while the block runs.
@@ -99,7 +107,7 @@ def now_ns(session: Session) -> int:
 
 
 def explained(session: Session, wanted: Sequence[Wanted]) -> dict[Wanted, VersionEntry]:
-    """Return what the shards still know of these versions, without their data.
+    """Return what the shards list of these versions: those that are retained, without data.
 
     Raises:
         ShardUnreachableError: A shard does not answer.
@@ -147,13 +155,13 @@ def _asked(session: Session, calls: Sequence[tuple[str, Request]]) -> list[Versi
     return entries
 
 
-def data_of(session: Session, wanted: Sequence[Wanted]) -> dict[Wanted, Datum]:
-    """Return the data of versions that are not null; what is forgotten meanwhile is left out.
+def found_of(session: Session, wanted: Sequence[Wanted]) -> dict[Wanted, Found]:
+    """Return what these versions are; those that are forgotten are left out.
 
     Raises:
         ShardUnreachableError: A shard does not answer.
     """
-    found: dict[Wanted, Datum] = {}
+    found: dict[Wanted, Found] = {}
     by_slot: dict[Slot, list[Wanted]] = {}
     for each in sorted(wanted):
         by_slot.setdefault(each.slot, []).append(each)
@@ -164,29 +172,27 @@ def data_of(session: Session, wanted: Sequence[Wanted]) -> dict[Wanted, Datum]:
     return found
 
 
-def _together(session: Session, wanted: Sequence[Wanted]) -> dict[Wanted, Datum]:
-    """Return the data of versions of different slots with one view, or else one by one."""
+def _together(session: Session, wanted: Sequence[Wanted]) -> dict[Wanted, Found]:
+    """Return versions of different slots by one view, or else one by one."""
+    found: dict[Wanted, Found] = {}
     if len(wanted) > 1:
-        try:
+        with suppress(ForgottenError, LeaseLostError):
             found = _as_of(session, wanted, max(wanted).stamp_ns)
-        except (ForgottenError, LeaseLostError):
-            found = {}
-    else:
-        found = {}
     for each in wanted:
         if each not in found:
-            try:
+            with suppress(ForgottenError, LeaseLostError):
                 found |= _as_of(session, [each], each.stamp_ns)
-            except (ForgottenError, LeaseLostError):
-                continue
     return found
 
 
-def _as_of(session: Session, wanted: Sequence[Wanted], at_ns: int) -> dict[Wanted, Datum]:
+def _as_of(session: Session, wanted: Sequence[Wanted], at_ns: int) -> dict[Wanted, Found]:
     items = [Item(int(Access.VIEW), *each.slot) for each in wanted]
     with viewed(session, items, at_ns=at_ns) as view:
         by_state = {(r.state.slot, r.state.version, r.state.stamp_ns): r for r in view.states}
-        found = {each: by_state.get((each.slot, each.version, each.stamp_ns)) for each in wanted}
-        held = {each: r for each, r in found.items() if r is not None and not r.state.null_reason}
-        data = view.fetch(tuple(held.values()))
-        return {each: data[each.slot] for each in held}
+        shown = {each: by_state.get((each.slot, each.version, each.stamp_ns)) for each in wanted}
+        readings = {each: reading for each, reading in shown.items() if reading is not None}
+        data = view.fetch([r for r in readings.values() if not r.state.null_reason])
+        return {
+            each: Found(reading.state.null_reason, data.get(each.slot))
+            for each, reading in readings.items()
+        }

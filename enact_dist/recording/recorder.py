@@ -22,7 +22,7 @@ from enact_dist.core.datum import Slot
 from enact_dist.errors import ConfigError, LinkError, LockTimeoutError
 from enact_dist.recording.disk import QUEUE_BYTES_MAX, DiskThread
 from enact_dist.recording.exact import Recorded
-from enact_dist.recording.fetching import Wanted, between, data_of, explained, now_ns
+from enact_dist.recording.fetching import Wanted, between, explained, found_of, now_ns
 from enact_dist.recording.file import CHUNK_BYTES, CHUNK_S, RecordingFile
 from enact_dist.terms import Entities
 from enact_dist.watch import Watch
@@ -33,8 +33,9 @@ if TYPE_CHECKING:
 
     from enact_dist.cell import Cell
     from enact_dist.config_shows import Shows
-    from enact_dist.core.datum import Datum, LockId
+    from enact_dist.core.datum import LockId
     from enact_dist.core.messages import AspectEntry, VersionEntry
+    from enact_dist.recording.fetching import Found
     from enact_dist.watch import Change
 
 SETTLE_S: Final = 0.25
@@ -45,6 +46,8 @@ HEARD_MAX: Final = 1000
 BATCH_MAX: Final = 256
 BATCH_BYTES_MAX: Final = 64 << 20
 """How many versions, and of how many bytes together, are fetched at once."""
+UNLISTED_BYTES: Final = 1 << 20
+"""What a version counts for whose size is not known before it is fetched."""
 WANTED_MAX: Final = 65_536
 """Versions that wait to be fetched; beyond, the oldest are given up, counted and named."""
 
@@ -341,27 +344,26 @@ class Recorder:
         try:
             entries = explained(self._session, batch)
             batch = _fitting(batch, entries)
-            held = [w for w in batch if w in entries and not entries[w].state.null_reason]
-            data = data_of(self._session, held)
+            found = found_of(self._session, batch)
         except (LinkError, LockTimeoutError):
             self._session.client.check_usable()
             return  # a shard is away; its history will say what it still has
         del self._pending[: len(batch)]
         for wanted in batch:
-            if wanted not in entries or (wanted in held and wanted not in data):
+            if wanted not in found:
                 stalled = wanted.stamp_ns <= self._stalled_ns
                 self._miss_one(wanted, DISK_SLOW if stalled else FORGOTTEN)
-        known = [w for w in batch if w in data or _is_null(w, entries)]
+        known = [w for w in batch if w in found]
         initial = [w for w in known if w in self._initial]
         if initial:
             self.summary.initial += len(initial)
-            self._write(initial, 0, self._begin_ns, entries, data)
+            self._write(initial, 0, self._begin_ns, entries, found)
         for group in _commits([w for w in known if w not in self._initial], entries):
             stamp_ns = group[0].stamp_ns
             self.summary.commits += 1
             self.summary.out_of_order += stamp_ns < self._last_ns
             self._last_ns = max(self._last_ns, stamp_ns)
-            self._write(group, self.summary.commits, stamp_ns, entries, data)
+            self._write(group, self.summary.commits, stamp_ns, entries, found)
 
     def _write(
         self,
@@ -369,10 +371,10 @@ class Recorder:
         commit: int,
         log_ns: int,
         entries: Mapping[Wanted, VersionEntry],
-        data: Mapping[Wanted, Datum],
+        found: Mapping[Wanted, Found],
     ) -> None:
         self.summary.versions += len(group)
-        versions = tuple(_recorded(w, entries[w], data.get(w), commit) for w in group)
+        versions = tuple(_recorded(w, entries.get(w), found[w], commit) for w in group)
         self._disk.put(versions, log_ns)
 
     def _finish(self, watch: Watch) -> None:
@@ -391,15 +393,11 @@ def _stamp(wanted: Wanted) -> int:
     return wanted.stamp_ns
 
 
-def _is_null(wanted: Wanted, entries: Mapping[Wanted, VersionEntry]) -> bool:
-    return wanted in entries and bool(entries[wanted].state.null_reason)
-
-
 def _fitting(batch: list[Wanted], entries: Mapping[Wanted, VersionEntry]) -> list[Wanted]:
     """Return as many of the first as have `BATCH_BYTES_MAX` together, commits whole."""
     size = 0
     for index, wanted in enumerate(batch):
-        size += entries[wanted].state.size if wanted in entries else 0
+        size += entries[wanted].state.size if wanted in entries else UNLISTED_BYTES
         if size > BATCH_BYTES_MAX and index and wanted.stamp_ns != batch[index - 1].stamp_ns:
             return batch[:index]
     return batch
@@ -415,7 +413,7 @@ def _commits(
     """
     for _, same in itertools.groupby(batch, _stamp):
         group = list(same)
-        causes = [entries[wanted].cause for wanted in group]
+        causes = [entries[wanted].cause if wanted in entries else None for wanted in group]
         by_lock: dict[LockId | None, list[Wanted]] = {}
         for wanted, cause in zip(group, causes, strict=True):
             lock = cause.lock if cause is not None and None not in causes else None
@@ -423,16 +421,16 @@ def _commits(
         yield from by_lock.values()
 
 
-def _recorded(wanted: Wanted, entry: VersionEntry, datum: Datum | None, commit: int) -> Recorded:
-    cause = entry.cause
+def _recorded(wanted: Wanted, entry: VersionEntry | None, found: Found, commit: int) -> Recorded:
+    cause = entry.cause if entry is not None else None
     return Recorded(
         wanted.slot,
         wanted.version,
         wanted.stamp_ns,
         wanted.shard,
         commit,
-        datum,
-        entry.state.null_reason,
+        found.datum,
+        found.null_reason,
         cause.actor if cause is not None else "",
         cause.host if cause is not None else "",
         cause.pid if cause is not None else 0,
