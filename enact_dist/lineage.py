@@ -12,7 +12,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from enact_dist.core.datum import LockId, Position, Slot
 from enact_dist.core.messages import (
@@ -93,7 +93,6 @@ class Made:
     left_out: int = 0
     elsewhere: bool = False
     unfollowed: int = 0
-    children: tuple[Self, ...] = ()
 
     @property
     def known(self) -> bool:
@@ -105,33 +104,50 @@ class Made:
         """What it is a version of."""
         return Slot(self.world, self.entity.name, self.aspect)
 
-    def walk(self) -> Iterator[Self]:
-        """Yield this version and all that follow it in the tree, each once."""
-        yield self
-        for child in self.children:
-            if not child.elsewhere:
-                yield from child.walk()
-
     def __repr__(self) -> str:
-        name = f"{self.world}:{self.entity}/{self.aspect} v{self.version}"
-        return f"<{type(self).__name__} of {name}: {len(self.children)} next>"
+        return f"<{type(self).__name__} of {self.slot} v{self.version}>"
 
 
+@dataclass(frozen=True, slots=True, repr=False)
 class CauseTree(Made):
-    """A version with those that its lock had read when it was committed, and their causes."""
+    """A version with those that its lock had read when it was committed, and their causes.
 
-    __slots__ = ()
+    Attributes:
+        children: What it was made of, by name.
+    """
+
+    children: tuple[CauseTree, ...] = ()
+
+    def walk(self) -> Iterator[CauseTree]:
+        """Yield this version and all that led to it, each once."""
+        return _walk(self)
 
 
+@dataclass(frozen=True, slots=True, repr=False)
 class EffectTree(Made):
-    """A version with those whose locks had read it when they were committed, and their effects."""
+    """A version with those whose locks had read it when they were committed, and their effects.
 
-    __slots__ = ()
+    Attributes:
+        children: What it went into, the oldest first.
+    """
+
+    children: tuple[EffectTree, ...] = ()
+
+    def walk(self) -> Iterator[EffectTree]:
+        """Yield this version and all that came of it, each once."""
+        return _walk(self)
 
 
 Tree = TypeVar("Tree", CauseTree, EffectTree)
 Part = TypeVar("Part")
 _NOBODY: Final = Cause(LockId("", 0, 0), "", "", "", 0, 0, 0, (), 0, ())
+
+
+def _walk(tree: Tree) -> Iterator[Tree]:
+    yield tree
+    for child in tree.children:
+        if not child.elsewhere:
+            yield from _walk(child)
 
 
 def causes_of(session: Session, named: Named, version: int, depth: int | None) -> CauseTree:
@@ -156,6 +172,8 @@ def _slot_of(
     name = world if isinstance(world, str) else world.name
     if not isinstance(world, str) and getattr(world, "session", None) is not session:
         raise MisuseError(f"{world!r} is no world context of this cell as it is connected here")
+    if not isinstance(world, str) and world.past:
+        raise MisuseError(f"{world!r} is as it was; name {name!r} and a version of its history")
     if name not in session.client.worlds():
         session.check_world(name)
     try:

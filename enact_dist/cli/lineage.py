@@ -14,7 +14,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from enact_dist.cli.verbs import Verb
-    from enact_dist.lineage import Made
+    from enact_dist.lineage import CauseTree, EffectTree, Made
+
+    Tree = CauseTree | EffectTree
 
 DEPTH: Final = 3
 """Steps that are shown unless more are asked for: a screen or two."""
@@ -84,14 +86,14 @@ def show_effects(arguments: argparse.Namespace) -> int:
     return DONE
 
 
-def _print(tree: Made, arguments: argparse.Namespace) -> None:
+def _print(tree: Tree, arguments: argparse.Namespace) -> None:
     if arguments.json:
         print_json(facts_of(tree))
     else:
         print_tree(drawn(tree, alike_min=0 if arguments.all else ALIKE_MIN))
 
 
-def facts_of(one: Made) -> dict[str, object]:
+def facts_of(one: Tree) -> dict[str, object]:
     """Return a tree as JSON can carry it."""
     return {
         "world": one.world,
@@ -130,7 +132,7 @@ class Line:
         self.children[str(len(self.children))] = line
 
 
-def drawn(tree: Made, *, alike_min: int = ALIKE_MIN) -> Line:
+def drawn(tree: Tree, *, alike_min: int = ALIKE_MIN) -> Line:
     """Return the lines of a tree.
 
     Args:
@@ -141,9 +143,9 @@ def drawn(tree: Made, *, alike_min: int = ALIKE_MIN) -> Line:
     return _line_of([tree], alike_min)
 
 
-def _line_of(alike: Sequence[Made], alike_min: int) -> Line:
+def _line_of(alike: Sequence[Tree], alike_min: int) -> Line:
     line = Line(_label_of_one(alike[0]) if len(alike) == 1 else _label_of_many(alike))
-    groups: dict[tuple[object, ...], list[Made]] = {}
+    groups: dict[tuple[object, ...], list[Tree]] = {}
     for child in _once(child for one in alike for child in one.children):
         groups.setdefault(_likeness(child), []).append(child)
     repeated = groups.pop(_REPEATED, [])
@@ -176,9 +178,9 @@ def _names_of(repeated: Sequence[Made], alike_min: int) -> Iterable[str]:
             yield from map(_name, group)
 
 
-def _once(many: Iterable[Made]) -> Iterable[Made]:
+def _once(many: Iterable[Tree]) -> Iterable[Tree]:
     """Leave out those that are shown in full among the others."""
-    found: dict[tuple[object, ...], Made] = {}
+    found: dict[tuple[object, ...], Tree] = {}
     for one in many:
         key = one.slot, one.position
         if key not in found or found[key].elsewhere:

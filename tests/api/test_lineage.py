@@ -3,20 +3,23 @@
 import pytest
 
 from enact_dist import (
+    Actor,
     Aspect,
     Entities,
     Entity,
     Lock,
     Read,
     ReadEach,
+    Together,
     View,
     ViewEach,
+    World,
     Write,
     WriteEach,
 )
 from enact_dist.errors import ForgottenError, MisuseError, NullDatumError, UnknownWorldError
 from enact_dist.lineage import DEPTH_MAX, EffectTree
-from enact_dist.testing import ManualClock, worlds
+from enact_dist.testing import ManualClock, run_once, worlds
 
 COUNT = Aspect("count", int)
 SUM = Aspect("sum", int)
@@ -135,6 +138,31 @@ def test_written_pattern_tells_what_was_looked_at_before(cell, online):
 
     tree = cell.why("online", "part/new", COUNT)
     assert names(tree.children) == ["online:part/2/count v1"]
+
+
+class Paired(Actor):
+    """Add up a set of data that bear one capture stamp."""
+
+    pair = Together([View(World("online"), entity, COUNT) for entity in (here, there)])
+    sum = Write(World("online"), total, SUM)
+    triggers = (pair,)
+
+    def update(self, lock):
+        """Add them up."""
+        lock[self.sum] = sum(lock[self.pair])
+
+
+def test_set_comes_from_the_versions_that_bear_its_stamp():
+    """An update for an older set names the older version, not the newest one."""
+    with worlds("online") as cell:
+        online = cell.world("online")
+        for entity, stamp_ns in ((here, 10), (there, 10), (here, 20)):
+            with Lock(Write(online, entity, COUNT)) as lock:
+                lock.put(Write(online, entity, COUNT), stamp_ns, stamp_ns=stamp_ns)
+
+        assert run_once(Paired(), cell) == 1
+
+        assert causes(cell) == ["online:a/1/count v1", "online:b/1/count v1"]
 
 
 def test_more_reads_than_a_commit_names_are_counted(cell, online):
@@ -286,6 +314,15 @@ def test_what_cannot_be_explained_is_refused_by_name(cell, online, arguments, er
 
     with pytest.raises(error, match=words):
         cell.why(*arguments)
+
+
+def test_past_context_is_asked_about_by_version(cell, online):
+    """Of what was the newest version then the history tells the number."""
+    online.init(here, COUNT, 1)
+    past = online.at(cell.why("online", here, COUNT).position)
+
+    with pytest.raises(MisuseError, match="name 'online' and a version"):
+        cell.why(past, here, COUNT)
 
 
 def test_depth_outside_its_limits_is_refused(cell, online):

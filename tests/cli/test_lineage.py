@@ -88,6 +88,20 @@ def test_impact_names_what_came_of_a_datum(ask):
     ]
 
 
+def test_kept_tree_is_listed_under_its_label(ask, cell):
+    """`--keep` takes every version of the tree; `enact world kept` shows them."""
+    assert ask("why", "online", "system/sum@1", "--keep", "incident").status == 0
+
+    kept = cell.kept()["incident"]
+    cell.let_go("incident")
+
+    assert {str(version.slot) for version in kept} == {
+        "online:system/sum",
+        "training:product/milk/sum",
+        *(f"training:view/{number}/count" for number in range(5)),
+    }
+
+
 @pytest.mark.parametrize(
     ("words", "status", "text"),
     [

@@ -20,6 +20,7 @@ from enact_dist import (
     WriteEach,
     connect,
 )
+from enact_dist.lineage import CauseTree
 
 
 @dataclass(frozen=True)
@@ -63,6 +64,8 @@ def count_contacts() -> None:
         assert_type(snapshot.get(view, 0), int)
         for row in online.diff(cell.world("training"), "work_*", [MESH, "contact_count"]):
             assert_type(row.difference, Difference | None)
+        assert_type(cell.why(online, bench, COUNT, 3, depth=2).children, tuple[CauseTree, ...])
+        assert_type([one.version for one in cell.impact("online", "b", "c").walk()], list[int])
         with online.watch_diff(online.at(-1.0), bench, COUNT) as watch:
             assert_type([row.entity for row in watch], list[Entity])
 
