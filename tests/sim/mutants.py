@@ -16,6 +16,7 @@ import mutants_one_shard as one
 import mutants_over_shards as over
 import mutants_payloads as payloads
 import mutants_readers as readers
+import mutants_worlds as worlds
 from mutants_directed import DIRECTED
 
 if TYPE_CHECKING:
@@ -33,7 +34,7 @@ def _of(module: Any) -> tuple[Mutant, ...]:
     )
 
 
-SIMULATED = (*_of(one), *_of(over), *_of(readers), *_of(payloads))
+SIMULATED = (*_of(one), *_of(over), *_of(readers), *_of(payloads), *_of(worlds))
 """Those that the simulator catches."""
 ALL = (*SIMULATED, *DIRECTED)
 

@@ -93,7 +93,9 @@ class WorldJudge:
         picture: Picture,
     ) -> None:
         version = picture.bases.get(slot.context, 0) + 1
-        if (content.version, content.stamp_ns) != (version, world.at_ns):
+        if content.stamp_ns != world.at_ns:
+            self._fail("a fork is of one moment", slot, content, world)
+        if content.version != version:
             self._fail("the versions of a context are never used twice", slot, content, version)
         if _bytes(content.datum) != _bytes(source.datum):
             self._fail("a fork has what its source had", slot, content, source)
