@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
+from enact_dist.core.admission import unknown_world
 from enact_dist.core.datum import Column, Slot
 from enact_dist.core.messages import EpochChanged, Forgotten, Refused, TakeView, Viewed
 from enact_dist.core.records import Reply
@@ -118,7 +119,13 @@ class ViewDesk:
             waited = end_ns <= self._state.now_ns or self._state.draining
             if waited or self._undecided_ns(message.items) > message.at_ns:
                 del self._parked[reply_to]
-                yield Reply(reply_to, self._viewed(message))
+                yield Reply(reply_to, self._dropped(message) or self._viewed(message))
+
+    def _dropped(self, message: TakeView) -> Refused | None:
+        """Refuse a view of a context that was dropped while it waited for another one."""
+        worlds = self._state.catalogue.worlds
+        gone = next((item.context for item in message.items if item.context not in worlds), None)
+        return None if gone is None else unknown_world(gone, worlds)
 
     def next_deadline_ns(self) -> int | None:
         """Return when a view has waited enough."""

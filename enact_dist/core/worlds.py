@@ -167,57 +167,29 @@ class WorldDesk:
 
     def _make(self, act: _Act) -> Iterator[Effect]:
         """Hand a fork to the store."""
-        message = act.message
+        message, slots = act.message, self._state.slots
         assert isinstance(message, Fork)
         del self._waiting[message.world]
         made: list[tuple[Slot, Content]] = []
         records: list[Record] = [WorldRecord(message.world, message.source, message.at_ns)]
         forgotten: Forgotten | None = None
-        for slot, _ in self._state.slots.of_context(message.source):
-            content = self._state.slots.as_of(slot, message.at_ns)
+        fork = _Making(self._state, message)
+        for source, newest in slots.of_context(message.source):
+            is_newest = newest.version > 0 and newest.stamp_ns <= message.at_ns
+            content = newest if is_newest else slots.as_of(source, message.at_ns)
             if isinstance(content, int):
                 if forgotten is None or content > forgotten.oldest_ns:
-                    forgotten = Forgotten(slot, content)
-            elif content is not NOTHING and forgotten is None:
-                new, record = self._forked_slot(message, slot, content)
-                made.append(new)
-                records.append(record)
+                    forgotten = Forgotten(source, content)
+            elif content is not NOTHING:
+                slot, shared = fork.shared(source, content)
+                made.append((slot, shared))
+                records.append(fork.record(slot, shared, source, content))
         if forgotten is not None:
             self._end(act)
             yield from self._told(act, forgotten)
             return
         act.made = tuple(made)
         yield self._persist(act, tuple(records))
-
-    def _forked_slot(
-        self, message: Fork, source: Slot, content: Content
-    ) -> tuple[tuple[Slot, Content], SlotRecord]:
-        """Return a slot of a fork, which shares what it has with its source, and its record."""
-        state, at_ns = self._state, message.at_ns
-        slot = source._replace(context=message.world)
-        version = state.slots.next_version(slot)
-        session = state.sessions.by_id.get(message.session)
-        cause = Cause(
-            LockId(message.session, 0, 0),
-            CAUSE_FORK,
-            session.actor if session is not None else "",
-            session.host if session is not None else "",
-            session.pid if session is not None else 0,
-            at_ns,
-            0,
-            (DatumRead(source, content.version, content.stamp_ns),),
-            0,
-            (SlotVersion(slot, version),),
-        )
-        datum, reason = content.datum, content.null_reason
-        told = "" if datum is not None else reason.name
-        if state.catalogue.durability(slot.aspect) is Durability.VOLATILE:
-            record = SlotRecord(slot, version, at_ns, None, told, volatile=True)
-        else:
-            stored = datum is not None and state.slots.is_stored(source, content.version)
-            same_as = SlotVersion(source, content.version) if stored else None
-            record = SlotRecord(slot, version, at_ns, datum, told, cause=cause, same_as=same_as)
-        return (slot, Content(version, at_ns, datum, reason, cause)), record
 
     def _forked(self, world: str) -> Forked:
         slots = sum(1 for _ in self._state.slots.of_context(world))
@@ -329,6 +301,36 @@ class WorldDesk:
         acts = (*self._waiting.values(), *self._at_store.values())
         assert sorted(act.message.world for act in acts) == sorted(self._state.busy_worlds)
         assert not self._state.busy_worlds.keys() & self._state.catalogue.worlds.keys()
+
+
+class _Making:
+    """The slots of one fork, each sharing what it has with a version of its source."""
+
+    def __init__(self, state: ShardState, message: Fork) -> None:
+        session = state.sessions.by_id.get(message.session)
+        who = (session.actor, session.host, session.pid) if session is not None else ("", "", 0)
+        self._by = (LockId(message.session, 0, 0), CAUSE_FORK, *who, message.at_ns, 0)
+        self._state, self._world, self._at_ns = state, message.world, message.at_ns
+        self._version = state.slots.version_base(message.world) + 1
+
+    def shared(self, source: Slot, content: Content) -> tuple[Slot, Content]:
+        """Return a slot of the fork and what it has."""
+        slot, version = Slot(self._world, source.entity, source.aspect), self._version
+        read = DatumRead(source, content.version, content.stamp_ns)
+        cause = Cause(*self._by, (read,), 0, (SlotVersion(slot, version),))
+        return slot, Content(version, self._at_ns, content.datum, content.null_reason, cause)
+
+    def record(self, slot: Slot, shared: Content, source: Slot, content: Content) -> SlotRecord:
+        """Return what the store is to keep of it; bytes that are there already are named."""
+        state, datum, version = self._state, shared.datum, shared.version
+        reason = "" if datum is not None else shared.null_reason.name
+        if state.catalogue.durability(slot.aspect) is Durability.VOLATILE:
+            return SlotRecord(slot, version, self._at_ns, None, reason, volatile=True)
+        stored = datum is not None and state.slots.is_stored(source, content.version)
+        same_as = SlotVersion(source, content.version) if stored else None
+        return SlotRecord(
+            slot, version, self._at_ns, datum, reason, cause=shared.cause, same_as=same_as
+        )
 
 
 def _fork_of(message: Fork) -> tuple[str, str, int]:

@@ -513,6 +513,25 @@ def test_nothing_new_begins_in_a_context_that_is_going(bench):
     assert isinstance(bench.ask(Register("ann", ("plan",), ())), Registered)
 
 
+def test_view_that_waited_while_its_context_was_dropped_is_refused(bench):
+    """It shows no nulls for what was there as of its stamp."""
+    bench.ask(Register("ann", ("plan",), ()))
+    write(bench, "1", of("plan"))
+    lock = lock_id()
+    grant = bench.granted(lock, item(W), alone=False)
+    bench.ask(Prepare(lock, grant.token, (WriteItem(slot(), None),), 0, (), "far", Token(1, 1)))
+    items = (Item(V, "plan", "piece", "count"), item(V))
+    at_ns = bench.shard.state.stamp()
+    view = TakeView(lock_id("ann", 2, 1), 1, 1, bench.next_count("ann"), items, 0, at_ns, True)
+    handle = bench.send(view)
+    assert drop(bench, "plan") == Dropped("plan", 1)
+    assert handle not in bench.answers
+
+    bench.ask(Finish(lock, Position(at_ns, "far")))
+
+    assert bench.answers[handle].code == "unknown_world"
+
+
 def test_drop_that_a_crash_took_leaves_everything(bench):
     """Nobody was told that it is gone."""
     bench.ask(Register("ann", ("plan",), ()))

@@ -9,8 +9,9 @@ from enact_dist.core import commits, prepares
 from enact_dist.core.commits import Commits
 from enact_dist.core.messages import DropWorld
 from enact_dist.core.records import Persist, Publish
+from enact_dist.core.shard_state import ShardState
 from enact_dist.core.slots import SlotMap
-from enact_dist.core.worlds import WorldDesk
+from enact_dist.core.worlds import WorldDesk, _Making
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -79,14 +80,12 @@ def forks_before_the_undecided(patch: Patch) -> None:
 
 def forks_at_a_moment_of_its_own(patch: Patch) -> None:
     """Each shard stamps its part of a fork with its own present."""
-    forked_slot = WorldDesk._forked_slot
+    init = _Making.__init__
 
-    def wrong(self: WorldDesk, message: Any, source: Any, content: Any) -> Any:
-        (slot, new), record = forked_slot(self, message, source, content)
-        stamp_ns = self._state.stamp()
-        return (slot, replace(new, stamp_ns=stamp_ns)), replace(record, stamp_ns=stamp_ns)
+    def wrong(self: _Making, state: Any, message: Any) -> None:
+        init(self, state, replace(message, at_ns=state.stamp()))
 
-    patch(WorldDesk, "_forked_slot", wrong)
+    patch(_Making, "__init__", wrong)
 
 
 def tells_of_forks_too_early(patch: Patch) -> None:
@@ -106,18 +105,18 @@ def tells_of_forks_too_early(patch: Patch) -> None:
 
 def forks_name_no_source(patch: Patch) -> None:
     """The lineage of a fork ends in itself."""
-    forked_slot = WorldDesk._forked_slot
+    shared = _Making.shared
 
-    def wrong(self: WorldDesk, message: Any, source: Any, content: Any) -> Any:
-        (slot, new), record = forked_slot(self, message, source, content)
-        return (slot, replace(new, cause=new.cause._replace(reads=()))), record
+    def wrong(self: _Making, source: Any, content: Any) -> Any:
+        slot, new = shared(self, source, content)
+        return slot, replace(new, cause=new.cause._replace(reads=()))
 
-    patch(WorldDesk, "_forked_slot", wrong)
+    patch(_Making, "shared", wrong)
 
 
 def starts_versions_again(patch: Patch) -> None:
     """The versions of a context that was dropped start with 1 when it is made again."""
-    patch(SlotMap, "next_version", lambda slots, slot: slots[slot].version + 1)
+    patch(SlotMap, "version_base", lambda _slots, _context: 0)
 
 
 def forgets_versions_at_a_restart(patch: Patch) -> None:
@@ -174,4 +173,4 @@ def drops_half_of_it(patch: Patch) -> None:
 
 def carries_out_late_copies(patch: Patch) -> None:
     """A fork or drop that comes a second time is carried out a second time."""
-    patch(WorldDesk, "_answered_before", lambda _desk, _message: None)
+    patch(ShardState, "answered_before", lambda _state, _message: None)

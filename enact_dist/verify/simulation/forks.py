@@ -17,19 +17,21 @@ from enact_dist.core.messages import (
     Forgotten,
     Fork,
     Forked,
+    Item,
     Reached,
     Refused,
 )
 from enact_dist.core.multilock import OVERLOAD
+from enact_dist.terms import Access
 from enact_dist.verify.simulation.cells import CONTEXTS
 from enact_dist.verify.simulation.client_host import Calls, Sleep, Steps
-from enact_dist.verify.simulation.workload import PLAIN, Job
+from enact_dist.verify.simulation.workload import ENTITIES, PLAIN, Job
 from enact_dist.verify.simulation.world import MS, S
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from enact_dist.core.messages import Answer, Item
+    from enact_dist.core.messages import Answer, Request
     from enact_dist.verify.simulation.client_host import ClientHost, Thread
     from enact_dist.verify.simulation.model import Model
     from enact_dist.verify.simulation.workload import Workload
@@ -44,6 +46,10 @@ NAMES: Final = 2
 """Names that one process forks under."""
 TRIES: Final = 60
 """How often a shard is asked for one thing: longer than any partition lasts."""
+IN_USE: Final = 0.3
+"""Share of the contexts that somebody tries to drop under a lock."""
+LATE: Final = 0.3
+"""How often a copy of an earlier request comes in between."""
 _AGO_NS: Final = (0, 0, 0, 0, 50 * MS, 500 * MS)
 
 
@@ -53,6 +59,7 @@ class Forker:
     def __init__(self, world: World, model: Model, workload: Workload) -> None:
         self._world, self._model, self._workload = world, model, workload
         self._unclear: dict[str, None] = {}
+        self._sent: dict[str, list[tuple[str, Request]]] = {}
         self._newest_ns = 0
         self.takes_place = world.schedule.stream("forks").random() < SHARE
 
@@ -66,10 +73,14 @@ class Forker:
             name = f"trial-{host.name}-{luck.randrange(NAMES)}"
             if name in sources:
                 sources.remove(name)
+                number += 1
+                yield from self._drop_in_use(host, lane, name, f"{host.name}/{lane}.{number}", luck)
                 yield from self._drop(host, name, luck)
+                yield from self._late_copy(host, luck)
             source = luck.choice(sources)
             if name not in self._unclear and (yield from self._fork(host, name, source, luck)):
                 sources.append(name)
+                yield from self._late_copy(host, luck)
                 for _ in range(luck.choice((0, 1, 2, 4))):
                     number += 1
                     job = self._job(f"{host.name}/{lane}.{number}", name, luck)
@@ -122,6 +133,33 @@ class Forker:
         if all(gone):
             del self._unclear[name]
 
+    def _drop_in_use(
+        self, host: ClientHost, lane: int, name: str, job: str, luck: Random
+    ) -> Thread:
+        """Ask for the end of a context, in some cases, while a lock is held in it."""
+        if luck.random() >= IN_USE:
+            return
+        client = host.client
+
+        def drops() -> Thread:
+            for shard in client.placement.shards:
+                count = client.sendings.next(host.local_ns)
+                request = DropWorld(client.session, name, client.epoch(shard.name), count)
+                (answer,) = yield Calls([(shard.name, request)])
+                held = isinstance(answer, Refused) and answer.code == "held"
+                self._world.tally["drops refused for a lock"] += held
+
+        item = Item(Access.READ, name, luck.choice(ENTITIES), "count")
+        reads = Job(job, "read", (item,), luck, 2 * S, 60 * S, 0, False, False, meanwhile=drops)
+        yield from self._workload.do(host, lane, reads)
+
+    def _late_copy(self, host: ClientHost, luck: Random) -> Thread:
+        """Let a copy of an earlier request come late, in some cases; nobody minds its answer."""
+        sent = self._sent.get(host.name, [])
+        if sent and luck.random() < LATE:
+            self._world.tally["copies of forks and drops that came late"] += 1
+            yield Calls([luck.choice(sent)])
+
     def _check_gone(self, name: str) -> None:
         """What was dropped on every shard has not come back by itself."""
         for shard, picture in self._model.pictures.items():
@@ -139,6 +177,7 @@ class Forker:
                     client.answered(shard, hello, answer, host.local_ns)
                 continue
             request = make(client.epoch(shard), client.sendings.next(host.local_ns))
+            self._sent.setdefault(host.name, []).append((shard, request))
             answer = None
             for _ in range(luck.choice((1, 2, 3))):
                 (answer,) = yield Calls([(shard, request)])

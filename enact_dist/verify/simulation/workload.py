@@ -34,6 +34,8 @@ from enact_dist.verify.simulation.payloads import DRAFT_NS, Stager
 from enact_dist.verify.simulation.world import MS, S
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from enact_dist.verify.simulation.model import Model
     from enact_dist.verify.simulation.world import World
 
@@ -89,6 +91,8 @@ class Job:
     label: str = ""
     rests_ns: int = 0
     """How long it rests after the first slice of a large datum; with this all data are large."""
+    meanwhile: Callable[[], Thread] | None = None
+    """What it does besides while it has its lock."""
 
 
 class Workload:
@@ -269,6 +273,8 @@ class Workload:
             data = yield from self._data(host, lock)
             if lock.phase is Phase.HELD and job.work_ns:
                 yield Sleep(job.work_ns)
+            if job.meanwhile is not None:
+                yield from job.meanwhile()
             if data is None or job.abandons:
                 lock.release()
             elif lock.phase is Phase.HELD:
