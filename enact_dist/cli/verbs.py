@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.errors import ConfigError
+from enact_dist.terms import Entities
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -108,6 +109,14 @@ def whole(text: str) -> int:
     if value < 1:
         raise ValueError(text)
     return value
+
+
+def entities(text: str) -> str:
+    """Read a pattern of entities; an `argparse` type."""
+    try:
+        return str(Entities(text))
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def pair(text: str) -> tuple[str, str]:

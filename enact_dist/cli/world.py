@@ -13,6 +13,7 @@ from enact_dist.cli.verbs import (
     add_noun,
     add_reader,
     add_verb,
+    entities,
     open_cell,
     seconds,
     slot_name,
@@ -56,7 +57,9 @@ def _add_tree(verbs: argparse._SubParsersAction[Verb]) -> None:
         example="enact world tree online 'tray/**'",
     )  # fmt: skip
     tree.add_argument("world", metavar="WORLD", help="name of the world context")
-    tree.add_argument("pattern", metavar="PATTERN", nargs="?", default="**", help="of entities")
+    tree.add_argument(
+        "pattern", metavar="PATTERN", type=entities, nargs="?", default="**", help="of entities"
+    )
     tree.add_argument("--null", action="store_true", help="show slots without a datum, too")
     add_reader(tree)
 
@@ -101,7 +104,9 @@ def _add_watch(verbs: argparse._SubParsersAction[Verb]) -> None:
         example="enact world watch online 'tray/**' --aspect surface",
     )  # fmt: skip
     watch.add_argument("world", metavar="WORLD", help="name of the world context")
-    watch.add_argument("pattern", metavar="PATTERN", nargs="?", default="**", help="of entities")
+    watch.add_argument(
+        "pattern", metavar="PATTERN", type=entities, nargs="?", default="**", help="of entities"
+    )
     watch.add_argument("--aspect", action="append", metavar="NAME", help="only these")
     watch.add_argument("--count", type=whole, metavar="N", help="leave after N changes")
     add_reader(watch)

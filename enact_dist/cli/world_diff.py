@@ -21,6 +21,7 @@ from enact_dist.cli.verbs import (
     add_reader,
     add_verb,
     cell_target,
+    entities,
     is_endpoint,
     open_cell,
     see_working_folder,
@@ -56,7 +57,11 @@ def add_diff(verbs: argparse._SubParsersAction[Verb]) -> None:
     diff.add_argument("left", metavar="WORLD1", help="name of a world context")
     diff.add_argument("right", metavar="WORLD2", help="another one, or the same at another time")
     diff.add_argument(
-        "--entities", metavar="PATTERN", default="**", help="only these (default: all)"
+        "--entities",
+        metavar="PATTERN",
+        type=entities,
+        default="**",
+        help="only these (default: all)",
     )
     diff.add_argument("--aspect", action="append", metavar="NAME", help="only these aspects")
     diff.add_argument("--at1", type=moment, metavar="TIME", help=f"the first as of {MOMENT_HELP}")
@@ -124,12 +129,13 @@ def configured_aspects(arguments: argparse.Namespace) -> dict[str, Aspect[Any]]:
     if is_endpoint(target):
         return {}
     see_working_folder()
-    entries = [entry for entry in load_config(target).aspects if entry.compare]
-    wanted = arguments.aspect or [entry.name for entry in entries]
+    allowed = dict(arguments.tolerance)
     return {
         entry.name: load_aspect(entry.name, entry.compare)
-        for entry in entries
-        if entry.name in wanted
+        for entry in load_config(target).aspects
+        if entry.compare
+        and entry.name not in allowed
+        and (not arguments.aspect or entry.name in arguments.aspect)
     }
 
 
@@ -149,7 +155,9 @@ def load_aspect(name: str, target: str) -> Aspect[Any]:
     try:
         found = getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError) as error:
-        raise ConfigError(f"{asked}: {error}; run from the folder that holds it") from error
+        raise ConfigError(
+            f"{asked}: {error}; run from the folder that holds it, or say --tolerance {name}=0"
+        ) from error
     if isinstance(found, Aspect):
         if found.name != name:
             raise ConfigError(f"{asked} is the aspect {found.name!r}")

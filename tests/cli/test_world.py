@@ -169,3 +169,14 @@ def test_watch_ends_with_status_0_on_a_signal(spawn, until, at, cell_file, numbe
 
     assert watch.wait(10) == 0
     assert (change["aspect"], change["version"], change["null"]) == ("count", 1, False)
+
+
+@pytest.mark.parametrize(
+    "verb", [("tree", "online"), ("watch", "online"), ("diff", "online", "training", "--entities")]
+)
+def test_what_is_no_pattern_is_a_usage_error(at, verb, capsys):
+    """A character that no name can have is refused where it is read."""
+    with pytest.raises(SystemExit) as caught:
+        at(*verb, "a??")
+    assert caught.value.code == 2
+    assert "'a??' is no pattern of entities" in capsys.readouterr().err

@@ -153,6 +153,8 @@ def test_tolerance_of_the_command_line_holds_for_its_aspect(diff, with_vocabular
     named = with_vocabulary("the_vocabulary:POSE", *pose, "--tolerance", "pose=1")
     unnamed = with_vocabulary("the_vocabulary:POSE", *pose, "--tolerance", "1")
     assert (named.status, unnamed.status) == (0, 4)
+    unread = with_vocabulary("no_such_module:POSE", *pose, "--tolerance", "pose=1")
+    assert unread.status == 0, "what the command line says need not be loaded"
     assert diff(*pose, "--tolerance", "cuont=1").status == 2
 
 
