@@ -83,6 +83,7 @@ class DiffWatch:
 
         Raises:
             ForgottenError: A shard of the past side has restarted, and does not know it any more.
+            UnknownWorldError: One of the contexts was dropped.
             ShardUnreachableError: A shard does not answer; what has changed is looked at again by
                 the next call.
             MisuseError: The cell was closed.

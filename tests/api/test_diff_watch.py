@@ -6,7 +6,7 @@ import pytest
 
 from enact_dist import Aspect, Entity, Lock, Write, local
 from enact_dist.comparing import Tolerance
-from enact_dist.errors import LockHeldError, MisuseError
+from enact_dist.errors import LockHeldError, MisuseError, UnknownWorldError
 
 SHIFT = Aspect("shift_mm", float, compare=Tolerance(absolute=0.5, unit="mm"))
 COUNT = Aspect("count", int)
@@ -218,3 +218,16 @@ def test_past_context_is_a_reference_that_stays(online):
         from enact_dist.diff_watch import DiffWatch
 
         DiffWatch(before, before, "**", ())
+
+
+def test_context_that_is_dropped_ends_its_standing_diff(cell, online):
+    """Whoever follows it is told that it is gone, not that all its data differ."""
+    put(online, piece, COUNT, 1)
+    fork = online.fork("what_if")
+    with online.watch_diff(fork) as watch:
+        assert told(watch, 0) is None
+        cell.drop_world("what_if")
+        with pytest.raises(UnknownWorldError, match="what_if"):
+            watch.next(SOON_S)
+    with pytest.raises(UnknownWorldError, match="what_if"):
+        online.diff(fork)
