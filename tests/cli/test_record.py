@@ -154,6 +154,18 @@ def test_missing_library_is_named_with_its_extra(cell_file, tmp_path):
     assert "enact-dist[record]" in done.stderr
 
 
+def test_progress_is_shown_on_a_terminal_only(enact, cell_file, put, tmp_path, monkeypatch):
+    """One line, written over again and again, and taken away at the end."""
+    put("progress", a=1)
+    words = ("record", cell_file, "--world", "progress", "--seconds", "0.3", "--out")
+    assert enact(*words, tmp_path / "one.mcap").err == ""
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
+    shown = enact(*words, tmp_path / "two.mcap").err
+    assert "1 versions" in shown
+    assert shown.count("\n") == 0
+    assert shown.endswith("\r\033[K")
+
+
 def test_file_that_is_there_is_kept(enact, cell_file, tmp_path):
     """A recording never takes the place of another one."""
     out = tmp_path / "run.mcap"

@@ -88,7 +88,7 @@ def file(path, *, shows=lambda _: GUESSED, worlds="online", **options):
 def counting(path, commits, *, per_chunk=1, size=0, **options):
     """Write a recording of commits of two slots each, so many in a chunk; it is not ended."""
     recording = file(path, chunk_bytes=1 << 40, **options)
-    filler = np.zeros(size, np.uint8)
+    filler = np.full(size, 7, np.uint8)
     for number in range(1, commits + 1):
         pair = [
             recorded(name, [number, filler] if size else number, version=number, commit=number)

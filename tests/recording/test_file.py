@@ -126,11 +126,11 @@ def chunk_ends(path):
     return ends
 
 
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory):
+@pytest.fixture(scope="module", params=["none", "lz4", "zstd"])
+def whole(request, tmp_path_factory):
     """A recording of five chunks of two commits each."""
     path = tmp_path_factory.mktemp("whole") / "whole.mcap"
-    counting(path, 10, per_chunk=2, size=500).close({})
+    counting(path, 10, per_chunk=2, size=500, compression=request.param).close({})
     return path
 
 
@@ -179,6 +179,21 @@ def test_tail_of_zeros_and_of_noise_are_missing(whole, tmp_path):
         assert recording.missing_bytes > 0
 
 
+def test_hole_in_a_chunk_is_where_the_recording_ends(whole, tmp_path):
+    """Pages that never reached the disk: its checksum tells, wherever in the chunk they are."""
+    ends = chunk_ends(whole)
+    content = whole.read_bytes()
+    path = tmp_path / "hole.mcap"
+    with whole.open("rb") as stream:
+        chunks = [r for r in StreamReader(stream, emit_chunks=True).records if isinstance(r, Chunk)]
+    length = len(chunks[3].data)
+    for offset in range(0, length - 8, max(1, length // 40)):
+        at = ends[3] - length + offset
+        path.write_bytes(content[:at] + bytes(8) + content[at + 8 : ends[3]])
+        if content[at : at + 8] != bytes(8):
+            assert len(read(path)[1]) == 6, offset
+
+
 def test_public_library_reads_whole_chunks_of_a_cut_file(whole):
     """Record by record, it gives the same messages before it meets the cut."""
     ends = chunk_ends(whole)
@@ -203,7 +218,7 @@ def test_open_chunk_is_not_on_the_disk_and_an_ended_one_is(tmp_path):
 def test_chunk_ends_by_size_with_a_whole_commit(tmp_path):
     """The commit that fills a chunk is the last one in it, whole."""
     path = tmp_path / "run.mcap"
-    recording = file(path, chunk_bytes=1000)
+    recording = file(path, chunk_bytes=100)
     for number in (1, 2):
         pair = [recorded(name, b"x" * 400, commit=number) for name in ("bench", "piece")]
         recording.add_commit(pair, pair[0].stamp_ns)

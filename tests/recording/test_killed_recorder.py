@@ -14,6 +14,7 @@ from mcap.exceptions import McapError
 from mcap.records import Channel, Message
 from mcap.stream_reader import StreamReader
 
+from enact_dist import Aspect, Entity, Lock, Write, connect
 from enact_dist.recording.reading import Recording
 
 HERE = Path(__file__).parent
@@ -96,6 +97,40 @@ def test_killed_recorder_leaves_whole_commits_without_a_hole(endpoint, started, 
         assert _publicly_readable(path) == 2 * len(commits)
         held.append(len(numbered))
     assert max(held) > 50, "under load"
+
+
+@pytest.mark.slow
+def test_recording_goes_on_when_a_shard_comes_back(started, tmp_path):
+    """Killed and started again, its durable data have no hole in the recording."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        address = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    file = tmp_path / "cell.toml"
+    file.write_text(
+        'name = "back"\nworlds = ["online"]\ndata_folder = "data"\nsession_ttl_s = 1.0\n'
+        f'[shards.only]\nlisten = "{address}"\n'
+    )
+    run = ("-m", "enact_dist.cli.main", "shard", "run", "only", "--cell", file)
+    shard = started(*run, ready="ready")
+    path = tmp_path / "run.mcap"
+    count = Aspect("count", int, retention=100)
+    with connect(file) as cell:
+        request = Write(cell.world("online"), Entity("piece"), count)
+        recorder = started("-m", "enact_dist.cli.main", "record", file, "--out", path, ready="")
+        while not path.exists():
+            assert recorder.poll() is None, recorder.stdout.read()
+        for number in range(40):
+            if number == 20:
+                shard.kill()
+                shard.wait()
+                started(*run, ready="ready")
+            with Lock(request, wait_s=30.0) as lock:
+                lock[request] = number
+        recorder.send_signal(signal.SIGTERM)
+        text = recorder.stdout.read()
+        assert recorder.wait(60) == 0, text
+    found = [v.version for c in Recording(path).commits() for v in c.versions]
+    assert found == list(range(found[0], 41)), text
 
 
 def _publicly_readable(path):

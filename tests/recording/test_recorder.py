@@ -3,6 +3,7 @@
 import errno
 import os
 import threading
+import time
 from dataclasses import dataclass
 
 import numpy as np
@@ -147,6 +148,18 @@ def test_null_is_a_version(cell, online, tmp_path):
     assert (last.version, last.datum, last.null_reason) == (2, None, "DELETED")
 
 
+def test_a_chunk_ends_by_time_while_nothing_happens(cell, online, tmp_path):
+    """What a power cut may take is bounded for a quiet cell, too."""
+    path = tmp_path / "run.mcap"
+    with Running(cell, path, chunk_s=0.1):
+        put((Write(online, piece, COUNT), 1))
+        ends_s = time.monotonic() + 20.0
+        while not commits_of(path):
+            assert time.monotonic() < ends_s
+            time.sleep(0.02)
+        assert not Recording(path).end
+
+
 def test_only_what_is_chosen_is_recorded(cell, online, tmp_path):
     """By context, pattern of entities and aspect."""
     options = {"worlds": ["online"], "entities": "piece*", "aspects": ["count"]}
@@ -266,6 +279,8 @@ def test_disk_that_is_too_slow_costs_no_memory_and_is_named(cell, online, tmp_pa
     with Running(cell, path, queue_bytes=1) as summary:
         for number in range(40):
             put((Write(online, piece, fleeting), number))
+        time.sleep(2 * recorder.SETTLE_S)
+        assert summary.versions < 40, "no more is fetched than one batch beyond what has room"
         go_on.set()
     commits = commits_of(path)
     recorded = [v.version for c in commits for v in c.versions]
