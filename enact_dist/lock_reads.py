@@ -15,13 +15,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from enact_dist.core.datum import Slot
 from enact_dist.core.message_parts import READS_MAX
 from enact_dist.reading import slot_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
+    from enact_dist.core.datum import Slot
     from enact_dist.core.messages import DatumRead
     from enact_dist.reading import EachData, Readings
     from enact_dist.terms import LockRequest
@@ -41,7 +41,8 @@ def reads_of(
         requests: What it asked for.
         each: The mappings of its patterns that were used.
     """
-    looked_at, slots = readings.looked_at, dict[Slot, None]()
+    looked_at = readings.looked_at
+    slots: dict[Slot, None] = {}
     for request in requests:
         access = request.access
         if not (access.writes or access.each):
@@ -53,4 +54,4 @@ def reads_of(
             if looked_at.keys().isdisjoint(shown):
                 slots.update(dict.fromkeys(shown))
     reads = readings.versions(slots)
-    return tuple(reads[:READS_MAX]), max(0, len(reads) - READS_MAX)
+    return reads[:READS_MAX], max(0, len(reads) - READS_MAX)

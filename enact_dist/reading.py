@@ -89,10 +89,10 @@ class Readings:
             if not is_null(reading.state):
                 yield reading.shard, reading.state
 
-    def versions(self, slots: Iterable[Slot]) -> list[DatumRead]:
+    def versions(self, slots: Iterable[Slot]) -> tuple[DatumRead, ...]:
         """Return which version of each of these slots was shown, of those that were."""
-        shown = self._readings
-        return [_read_of(shown[slot].state[:3]) for slot in slots if slot in shown]
+        found = map(self._readings.get, slots)
+        return tuple([_read_of(reading.state[:3]) for reading in found if reading is not None])
 
     def shard(self, slot: Slot) -> str:
         """Return the shard that showed the slot."""
