@@ -59,6 +59,8 @@ OVER_MAX: Final = 4096
 """Names of payloads that were adopted or given up, by which late slices are known."""
 ROOM_S: Final = 1.0
 """How long a new draft waits for files that are on their way out."""
+ROOM_TRIES: Final = 8
+"""So often history lets go for a draft, each time of more, while others take the room before it."""
 
 _log = logging.getLogger("enact.shard")
 
@@ -133,7 +135,7 @@ class PayloadDesk:
         self._files: dict[str, int] = {}
         self._adopted: dict[str, weakref.ref[Pages | Plain]] = {}
         self._over: OrderedDict[str, None] = OrderedDict()
-        self._bytes = 0
+        self._bytes = self._gone = 0
         self._full = 0, 0
 
     # ---------------------------------------------------------------- drafts
@@ -217,11 +219,15 @@ class PayloadDesk:
         until_ns, least = self._full
         if self._clock.monotonic_ns() < until_ns and total >= least:
             return False  # looking through all history again would only delay the others
-        self._make_room(self._bytes + total - self._bytes_max)
-        # What is let go of takes a moment to leave.
-        leftovers().wait(ROOM_S)
-        if self._reserved(total):
-            return True
+        for attempt in range(1, ROOM_TRIES + 1):
+            gone = self._gone
+            self._make_room(self._bytes + attempt * total - self._bytes_max)
+            # What is let go of takes a moment to leave.
+            leftovers().wait(ROOM_S)
+            if self._reserved(total):
+                return True
+            if self._gone == gone:
+                break  # history has no more to give; else another payload has taken the room
         self._full = self._clock.monotonic_ns() + FULL_NS, total
         return False
 
@@ -346,6 +352,7 @@ class PayloadDesk:
                 _log.info("payload %s: %s", file, error)
         with self._mutex:
             self._bytes -= self._files.pop(file, 0)
+            self._gone += 1
             self._adopted.pop(file, None)
 
     # ---------------------------------------------------------------- life

@@ -288,6 +288,26 @@ def test_history_goes_before_a_payload_is_refused(folder):
     assert names(folder) == [f"{SESSION}-2", f"{SESSION}-3"]
 
 
+def test_room_that_another_payload_takes_first_is_made_again(folder):
+    """Cameras come at one moment: what goes for one of them may be had by the next."""
+    kept, asked = [], []
+
+    def make_room(size):
+        asked.append(size)
+        kept.pop(0)
+        if len(asked) == 1:
+            assert stage(desk, f"{SESSION}-4") == Staged(f"{SESSION}-4", 0, True)
+
+    desk = PayloadDesk(folder, 2 * SIZE, make_room=make_room)
+    for number in (1, 2):
+        stage(desk, f"{SESSION}-{number}", body=b"x" * SIZE)
+        kept.append(adopted(desk, f"{SESSION}-{number}"))
+
+    assert stage(desk, f"{SESSION}-3") == Staged(f"{SESSION}-3", 0, True)
+    assert asked == [SIZE, 2 * SIZE]
+    assert names(folder) == [f"{SESSION}-3", f"{SESSION}-4"]
+
+
 def test_client_that_asks_again_and_again_delays_nobody(folder):
     """History is looked through once for what cannot fit; what is smaller is another matter."""
     asked = []
