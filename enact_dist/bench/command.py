@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Final
 from enact_dist.bench.decisions import core_cases
 from enact_dist.bench.faults import run_recovery, run_stopped
 from enact_dist.bench.floors import Floors
+from enact_dist.bench.history import run_history
 from enact_dist.bench.layers import run_layers
 from enact_dist.bench.memory import run_memory
 from enact_dist.bench.payloads import run_fetch, run_publish, run_wakeup
@@ -60,6 +61,7 @@ BENCHES: Final[dict[str, Callable[[Run], None]]] = {
     "fetch": run_fetch,
     "publish": run_publish,
     "wakeup": run_wakeup,
+    "history": run_history,
     "pipeline": run_pipeline,
     "stopped": run_stopped,
     "memory": run_memory,

@@ -148,11 +148,11 @@ class Place:
 
     # ---------------------------------------------------------------- cells
 
-    def world(self, carrier: str) -> WorldContext:
-        """Return the benches' world context as this process reaches it over a carrier."""
+    def world(self, carrier: str, name: str = WORLD) -> WorldContext:
+        """Return a world context as this process reaches it over a carrier; made if need be."""
         if carrier not in self._cells:
             self._cells[carrier] = self._stack.enter_context(self._opened(carrier))
-        return self._cells[carrier].create_world(WORLD)
+        return self._cells[carrier].create_world(name)
 
     def way(self, carrier: str) -> str:
         """Return how calls over a carrier travel: "socket", "zenoh" or `EMBEDDED`.

@@ -5,6 +5,7 @@ storer    writes an array anew at each line ``ENTITY BYTES``
 notifier  at a line, writes numbered and stamped arrays with pauses between them
 fetcher   fetches one datum over and over, and says when it begins and when it has it
 waiter    at a line, its threads queue for one slot; says when each had it and began to leave it
+cameras   from the time in a line on, a thread per camera writes images, with history and without
 ========  =======================================================================================
 
 It says ``ready:`` once it has joined; it leaves when its standard input ends.
@@ -20,8 +21,10 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from enact_dist.bench.history import CAMERAS, IMAGE_BYTES, IMAGES, PERIOD_NS, side_of
 from enact_dist.bench.payloads import ARRAY, WAIT_S, said, store
 from enact_dist.bench.place import WORLD
+from enact_dist.bench.timing import sleep_until
 from enact_dist.bench.updates import slots
 from enact_dist.connecting import connect
 from enact_dist.link.datum_cache import DatumCache
@@ -106,11 +109,46 @@ def _wait(world: WorldContext, options: dict[str, Any]) -> None:
     sys.stdin.read()
 
 
+def _film(world: WorldContext, options: dict[str, Any]) -> None:
+    late, failed = [0] * CAMERAS, list[BaseException]()
+    images = [np.full(IMAGE_BYTES, camera, np.uint8) for camera in range(CAMERAS)]
+    writes = [
+        [Write(world, Entity(f"history/camera/{camera}"), aspect) for aspect in IMAGES]
+        for camera in range(CAMERAS)
+    ]
+    print("ready:", flush=True)
+    start_ns = int(sys.stdin.readline())
+
+    def film(camera: int) -> None:
+        try:
+            for tick in range(options["ticks"]):
+                due_ns = start_ns + tick * PERIOD_NS
+                sleep_until(due_ns)
+                write = writes[camera][side_of(tick)]
+                images[camera][:8].view(np.int64)[0] = tick
+                with Lock(write, wait_s=WAIT_S) as lock:
+                    lock.put(write, images[camera], stamp_ns=tick + 1)
+                late[camera] += time.perf_counter_ns() > due_ns + PERIOD_NS
+        except BaseException as error:  # noqa: BLE001 (raised again below)
+            failed.append(error)
+
+    threads = [threading.Thread(target=film, args=(camera,)) for camera in range(CAMERAS)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    if failed:
+        raise failed[0]
+    print("did:", said(late), flush=True)
+    sys.stdin.read()
+
+
 _ROLES: Final[dict[str, Callable[[WorldContext, dict[str, Any]], None]]] = {
     "storer": _store,
     "notifier": _notify,
     "fetcher": _fetch,
     "waiter": _wait,
+    "cameras": _film,
 }
 
 

@@ -23,6 +23,7 @@ NAMES: Final = (
     "fetch",
     "publish",
     "wakeup",
+    "history",
     "pipeline",
     "stopped",
     "memory",

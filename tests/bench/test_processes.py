@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from enact_dist.bench import pipeline
+from enact_dist.bench import history, pipeline
 from enact_dist.bench.decisions import Decider, granted_of, hand_over_us
 from enact_dist.bench.floors import ECHO, FDATASYNC, PUBLISH, QUERY, Floors
 from enact_dist.bench.pipeline_worker import (
@@ -164,3 +164,22 @@ def test_pipeline_of_17_processes_takes_sets(new_run, monkeypatch):
         rows
     )
     assert "growth of the shared folder" in rows
+
+
+@pytest.mark.slow
+def test_history_fills_its_cap_beside_updates(new_run, monkeypatch):
+    """A short run: images with history fill shared memory up to its cap, and none is refused."""
+    monkeypatch.setattr(history, "CAP_BYTES", 100_000_000)  # the images of 1.4 s
+    run = new_run("auto")
+
+    history.run_history(run)
+
+    rows = {row.variant: row for row in run.rows() if row.name == "history"}
+    memory = rows["8 cameras, 74 MB/s, shared memory at most"]
+    assert memory.met
+    assert 0.9 * history.CAP_BYTES / 1e6 < memory.value <= history.CAP_BYTES / 1e6
+    for side in history.SIDES:
+        assert rows[f"update beside 8 cameras, {side}"].median_us > 0
+        assert rows[f"update, durable, {side}"].median_us > 0
+    assert rows["list of 1,000 versions"].median_us > 0
+    assert rows["fork of 100 slots of 0.9 MB, per slot"].goal is not None
