@@ -1,0 +1,42 @@
+"""A shard's history is that of a plain list of dicts, whatever is committed, forked, kept or lost.
+
+`ENACT_MACHINE_EXAMPLES=500 python -m pytest -s tests/core/test_history_machine.py` runs the full
+amount and prints how often each kind of step and of answer was met.
+"""
+
+from __future__ import annotations
+
+from machine_history import ShardHistoryMachine
+from time_runs import run_and_meet
+
+EXAMPLES, STEPS = 40, 80
+MET = (
+    "commits",
+    "commits over shards",
+    "pauses",
+    "forks",
+    "forks of forks",
+    "forks of the forgotten",
+    "drops",
+    "worlds made again",
+    "keeps",
+    "kept too late",
+    "labels let go",
+    "restarts",
+    "died before the record",
+    "died after the record",
+    "travels",
+    "travels by pattern",
+    "travels to a null",
+    "views that waited",
+    "forgotten",
+    "exact captures",
+    "nearest captures",
+    "explained too late",
+    "effects",
+)
+
+
+def test_shard_agrees_with_a_list_of_dicts_about_the_past():
+    """Listings, views as of any moment, captures, causes and effects, over crashes and restarts."""
+    assert run_and_meet(ShardHistoryMachine, EXAMPLES, STEPS, MET) == []
