@@ -223,7 +223,7 @@ class Batch:
                 key, body = session_row(record)
             case SessionEnded():
                 self.changes[key_of(Kind.SESSION, record.session)] = None
-                self.forget_ended(record.wall_ns)
+                self._forget_ended(record.wall_ns)
                 self._outcomes.ended(record.session, record.wall_ns)
                 key, body = ended_row(record)
             case OutcomeRecord():
@@ -251,7 +251,7 @@ class Batch:
                 raise TypeError(f"no record of a store: {record!r}")
         self.changes[key] = body
 
-    def forget_ended(self, wall_ns: int) -> None:
+    def _forget_ended(self, wall_ns: int) -> None:
         """Remove the outcomes of sessions that ended long before `wall_ns`."""
         for key in self._outcomes.expired(wall_ns):
             self.changes[key] = None

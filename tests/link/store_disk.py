@@ -21,7 +21,7 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePath
 from typing import NamedTuple
 
-EXHAUSTIVE_MAX = 1 << 10
+EXHAUSTIVE_MAX = 1 << 6
 """Up to so many subsets of unforced writes all are tried, beyond a sample."""
 
 CALLS = (

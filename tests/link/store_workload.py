@@ -24,13 +24,16 @@ from enact_dist.core.messages import (
     AspectEntry,
     Break,
     Commit,
+    DropWorld,
     Finish,
     Finished,
     ForceAbort,
+    Fork,
     Goodbye,
     Granted,
     Hello,
     Item,
+    KeepVersions,
     ListLocks,
     PlacementMap,
     Prepare,
@@ -39,6 +42,7 @@ from enact_dist.core.messages import (
     Resolve,
     Resolved,
     ShardEntry,
+    SlotVersion,
     WriteItem,
 )
 from enact_dist.core.records import Call, Called, Persist, Persisted, Reply, SlotRecord, Tick
@@ -50,19 +54,24 @@ from enact_dist.link.blobs import BlobFolder
 from enact_dist.link.store import open_store
 from enact_dist.link.store_database import Database
 from enact_dist.link.store_mark import MarkFile
+from enact_dist.link.store_states import States
 from enact_dist.terms import Access
 
 ASPECTS = {"kept": "durable", "swift": "os", "volatile": "volatile"}
+RETAINED = {"kept": 2, "swift": 3, "volatile": 3}
 SETTINGS = ShardSettings(
     "s0",
     PlacementMap(1, (ShardEntry("s0", ()), ShardEntry("s1", ())), ()),
     worlds=("online",),
-    aspects=tuple(AspectEntry(name, "", durability) for name, durability in ASPECTS.items()),
+    aspects=tuple(AspectEntry(name, "", ASPECTS[name], RETAINED[name]) for name in ASPECTS),
 )
 LOG_BYTES = 150_000
 """The log is carried into the database and begun anew this often, many times in one run."""
 SIZES = (0, 40, 300, 2_000, 9_000, 66_000)
 ENTITIES = 5
+FORKS_MAX = 3
+PROMISING = {"Committed", "Prepared", "Welcome", "Finished", "Forked", "Dropped", "Kept"}
+"""The answers that promise something."""
 FAR_TOKEN = Token(7, 7)
 
 
@@ -127,7 +136,7 @@ class Driver:
             elif isinstance(effect, Reply):
                 self.replies[effect.reply_to] = effect.answer
                 asked = dict(self.unanswered).get(effect.reply_to)
-                if type(effect.answer).__name__ in {"Committed", "Prepared", "Welcome", "Finished"}:
+                if type(effect.answer).__name__ in PROMISING:
                     self.say("answer", (flat_record(asked), effect.answer))
 
     def flush(self):
@@ -149,16 +158,22 @@ class Driver:
     def run(self, steps):
         acts = {
             self.commit: 10,
+            self.commit_large: 3,
             self.prepare: 4,
             self.decide: 4,
             self.hear: 4,
+            self.fork: 3,
+            self.drop: 1,
+            self.keep: 3,
             self.hello: 1,
             self.goodbye: 1,
             self.break_one: 1,
             self.later: 2,
             self.much_later: 1,
         }
-        self.commit_large()
+        for act in (self.commit_large, self.fork, self.keep):
+            act()
+            self.flush()
         for _ in range(steps):
             (act,) = self.rng.choices(list(acts), list(acts.values()))
             act()
@@ -166,14 +181,22 @@ class Driver:
                 self.flush()
         self.flush()
 
-    def acquire(self, slots):
-        """Lock slots; return the grant, None where they are not free."""
+    def session(self):
+        """Return some session."""
         if not self.sessions:
             self.hello()
             self.flush()
+        return self.rng.choice(self.sessions)
+
+    def worlds(self):
+        """Return the world contexts that there are."""
+        return list(self.shard.state.catalogue.worlds)
+
+    def acquire(self, slots):
+        """Lock slots; return the grant, None where they are not free."""
         self.seq += 1
         seq = self.epoch * 10_000 + self.seq
-        lock = LockId(self.rng.choice(self.sessions), self.rng.randrange(2), seq)
+        lock = LockId(self.session(), self.rng.randrange(2), seq)
         items = tuple(Item(int(Access.WRITE), *slot) for slot in slots)
         granted = self.send(Acquire(lock, self.epoch, 1, 0, items, 0, 10**11, 0))
         if isinstance(granted, Granted):
@@ -183,7 +206,8 @@ class Driver:
 
     def some_slots(self, count):
         names = [(e, a) for e in range(ENTITIES) for a in ASPECTS]
-        return [Slot("online", f"e{e}", a) for e, a in self.rng.sample(names, count)]
+        world = self.rng.choice([*self.worlds(), "online", "online"])
+        return [Slot(world, f"e{e}", a) for e, a in self.rng.sample(names, count)]
 
     def writes(self, slots):
         return tuple(WriteItem(slot, self.datum()) for slot in slots)
@@ -191,7 +215,7 @@ class Driver:
     def datum(self):
         if self.rng.random() < 0.15:
             return None
-        size = self.rng.choice(SIZES)
+        (size,) = self.rng.choices(SIZES, (3, 3, 3, 3, 3, 1))
         return Datum(self.rng.randbytes(5), self.rng.randbytes(size), size, self.rng.randrange(99))
 
     def commit(self):
@@ -205,13 +229,12 @@ class Driver:
         self.send(Commit(granted.lock, granted.token, writes, 0, participants=far))
 
     def commit_large(self):
-        """Commit a body in a file that a power cut may take."""
-        slot = Slot("online", "e0", "swift")
+        """Commit a body in a file: one that a power cut may take, or one that it may not."""
+        slot = Slot("online", "e0", self.rng.choice(("swift", "swift", "kept")))
         granted = self.acquire([slot])
         if granted is not None:
             datum = Datum(b"large", self.rng.randbytes(SIZES[-1]), SIZES[-1])
             self.send(Commit(granted.lock, granted.token, (WriteItem(slot, datum),), 0))
-            self.flush()
 
     def prepare(self):
         """Prepare for another shard's decision."""
@@ -255,6 +278,28 @@ class Driver:
                 finished = Finished(call.request.lock)
                 self.perform(self.handle(Called(call.shard, call.request, finished)))
 
+    def fork(self):
+        """Fork a context as of now, or of a while ago."""
+        if len(self.worlds()) > FORKS_MAX:
+            self.drop()
+        source, name = self.rng.choice(self.worlds()), f"fork{self.epoch}-{self.handles}"
+        at_ns = self.shard.state.stamps.last_ns - self.rng.choice((0, 0, 10**8))
+        if at_ns > 0:
+            self.send(Fork(self.session(), name, source, at_ns))
+
+    def drop(self):
+        """Drop a context that is not in the configuration."""
+        others = [world for world in self.worlds() if world not in SETTINGS.worlds]
+        if others:
+            self.send(DropWorld(self.session(), self.rng.choice(others)))
+
+    def keep(self):
+        """Keep the newest versions of some slots under a label, or let go of it."""
+        slots = self.some_slots(3) if self.rng.random() < 0.8 else []
+        newest = [SlotVersion(slot, self.shard.state.slots[slot].version) for slot in slots]
+        versions = tuple(version for version in newest if version.version)
+        self.send(KeepVersions(self.session(), self.rng.choice("xy"), versions))
+
     def hello(self):
         name = f"session{len(self.sessions)}-{self.epoch}-{self.handles}"
         self.send(Hello(name, 0, 10**10, "a", "h", 1, False))
@@ -297,6 +342,14 @@ def _body_not_forced(write):
     return lambda self, body, *, durable: write(self, body, durable=False)._replace(synced=durable)
 
 
+def _not_forced_later(_force):
+    return lambda _self, blob: blob._replace(synced=True)
+
+
+def _gone_with_the_first(_last):
+    return lambda _self, _name: True
+
+
 def _unlinked_early(discard):
     return lambda self, replaced, *, forced: discard(self, replaced, forced=forced or True)
 
@@ -309,6 +362,8 @@ WRONG = {
     "durable commits are not forced": (Database, "commit", _not_forced),
     "names of large bodies are not forced": (BlobFolder, "sync_names", _names_not_forced),
     "large bodies are not forced": (BlobFolder, "write", _body_not_forced),
+    "the file of a fork is not forced": (BlobFolder, "force", _not_forced_later),
+    "a file goes with its first row": (States, "_last", _gone_with_the_first),
     "a replaced body is unlinked early": (store_module.Store, "_discard", _unlinked_early),
     "the mark runs ahead of the disk": (MarkFile, "note", _marked_early),
 }

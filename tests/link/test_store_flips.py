@@ -8,15 +8,23 @@ import collections
 import random
 import re
 import shutil
+from dataclasses import replace
 
 import pytest
 from store_disk import memory_folder
 from store_model import State
 from store_writer import outcome_record, persist, slot_record
 
-from enact_dist.core.datum import Datum, LockId, Position, Token
-from enact_dist.core.messages import Item, SlotVersion, WriteItem
-from enact_dist.core.records import DecisionRecord, PreparedRecord, SessionRecord, WorldRecord
+from enact_dist.core.datum import Datum, LockId, Position, Slot, Token
+from enact_dist.core.messages import Cause, DatumRead, Item, SlotVersion, WriteItem
+from enact_dist.core.records import (
+    DecisionRecord,
+    KeptRecord,
+    PreparedRecord,
+    SessionRecord,
+    WorldDropped,
+    WorldRecord,
+)
 from enact_dist.errors import StoreError
 from enact_dist.link.blobs import Blob, BlobFolder, DamagedBlobError
 from enact_dist.link.store import open_store
@@ -25,6 +33,18 @@ from enact_dist.terms import Durability
 pytestmark = pytest.mark.slow
 FRAME_BYTES = 24 + 4096
 LARGE = 66_000
+READ = Slot("online", "b", "aspect")
+
+
+CAUSE = Cause(LockId("s", 1, 1), "commit", "a", "h", 1, 5, 2, (DatumRead(READ, 1, 4),), 3, ())
+
+
+def fork(name, version, **more):
+    """Return the state of a fork's slot, with the bytes of its source's version."""
+    source = slot_record(name, version, **more)
+    same_as = SlotVersion(source.slot, version)
+    slot = source.slot._replace(context="fork")
+    return replace(source, slot=slot, same_as=same_as, cause=CAUSE)
 
 
 def batches():
@@ -45,10 +65,16 @@ def batches():
             7,
             "s1",
             Token(2, 2),
+            CAUSE,
         ),
         DecisionRecord(LockId("near", 1, 1), Position(5, "s0"), ("s1",)),
+        WorldRecord("fork", "online", 7),
+        WorldDropped("gone", 3),
+        KeptRecord("label", (SlotVersion(slot, 1),)),
+        fork("a", 1, size=40),
+        fork("large", 1, size=LARGE),
     ]
-    yield [slot_record("a", 2, size=60)]
+    yield [replace(slot_record("a", 2, size=60), history=True, cause=CAUSE)]
 
 
 @pytest.fixture
@@ -65,9 +91,7 @@ def folders(memory):
     folder = memory / "closed"
     store, _ = open_store(folder, unix_s=1)
     for records in batches():
-        durability = (
-            Durability.OS if records[0] == slot_record("a", 2, size=60) else Durability.DURABLE
-        )
+        durability = Durability.OS if len(records) == 1 else Durability.DURABLE
         store.write([persist(*records, durability=durability)])
         state = state.after([(durability, records)])
     shutil.copytree(folder, memory / "killed")
