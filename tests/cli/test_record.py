@@ -8,6 +8,7 @@ import sys
 import pytest
 
 from enact_dist import Aspect, Entity, Lock, Write, connect
+from enact_dist.recording.reading import Recording
 
 COUNT = Aspect("count", int)
 
@@ -57,14 +58,17 @@ def test_a_signal_ends_the_recording_whole(enact, spawn, cell_file, put, tmp_pat
     process = spawn("record", cell_file, "--out", out, "--world", world, "--json")
     while not (out.exists() and out.stat().st_size):
         assert process.poll() is None
-    put(world, a=2, b=2)
+    put(world, **dict.fromkeys("abcdefgh", 2))
     process.send_signal(number)
     text = process.stdout.read()
     assert process.wait(20) == 0, text
     summary = json.loads(text)
     done = enact("replay", out, "--into", cell_file, "--world", f"{world}=copy{number}", "--json")
     assert (done.json["whole"], done.json["versions"]) == (True, summary["versions"])
-    assert summary["versions"] == 3
+    assert summary["versions"] == 9
+    _, commit = Recording(out).commits()
+    assert len(commit.versions) == 8
+    assert {version.shard for version in commit.versions} == {"left", "right"}
 
 
 def test_cut_recording_is_said_to_be_cut(enact, cell_file, put, tmp_path):

@@ -1,4 +1,4 @@
-"""Lets the tests of this folder share their samples; two shards of a cell in this process."""
+"""Lets the tests of this folder share their samples; a cell in this process."""
 
 import sys
 from pathlib import Path
