@@ -15,7 +15,7 @@ from enact_dist.wire.limits import ITEMS_MAX
 from enact_dist.wire.payload import decode_untyped
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterator, Mapping
 
     from enact_dist.core.messages import AspectEntry, Item, SlotState
     from enact_dist.session import Session
@@ -52,14 +52,7 @@ def take_snapshot(
     for attempt in range(1, VIEWS_MAX + 1):
         try:
             captured_ns = _newest_set_ns(session, together) if together is not None else 0
-            in_set = together.requests if together is not None else ()
-            items = [
-                item
-                for request in requests
-                for item in _items_of(
-                    session, request, moment, captured_ns if request in in_set else 0
-                )
-            ]
+            items = _items(session, requests, moment, together, captured_ns)
             readings = take_readings(session, items, past_ns=moment.at_ns)
             snapshot = Snapshot(readings, requests, together, captured_ns)
             if together is None or attempt == VIEWS_MAX or snapshot.has_set():
@@ -94,19 +87,31 @@ def _moment_of(requests: tuple[LockRequest[Any], ...], together: Together[Any] |
     return moment
 
 
-def _items_of(
-    session: Session, request: LockRequest[Any], moment: Moment, captured_ns: int
-) -> Iterable[Item]:
-    """Yield the protocol's lines for one request."""
-    captured_ns = captured_ns or moment.captured_ns
-    if not captured_ns or not request.access.each:
-        yield session.item_of(request, captured_ns, nearest=moment.nearest)
-        return
-    # What was captured when is asked slot by slot.
+def _items(
+    session: Session,
+    requests: tuple[LockRequest[Any], ...],
+    moment: Moment,
+    together: Together[Any] | None,
+    set_ns: int,
+) -> list[Item]:
+    """Return the protocol's lines for all requests; those of a set ask for its capture stamp."""
+    in_set = together.requests if together is not None else ()
+    items: list[Item] = []
+    for request in requests:
+        captured_ns = set_ns if request in in_set else moment.captured_ns
+        if captured_ns and request.access.each:
+            items += _items_of_each(session, request, moment)
+        else:
+            items.append(session.item_of(request, captured_ns, nearest=moment.nearest))
+    return items
+
+
+def _items_of_each(session: Session, request: LockRequest[Any], moment: Moment) -> Iterator[Item]:
+    """Yield the lines for a pattern by capture stamp, which is asked slot by slot."""
     context, pattern, aspect = request.address
     for _, state in survey_states(session, context, pattern, (aspect,)):
         view = View(request.world, Entity(state.slot.entity), request.aspect)
-        yield session.item_of(view, captured_ns, nearest=moment.nearest)
+        yield session.item_of(view, moment.captured_ns, nearest=moment.nearest)
 
 
 def survey_states(

@@ -1,4 +1,4 @@
-"""A world context as its user sees it: initial data, views without locks, watches, listings.
+"""A world context as its user sees it: data to begin with, views, watches, its past, its forks.
 
 A world context W maps (entity, aspect) to a datum or null (ENACT 3.2); `WorldContext` is the
 handle, the map itself lies on the shards.
