@@ -151,8 +151,6 @@ class History:
             if datum is not None:
                 self._loose_bytes += datum.size
                 self._payloads.count(datum, may_go=1)
-            if found.kept and old.version in found.kept:
-                found.index(old)
             return
         found.held += 1
         self.count += 1
@@ -188,11 +186,10 @@ class History:
             self._loose_bytes += datum.size
             if not datum.file:
                 self.bytes -= datum.size
-        if old.version not in found.kept:
-            if datum is not None and datum.stamp_ns:
+            if datum.stamp_ns:
                 found.unindex(old)
-            if found.stored:
-                self._forgotten.append(SlotVersion(found.slot, old.version))
+        if found.stored and old.version not in found.kept:
+            self._forgotten.append(SlotVersion(found.slot, old.version))
         if found.young < len(found.states) > found.held:
             self._trim(found)
 
@@ -351,25 +348,15 @@ class History:
         if found is None:
             found = self._opened(slot, stored=self.policy(slot.aspect).stored)
             found.until_ns = newest.stamp_ns
-        self._keep(label, found, content, indexed=is_newest or found.is_held(number))
+        self._keep(label, found, content)
         return True
 
-    def _keep(
-        self,
-        label: str,
-        found: SlotHistory,
-        content: Content,
-        *,
-        indexed: bool = False,
-        until_ns: int = 0,
-    ) -> None:
+    def _keep(self, label: str, found: SlotHistory, content: Content, *, until_ns: int = 0) -> None:
         kept = found.kept.get(content.version)
         if kept is None:
             kept = found.kept[content.version] = KeptVersion(content, until_ns)
             self.kept_bytes += _own_bytes(content)
             self._payloads.count(content.datum, stays=1)
-            if not indexed:
-                found.index(content)
         kept.labels.add(label)
         self.labels.setdefault(label, {})[SlotVersion(found.slot, content.version)] = None
 
@@ -392,11 +379,10 @@ class History:
         del found.kept[version]
         self.kept_bytes -= _own_bytes(kept.content)
         self._payloads.count(kept.content.datum, stays=-1)
-        if found.is_held(version):
+        if found.is_held(version) or not found.stored:
             return
-        found.unindex(kept.content)
         # The newest one, too: a commit that replaces it may be with the store already.
-        if found.stored and not (is_newest and self.will_hold(found.slot, kept.content)):
+        if not (is_newest and self.will_hold(found.slot, kept.content)):
             self._forgotten.append(SlotVersion(found.slot, version))
 
     # ---------------------------------------------------------------- restart
@@ -431,8 +417,7 @@ class History:
             version = content.version
             tail = first <= version <= newest.version
             for label in labels.get(SlotVersion(slot, version), ()):
-                until_ns = 0 if tail else untils[version]
-                self._keep(label, found, content, indexed=tail, until_ns=until_ns)
+                self._keep(label, found, content, until_ns=0 if tail else untils[version])
             if not tail and version not in found.kept:
                 self._forgotten.append(SlotVersion(slot, version))
         limits = self.policy(slot.aspect).limits

@@ -105,6 +105,6 @@ def surveyed(state: ShardState, message: Survey, *, stamp_ns: int) -> Surveyed:
     for slot, newest in state.slots.selected(message.contexts, message.patterns, message.aspects):
         replaced = state.slots.history.of(slot) if message.retained else None
         if replaced is not None:
-            states += [state_of(slot, older, with_datum=False) for older, _ in replaced.known()]
+            states += [state_of(slot, older, with_datum=False) for older in replaced.retained()]
         states.append(state_of(slot, newest, with_datum=False))
     return Surveyed(state.epoch, state.commits.notice_number, stamp_ns, tuple(states))

@@ -103,11 +103,15 @@ class SlotHistory:
             until_ns = self.until_ns_of(version)
             if until_ns and (first is None or version < first):
                 yield self.kept[version].content, until_ns
-        held = list(islice(self.states, len(self.states) - self.held, None))
+        held = self.retained()
         for content, after in pairwise(held):
             yield content, after.stamp_ns
         if held:
             yield held[-1], self.until_ns
+
+    def retained(self) -> list[Content]:
+        """Return the versions within the slot's retention, oldest first."""
+        return list(islice(self.states, len(self.states) - self.held, None))
 
     def until_ns_of(self, version: int) -> int:
         """Return until when a kept version was current, 0 where it is the newest one."""
@@ -138,18 +142,14 @@ class SlotHistory:
     # ---------------------------------------------------------------- by capture stamp
 
     def index(self, content: Content) -> None:
-        """Let a version be found by its capture stamp, if it has one."""
-        if content.datum is not None and content.datum.stamp_ns:
-            insort(self._captures, (content.datum.stamp_ns, content.version))
+        """Let a version within retention be found by its capture stamp, which it has."""
+        assert content.datum is not None
+        insort(self._captures, (content.datum.stamp_ns, content.version))
 
     def unindex(self, content: Content) -> None:
         """Let a version not be found by its capture stamp any more."""
-        if content.datum is None or not content.datum.stamp_ns:
-            return
-        entry = content.datum.stamp_ns, content.version
-        index = bisect_left(self._captures, entry)
-        if index < len(self._captures) and self._captures[index] == entry:
-            del self._captures[index]
+        assert content.datum is not None
+        del self._captures[bisect_left(self._captures, (content.datum.stamp_ns, content.version))]
 
     def captured(self, captured_ns: int, *, version_max: int) -> Content | None:
         """Return the latest version up to `version_max` that was captured then."""
@@ -183,10 +183,9 @@ class SlotHistory:
         held = [state for state in self.states if self.is_held(state.version)]
         assert len(held) == self.held, (len(held), self.held)
         assert self.size == sum(state.datum.size for state in held if state.datum is not None)
-        found = {content.version: content for content, _ in self.known()}
-        right = {
-            (content.datum.stamp_ns, version)
-            for version, content in found.items()
-            if content.datum is not None and content.datum.stamp_ns
-        }
+        right = [
+            (state.datum.stamp_ns, state.version)
+            for state in held
+            if state.datum is not None and state.datum.stamp_ns
+        ]
         assert self._captures == sorted(right), (self._captures, right)

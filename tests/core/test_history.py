@@ -428,6 +428,19 @@ class TestLabels:
         assert [unreadable.code, many.code] == ["value", "no_room"]
 
 
+def test_kept_version_is_not_found_by_its_capture(bench):
+    """Its slot may have had others with that stamp, which are forgotten: a set would be torn."""
+    retain(bench, "frame", 2)
+    capture(bench, 100)
+    bench.ask(KeepVersions("ann", "a", (SlotVersion(slot("cam", "frame"), 1),)))
+    for stamp_ns in (100, 200, 300):
+        capture(bench, stamp_ns)
+    asked = item(V, "cam", "frame")._replace(captured_ns=100)
+
+    assert shown(bench, bench.shard.state.stamp(), asked) == ["OUTSIDE_RETENTION"]
+    assert listed(bench, "frame") == [1, 3, 4]
+
+
 class TestNearest:
     @pytest.mark.parametrize(
         ("captured_ns", "version"),

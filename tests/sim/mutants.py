@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import mutants_directed
+import mutants_history as history
 import mutants_one_shard as one
 import mutants_over_shards as over
 import mutants_payloads as payloads
@@ -34,7 +35,14 @@ def _of(module: Any) -> tuple[Mutant, ...]:
     )
 
 
-SIMULATED = (*_of(one), *_of(over), *_of(readers), *_of(payloads), *_of(worlds))
+SIMULATED = (
+    *_of(one),
+    *_of(over),
+    *_of(readers),
+    *_of(payloads),
+    *_of(worlds),
+    *_of(history),
+)
 """Those that the simulator catches."""
 ALL = (*SIMULATED, *DIRECTED)
 

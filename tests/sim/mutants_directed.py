@@ -134,6 +134,11 @@ def shows_the_future_by_stamp(patch: Patch) -> None:
     patch(SlotHistory, "captured", wrong)
 
 
+def keeps_captures_of_what_is_gone(patch: Patch) -> None:
+    """What has left its retention stays in the index by capture stamp, for ever."""
+    patch(SlotHistory, "unindex", lambda _history, _content: None)
+
+
 def forgets_a_later_commit_of_its_own(patch: Patch) -> None:
     """A client that is told of two commits in the other order waits for the earlier one only."""
 
@@ -162,6 +167,7 @@ DIRECTED = {
     forgets_a_later_commit_of_its_own: (
         "test_own_commit_is_shown_though_an_earlier_one_was_told_later"
     ),
+    keeps_captures_of_what_is_gone: "test_history_agrees_with_a_plain_list",
     views_do_not_renew: "test_everything_that_is_counted_renews",
 }
 """Each with the test of `tests/core` that catches it."""

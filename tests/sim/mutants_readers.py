@@ -20,7 +20,7 @@ def shows_the_first_of_a_stamp(patch: Patch) -> None:
     """Of two versions with one stamp the older one is shown."""
 
     def wrong(self: SlotHistory, captured_ns: int, *, version_max: int) -> Any:
-        for old, _ in self.known():
+        for old in self.retained():
             stamp_ns = old.datum.stamp_ns if old.datum is not None else 0
             if stamp_ns == captured_ns and old.version <= version_max:
                 return old

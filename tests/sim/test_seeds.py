@@ -127,6 +127,12 @@ HAPPENED = (
     "forks of what is forgotten",
     "copies of forks and drops that came late",
     "shard: forks_waited",
+    # What was, and what was kept of it.
+    "data shown as of long ago",
+    "views of what is forgotten",
+    "replaced versions listed",
+    "labels changed",
+    "kept versions found after a restart",
     # What came apart from its commit.
     "slices staged",
     "slices sent again",

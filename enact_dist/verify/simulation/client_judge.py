@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from enact_dist.core.messages import Forgotten
 from enact_dist.core.phase import Phase
 from enact_dist.terms import Access, Durability
 from enact_dist.verify.simulation.cells import CONTEXTS
@@ -99,9 +100,8 @@ class ClientJudge:
         self._world.tally[f"told: {entry.told.value if entry.told else '-'}"] += 1
         applied = any(entry.id in picture.applied for picture in self._model.pictures.values())
         refusal = entry.lock.refusal
-        if refusal is not None and not (
-            self._model.clocks_were_set and getattr(refusal, "code", "") == "clock_skew"
-        ):
+        skewed = self._model.clocks_were_set and getattr(refusal, "code", "") == "clock_skew"
+        if refusal is not None and not skewed and not isinstance(refusal, Forgotten):
             self._fail("nothing is refused", entry.id, refusal)
         applied = applied or entry.id in self._model.permitted_losses
         if entry.told is Phase.COMMITTED and entry.lock.versions and not applied:

@@ -52,6 +52,11 @@ class Entry:
         """The lock's identity."""
         return self.lock.lock
 
+    @property
+    def past_ns(self) -> int:
+        """As of which stamp it views the past, 0 where it does not."""
+        return self.lock.plan.past_ns
+
     def readings(self) -> list[Reading]:
         """Return what the lock read under protection: its reads, and its views if expected."""
         return [
@@ -63,6 +68,8 @@ class Entry:
     def views(self) -> list[Reading]:
         """Return what the lock saw without protection, at whatever shard; not by stamp."""
         stamps = self.stamps()
+        if self.past_ns:
+            return []  # each datum was judged when it was shown
         return [
             reading
             for reading in self.lock.states

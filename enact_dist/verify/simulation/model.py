@@ -13,15 +13,21 @@ from enact_dist.core.datum import Datum, LockId, Slot
 from enact_dist.core.messages import (
     Committed,
     Finished,
+    Forgotten,
     Goodbye,
     Granted,
     Hello,
+    KeepVersions,
+    Kept,
+    ListHistory,
     Notice,
     Prepared,
     SlotVersion,
     Survey,
     Surveyed,
+    TakeView,
     Valid,
+    Versions,
     Viewed,
 )
 from enact_dist.core.records import (
@@ -43,6 +49,7 @@ from enact_dist.verify.simulation.cause_judge import CauseJudge
 from enact_dist.verify.simulation.client_judge import ClientJudge
 from enact_dist.verify.simulation.history import TOLD_NOT, History
 from enact_dist.verify.simulation.lock_judge import LockJudge
+from enact_dist.verify.simulation.past_judge import PastJudge
 from enact_dist.verify.simulation.payloads import copied
 from enact_dist.verify.simulation.picture import Picture, State
 from enact_dist.verify.simulation.prefixes import judge_prefixes
@@ -71,6 +78,7 @@ class Model:
         self.durabilities = {entry.name: Durability(entry.durability) for entry in aspects}
         versions = {entry.name: limits_of(entry).versions for entry in aspects}
         self._readers = ReaderJudge(self, versions)
+        self._pasts = PastJudge(self, versions)
         self.pictures: dict[str, Picture] = {}
         self.of_clients = ClientJudge(world, history, self)
         self.absent: dict[LockId, dict[tuple[str, Slot], tuple[int, tuple[int, int]]]] = {}
@@ -190,6 +198,7 @@ class Model:
                 self._fail("a datum keeps its capture stamp", slot, content, before)
             picture.restarted_at[slot] = len(picture.chains[slot]) - 1
         self._causes.booted(host, picture)
+        self._pasts.booted(host, recovered, picture)
         if len(recovered.outcomes) > len(picture.lanes):
             self._fail("I14 one outcome per lane", len(recovered.outcomes), len(picture.lanes))
         picture.arrivals.clear()
@@ -222,10 +231,19 @@ class Model:
         self._check_commits(host, effects, picture)
         self._worlds.check_told()
         self._locks.judge(host, message, picture)
+        if isinstance(message, KeepVersions):
+            self._pasts.take_keep(host, message, picture)
         for effect in effects:
             if not isinstance(effect, Reply):
                 continue
-            if isinstance(effect.answer, Granted | Viewed):
+            asked = host.asked.get(effect.reply_to)
+            if isinstance(asked, TakeView) and asked.strict:
+                self._judge_past(effect.answer, asked, picture)
+            elif isinstance(effect.answer, Versions) and isinstance(asked, ListHistory):
+                self._pasts.check_list(asked, effect.answer, picture)
+            elif isinstance(effect.answer, Kept):
+                self._pasts.check_kept(host, effect.answer, picture)
+            elif isinstance(effect.answer, Granted | Viewed):
                 self._readers.check(host, effect.answer, picture)
             elif isinstance(effect.answer, Surveyed) and isinstance(message, Survey):
                 self._readers.check_survey(message, effect.answer, picture)
@@ -233,6 +251,12 @@ class Model:
                 lock = effect.answer.lock
                 if lock in picture.granted_ever:  # else it only expected something here
                     picture.confirmed[lock] = picture.granted_ever[lock]
+
+    def _judge_past(self, answer: object, asked: TakeView, picture: Picture) -> None:
+        if isinstance(answer, Viewed):
+            self._pasts.check_view(answer, asked.at_ns, asked.items, picture)
+        elif isinstance(answer, Forgotten):
+            self._pasts.check_forgotten(answer, asked, picture)
 
     def _check_commits(self, host: ShardHost, effects: Sequence[Effect], picture: Picture) -> None:
         told = {
@@ -413,6 +437,8 @@ class Model:
                 self._fail("I2 versions are a chain", slot, version, before)
             if before.epoch == picture.epoch and stamp_ns <= before.stamp_ns:
                 self._fail("stamps grow", slot, stamp_ns, before)
+            if stamp_ns <= picture.promised.get(slot, 0):
+                self._fail("the past does not change", slot, stamp_ns, picture.promised[slot])
             if datum is not None:
                 self._check_content(lock, slot, before, datum)
             picture.put(slot, State(version, stamp_ns, lock, picture.epoch, datum))

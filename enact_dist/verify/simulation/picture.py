@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from enact_dist.core.datum import Datum, LockId, Slot, Token
 
 if TYPE_CHECKING:
-    from enact_dist.core.messages import WorldEntry
+    from enact_dist.core.messages import SlotVersion, WorldEntry
     from enact_dist.core.records import Persist, PreparedRecord
 
 
@@ -38,7 +38,9 @@ class Picture:
 
     `restarted_at` is where in its chain a slot stood when the shard last started, or its context
     was dropped; `restarts` are all writers that are no locks, with begin and end; `worlds` the
-    forks, and `bases` from where on the versions of dropped contexts are free.
+    forks, and `bases` from where on the versions of dropped contexts are free.  `started_ns` is the
+    stamp at which this epoch began, `promised` up to which stamp the past of a slot was shown in
+    it, and `labels` what each label keeps.
     """
 
     epoch: int = 0
@@ -63,6 +65,10 @@ class Picture:
     restarts: list[tuple[str, int, int]] = field(default_factory=list)
     worlds: dict[str, WorldEntry] = field(default_factory=dict)
     bases: dict[str, int] = field(default_factory=dict)
+    started_ns: int = 0
+    promised: dict[Slot, int] = field(default_factory=dict)
+    labels: dict[str, dict[SlotVersion, State]] = field(default_factory=dict)
+    confirmed_labels: dict[str, None] = field(default_factory=dict)
 
     def now(self, slot: Slot) -> State:
         """Return the newest committed state of a slot."""
@@ -91,6 +97,11 @@ class Picture:
             if state.version and (not found or state.version == found[-1].version - 1):
                 found.append(state)
         return found[::-1]
+
+    def labels_of(self, slot: Slot) -> list[State]:
+        """Return the versions of a slot that labels keep, each once."""
+        kept = (item for versions in self.labels.values() for item in versions.items())
+        return list({key.version: state for key, state in kept if key.slot == slot}.values())
 
     def put(self, slot: Slot, state: State) -> None:
         """Add a state to the chain of a slot."""

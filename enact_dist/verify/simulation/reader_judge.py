@@ -118,8 +118,7 @@ class ReaderJudge:
         A restart leaves what is on the disk, and of volatile slots nothing.
         """
         line = picture.line(slot, volatile=self._model.is_volatile(slot))
-        count = self._retentions[slot.aspect] - 1
-        return line[:-1][-count:] if count > 0 else []
+        return line[-self._retentions[slot.aspect] : -1]
 
     def check_survey(self, message: Survey, answer: Surveyed, picture: Picture) -> None:
         """A survey names every version that is retained, oldest first, and then the newest."""

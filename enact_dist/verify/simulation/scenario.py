@@ -21,6 +21,7 @@ from enact_dist.verify.simulation.cells import CONTEXTS, WORK_NS
 from enact_dist.verify.simulation.client_host import ClientHost
 from enact_dist.verify.simulation.forks import Forker
 from enact_dist.verify.simulation.graph import Graph
+from enact_dist.verify.simulation.historian import Historian
 from enact_dist.verify.simulation.history import History
 from enact_dist.verify.simulation.injector import Injector
 from enact_dist.verify.simulation.model import Model
@@ -96,6 +97,7 @@ class Scenario:
             host.asserts = asserts
         self.workload = Workload(world, self.history, self.model, entities=cell.entities)
         self.forker = Forker(world, self.model, self.workload)
+        self.historian = Historian(world, self.history, self.model, self.workload)
         self.injector = Injector(
             world, cell, self.network, self.shards, until_ns=self._faults_end_ns
         )
@@ -142,6 +144,8 @@ class Scenario:
                 host.start(self.workload.thread(host, lane))
             if self.forker.takes_place:
                 host.start(self.forker.thread(host, self.cell.lanes))
+            if self.historian.takes_place:
+                host.start(self.historian.thread(host, self.cell.lanes + 1))
 
         host.start(host.open(ASPECTS, work))
 

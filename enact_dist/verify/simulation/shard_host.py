@@ -29,7 +29,7 @@ ASSERT_EVERY = 4
 
 
 class ShardHost(Host):
-    """A shard daemon."""
+    """A shard daemon.  `asked` are the requests that it has not answered yet, by their handles."""
 
     def __init__(
         self, world: World, settings: ShardSettings, faults: Faults, *, wall_offset_ns: int
@@ -49,6 +49,7 @@ class ShardHost(Host):
         self.on_decision: Callable[[ShardHost, list[str]], None] = lambda _host, _told: None
         self.network: Network
         self.peers: dict[str, ShardHost] = {}
+        self.asked: dict[int, Request] = {}
         self._replies: dict[int, Callable[[Answer], None]] = {}
         self._handle = self._steps = 0
         self._stalled = False
@@ -64,6 +65,7 @@ class ShardHost(Host):
         self.clock = self.new_clock()
         recovered = self.disk.recovered(unix_s=self.wall_ns // S)
         self._replies.clear()
+        self.asked.clear()
         self.shard = Shard(self.settings, recovered, now_ns=self.local_ns, wall_ns=self.wall_ns)
         self.payloads = ShardPayloads(self)
         self.model.booted(self, recovered, crashed_at_ns=self._crashed_at_ns)
@@ -128,7 +130,7 @@ class ShardHost(Host):
             reply(self.payloads.stage(message))
             return
         self._handle += 1
-        self._replies[self._handle] = reply
+        self._replies[self._handle], self.asked[self._handle] = reply, message
         self._give(self.payloads.with_bodies(message), self._handle)
 
     def event(self, event: Event) -> None:
@@ -155,6 +157,7 @@ class ShardHost(Host):
         for effect in effects:
             if isinstance(effect, Reply):
                 reply = self._replies.pop(effect.reply_to, None)
+                self.asked.pop(effect.reply_to, None)
                 if reply is None:
                     self.world.violation("one answer per request", self.name, effect.answer)
                     return

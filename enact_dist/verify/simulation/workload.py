@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from enact_dist.verify.simulation.world import World
 
 ASPECTS = (
-    AspectEntry("count", "int", "durable"),
+    AspectEntry("count", "int", "durable", 6),
     AspectEntry("note", "int", "os", 3),
     AspectEntry("frame", "int", "volatile", 4),
     AspectEntry("made", "str", "durable"),
@@ -270,7 +270,7 @@ class Workload:
             self._world.tell(job.name, "has its lock")
             self._model.of_clients.holds(host, entry)
             self._model.of_clients.shows_own(own, entry)
-            data = yield from self._data(host, lock)
+            data = yield from self.data(host, lock)
             if lock.phase is Phase.HELD and job.work_ns:
                 yield Sleep(job.work_ns)
             if job.meanwhile is not None:
@@ -300,7 +300,7 @@ class Workload:
 
     # ---------------------------------------------------------------- reading
 
-    def _data(self, host: ClientHost, lock: MultiLock) -> Steps[dict[Slot, Datum | None] | None]:
+    def data(self, host: ClientHost, lock: MultiLock) -> Steps[dict[Slot, Datum | None] | None]:
         """Return the datum of each slot read, fetching what did not come with the grant."""
         data: dict[Slot, Datum | None] = {}
         for reading in lock.states:
