@@ -94,7 +94,9 @@ class Picture:
         chain = self.chains.get(slot, [])
         found: list[State] = []
         for state in reversed(chain[self.restarted_at.get(slot, 0) if volatile else 0 :]):
-            if state.version and (not found or state.version == found[-1].version - 1):
+            if not state.version:
+                break  # a restart has lost the slot with all that it had
+            if not found or state.version == found[-1].version - 1:
                 found.append(state)
         return found[::-1]
 
