@@ -10,6 +10,7 @@ counted, and written into the recording by name and reason.
 from __future__ import annotations
 
 import bisect
+import contextlib
 import itertools
 import threading
 import time
@@ -48,8 +49,9 @@ BATCH_BYTES_MAX: Final = 64 << 20
 """How many versions, and of how many bytes together, are fetched at once."""
 UNLISTED_BYTES: Final = 1 << 20
 """What a version counts for whose size is not known before it is fetched."""
-WANTED_MAX: Final = 65_536
-"""Versions that wait to be fetched; beyond, the oldest are given up, counted and named."""
+WANTED_MAX: Final = 1 << 18
+"""Versions that wait to be fetched, 100 MB of names: more than shards list slots.  Beyond, the
+oldest are given up, counted and named."""
 
 FINISH_S: Final = 30.0
 """How long the end of a recording may take."""
@@ -186,7 +188,7 @@ class Recorder:
                     self.summary.seconds = time.monotonic() - begun_s
                     if seconds is not None and self.summary.seconds >= seconds:
                         break
-                    self._listen(watch)
+                    self._listen(watch, 0.0 if self._settled() else POLL_S)
                     self._record_settled()
                     self._look_at(file)
                     tell(self.summary)
@@ -246,11 +248,10 @@ class Recorder:
     def _listen_until_settled(self, watch: Watch) -> None:
         ends_s = time.monotonic() + SETTLE_S
         while time.monotonic() < ends_s:
-            self._listen(watch)
+            self._listen(watch, POLL_S)
 
-    def _listen(self, watch: Watch) -> None:
-        """Take what the watch tells; wait a little where there is nothing else to do."""
-        wait_s = 0.0 if self._settled() else POLL_S
+    def _listen(self, watch: Watch, wait_s: float) -> None:
+        """Take what the watch tells, and wait so long for the first of it."""
         for _ in range(HEARD_MAX):
             change = watch.next(wait_s)
             wait_s = 0.0
@@ -273,7 +274,8 @@ class Recorder:
         if aspect not in self._aspects:
             client = self._session.client
             if aspect not in client.aspect_entries():
-                client.greet()
+                with contextlib.suppress(LinkError):  # of a shard that is away
+                    client.greet()
             if aspect in client.aspect_entries():
                 self._aspects[aspect] = client.aspect_entries()[aspect]
 

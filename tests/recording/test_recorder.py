@@ -245,11 +245,11 @@ def test_versions_without_a_notice_come_from_the_history(cell, online, tmp_path,
     entered, go_on = threading.Event(), threading.Event()
     listen = Recorder._listen
 
-    def paused(self, watch):
+    def paused(self, watch, wait_s):
         if self.summary.commits:
             entered.set()
             assert go_on.wait(20)
-        listen(self, watch)
+        listen(self, watch, wait_s)
 
     monkeypatch.setattr(Recorder, "_listen", paused)
     with Running(cell, path) as summary:
