@@ -104,7 +104,8 @@ class Cause(NamedTuple):
         pid: Its process.
         stamp_ns: Stamp of the commit.
         held_ns: How long the lock had been held when its commit, or its promise, reached the shard.
-        reads: Every datum that the lock read or viewed, and each replaced one that it looked at.
+        reads: Every datum that the lock read or viewed, of a pattern those that its block looked
+            at, and each replaced one that it looked at.
         reads_left_out: How many further ones there were than a message holds.
         writes: What the commit set on this shard.
     """
