@@ -25,9 +25,8 @@ FORMAT: Final = 3
 """Version of everything below a data folder; goes up when an older program could misread it.
 
 2: commits over shards are stored (prepared locks, decisions), and the mark is there first.
-3: slots have a row per stored state, with its cause.  A folder of 2 is refused, not upgraded: its
-states have neither, and a history that begins with an unexplained state would look like one that
-was cut.
+3: slots have a row per stored state, with its cause.  A folder of 2 is refused as well: to take a
+row in either form would weaken the check that it is exactly what was written.
 """
 
 _FORMAT_WORDS: Final = "enact-dist store"
