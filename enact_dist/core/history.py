@@ -15,6 +15,7 @@ from collections import deque
 from itertools import pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+from enact_dist.core.causes import cause_bytes
 from enact_dist.core.datum import Slot
 from enact_dist.core.message_parts import SlotVersion
 from enact_dist.core.payload_names import PayloadNames
@@ -35,8 +36,8 @@ LOOSE_STATES_MAX: Final = 50_000
 """States that were replaced within that time: where the wall clock was set back, the stamps stand
 still for as long, and nothing would be old."""
 HELD_BYTES_MAX: Final = 256 << 20
-"""Bytes of replaced data within retention, over all slots of a shard; those of payloads have a cap
-of their own, which the link keeps."""
+"""Bytes of replaced data and their lineage within retention, over all slots of a shard; those of
+payloads have a cap of their own, which the link keeps."""
 HELD_STATES_MAX: Final = 100_000
 """Replaced states within retention, over all slots of a shard."""
 
@@ -154,12 +155,10 @@ class History:
             return
         found.held += 1
         self.count += 1
+        self.bytes += _own_bytes(old)
         if datum is not None:
             found.size += datum.size
-            if datum.file:
-                self._payloads.count(datum, may_go=1)
-            else:
-                self.bytes += datum.size
+            self._payloads.count(datum, may_go=1)
             if datum.stamp_ns:
                 found.index(old)
         while found.held >= limits.versions or found.size > limits.size:
@@ -180,12 +179,11 @@ class History:
         found.held -= 1
         self.count -= 1
         self._loose += 1
+        self.bytes -= _own_bytes(old)
         datum = old.datum
         if datum is not None:
             found.size -= datum.size
             self._loose_bytes += datum.size
-            if not datum.file:
-                self.bytes -= datum.size
             if datum.stamp_ns:
                 found.unindex(old)
         if found.stored and old.version not in found.kept:
@@ -461,6 +459,7 @@ class History:
 
 
 def _own_bytes(content: Content) -> int:
-    """Return the bytes that a state holds in the memory of the shard alone."""
-    datum = content.datum
-    return datum.size if datum is not None and not datum.file else 0
+    """Return the bytes that a state holds in the memory of the shard alone, lineage included."""
+    datum, cause = content.datum, content.cause
+    size = datum.size if datum is not None and not datum.file else 0
+    return size if cause is None else size + cause_bytes(cause)

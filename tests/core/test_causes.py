@@ -6,6 +6,7 @@ import pytest
 from client_bench import CellBench
 from shard_bench import MS, S, ShardBench, datum, item, lock_id, slot
 
+from enact_dist.core.causes import READ_BYTES
 from enact_dist.core.message_parts import READS_MAX
 from enact_dist.core.messages import (
     Cause,
@@ -222,3 +223,17 @@ def test_question_about_too_much_is_refused(kind):
     one = SlotVersion(slot(), 1) if kind is Explain else READ
 
     assert isinstance(ShardBench().ask(kind((one,) * 4097)), Refused)
+
+
+def test_lineage_counts_in_the_cap_of_history(monkeypatch):
+    """Versions that name much of what was read go as early as large ones."""
+    bench = ShardBench()
+    bench.hello("ann")
+    history = bench.shard.state.slots.history
+    monkeypatch.setattr(history, "_bytes_max", 3 * 100 * READ_BYTES + 100)
+    for seq in range(1, 8):
+        committed(bench, (slot(), "1"), seq=seq, reads=[READ] * 100)
+
+    assert history.count == 3
+    assert history.dropped == 3
+    assert history.bytes == 3 * (100 * READ_BYTES + 1)
