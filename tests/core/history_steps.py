@@ -36,6 +36,7 @@ WORLDS = st.sampled_from((*FIRM, *FIRM, *FORKS))
 ENTITIES = ("piece", "bench")
 LABELS = ("drop-17", "best")
 PAUSES_NS = (700 * MS, 1700 * MS, 5500 * MS)
+CAPTURES_MAX = 4
 DOWN_NS = 400 * MS
 """A restart takes longer than any stamp here lies ahead of the wall clock: the stamps go on."""
 KEPT, NOT_KEPT = "kept", "not kept"
@@ -46,7 +47,7 @@ PICK = st.integers(0, (1 << 30) - 1)
 ASPECT = st.sampled_from(tuple(RULES))
 WHERE = st.tuples(WORLDS, st.sampled_from(ENTITIES), ASPECT)
 WRITES = st.lists(
-    st.tuples(WHERE, st.one_of(st.none(), st.integers(0, 60)), st.integers(0, 4)),
+    st.tuples(WHERE, st.one_of(st.none(), st.integers(0, 60)), st.integers(0, CAPTURES_MAX)),
     min_size=1,
     max_size=3,
     unique_by=lambda write: write[0],

@@ -13,6 +13,7 @@ from typing import Any, ClassVar
 from history_steps import (
     ASPECT,
     ASPECTS,
+    CAPTURES_MAX,
     DOWN_NS,
     FIRM,
     FORK,
@@ -231,16 +232,18 @@ class ShardHistoryMachine(RuleBasedStateMachine):
             _check_state(state, shown[place])
         self.tally["travels by pattern"] += bool(found)
 
-    @rule(where=PICK, captured_ns=st.integers(1, 5), nearest=st.booleans())
-    def travel_by_capture(self, where, captured_ns, nearest):
-        """A slot is seen as it was captured at a stamp, or next to it."""
+    @rule(where=PICK, nearest=st.booleans())
+    def travel_by_capture(self, where, nearest):
+        """A slot is seen as it was captured at each stamp, or next to it."""
         place = self._place(where)
-        answer = self._view([Item(int(Access.VIEW), *place, 0, captured_ns, nearest)], 0)
-        assert isinstance(answer, Viewed), answer
-        expected = self.model.captured(place, captured_ns, nearest=nearest)
-        _check_state(answer.states[0], expected)
-        if isinstance(expected, dict):
-            self.tally["nearest captures" if nearest else "exact captures"] += 1
+        for captured_ns in range(1, CAPTURES_MAX + 2):
+            item = Item(int(Access.VIEW), *place, 0, captured_ns, nearest)
+            answer = self._view([item], 0)
+            assert isinstance(answer, Viewed), answer
+            expected = self.model.captured(place, captured_ns, nearest=nearest)
+            _check_state(answer.states[0], expected)
+            if isinstance(expected, dict):
+                self.tally["nearest captures" if nearest else "exact captures"] += 1
 
     @rule(pick=PICK)
     def explain(self, pick):
