@@ -42,7 +42,8 @@ class ShardInfo:
     """One shard of the cell; `reachable` False leaves everything else at zero.
 
     Attributes:
-        open: False while a restarted shard waits for older leases to end.
+        open: Whether it grants locks; False while it waits for older leases to end after a start,
+            and while it ends.
         clock_ahead_s: Its wall clock less ours, half a round trip taken off.
         round_trip_s: Of the call that asked.
         carrier: How this process's calls to it travel: "socket", or "zenoh" and why.

@@ -346,7 +346,9 @@ def shared_data(shard: ShardInfo) -> Iterator[Finding]:
 
 
 def _connection(subject: str, shard: ShardInfo) -> Finding:
-    state = "" if shard.open else ", still waits for leases of before its restart"
+    from enact_dist.link.shard_health import state_of
+
+    state = "" if shard.open else f", {state_of(open_=False, counters=shard.counters)}"
     took = f"{shard.round_trip_s * 1e3:.2f} ms over {shard.carrier}"
     text = f"{shard.endpoint} answers in {took}{state}"
     if shard.round_trip_s > ROUND_TRIP_S_WARN:

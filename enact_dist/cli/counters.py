@@ -86,6 +86,7 @@ OF_A_SHARD: Final[dict[str, Counter]] = {
     ),
     "alarms": Counter("of these, those that nobody has settled yet", "enact lock audit"),
     # This process and its host
+    "draining": Counter("1 while this shard ends and grants nothing new"),
     "stalls": Counter("times this host stood still; no lease paid for it", _BUSY),
     "disk_stalls": Counter(
         "times a write took more than a second",

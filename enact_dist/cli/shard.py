@@ -1,14 +1,15 @@
-"""`enact shard run|ls`."""
+"""`enact shard run|ls|check`."""
 
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from enact_dist.cli.counters import told
 from enact_dist.cli.output import print_json, print_table, shown_bytes, shown_s
 from enact_dist.cli.verbs import (
     DONE,
+    FAILED,
     UNREACHABLE,
     add_cell,
     add_noun,
@@ -26,6 +27,10 @@ if TYPE_CHECKING:
 
     from enact_dist.cell_info import ShardInfo
     from enact_dist.cli.verbs import Verb
+    from enact_dist.link.shard_health import ShardHealth
+
+CHECK_S: Final = 2.0
+"""How long a health check waits: it is called every few seconds, and a local answer takes 1 ms."""
 
 
 def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
@@ -61,6 +66,24 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
         "--counters", action="store_true", help="list what each has counted, and what that means"
     )
     add_reader(ls)
+    check = add_verb(
+        verbs,
+        "check",
+        "ask shards whether they are ready, or alive; made to be called every few seconds",
+        run=check_shards,
+        example="enact shard check left --cell cell.toml --alive\n"
+        "enact shard check --cell tcp/127.0.0.1:7447 --json",
+    )
+    check.add_argument(
+        "name", metavar="NAME", nargs="?", help="name of the shard (default: each one of the cell)"
+    )
+    asks = check.add_mutually_exclusive_group()
+    asks.add_argument(
+        "--ready", action="store_true", help="it answers and grants locks (the default)"
+    )
+    asks.add_argument("--alive", action="store_true", help="it answers")
+    add_reader(check)
+    check.set_defaults(timeout_s=CHECK_S)
 
 
 def run_shard(arguments: argparse.Namespace) -> int:
@@ -120,6 +143,40 @@ def list_shards(arguments: argparse.Namespace) -> int:
     return DONE if all(shard.reachable for shard in shards) else UNREACHABLE
 
 
+def check_shards(arguments: argparse.Namespace) -> int:
+    """Ask shards how they are; status 3 if one does not answer, 1 if one grants no locks.
+
+    *Alive*: the shard's dispatcher answers a request that came over its endpoint; a supervisor
+    should start one that is not alive anew.  *Ready*: it grants locks as well, so it neither waits
+    for leases of before its start to end nor drains before its end; both pass by themselves.
+    """
+    found = _health(arguments)
+    if arguments.json:
+        print_json(found)
+    else:
+        for shard in found:
+            print(shard)
+    if not all(shard.alive for shard in found):
+        return UNREACHABLE
+    return DONE if arguments.alive or all(shard.ready for shard in found) else FAILED
+
+
+def _health(arguments: argparse.Namespace) -> list[ShardHealth]:
+    from enact_dist.link import shard_health
+
+    target = cell_target(arguments)
+    if is_endpoint(target):
+        return shard_health.of_endpoint(target, arguments.name, timeout_s=arguments.timeout_s)
+    from enact_dist.config import load_config
+
+    config = load_config(target)
+    names = [arguments.name] if arguments.name else [shard.name for shard in config.shards]
+    endpoints = {
+        name: (*config.shard(name).advertise, *config.shard(name).listen) for name in names
+    }
+    return shard_health.of_shards(config.name, endpoints, timeout_s=arguments.timeout_s)
+
+
 def _row(shard: ShardInfo) -> tuple[object, ...]:
     if not shard.reachable:
         return (shard.name, shard.endpoint, "UNREACHABLE", *["-"] * 8)
@@ -145,6 +202,8 @@ def _shared(shard: ShardInfo) -> str:
 
 
 def _state(shard: ShardInfo) -> str:
-    state = "open" if shard.open else "waits for older leases"
+    from enact_dist.link.shard_health import state_of
+
+    state = state_of(open_=shard.open, counters=shard.counters)
     alarms = shard.counters.get("alarms", 0)
     return f"{state}, ALARMS: {alarms} (enact lock audit)" if alarms else state

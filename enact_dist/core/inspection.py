@@ -64,7 +64,7 @@ def sessions(state: ShardState) -> Sessions:
     return Sessions(
         state.settings.name,
         state.epoch,
-        not state.sessions.in_grace(now_ns),
+        state.grants,
         now_ns - state.born_ns,
         state.wall_ns,
         state.slots.count,
@@ -89,10 +89,11 @@ def sessions(state: ShardState) -> Sessions:
 
 
 def _counted(state: ShardState) -> dict[str, int]:
-    """Return the statistics, retention, and alarms nobody has seen to, of earlier epochs too."""
+    """Return the statistics, what there is now, and alarms, of earlier epochs too."""
     history = state.slots.history
     others = {
         "alarms": state.audit.alarms,
+        "draining": int(state.draining),
         "retained_bytes": history.bytes,
         "retained_dropped": history.dropped,
     }

@@ -168,9 +168,14 @@ class ShardState:
         if session is not None and session.act[0] == message.count:
             session.act = (message.count, answer)
 
+    @property
+    def grants(self) -> bool:
+        """Whether locks are granted now: not in the grace after a start, not before an end."""
+        return not self.draining and not self.sessions.in_grace(self.now_ns)
+
     def grant_ready(self) -> Iterator[Effect]:
         """Grant whatever may be granted now."""
-        if not self.draining and not self.sessions.in_grace(self.now_ns):
+        if self.grants:
             yield from self.tenures.grant_ready(now_ns=self.now_ns, stamp_ns=self.stamp())
 
     def stamp(self, seen_ns: int = 0) -> int:

@@ -26,7 +26,7 @@ from enact_dist.link.shard_calls import ShardCalls
 from enact_dist.link.shared_folder import SharedFolder
 from enact_dist.link.signals import StopSignals
 from enact_dist.link.socket_service import SocketService
-from enact_dist.link.zenoh_config import close_session, open_session
+from enact_dist.link.zenoh_config import close_session, open_session, to_reach
 from enact_dist.link.zenoh_discovery import FoundShard, find_shards
 from enact_dist.link.zenoh_service import ZenohService
 
@@ -198,7 +198,7 @@ def refuse_second_daemon(settings: DaemonSettings) -> None:
     advertised = [
         endpoint for shard in shards if shard.name == name for endpoint in shard.endpoints
     ]
-    endpoints = list(dict.fromkeys(map(_reachable, (*settings.listen, *advertised))))
+    endpoints = list(dict.fromkeys(map(to_reach, (*settings.listen, *advertised))))
     listening = [endpoint for endpoint in endpoints if _somebody_listens(endpoint)]
     found = find_shards(listening, timeout_s=PROBE_S) if listening else ()
     if FoundShard(settings.cell, name) in found:
@@ -219,11 +219,6 @@ def _somebody_listens(endpoint: str) -> bool:
     except (OSError, ValueError):
         return False
     return True
-
-
-def _reachable(endpoint: str) -> str:
-    """Return an endpoint to connect to where the daemon listens on every address."""
-    return endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
 
 
 def run_shard(settings: DaemonSettings) -> int:

@@ -97,6 +97,11 @@ def session_config(
     return config
 
 
+def to_reach(endpoint: str) -> str:
+    """Return an endpoint to connect to on this host where a daemon listens on every address."""
+    return endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
+
+
 def open_session(
     *,
     listen: Sequence[str] = (),

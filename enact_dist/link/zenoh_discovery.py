@@ -87,6 +87,41 @@ def discover(endpoints: Sequence[str], hello: Hello, *, timeout_s: float) -> tup
     )
 
 
+def ask_shards(
+    endpoints: Sequence[str], shards: Sequence[FoundShard], message: Request, *, timeout_s: float
+) -> dict[FoundShard, Answer]:
+    """Ask each of `shards` the same; return the answers of those that answer in time.
+
+    Raises:
+        ConfigError: An endpoint cannot be read.
+        ProtocolError: An answer cannot be read.
+    """
+    deadline_s = time.monotonic() + timeout_s
+    answers: dict[FoundShard, Answer] = {}
+    session = open_session(connect=endpoints, lease_s=PROBE_LEASE_S, open_s=timeout_s)
+    try:
+        while (left_s := deadline_s - time.monotonic()) > 0 and len(answers) < len(shards):
+            # One that hangs must leave the others time for a second question, after they connect.
+            asked = [
+                (shard, _get(session, _key(shard, message), message, max(0.05, left_s / 2)))
+                for shard in shards
+                if shard not in answers
+            ]
+            for shard, replies in asked:
+                for reply in replies:
+                    if reply.ok is not None:
+                        answers[shard] = answer_in(reply.ok, shard.shard)
+            if len(answers) < len(shards):
+                time.sleep(POLL_S)
+    finally:
+        close_session(session)
+    return answers
+
+
+def _key(shard: FoundShard, message: Request, actor: str = "") -> str:
+    return request_key(shard.cell, shard.shard, verb_of(message), actor or NAMELESS)
+
+
 def _find(session: zenoh.Session, deadline_s: float) -> tuple[FoundShard, ...]:
     """Ask until somebody has answered or time is up."""
     if not wait_connected(session, deadline_s - time.monotonic()):
@@ -107,7 +142,7 @@ def _find(session: zenoh.Session, deadline_s: float) -> tuple[FoundShard, ...]:
 def _greet(
     session: zenoh.Session, found: FoundShard, hello: Hello, deadline_s: float
 ) -> Answer | None:
-    key = request_key(found.cell, found.shard, verb_of(hello), hello.actor or NAMELESS)
+    key = _key(found, hello, hello.actor)
     for reply in _get(session, key, hello, max(0.05, deadline_s - time.monotonic())):
         if reply.ok is not None:
             return answer_in(reply.ok, found.shard)
