@@ -1,14 +1,18 @@
 """The past is one cut over shards, and stays what it was: under load, and over restarts."""
 
+import os
 import random
+import threading
 import time
 
 import pytest
 from accounts import COUNT, LEFT, PINS, RIGHT, open_accounts
 
 from enact_dist import Position, View, connect
+from enact_dist.errors import ForgottenError
 
 READS = 100_000
+READS_OVER_KILLS = int(os.environ.get("ENACT_PAST_READS", "3000"))
 SAMPLES = 200
 BOTH = 1000
 
@@ -83,3 +87,43 @@ def test_past_is_the_same_after_shards_were_killed(cell):
 
             for moment in list(traveller.seen):
                 traveller.read(moment)
+
+
+@pytest.mark.slow
+def test_sum_holds_while_shards_are_killed_and_little_is_retained(make_cell):
+    """A read of the past is whole or forgotten: then it lies before what the error says is known."""
+    aspects = "[aspects.count]\nretention = 20"
+    cell = make_cell(shards=("s0", "s1"), pins=PINS, aspects=aspects, ttl_s=1.0).start_all()
+    reads, forgotten = 0, []
+    with connect(cell.file) as joined:
+        traveller = Traveller(joined, seed=3)
+        worker = cell.worker("transfer", 1, 1_000_000)
+        worker.expect("progress")
+        done = threading.Event()
+
+        def kill_each():
+            try:
+                for name in ("s1", "s0"):
+                    worker.expect("progress")
+                    cell.kill(name)
+                    cell.start(name)
+                worker.expect("progress")
+            finally:
+                done.set()
+
+        killer = threading.Thread(target=kill_each)
+        killer.start()
+        while reads < READS_OVER_KILLS or not done.is_set():
+            moment = traveller.moment()
+            try:
+                traveller.read(moment)
+            except ForgottenError as error:
+                forgotten.append((moment.stamp_ns, error.oldest_ns))
+                traveller.seen.pop(moment, None)
+            reads += 1
+        killer.join()
+
+        assert 0 < len(forgotten) < reads
+        assert all(asked_ns < oldest_ns for asked_ns, oldest_ns in forgotten)
+        assert len(set(traveller.seen.values())) > 1
+        assert cell.daemons["s0"].popen.poll() is None
