@@ -177,6 +177,7 @@ class Model:
         writer = f"restart {recovered.epoch} of {host.name}"
         picture.restarts.append((writer, crashed_at_ns, self._world.now_ns))
         self._worlds.booted(host, recovered, picture)
+        picture.vanished = frozenset(picture.chains) - {record.slot for record in recovered.slots}
         found = {record.slot: record for record in recovered.slots if not record.volatile}
         prepared = {w.slot: record.lock for record in recovered.prepared for w in record.writes}
         for slot in list(picture.chains):

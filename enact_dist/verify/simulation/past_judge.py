@@ -68,11 +68,10 @@ class PastJudge:
         if right.version:
             return (NullReason.DELETED.name,)
         if self._model.is_volatile(slot) and picture.epoch > 1:
-            # A restart may know that a slot exists whose only write came to nothing.
-            return (
-                NullReason.LOST.name,
-                *([NullReason.NEVER_SET.name] if right is NEVER_SET else []),
-            )
+            # A restart may know that a slot exists whose only write came to nothing; a power cut
+            # may take the record of a slot that was written.
+            unknown = right is NEVER_SET or slot in picture.vanished
+            return (NullReason.LOST.name, *([NullReason.NEVER_SET.name] if unknown else []))
         return (NullReason.NEVER_SET.name,)
 
     def check_forgotten(self, answer: Forgotten, asked: TakeView, picture: Picture) -> None:

@@ -40,7 +40,8 @@ class Picture:
     was dropped; `restarts` are all writers that are no locks, with begin and end; `worlds` the
     forks, and `bases` from where on the versions of dropped contexts are free.  `started_ns` is the
     stamp at which this epoch began, `promised` up to which stamp the past of a slot was shown in
-    it, and `labels` what each label keeps.
+    it, and `labels` what each label keeps.  `vanished` are the slots of which the last crash has
+    taken even that they were there.
     """
 
     epoch: int = 0
@@ -65,6 +66,7 @@ class Picture:
     restarts: list[tuple[str, int, int]] = field(default_factory=list)
     worlds: dict[str, WorldEntry] = field(default_factory=dict)
     bases: dict[str, int] = field(default_factory=dict)
+    vanished: frozenset[Slot] = frozenset()
     started_ns: int = 0
     promised: dict[Slot, int] = field(default_factory=dict)
     labels: dict[str, dict[SlotVersion, State]] = field(default_factory=dict)
