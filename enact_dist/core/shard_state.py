@@ -99,6 +99,7 @@ class ShardState:
         stamps += [record.at_ns for record in recovered.worlds]
         stamps += [record.position.stamp_ns for record in recovered.outcomes]
         stamps += [record.position.stamp_ns for record in recovered.decisions]
+        stamps += [record.stamp_ns for record in recovered.prepared]
         self.stamps = Stamps(max(stamps, default=0))
         self.slots = SlotMap(
             recovered.slots,

@@ -19,6 +19,7 @@ from enact_dist.core.messages import (
     KeepVersions,
     Kept,
     ListHistory,
+    Prepare,
     Refused,
     Register,
     SlotVersion,
@@ -143,6 +144,20 @@ class TestAsOfAStamp:
         assert as_of(bench, before_ns, asked) == Forgotten(slot(aspect="frame"), since_ns)
         assert shown(bench, since_ns, asked) == shown(bench, after_ns - 1, asked) == ["LOST"]
         assert shown(bench, after_ns, asked) == ["2"]
+
+    def test_what_was_before_an_undecided_commit_was_before_the_restart(self, bench):
+        """Though the wall clock lay behind: the stamp of what is prepared says how far time was."""
+        bench.wall_ns += SEC
+        before_ns = write(bench, "1", "frame")
+        grant = bench.granted(lock_id("ann", 3, next(bench._handles)), item(W))
+        writes = (WriteItem(slot(), datum("2")),)
+        prepared = bench.ask(Prepare(grant.lock, grant.token, writes, 0, (), "far", grant.token))
+        bench.wall_ns -= SEC
+        bench.restart()
+        bench.hello("ann", known_epoch=bench.shard.epoch)
+
+        answer = as_of(bench, before_ns, item(V, aspect="frame"))
+        assert answer == Forgotten(slot(aspect="frame"), prepared.stamp_ns)
 
     def test_time_that_is_still_to_come_is_refused(self, bench):
         """As far as the skew of clocks allows, the shard's own clock moves on instead."""
