@@ -73,7 +73,9 @@ class TakeView:
     Large data stay fetchable for the lock id until it is released or overtaken by its lane.
     With `at_ns` the data are asked as of that stamp: the shard moves its clock past it, waits (at
     most a slice) for undecided commits stamped up to it, and goes back to it where it still can.
-    With `strict` it never shows the present instead: what is forgotten is answered `Forgotten`.
+    With `strict` it never shows the present instead: what is forgotten is answered `Forgotten`, and
+    a stamp further ahead than clocks may be apart is refused.  Where the answer ends before `at_ns`
+    (`until_ns`), an undecided commit stands in the way: ask again.
     """
 
     lock: LockId
