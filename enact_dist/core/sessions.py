@@ -96,7 +96,7 @@ class Session:
 class SessionTable:
     """All sessions of one shard, and the grace after a restart."""
 
-    __slots__ = ("_retired", "_tokens", "by_id", "grace_end_ns")
+    __slots__ = ("_retired", "_retired_acts", "_tokens", "by_id", "grace_end_ns")
 
     def __init__(
         self,
@@ -107,6 +107,7 @@ class SessionTable:
     ) -> None:
         self.by_id: dict[str, Session] = {}
         self._tokens: dict[str, bool] = {}
+        self._retired_acts: dict[str, tuple[int, Answer | None]] = {}
         self._retired: dict[str, dict[int, Lane]] = {}
         for record in recovered:
             self.by_id[record.session] = Session(
@@ -148,6 +149,7 @@ class SessionTable:
         if session is None:
             session = Session(message.session, ttl_ns, renewed_ns=now_ns, acknowledged=True)
             session.lanes = self._retired.pop(message.session, {})
+            session.act = self._retired_acts.pop(message.session, session.act)
             self.by_id[message.session] = session
             if message.session in self._tokens:
                 session.token_present = self._tokens.pop(message.session)
@@ -200,7 +202,7 @@ class SessionTable:
         return found.lanes if found is not None else self._retired.get(session)
 
     def forget(self, session: str) -> None:
-        """Drop a session; what its lanes did last stays known for late questions."""
+        """Drop a session; what it did last stays known, for late questions and late copies."""
         found = self.by_id.pop(session, None)
         if found is None:
             return
@@ -210,3 +212,7 @@ class SessionTable:
             self._retired[session] = found.lanes
             while len(self._retired) > SESSIONS_MAX:
                 del self._retired[next(iter(self._retired))]
+        if found.act[0]:
+            self._retired_acts[session] = found.act
+            while len(self._retired_acts) > SESSIONS_MAX:
+                del self._retired_acts[next(iter(self._retired_acts))]

@@ -21,6 +21,7 @@ from enact_dist.core.messages import (
     Forgotten,
     Fork,
     Forked,
+    Goodbye,
     Hello,
     Item,
     Prepare,
@@ -615,3 +616,17 @@ def test_commit_on_a_fork_goes_on_from_its_stamp():
 
     assert answer.position.stamp_ns > ahead_ns
     assert ASPECTS[0].name == "count"
+
+
+def test_late_copy_makes_no_context_when_its_session_was_away(bench):
+    """A session that is opened again in the same epoch has asked for what it has asked for."""
+    at_ns = write(bench, "1")
+    late = Fork("ann", "what_if", "online", at_ns, 1, bench.next_count("ann"))
+    bench.ask(late)
+    assert isinstance(bench.ask(DropWorld("ann", "what_if", 1, bench.next_count("ann"))), Dropped)
+    bench.ask(Goodbye("ann"))
+    bench.hello("ann")
+
+    assert isinstance(bench.ask(late), Refused)
+
+    assert "what_if" not in bench.shard.state.catalogue.worlds
