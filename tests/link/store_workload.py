@@ -171,7 +171,10 @@ class Driver:
             self.later: 2,
             self.much_later: 1,
         }
-        for act in (self.commit_large, self.fork, self.keep):
+        for aspect in ("kept", "kept", "kept", "swift"):
+            self.commit_large(aspect)
+            self.flush()
+        for act in (self.fork, self.keep):
             act()
             self.flush()
         for _ in range(steps):
@@ -228,9 +231,9 @@ class Driver:
         writes = self.writes(slots)
         self.send(Commit(granted.lock, granted.token, writes, 0, participants=far))
 
-    def commit_large(self):
+    def commit_large(self, aspect=""):
         """Commit a body in a file: one that a power cut may take, or one that it may not."""
-        slot = Slot("online", "e0", self.rng.choice(("swift", "swift", "kept")))
+        slot = Slot("online", "e0", aspect or self.rng.choice(("swift", "swift", "kept")))
         granted = self.acquire([slot])
         if granted is not None:
             datum = Datum(b"large", self.rng.randbytes(SIZES[-1]), SIZES[-1])
