@@ -11,5 +11,6 @@ The three laws
 Reading order: `datum` (addresses, identities), `messages` (the protocol), `lock_table` (who waits),
 `sessions` (who is alive), `tenures` (the life of a lock), `commits` (the fence), `shard` (all of it
 behind one method), then the client's half: `beliefs`, `client`,
-`multilock`, `cuts`, `finishing`; and for commits over shards `prepares` and `decisions`.
+`multilock`, `cuts`, `finishing`; for commits over shards `prepares` and `decisions`; and for
+contexts in time `history` (what was), `causes` (why it is so) and `worlds` (forks and drops).
 """
