@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from enact_dist.core.epochs import state_of
 from enact_dist.errors import ConfigError, EnactError, ShardUnreachableError
 
 if TYPE_CHECKING:
@@ -346,9 +347,8 @@ def shared_data(shard: ShardInfo) -> Iterator[Finding]:
 
 
 def _connection(subject: str, shard: ShardInfo) -> Finding:
-    from enact_dist.link.shard_health import state_of
-
-    state = "" if shard.open else f", {state_of(open_=False, counters=shard.counters)}"
+    draining = bool(shard.counters.get("draining"))
+    state = "" if shard.open else f", {state_of(grants=False, draining=draining)}"
     took = f"{shard.round_trip_s * 1e3:.2f} ms over {shard.carrier}"
     text = f"{shard.endpoint} answers in {took}{state}"
     if shard.round_trip_s > ROUND_TRIP_S_WARN:

@@ -5,13 +5,15 @@ from __future__ import annotations
 import logging
 import os
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
+from enact_dist.actor_life import StopWithPulse
 from enact_dist.cli.output import print_json, print_table, shown_s
 from enact_dist.cli.verbs import (
     DONE,
     FAILED,
     add_cell,
+    add_log,
     add_noun,
     add_reader,
     add_timeout,
@@ -25,6 +27,8 @@ from enact_dist.cli.verbs import (
     verbs_of,
 )
 from enact_dist.errors import ConfigError, ProtocolError
+from enact_dist.link.log import JsonLines
+from enact_dist.link.service_manager import ServiceManager
 from enact_dist.link.signals import StopSignals
 
 if TYPE_CHECKING:
@@ -35,6 +39,8 @@ if TYPE_CHECKING:
     from enact_dist.actor_report import ActorStatistics
     from enact_dist.cell_info import ActorInfo
     from enact_dist.cli.verbs import Verb
+
+_TEXT: Final = "%(levelname)s %(name)s: %(message)s"
 
 
 def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
@@ -82,6 +88,7 @@ def _add_run(verbs: argparse._SubParsersAction[Verb]) -> None:
     )
     add_cell(run)
     add_timeout(run)
+    add_log(run)
     run.add_argument("--name", default="", help="how others see it (default: its class)")
     run.add_argument(
         "--world",
@@ -101,14 +108,28 @@ def run_actor(arguments: argparse.Namespace) -> int:
     from enact_dist.actor_runner import run_actor as run
 
     see_working_folder()
-    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
-    with StopSignals() as stop:
+    manager = ServiceManager()
+    json_lines = JsonLines(process=f"actor {arguments.name or arguments.target}")
+    _log_to_stderr(json_lines if arguments.log == "json" else logging.Formatter(_TEXT))
+    with StopSignals() as signals:
         actor, name, worlds = _made(arguments)
+        stop = StopWithPulse(manager.alive)
         with open_cell(arguments, observer=False, actor=name) as cell:
+            json_lines.cell, json_lines.process = cell.name, f"actor {name}"
             print(f"ready: actor {name} in cell {cell.name}", flush=True)
-            statistics = run(actor, cell, worlds, stop=stop.event, name=name)
+            manager.ready()
+            signals.call(lambda _: manager.stopping())
+            signals.call(lambda _: stop.set())
+            statistics = run(actor, cell, worlds, stop=stop, name=name)
     print(_farewell(name, statistics), flush=True)
     return DONE
+
+
+def _log_to_stderr(formatter: logging.Formatter) -> None:
+    """Let the log of the actor and of what it uses go to standard error."""
+    handler = logging.StreamHandler()
+    handler.setFormatter(formatter)
+    logging.basicConfig(level=logging.INFO, handlers=[handler])
 
 
 def _made(arguments: argparse.Namespace) -> tuple[Actor, str, dict[str, str] | None]:

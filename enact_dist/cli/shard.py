@@ -12,14 +12,17 @@ from enact_dist.cli.verbs import (
     FAILED,
     UNREACHABLE,
     add_cell,
+    add_log,
     add_noun,
     add_reader,
     add_verb,
     cell_target,
+    duration,
     is_endpoint,
     open_cell,
     verbs_of,
 )
+from enact_dist.core.epochs import state_of
 from enact_dist.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -52,8 +55,14 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
         "--advertise", action="append", metavar="ENDPOINT", help="replaces `advertise`"
     )
     run.add_argument("--folder", metavar="DIR", help="replaces `folder` of cell.toml")
+    add_log(run)
     run.add_argument(
-        "--log-format", choices=("text", "json"), default="text", help="of the log on stderr"
+        "--drain",
+        dest="drain_s",
+        type=duration,
+        default=None,
+        metavar="S",
+        help="seconds that holders of locks may still finish after SIGTERM (default: 0.8)",
     )
     ls = add_verb(
         verbs,
@@ -113,10 +122,11 @@ def run_shard(arguments: argparse.Namespace) -> int:
             shard=config.shard_settings(shard.name),
             listen=shard.listen,
             folder=shard.folder,
-            log_format=arguments.log_format,
+            log=arguments.log,
             link_lease_s=config.ttl_s / 2,
             carrier=config.carrier,
             shared_bytes_max=config.shared_bytes_max,
+            drain_s=shard_daemon.DRAIN_S if arguments.drain_s is None else arguments.drain_s,
         )
     )
 
@@ -202,8 +212,6 @@ def _shared(shard: ShardInfo) -> str:
 
 
 def _state(shard: ShardInfo) -> str:
-    from enact_dist.link.shard_health import state_of
-
-    state = state_of(open_=shard.open, counters=shard.counters)
+    state = state_of(grants=shard.open, draining=bool(shard.counters.get("draining")))
     alarms = shard.counters.get("alarms", 0)
     return f"{state}, ALARMS: {alarms} (enact lock audit)" if alarms else state

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import socket
 import sys
+import time
 from typing import TYPE_CHECKING
 
 from enact_dist.cli.output import coloured
-from enact_dist.cli.verbs import add_verb, cell_config, see_working_folder
+from enact_dist.cli.verbs import add_log, add_verb, cell_config, see_working_folder
 from enact_dist.errors import ConfigError
 from enact_dist.link.signals import StopSignals
 
@@ -15,8 +17,8 @@ if TYPE_CHECKING:
     import argparse
 
     from enact_dist.cli.verbs import Verb
-    from enact_dist.config_types import ActorConfig, CellConfig, ShardConfig
-    from enact_dist.supervise import Task
+    from enact_dist.config_types import CellConfig
+    from enact_dist.supervise import Say, Task
 
 
 def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
@@ -31,6 +33,7 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
     up.add_argument("cell", metavar="CELL", nargs="?", help="the cell.toml (default: ./cell.toml)")
     up.add_argument("--host", metavar="NAME", help="act as this machine (default: its host name)")
     up.add_argument("--no-actors", action="store_true", help="run the shards only")
+    add_log(up)
 
 
 def run_up(arguments: argparse.Namespace) -> int:
@@ -47,8 +50,13 @@ def run_up(arguments: argparse.Namespace) -> int:
         raise ConfigError(f"no shard and no actor of {config.path} runs on host {host!r}")
     if actors:
         _refuse_misfits(config)
-    tasks = [*_shard_tasks(config, shards), *_actor_tasks(config, actors)]
-    say = _Log([task.name for task in tasks])
+    tasks = [
+        *(_task(config, "shard", shard.name, arguments.log) for shard in shards),
+        *(_task(config, "actor", actor.name, arguments.log) for actor in actors),
+    ]
+    say: Say = _Log([task.name for task in tasks])
+    if arguments.log == "json":
+        say = _JsonLog(config.name, {task.name: f"{task.kind} {task.name}" for task in tasks})
     say("", f"up: cell {config.name} on {host}, {len(shards)} shards, {len(actors)} actors")
     with StopSignals() as stop:
         status = Supervisor(tasks, say).run(stop.event, count=lambda: stop.count)
@@ -76,19 +84,11 @@ def _refuse_misfits(config: CellConfig) -> None:
         )
 
 
-def _shard_tasks(config: CellConfig, shards: list[ShardConfig]) -> list[Task]:
-    return [_task(config, "shard", shard.name) for shard in shards]
-
-
-def _actor_tasks(config: CellConfig, actors: list[ActorConfig]) -> list[Task]:
-    return [_task(config, "actor", actor.name) for actor in actors]
-
-
-def _task(config: CellConfig, kind: str, name: str) -> Task:
+def _task(config: CellConfig, kind: str, name: str, log: str) -> Task:
     from enact_dist.supervise import Task
 
     command = (sys.executable, "-m", "enact_dist.cli.main", kind, "run", name)
-    return Task(name, kind, (*command, "--cell", str(config.path)))
+    return Task(name, kind, (*command, "--cell", str(config.path), "--log", log))
 
 
 class _Log:
@@ -101,3 +101,24 @@ class _Log:
     def __call__(self, name: str, line: str) -> None:
         prefix = f"{name or 'enact':<{self._width}} |"
         print(coloured(prefix, self._order.get(name, -1)), line, flush=True)
+
+
+class _JsonLog:
+    """Prints JSON objects as they come, and makes one of each other line; see `link.log`."""
+
+    def __init__(self, cell: str, processes: dict[str, str]) -> None:
+        self._cell, self._processes = cell, processes
+
+    def __call__(self, name: str, line: str) -> None:
+        if not _is_object(line):
+            of_ours = {"time": round(time.time(), 6), "level": "INFO", "logger": "enact.up"}
+            where = {"cell": self._cell, "process": self._processes.get(name, "up")}
+            line = json.dumps({**of_ours, "event": "", "text": line, **where}, ensure_ascii=False)
+        print(line, flush=True)
+
+
+def _is_object(line: str) -> bool:
+    try:
+        return isinstance(json.loads(line), dict)
+    except ValueError:
+        return False

@@ -95,6 +95,21 @@ def add_timeout(parser: Verb) -> None:
     )
 
 
+def add_log(parser: Verb) -> None:
+    """Add the option that says what the log on standard error looks like."""
+    parser.add_argument(
+        "--log",
+        choices=("text", "json"),
+        default="text",
+        help="what the log on stderr looks like; json: an object per line (enact_dist.link.log)",
+    )
+
+
+def duration(text: str) -> float:
+    """Read a number of seconds, 0 included; an `argparse` type."""
+    return 0.0 if text.strip() in {"0", "0.0"} else seconds(text)
+
+
 def seconds(text: str) -> float:
     """Read a positive number of seconds; an `argparse` type."""
     value = float(text)

@@ -1,4 +1,4 @@
-"""Epochs of shards: what a number says of the shard that began it."""
+"""Epochs of shards: what a number says of the shard that began it, and how far it is in it."""
 
 from __future__ import annotations
 
@@ -20,3 +20,10 @@ def unkept_epoch(wall_ns: int) -> int:
 def is_kept(epoch: int) -> bool:
     """Whether a shard has begun this epoch with what it had kept of the one before."""
     return epoch < UNKEPT_FROM
+
+
+def state_of(*, grants: bool, draining: bool) -> str:
+    """Say in words whether a shard grants locks, and if not, why."""
+    if grants:
+        return "open"
+    return "drains" if draining else "waits for older leases"

@@ -27,7 +27,7 @@ import time
 from collections import deque
 from typing import TYPE_CHECKING, Final, cast
 
-from enact_dist.core.epochs import unkept_epoch
+from enact_dist.core.epochs import state_of, unkept_epoch
 from enact_dist.core.messages import (
     Acquire,
     AwaitStamp,
@@ -164,9 +164,11 @@ class ShardHost:
         self._watchers: tuple[Callable[[Notice], None], ...] = ()
         self._call: Callable[[str, Request], None] | None = None
         self._inboxes: tuple[Callable[[], None], ...] = ()
+        self._each_tick: tuple[Callable[[], None], ...] = ()
         self._failure: Exception | None = None
         self._ended = False
         self._draining = False
+        self._hurried = False
         self._rests = threading.Event()
         self._wake = threading.Condition(threading.Lock())
         self._look_again = False
@@ -192,6 +194,12 @@ class ShardHost:
     def epoch(self) -> int:
         """The shard's epoch, new with every start."""
         return self._shard.epoch
+
+    @property
+    def state(self) -> str:
+        """Whether locks are granted, and if not, why; read without the mutex."""
+        state = self._shard.state
+        return state_of(grants=state.grants, draining=state.draining)
 
     @property
     def ended(self) -> bool:
@@ -279,6 +287,14 @@ class ShardHost:
     def add_inbox(self, drain: Callable[[], None]) -> None:
         """Call `drain` before each tick; it submits what its transport has received already."""
         self._inboxes = (*self._inboxes, drain)
+
+    def each_tick(self, act: Callable[[], None]) -> None:
+        """Call `act` after each tick, so at least every `TICK_S_MAX` while the shard decides.
+
+        It is called by the timer's thread once the mutex was had and the shard has returned: a
+        shard that hangs does not call it.  It must not block.
+        """
+        self._each_tick = (*self._each_tick, act)
 
     # ---------------------------------------------------------------- messages in, effects out
 
@@ -374,6 +390,8 @@ class ShardHost:
     def _keep_time(self) -> None:
         while not self._ended:
             wait_s = (self.tick() - self._clock.monotonic_ns()) / 1e9
+            for act in self._each_tick:
+                act()
             with self._wake:
                 if not self._look_again:
                     self._wake.wait(min(max(wait_s, TICK_S_MIN), TICK_S_MAX))
@@ -404,9 +422,14 @@ class ShardHost:
         """Wait until a drained shard may stop without anybody losing a lock or a commit.
 
         Returns:
-            Whether it may, or has failed; False after `timeout_s`.
+            Whether it may, or has failed; False after `timeout_s`, and after `hurry`.
         """
-        return self._rests.wait(timeout_s)
+        return self._rests.wait(timeout_s) and not self._hurried
+
+    def hurry(self) -> None:
+        """End `wait_idle`."""
+        self._hurried = True
+        self._rests.set()
 
     def close(self) -> None:
         """Keep what is on its way to the store, then end; twice is harmless."""

@@ -10,6 +10,7 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from enact_dist.core.epochs import state_of
 from enact_dist.core.messages import ListSessions, Sessions
 from enact_dist.errors import ShardUnreachableError
 from enact_dist.link.zenoh_config import to_reach
@@ -98,13 +99,6 @@ def of_endpoint(endpoint: str, name: str | None, *, timeout_s: float) -> list[Sh
     return [_health(shard.shard, answers.get(shard), endpoint, took_s) for shard in wanted]
 
 
-def state_of(*, open_: bool, counters: Mapping[str, int]) -> str:
-    """Say in words whether a shard grants locks, and if not, why."""
-    if open_:
-        return "open"
-    return "drains" if counters.get("draining") else "waits for older leases"
-
-
 def _health(name: str, answer: object, endpoint: str, took_s: float) -> ShardHealth:
     if not isinstance(answer, Sessions):
         return ShardHealth(name, False, False, "unreachable", endpoint, took_s=took_s)
@@ -113,7 +107,7 @@ def _health(name: str, answer: object, endpoint: str, took_s: float) -> ShardHea
         name,
         alive=True,
         ready=answer.open,
-        state=state_of(open_=answer.open, counters=counters),
+        state=state_of(grants=answer.open, draining=bool(counters.get("draining"))),
         endpoint=endpoint,
         epoch=answer.epoch,
         uptime_s=answer.uptime_ns / 1e9,

@@ -56,6 +56,7 @@ class StopSignals:
         self.count = 0
         self.before: dict[signal.Signals, Callable[[int, FrameType | None], object] | int | None]
         self._acts: list[Callable[[str], None]] = []
+        self._acts_again: list[Callable[[str], None]] = []
         self._mutex = threading.Lock()
         self._name = ""
         self._thread = threading.Thread(target=self._serve, name="enact-signals", daemon=True)
@@ -88,6 +89,11 @@ class StopSignals:
         if name:
             act(name)
 
+    def call_again(self, act: Callable[[str], None]) -> None:
+        """Call `act` with the first signal's name at each signal after the first."""
+        with self._mutex:
+            self._acts_again.append(act)
+
     def _serve(self) -> None:
         while (number := self._numbers.recv(1)[0]) != _END:
             if number not in STOPPING:
@@ -95,7 +101,7 @@ class StopSignals:
             self.count += 1
             with self._mutex:
                 first, self._name = not self._name, signal.Signals(number).name
-                acts = list(self._acts) if first else []
+                acts = list(self._acts if first else self._acts_again)
             for act in acts:
                 act(self._name)
             self.event.set()

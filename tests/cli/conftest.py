@@ -52,7 +52,8 @@ listen = "tcp/127.0.0.1:{right}"
 def start(*words, **options):
     """Start `enact` as a process of its own, its output readable line by line."""
     options = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True} | options
-    return subprocess.Popen([*ENACT, *map(str, words)], env=SURROUNDINGS, **options)
+    env = SURROUNDINGS | options.pop("env", {})
+    return subprocess.Popen([*ENACT, *map(str, words)], env=env, **options)
 
 
 def read_until(process, mark):

@@ -244,7 +244,7 @@ from pathlib import Path
 from enact_dist.core.messages import AspectEntry, PlacementMap, ShardEntry
 from enact_dist.core.shard_state import ShardSettings
 from enact_dist.link.shard_daemon import DaemonSettings, run_shard
-endpoint, folder, log_format, durability = sys.argv[1:]
+endpoint, folder, log, durability = sys.argv[1:]
 shard = ShardSettings(
     "s0",
     PlacementMap(1, (ShardEntry("s0", (endpoint,)),), ()),
@@ -252,7 +252,7 @@ shard = ShardSettings(
     aspects=(AspectEntry("count", "", durability),),
 )
 path = Path(folder) if folder else None
-sys.exit(run_shard(DaemonSettings("cell", shard, (endpoint,), path, log_format)))
+sys.exit(run_shard(DaemonSettings("cell", shard, (endpoint,), path, log)))
 """
 
 
@@ -260,10 +260,8 @@ sys.exit(run_shard(DaemonSettings("cell", shard, (endpoint,), path, log_format))
 def process(program):
     """Start a daemon as a process; returns it once it said that it is ready."""
 
-    def start(
-        endpoint, folder="", *, first="", log_format="text", durability="volatile", ready=True
-    ):
-        started = program(first + DAEMON, endpoint, folder, log_format, durability)
+    def start(endpoint, folder="", *, first="", log="text", durability="volatile", ready=True):
+        started = program(first + DAEMON, endpoint, folder, log, durability)
         if ready:
             line = started.stdout.readline()
             assert line.startswith("ready: shard s0 of cell cell at "), line + started.stderr.read()

@@ -243,7 +243,7 @@ def test_daemon_acknowledges_nothing_and_ends_with_status_1_when_its_disk_is_ful
     process, carry, make_peer, endpoint, tmp_path
 ):
     """A commit that could not be written is never answered, and the daemon does not go on."""
-    started = process(endpoint, tmp_path, first=FULL_DISK, log_format="json", durability="durable")
+    started = process(endpoint, tmp_path, first=FULL_DISK, log="json", durability="durable")
     peer = speak(carry(endpoint), make_peer, durability="durable")
 
     answer = peer.write("cup", bytes(3_000_000))

@@ -1,0 +1,123 @@
+"""The log of a process: lines for people, or one JSON object per line with fields that stay.
+
+=======  ==========================================================================================
+field    of a line of `--log json`
+=======  ==========================================================================================
+time     seconds since 1970, a number
+level    "DEBUG", "INFO", "WARNING", "ERROR" or "CRITICAL"
+logger   which part speaks: "enact.shard", "enact.store", "enact.link", "enact.actor", …
+event    what happened, in words that programs may rely on ("lock.taken", "shard.stop"); empty
+         where a line is for people only
+text     the line for people
+cell     name of the cell; empty where it is not known yet
+process  "shard NAME" or "actor NAME"
+error    a traceback; only where there is one
+=======  ==========================================================================================
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import queue
+import threading
+from contextlib import suppress
+from logging.handlers import QueueHandler
+from typing import Final
+
+FORMATS: Final = ("text", "json")
+TEXT: Final = "%(asctime)s %(levelname)s %(name)s %(message)s"
+STDERR: Final = 2
+LAST_S: Final = 0.3
+"""How long an ending process waits until its last lines are written."""
+LINES_MAX: Final = 10_000
+"""Log lines that wait for whoever reads the log; beyond, lines are lost, never time."""
+
+_log = logging.getLogger("enact.shard")
+
+
+class JsonLines(logging.Formatter):
+    """Makes one JSON object of each line; see the module.
+
+    Attributes:
+        cell: Name of the cell.
+        process: What the lines are said to come from.
+    """
+
+    def __init__(self, *, cell: str = "", process: str = "") -> None:
+        super().__init__()
+        self.cell, self.process = cell, process
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the line without its end."""
+        line = {
+            "time": round(record.created, 6),
+            "level": record.levelname,
+            "logger": record.name,
+            "event": getattr(record, "event", ""),
+            "text": record.getMessage(),
+            "cell": self.cell,
+            "process": self.process,
+        }
+        if record.exc_info:
+            line["error"] = self.formatException(record.exc_info)
+        return json.dumps(line, ensure_ascii=False)
+
+
+class Log:
+    """Sends the log of a daemon to stderr from a thread of its own while its block runs.
+
+    A reader of the log that stops reading must not stop the shard, nor keep it from ending: lines
+    beyond `LINES_MAX` are lost and counted, and the last ones are waited for `LAST_S` only.
+    """
+
+    def __init__(self, formatter: logging.Formatter) -> None:
+        self._format = formatter.format
+        self._lines: queue.Queue[logging.LogRecord | None] = queue.Queue(LINES_MAX)
+        self._handler = _BoundedHandler(self._lines)
+        self._thread = threading.Thread(target=self._write, name="enact-log", daemon=True)
+        self._logger = logging.getLogger("enact")
+
+    def __enter__(self) -> None:
+        self._level = self._logger.level
+        self._logger.setLevel(logging.INFO)
+        self._logger.addHandler(self._handler)
+        self._thread.start()
+
+    def _write(self) -> None:
+        # To the descriptor itself: the locks of Python's streams and handlers, held while a full
+        # pipe blocks a line, would keep the interpreter from ending.
+        while (record := self._lines.get()) is not None:
+            left = f"{self._format(record)}\n".encode("utf-8", "backslashreplace")
+            try:
+                while left:
+                    left = left[os.write(STDERR, left) :]
+            except OSError:  # its reader is gone for good, or its disk is full
+                self._handler.lost += 1
+
+    def __exit__(self, *_: object) -> None:
+        if self._handler.lost:
+            _log.warning("%d lines of this log were lost", self._handler.lost)
+        self._logger.removeHandler(self._handler)
+        self._logger.setLevel(self._level)
+        with suppress(queue.Full):
+            self._lines.put_nowait(None)
+        self._thread.join(LAST_S)
+
+
+class _BoundedHandler(QueueHandler):
+    """Queues log records; counts those for which there is no room."""
+
+    lost = 0
+
+    def prepare(self, record: logging.LogRecord) -> logging.LogRecord:
+        """Make the text here, where what it tells of cannot change meanwhile; keep the rest."""
+        record.msg, record.args = record.getMessage(), None
+        return record
+
+    def enqueue(self, record: logging.LogRecord) -> None:
+        try:
+            self.queue.put_nowait(record)
+        except queue.Full:
+            self.lost += 1

@@ -1,0 +1,97 @@
+"""Tells a service manager such as systemd how this process is: `sd_notify` as plain datagrams.
+
+=============  ==================================================================================
+message        sent
+=============  ==================================================================================
+READY=1        once, when the process serves
+STATUS=…       whenever what it says has changed
+WATCHDOG=1     from the thread whose life it proves, three times per WatchdogSec: a dispatcher that
+               hangs says nothing, and is killed and started anew
+STOPPING=1     when the process was told to end
+=============  ==================================================================================
+
+Where NOTIFY_SOCKET is not set nothing happens.  The variables are taken out of the environment, so
+that no child speaks in this process's name.  A manager that is away never fails or delays anybody.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import socket
+import time
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from collections.abc import MutableMapping
+
+TELL_S: Final = 1.0
+"""How long a message about a change may wait for a manager that is slow to read."""
+PINGS_PER_PERIOD: Final = 3
+
+_log = logging.getLogger("enact.link")
+
+
+class ServiceManager:
+    """The service manager of this process.  `alive` is for one thread, the rest for any.
+
+    Args:
+        environment: Where NOTIFY_SOCKET, WATCHDOG_USEC and WATCHDOG_PID stand; they are taken out.
+
+    Attributes:
+        ping_s: How often `alive` pings, seconds; 0 where nobody asked for it.
+    """
+
+    def __init__(self, environment: MutableMapping[str, str] | None = None) -> None:
+        environment = os.environ if environment is None else environment
+        path = environment.pop("NOTIFY_SOCKET", "")
+        self._address = f"\0{path[1:]}" if path.startswith("@") else path
+        period = environment.pop("WATCHDOG_USEC", "")
+        mine = environment.pop("WATCHDOG_PID", "") in {"", str(os.getpid())}
+        asked = self._address and mine and period.isdecimal()
+        self.ping_s = int(period) / 1e6 / PINGS_PER_PERIOD if asked else 0.0
+        self._ping_at_s = 0.0
+        self._status = ""
+        self._failed = False
+
+    def ready(self, status: str = "") -> None:
+        """Say that this process serves."""
+        self._tell(f"READY=1\n{self._status_line(status)}MAINPID={os.getpid()}")
+
+    def stopping(self, status: str = "") -> None:
+        """Say that this process was told to end."""
+        self._tell(f"STOPPING=1\n{self._status_line(status)}")
+
+    def alive(self, status: str = "") -> None:
+        """Show a sign of life of the calling thread, and a status that has changed.
+
+        May be called as often as one likes: pings are as rare as they may be.  Never blocks.
+        """
+        if not self._address:
+            return
+        line = self._status_line(status) if status != self._status else ""
+        now_s = time.monotonic()
+        if self.ping_s and now_s >= self._ping_at_s:
+            self._ping_at_s = now_s + self.ping_s
+            line += "WATCHDOG=1"
+        if line:
+            self._tell(line, wait_s=0.0)
+
+    def _status_line(self, status: str) -> str:
+        self._status = status
+        return f"STATUS={' '.join(status.split())}\n" if status else ""
+
+    def _tell(self, text: str, *, wait_s: float = TELL_S) -> None:
+        if not self._address:
+            return
+        try:
+            with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as line:
+                line.settimeout(wait_s)
+                line.sendto(text.encode(), self._address)
+        except OSError as error:  # too long a path, nobody there, a full queue
+            if not self._failed:
+                self._failed = True
+                where = self._address.replace("\0", "@", 1)
+                _log.warning("the service manager at %s does not listen: %s", where, error)
+        else:
+            self._failed = False

@@ -1,0 +1,172 @@
+"""`enact shard run` and `actor run` as services: sd_notify, JSON logs and the drain."""
+
+import json
+import signal
+import socket
+import subprocess
+import threading
+
+import pytest
+
+from enact_dist import Aspect, Entity, Lock, Write, connect
+from enact_dist.errors import EnactError, LockTimeoutError
+
+COUNT = Aspect("count", int)
+ACTOR = """\
+import time
+from enact_dist import Actor, Aspect, Entity, World, Write
+
+class Beat(Actor):
+    online = World("online")
+    count = Write(online, Entity("beat"), Aspect("beats", int))
+    every_s = 3600.0
+
+    def update(self, lock):
+        raise ValueError("told in one line")
+
+class Hang(Beat):
+    def update(self, lock):
+        print("hangs", flush=True)
+        time.sleep(60)
+"""
+
+
+@pytest.fixture
+def manager(tmp_path):
+    """The socket of a service manager."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as heard:
+        heard.bind(str(tmp_path / "notify"))
+        heard.settimeout(20.0)
+        yield heard
+
+
+@pytest.fixture
+def watched(manager):
+    """The environment of a service with a watchdog of 0.3 s."""
+    return {"NOTIFY_SOCKET": manager.getsockname(), "WATCHDOG_USEC": "300000"}
+
+
+def hear(manager, mark):
+    """Return what the manager is told, up to a message with `mark`."""
+    heard = []
+    while not any(mark in line for line in heard):
+        heard += manager.recv(4096).decode().splitlines()
+    return heard
+
+
+def test_shard_tells_its_service_manager_how_it_is(write_cell, spawn, manager, watched):
+    """Ready once it serves, then signs of life, then that it ends."""
+    shard = spawn("shard", "run", "left", "--cell", write_cell(), env=watched)
+
+    start = hear(manager, "WATCHDOG=1")
+    shard.send_signal(signal.SIGTERM)
+    end = hear(manager, "STOPPING=1")
+
+    assert "READY=1" in start + end
+    assert f"MAINPID={shard.pid}" in start + end
+    assert "STATUS=open" in start + end
+    assert shard.wait(10) == 0
+
+
+def test_actor_pings_while_it_waits(tmp_path, cell_file, spawn, manager, watched):
+    """A source's pause of an hour is no hang."""
+    (tmp_path / "my_actors.py").write_text(ACTOR, encoding="utf-8")
+    spawn("actor", "run", "my_actors:Beat", "--cell", cell_file, env=watched)
+    assert "READY=1" in hear(manager, "READY=1")
+    for _ in range(3):
+        hear(manager, "WATCHDOG=1")
+
+
+def test_actor_whose_update_hangs_is_silent(tmp_path, cell_file, spawn, manager, watched, until):
+    """Then the service manager ends it and starts it anew."""
+    (tmp_path / "my_actors.py").write_text(ACTOR, encoding="utf-8")
+    until(spawn("actor", "run", "my_actors:Hang", "--cell", cell_file, env=watched), "hangs")
+    manager.settimeout(0.0)
+    with pytest.raises(BlockingIOError):
+        while True:
+            manager.recv(4096)
+    manager.settimeout(1.0)
+
+    with pytest.raises(TimeoutError):
+        manager.recv(4096)
+
+
+PINNED = '[[pins]]\nentities = "**"\nshard = "left"\n'
+
+
+def test_drain_lets_holders_finish_and_grants_nothing_new(write_cell, spawn, until, enact):
+    """The holder's commit counts, the shard leaves right after it, and nobody else gets a lock."""
+    file = write_cell(PINNED)
+    shard = spawn("shard", "run", "left", "--cell", file, "--drain", "60", "--log", "json")
+    until(shard, "ready: shard")
+    with connect(file, actor="holder") as cell:
+        piece = Write(cell.world("online"), Entity("piece"), COUNT)
+        other = Write(cell.world("online"), Entity("other"), COUNT)
+        with Lock(piece) as lock:
+            shard.send_signal(signal.SIGTERM)
+            until(shard, '"shard.stop"')
+            checked = enact("shard", "check", "left", "--cell", file)
+            alive = enact("shard", "check", "left", "--cell", file, "--alive")
+            in_vain = threading.Thread(target=refused, args=(other,))
+            in_vain.start()
+            in_vain.join()
+            lock[piece] = 7
+        assert lock.position is not None
+        status = shard.wait(10)
+
+    assert (checked.status, alive.status, status) == (1, 0, 0)
+    assert "drains" in checked.out
+
+
+def refused(write):
+    """Ask for a lock that is free; nobody may be given one any more."""
+    with pytest.raises(LockTimeoutError), Lock(write, wait_s=0.3):
+        pass
+
+
+def test_second_signal_ends_the_drain_and_the_holder_is_named(write_cell, spawn, until):
+    """Whoever cannot wait says it twice; the log says who paid, in a line for programs."""
+    file = write_cell(PINNED)
+    shard = spawn("shard", "run", "left", "--cell", file, "--drain", "60", "--log", "json")
+    until(shard, "ready: shard")
+    with connect(file, actor="slow") as cell, pytest.raises(EnactError):
+        piece = Write(cell.world("online"), Entity("piece"), COUNT)
+        with Lock(piece, wait_s=5.0) as lock:
+            shard.send_signal(signal.SIGTERM)
+            until(shard, '"shard.stop"')
+            shard.send_signal(signal.SIGTERM)
+            lines = [json.loads(line) for line in shard.stdout]
+            lock[piece] = 7
+
+    (line,) = [line for line in lines if line["event"] == "shard.drain_over"]
+    assert shard.wait(10) == 0
+    assert set(line) == {"time", "level", "logger", "event", "text", "cell", "process"}
+    assert (line["level"], line["cell"], line["process"]) == ("WARNING", "clitest", "shard left")
+    assert "slow@" in line["text"]
+    assert "online:piece/count" in line["text"]
+
+
+def test_log_of_an_actor_is_json_with_its_traceback(tmp_path, cell_file, spawn):
+    """A program that collects logs gets one object per error, not twenty lines."""
+    (tmp_path / "my_actors.py").write_text(ACTOR.replace("3600.0", "0.01"), encoding="utf-8")
+    actor = spawn("actor", "run", "my_actors:Beat", "--cell", cell_file, "--log", "json",
+                  "--name", "heart", stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)  # fmt: skip
+    with actor.stderr as lines:
+        line = json.loads(next(lines))
+
+    assert (line["level"], line["logger"], line["cell"]) == ("ERROR", "enact.actor", "clitest")
+    assert line["process"] == "actor heart"
+    assert line["error"].splitlines()[-1] == "ValueError: told in one line"
+
+
+def test_up_makes_json_of_every_line(write_cell, spawn, until):
+    """Also of the lines that its children print for people; each says which process it is from."""
+    up = spawn("up", write_cell(), "--no-actors", "--log", "json")
+    lines = until(up, "ready: shard left") + until(up, "ready: shard")
+    up.send_signal(signal.SIGTERM)
+    lines += list(up.stdout)
+
+    found = [json.loads(line) for line in lines]
+    assert {"up", "shard left", "shard right"} == {line["process"] for line in found}
+    assert {line["cell"] for line in found} == {"clitest"}
+    assert "shard.stop" in {line["event"] for line in found}
