@@ -50,6 +50,8 @@ shared_bytes_max       none           cap of each shard's large data in the memo
   folder               data_folder/   its data folder
                        NAME
   host                 this machine   host name of the machine that runs it
+  metrics              none           ``host:port``, or a port of the loopback, at which
+                                      Prometheus may ask for `/metrics` (deploy/metrics.md)
 [[pins]]               none           entities kept on one shard; the first match wins
   entities             required       name pattern, ``tray/**``
   shard                required       name of a shard
@@ -107,6 +109,7 @@ from enact_dist.config_values import (
     TTL_S_MIN,
     checked_endpoint,
     is_wildcard,
+    metrics_address,
 )
 from enact_dist.core.messages import Pin
 from enact_dist.errors import ConfigError
@@ -256,7 +259,7 @@ def _shards(root: Table, file: Path, data_folder: Path | None) -> tuple[ShardCon
 
 
 def _shard(name: str, table: Table, file: Path, data_folder: Path | None) -> ShardConfig:
-    table.refuse_unknown("listen", "advertise", "folder", "host")
+    table.refuse_unknown("listen", "advertise", "folder", "host", "metrics")
     _check_title(name, "shard", table)
     listen = _endpoints(table, "listen")
     if not listen:
@@ -271,7 +274,14 @@ def _shard(name: str, table: Table, file: Path, data_folder: Path | None) -> Sha
                 " that names the host",
             )
     folder = _folder(table, "folder", file) or (data_folder and data_folder / name)
-    return ShardConfig(name, listen, advertise, folder, _host(table))
+    return ShardConfig(name, listen, advertise, folder, _host(table), _metrics(table))
+
+
+def _metrics(table: Table) -> tuple[str, int] | None:
+    if "metrics" not in table.values:
+        return None
+    text = table.take_str("metrics")
+    return table.checked("metrics", lambda: metrics_address(text))
 
 
 def _host(table: Table) -> str:

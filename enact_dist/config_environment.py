@@ -10,6 +10,7 @@ ENACT_SHARED_BYTES_MAX        shared_bytes_max
 ENACT_SHARD_<NAME>_LISTEN     shards.NAME.listen, comma separated
 ENACT_SHARD_<NAME>_ADVERTISE  shards.NAME.advertise, comma separated
 ENACT_SHARD_<NAME>_FOLDER     shards.NAME.folder
+ENACT_SHARD_<NAME>_METRICS    shards.NAME.metrics
 ============================  =====================================================
 
 `<NAME>` is the shard's name in capitals, with ``_`` for ``.`` and ``-``.  Relative folders are
@@ -36,6 +37,7 @@ from enact_dist.config_values import (
     TTL_S_MIN,
     checked_endpoint,
     is_wildcard,
+    metrics_address,
 )
 from enact_dist.errors import ConfigError
 
@@ -52,7 +54,7 @@ _CELL_NAMES: Final = (
     "ENACT_SHARED_FOLDER",
 )
 _SHARD_PREFIX: Final = "ENACT_SHARD_"
-_SHARD_KEYS: Final = ("LISTEN", "ADVERTISE", "FOLDER")
+_SHARD_KEYS: Final = ("LISTEN", "ADVERTISE", "FOLDER", "METRICS")
 _CLOSE: Final = 0.85
 """Similarity from which a name counts as misspelt; ENACT_SESSION_TTL has 0.94."""
 
@@ -162,6 +164,12 @@ def _with_overrides(shard: ShardConfig, ours: Mapping[str, str]) -> ShardConfig:
     folder = ours.get(variable_of(shard.name, "FOLDER"))
     if folder:
         shard = dataclasses.replace(shard, folder=Path(folder).expanduser().absolute())
+    metrics = ours.get(variable_of(shard.name, "METRICS"))
+    if metrics:
+        try:
+            shard = dataclasses.replace(shard, metrics=metrics_address(metrics))
+        except ValueError as error:
+            raise ConfigError(f"{variable_of(shard.name, 'METRICS')}: {error}") from error
     return shard
 
 

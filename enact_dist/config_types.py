@@ -39,6 +39,7 @@ class ShardConfig:
         advertise: Endpoints at which others reach it; those of `listen` unless written.
         folder: Its data folder, absolute, or ``None`` to keep everything in memory.
         host: Host name of the machine it runs on; empty: wherever `enact up` is called.
+        metrics: Host and port at which Prometheus may ask, or ``None``.
     """
 
     name: str
@@ -46,6 +47,7 @@ class ShardConfig:
     advertise: tuple[str, ...]
     folder: Path | None
     host: str = ""
+    metrics: tuple[str, int] | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,6 +18,7 @@ TTL_S_MAX: Final = 60.0
 """A dead holder blocks its data for one TTL, a restarted shard waits one for absent sessions."""
 
 _ENDPOINT: Final = re.compile(r"tcp/(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+):(\d{1,5})\Z")
+_ADDRESS: Final = re.compile(r"((\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+)?:)?\d{1,5}\Z")
 _WILDCARDS: Final = ("0.0.0.0", "[::]")  # noqa: S104 - recognised here in order to be refused
 
 
@@ -34,6 +35,21 @@ def checked_endpoint(endpoint: str) -> str:
             " such as tcp/127.0.0.1:7447"
         )
     return endpoint
+
+
+def metrics_address(text: str) -> tuple[str, int]:
+    """Read ``host:port``, or a port of the loopback.
+
+    Raises:
+        ValueError: It has another form, or a port outside 1 to 65535.
+    """
+    host, _, port = text.rpartition(":")
+    if not _ADDRESS.match(text) or not 1 <= int(port) <= 65_535:
+        raise ValueError(
+            f"{text!r} is no address for metrics; write host:port, or a port of the loopback, such"
+            " as 127.0.0.1:9464 or 9464"
+        )
+    return host.strip("[]") or "127.0.0.1", int(port)
 
 
 def is_wildcard(endpoint: str) -> bool:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.cli.counters import told
 from enact_dist.cli.output import print_json, print_table, shown_bytes, shown_s
 from enact_dist.cli.verbs import (
     DONE,
@@ -24,6 +23,7 @@ from enact_dist.cli.verbs import (
 )
 from enact_dist.core.epochs import state_of
 from enact_dist.errors import ConfigError
+from enact_dist.link.counters import told
 
 if TYPE_CHECKING:
     import argparse
@@ -55,6 +55,11 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
         "--advertise", action="append", metavar="ENDPOINT", help="replaces `advertise`"
     )
     run.add_argument("--folder", metavar="DIR", help="replaces `folder` of cell.toml")
+    run.add_argument(
+        "--metrics",
+        metavar="HOST:PORT",
+        help="serve /metrics for Prometheus there; a port alone is one of the loopback",
+    )
     add_log(run)
     run.add_argument(
         "--drain",
@@ -109,6 +114,7 @@ def run_shard(arguments: argparse.Namespace) -> int:
         ("LISTEN", ",".join(arguments.listen or ())),
         ("ADVERTISE", ",".join(arguments.advertise or ())),
         ("FOLDER", arguments.folder),
+        ("METRICS", arguments.metrics),
     ):
         if found:
             environment[variable_of(arguments.name, key)] = found
@@ -126,6 +132,7 @@ def run_shard(arguments: argparse.Namespace) -> int:
             link_lease_s=config.ttl_s / 2,
             carrier=config.carrier,
             shared_bytes_max=config.shared_bytes_max,
+            metrics=shard.metrics,
             drain_s=shard_daemon.DRAIN_S if arguments.drain_s is None else arguments.drain_s,
         )
     )

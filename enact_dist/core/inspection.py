@@ -84,11 +84,11 @@ def sessions(state: ShardState) -> Sessions:
         ),
         tuple(state.catalogue.worlds),
         tuple(state.catalogue.aspects.values()),
-        tuple(Counter(name, count) for name, count in sorted(_counted(state).items())),
+        tuple(Counter(name, count) for name, count in sorted(counted(state).items())),
     )
 
 
-def _counted(state: ShardState) -> dict[str, int]:
+def counted(state: ShardState) -> dict[str, int]:
     """Return the statistics, what there is now, and alarms, of earlier epochs too."""
     history = state.slots.history
     others = {

@@ -28,6 +28,7 @@ from collections import deque
 from typing import TYPE_CHECKING, Final, cast
 
 from enact_dist.core.epochs import state_of, unkept_epoch
+from enact_dist.core.inspection import counted
 from enact_dist.core.messages import (
     Acquire,
     AwaitStamp,
@@ -67,7 +68,7 @@ if TYPE_CHECKING:
     from enact_dist.core.shard_state import ShardSettings
     from enact_dist.link.shared_folder import SharedFolder
     from enact_dist.link.store import Store
-    from enact_dist.link.store_thread import StoreThread
+    from enact_dist.link.store_thread import Latencies, StoreThread
 
 TICK_S_MAX: Final = 0.1
 """The timer wakes at least so often: bounds by how much an expiry may be late."""
@@ -200,6 +201,34 @@ class ShardHost:
         """Whether locks are granted, and if not, why; read without the mutex."""
         state = self._shard.state
         return state_of(grants=state.grants, draining=state.draining)
+
+    def figures(self) -> dict[str, float]:
+        """Return the counters and what there is now, by name; see `link.metrics`.
+
+        Taken without the mutex, so that who looks never delays the shard: one figure may be a
+        moment older than the next.
+        """
+        state, payloads = self._shard.state, self._payloads.figures()
+        tenures = list(state.tenures.by_lock.values())
+        held = sum(tenure.token is not None for tenure in tenures)
+        return {
+            **counted(state),
+            **payloads,
+            "ready": state.grants,
+            "epoch": self.epoch,
+            "uptime_seconds": (self._clock.monotonic_ns() - state.born_ns) / 1e9,
+            "sessions": len(state.sessions.by_id),
+            "slots": state.slots.count,
+            "slot_bytes": state.slots.bytes,
+            "locks_held": held,
+            "locks_waiting": len(tenures) - held,
+            "requests_parked": len(self._replies),
+        }
+
+    @property
+    def store_latencies(self) -> Latencies | None:
+        """How long the store's writes took; None where nothing is kept."""
+        return self._store_thread.latencies if self._store_thread is not None else None
 
     @property
     def ended(self) -> bool:

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from enact_dist.core.messages import Answer
     from enact_dist.core.shard_state import ShardSettings
     from enact_dist.link.host import ShardHost
+    from enact_dist.link.metrics_server import MetricsServer
 
 PROBE_S: Final = 0.3
 """How long another daemon under our name has to answer before we start."""
@@ -67,6 +68,7 @@ class DaemonSettings:
             beyond, history goes, then writes are refused.  None stands for half of what the file
             system there has, and plain memory beyond; 0 shares none.
         drain_s: How long holders may still finish after a signal.
+        metrics: Host and port at which Prometheus may ask, see `link.metrics`; None: nowhere.
     """
 
     cell: str
@@ -78,6 +80,7 @@ class DaemonSettings:
     carrier: str = "auto"
     shared_bytes_max: int | None = None
     drain_s: float = DRAIN_S
+    metrics: tuple[str, int] | None = None
 
 
 class RunningShard:
@@ -107,6 +110,10 @@ class RunningShard:
             if self._shared is not None and settings.carrier != "zenoh":
                 self._sockets = SocketService(self.host, self._shared)
                 undo.callback(self._sockets.close)
+            self._metrics: MetricsServer | None = None
+            if settings.metrics is not None:
+                self._metrics = _metrics_server(settings, self.host)
+                undo.callback(self._metrics.close)
             self._session = open_session(listen=settings.listen, lease_s=settings.link_lease_s)
             undo.callback(close_session, self._session)
             self._calls = ShardCalls(
@@ -150,6 +157,8 @@ class RunningShard:
                 self._sockets.close()
             self._service.close()
             close_session(self._session)
+            if self._metrics is not None:
+                self._metrics.close()
             if self._shared is not None:
                 self._shared.close()
             self._ended.set()
@@ -177,6 +186,14 @@ class RunningShard:
                 "; ".join(held),
                 extra={"event": "shard.drain_over"},
             )
+
+
+def _metrics_server(settings: DaemonSettings, host: ShardHost) -> MetricsServer:
+    from enact_dist.link.metrics import page
+    from enact_dist.link.metrics_server import MetricsServer
+
+    assert settings.metrics is not None
+    return MetricsServer(settings.metrics, lambda: page(host, settings.cell))
 
 
 def _shared_folder(settings: DaemonSettings) -> SharedFolder | None:

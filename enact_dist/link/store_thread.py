@@ -9,12 +9,35 @@ from __future__ import annotations
 
 import threading
 import time
-from typing import TYPE_CHECKING, Protocol
+from bisect import bisect_left
+from typing import TYPE_CHECKING, Final, Protocol
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from enact_dist.core.records import Persist
+
+
+BOUNDS_S: Final = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 10.0)
+"""Upper bounds of the classes in which durations of writes are counted, seconds."""
+
+
+class Latencies:
+    """How long something took, counted in classes.  One thread adds, any may read.
+
+    Attributes:
+        counts: One for each of `BOUNDS_S`, and one for what took longer.
+        sum_s: Of all durations.
+    """
+
+    def __init__(self) -> None:
+        self.counts = [0] * (len(BOUNDS_S) + 1)
+        self.sum_s = 0.0
+
+    def add(self, took_s: float) -> None:
+        """Count one duration."""
+        self.counts[bisect_left(BOUNDS_S, took_s)] += 1
+        self.sum_s += took_s
 
 
 class BatchStore(Protocol):
@@ -40,6 +63,7 @@ class StoreThread:
     Attributes:
         writing_since_s: When the batch was begun that is being written, on the monotonic clock;
             None while nothing is.
+        latencies: How long the batches took, the forcing of the disk included.
     """
 
     def __init__(
@@ -55,6 +79,7 @@ class StoreThread:
         self._queue: list[Persist] = []
         self._ending = False
         self.writing_since_s: float | None = None
+        self.latencies = Latencies()
         self._thread = threading.Thread(target=self._run, name="enact-store", daemon=True)
         self._thread.start()
 
@@ -90,9 +115,10 @@ class StoreThread:
         """Write what is queued and report it; return False at the end."""
         batch = self._next_batch()
         if batch:
-            self.writing_since_s = time.monotonic()
+            self.writing_since_s = started_s = time.monotonic()
             self._store.write(batch)
             self.writing_since_s = None
+            self.latencies.add(time.monotonic() - started_s)
             tickets = [persist.ticket for persist in batch if persist.ticket]
             if tickets:
                 self._done(tickets)

@@ -4,9 +4,9 @@ import ast
 from pathlib import Path
 
 import enact_dist
-from enact_dist.cli.counters import OF_A_CONNECTION, OF_A_SHARD, told
 from enact_dist.core.messages import ListSessions, PlacementMap, ShardEntry
 from enact_dist.core.shard_state import ShardSettings
+from enact_dist.link.counters import OF_A_CONNECTION, OF_A_SHARD, told
 from enact_dist.link.host import open_host
 from enact_dist.link.payload_desk import PayloadDesk
 

@@ -170,3 +170,31 @@ def test_up_makes_json_of_every_line(write_cell, spawn, until):
     assert {"up", "shard left", "shard right"} == {line["process"] for line in found}
     assert {line["cell"] for line in found} == {"clitest"}
     assert "shard.stop" in {line["event"] for line in found}
+
+
+def test_metrics_are_served_where_the_file_or_the_command_says(write_cell, spawn, until, enact):
+    """`metrics` of cell.toml is the default, `--metrics` wins; a port alone is of the loopback."""
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        port = probe.getsockname()[1]
+    file = write_cell()
+    file.write_text(file.read_text().replace("[shards.right]", 'metrics = "1"\n[shards.right]'))
+    shard = spawn("shard", "run", "left", "--cell", file, "--metrics", str(port))
+    until(shard, "ready: shard")
+
+    with socket.create_connection(("127.0.0.1", port)) as line:
+        line.sendall(b"GET /metrics HTTP/1.0\r\n\r\n")
+        text = line.makefile().read()
+
+    assert 'enact_ready{cell="clitest",shard="left"} 1' in text.splitlines()
+
+
+def test_metrics_at_no_address_are_a_usage_error(enact, write_cell):
+    """On the command line, in the file and in the environment."""
+    file = write_cell()
+    on_line = enact("shard", "run", "left", "--cell", file, "--metrics", "nowhere")
+    file.write_text(file.read_text().replace("[shards.right]", 'metrics = ":0"\n[shards.right]'))
+    in_file = enact("shard", "run", "left", "--cell", file)
+
+    assert (on_line.status, in_file.status) == (2, 2)
+    assert "ENACT_SHARD_LEFT_METRICS: 'nowhere' is no address for metrics" in on_line.err
+    assert "line 8" in in_file.err

@@ -1,7 +1,7 @@
 """What the counters of a shard and of a connection mean, and what to do where one grows.
 
-A shard counts from its start (`enact shard ls --counters`, `--json`), a connection from its own
-(`Cell.statistics`).  An empty remedy: that is work done, or harmless by itself.
+A shard counts from its start (`enact shard ls --counters`, `--json`, `/metrics`), a connection from
+its own (`Cell.statistics`).  An empty remedy: that is work done, or harmless by itself.
 """
 
 from __future__ import annotations
@@ -18,10 +18,12 @@ class Counter(NamedTuple):
     Attributes:
         meaning: What it counts.
         remedy: What to do where it grows; empty where that is as it should be.
+        now: Whether it is a figure of this moment, which falls again, and no count.
     """
 
     meaning: str
     remedy: str = ""
+    now: bool = False
 
 
 _BUSY: Final = "look for a busy host: top, and the shard's log"
@@ -84,9 +86,9 @@ OF_A_SHARD: Final[dict[str, Counter]] = {
     "forced_but_committed": Counter(
         "such that had been committed elsewhere: they stand in part", "enact lock audit"
     ),
-    "alarms": Counter("of these, those that nobody has settled yet", "enact lock audit"),
+    "alarms": Counter("of these, those that nobody has settled yet", "enact lock audit", now=True),
     # This process and its host
-    "draining": Counter("1 while this shard ends and grants nothing new"),
+    "draining": Counter("1 while this shard ends and grants nothing new", now=True),
     "stalls": Counter("times this host stood still; no lease paid for it", _BUSY),
     "disk_stalls": Counter(
         "times a write took more than a second",
@@ -108,7 +110,7 @@ OF_A_SHARD: Final[dict[str, Counter]] = {
         "check the disk; see the shard's log for which",
     ),
     # History
-    "retained_bytes": Counter("bytes of older versions that are kept now"),
+    "retained_bytes": Counter("bytes of older versions that are kept now", now=True),
     "retained_dropped": Counter(
         "older versions let go early: the limit of 256 MiB", "retain fewer versions of large data"
     ),
@@ -117,10 +119,12 @@ OF_A_SHARD: Final[dict[str, Counter]] = {
         "raise shared_bytes_max, or retain fewer versions of large data",
     ),
     # Large data
-    "payload_files": Counter("payloads that lie here now"),
-    "payload_bytes": Counter("bytes of these and of drafts now"),
-    "payload_bytes_max": Counter("the cap of the shared folder in bytes; 0 where there is none"),
-    "payload_drafts": Counter("payloads now that no commit has named yet"),
+    "payload_files": Counter("payloads that lie here now", now=True),
+    "payload_bytes": Counter("bytes of these and of drafts now", now=True),
+    "payload_bytes_max": Counter(
+        "the cap of the shared folder in bytes; 0 where there is none", now=True
+    ),
+    "payload_drafts": Counter("payloads now that no commit has named yet", now=True),
     "payloads_adopted": Counter("payloads that a commit has named"),
     "payloads_missing": Counter("payloads named by a commit and not here; they came again"),
     "payloads_refused": Counter(

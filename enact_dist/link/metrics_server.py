@@ -1,0 +1,111 @@
+"""Serves one page over HTTP, from threads that wait for nobody the shard waits for.
+
+Whoever reads slowly holds one of `READERS_MAX` threads, for `READ_S` per step at most; more readers
+are turned away.
+"""
+
+from __future__ import annotations
+
+import logging
+import socket
+import threading
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler
+from socketserver import TCPServer, ThreadingMixIn
+from typing import TYPE_CHECKING, Any, Final, cast
+
+from enact_dist.errors import LinkError
+from enact_dist.link.metrics import CONTENT_TYPE
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+READERS_MAX: Final = 8
+READ_S: Final = 5.0
+PATH: Final = "/metrics"
+POLL_S: Final = 0.1
+"""How long `close` may wait for the thread that accepts."""
+
+_log = logging.getLogger("enact.link")
+
+
+class MetricsServer:
+    """Answers ``GET /metrics`` until it is closed.
+
+    Args:
+        address: Host and port; port 0 takes any that is free.
+        page: Makes the page; called from the server's threads.
+
+    Attributes:
+        port: At which it listens.
+
+    Raises:
+        LinkError: The address is in use, or not of this host.
+    """
+
+    def __init__(self, address: tuple[str, int], page: Callable[[], str]) -> None:
+        host, port = address
+        try:
+            self._server = _Server(address, page)
+        except OSError as error:
+            raise LinkError(
+                f"metrics cannot be served at {host}:{port}: {error.strerror or error}; name"
+                " another address with --metrics"
+            ) from error
+        self.port: int = self._server.server_address[1]
+        self._thread = threading.Thread(
+            target=lambda: self._server.serve_forever(POLL_S), name="enact-metrics", daemon=True
+        )
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop listening; twice is harmless."""
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join()
+
+
+class _Server(ThreadingMixIn, TCPServer):
+    allow_reuse_address = True
+    daemon_threads = True
+    block_on_close = False
+
+    def __init__(self, address: tuple[str, int], page: Callable[[], str]) -> None:
+        self.address_family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
+        self.page = page
+        self._room = threading.BoundedSemaphore(READERS_MAX)
+        super().__init__(address, _Handler)
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        if self._room.acquire(blocking=False):
+            super().process_request(request, client_address)
+        else:
+            self.shutdown_request(request)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self._room.release()
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        _log.info("a reader of the metrics at %s went: lost in mid-answer", client_address)
+
+
+class _Handler(BaseHTTPRequestHandler):
+    timeout = READ_S
+    server_version, sys_version = "enact", ""
+
+    def do_GET(self) -> None:
+        if self.path.partition("?")[0] != PATH:
+            self.send_error(HTTPStatus.NOT_FOUND, f"there is {PATH} here, and nothing else")
+            return
+        body = cast("_Server", self.server).page().encode()
+        self.send_response(HTTPStatus.OK)
+        self.send_header("Content-Type", CONTENT_TYPE)
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, format: str, *arguments: object) -> None:  # noqa: A002 - its base's word
+        """Say nothing: it is asked every few seconds."""
