@@ -197,4 +197,4 @@ def test_metrics_at_no_address_are_a_usage_error(enact, write_cell):
 
     assert (on_line.status, in_file.status) == (2, 2)
     assert "ENACT_SHARD_LEFT_METRICS: 'nowhere' is no address for metrics" in on_line.err
-    assert "line 8" in in_file.err
+    assert "line 9: ':0' is no address for metrics" in in_file.err
