@@ -4,7 +4,8 @@ A replaced state is *held* while its aspect's retention allows (versions, age, b
 stays for two seconds so that cuts can be made (*loose*, where it is not held).  So what is known of
 a slot is a tail of its history without holes.  Beside it stands what labels keep, for good.
 
-Limits of the whole shard come before what an aspect retains: then the oldest goes first.  Whatever
+Limits of the whole shard come before what an aspect retains: then the oldest goes first; at the cap
+of shared memory, the oldest of the aspects whose history has payloads there.  Whatever
 of a stored aspect is held no longer waits in here until the store is told, with the next batch.
 """
 
@@ -77,6 +78,7 @@ class History:
         "_loose_bytes",
         "_number",
         "_payloads",
+        "_payloads_held",
         "_policies",
         "_queues",
         "_recent",
@@ -100,6 +102,7 @@ class History:
         self._by_slot: dict[Slot, SlotHistory] = {}
         self._recent: deque[tuple[int, SlotHistory]] = deque()
         self._queues: dict[str, list[tuple[int, int, SlotHistory]]] = {}
+        self._payloads_held: dict[str, int] = {}
         self._forgotten: list[SlotVersion] = []
         self._loose = self._loose_bytes = self._number = 0
         self.bytes = self.count = self.kept_bytes = self.dropped = 0
@@ -124,6 +127,8 @@ class History:
             return  # before its first version a slot is null: nothing to remember
         policy = self._policies.get(slot.aspect, UNKNOWN)
         found = self._by_slot.get(slot) or self._opened(slot, stored=policy.stored)
+        if policy.limits.versions <= 1 and found.held:
+            self._release_all(found)  # where nobody had said what is retained, more was
         found.until_ns = until_ns
         found.young += 1
         self._recent.append((until_ns, found))
@@ -158,13 +163,23 @@ class History:
         self.bytes += _own_bytes(old)
         if datum is not None:
             found.size += datum.size
-            self._payloads.count(datum, may_go=1)
+            if datum.file:
+                self._payloads.count(datum, may_go=1)
+                self._hold_payload(found.slot.aspect, 1)
             if datum.stamp_ns:
                 found.index(old)
         while found.held >= limits.versions or found.size > limits.size:
             self._release(found)
         if not found.queued and found.held:
             self._queue(found)
+
+    def _hold_payload(self, aspect: str, count: int) -> None:
+        """Count that so many more (or fewer) held states of an aspect have payloads."""
+        left = self._payloads_held.get(aspect, 0) + count
+        if left:
+            self._payloads_held[aspect] = left
+        else:
+            del self._payloads_held[aspect]
 
     def _queue(self, found: SlotHistory) -> None:
         found.queued = True
@@ -184,12 +199,18 @@ class History:
         if datum is not None:
             found.size -= datum.size
             self._loose_bytes += datum.size
+            if datum.file:
+                self._hold_payload(found.slot.aspect, -1)
             if datum.stamp_ns:
                 found.unindex(old)
         if found.stored and old.version not in found.kept:
             self._forgotten.append(SlotVersion(found.slot, old.version))
         if found.young < len(found.states) > found.held:
             self._trim(found)
+
+    def _release_all(self, found: SlotHistory) -> None:
+        while found.held:
+            self._release(found)
 
     def _trim(self, found: SlotHistory) -> None:
         """Drop the states of a slot that are neither held nor lately replaced."""
@@ -253,9 +274,9 @@ class History:
                 return found
         return None
 
-    def _drop_oldest(self) -> bool:
-        """Let the state that was replaced first of all be held no longer, before its time."""
-        firsts = [first for first in map(self._oldest, list(self._queues)) if first is not None]
+    def _drop_oldest(self, aspects: Iterable[str]) -> bool:
+        """Let the state of these aspects that was replaced first be held no longer."""
+        firsts = [first for first in map(self._oldest, aspects) if first is not None]
         if not firsts:
             return False
         self.dropped += 1
@@ -265,13 +286,14 @@ class History:
     def _fit(self) -> None:
         """Keep the limits of the whole shard."""
         while self.count > HELD_STATES_MAX or self.bytes > self._bytes_max:
-            self._drop_oldest()
+            self._drop_oldest(self._queues)
 
     def make_room(self, size: int) -> tuple[int, int]:
         """Forget the oldest states until so many bytes of payloads are named no more.
 
-        What is kept only to answer as of a recent stamp goes first.  Where all would not do, all
-        stay; what labels keep stays in any case.
+        What is kept only to answer as of a recent stamp goes first, then what is oldest in the
+        aspects that have payloads: a camera at the cap costs the others nothing.  Where all would
+        not do, all stay; what labels keep stays in any case.
 
         Returns:
             How many states went, and the bytes of payloads that only they named.
@@ -282,7 +304,7 @@ class History:
         states = self.count + self._loose
         while self._recent and before - self._payloads.spare < size:
             self._end_recent(self._recent[0][0] + 1)
-        while before - self._payloads.spare < size and self._drop_oldest():
+        while before - self._payloads.spare < size and self._drop_oldest(self._payloads_held):
             pass
         return states - self.count - self._loose, before - self._payloads.spare
 
@@ -304,8 +326,7 @@ class History:
             for version in list(found.kept):
                 for label in list(found.kept[version].labels):
                     self._let_go(label, found, version)
-            while found.held:
-                self._release(found)
+            self._release_all(found)
             self._trim(found)
         for queue in self._queues.values():
             queue[:] = [entry for entry in queue if self._by_slot.get(entry[2].slot) is entry[2]]
@@ -419,6 +440,9 @@ class History:
             if not tail and version not in found.kept:
                 self._forgotten.append(SlotVersion(slot, version))
         limits = self.policy(slot.aspect).limits
+        if limits.versions <= 1:  # less than before the restart: never held, so never released
+            gone = [n for n in range(first, newest.version) if n not in found.kept]
+            self._forgotten += [SlotVersion(slot, version) for version in gone]
         found.young = len(rows)  # nothing of it goes before all is here
         for version in range(first, newest.version):
             found.until_ns = rows.get(version + 1, newest).stamp_ns
@@ -431,6 +455,7 @@ class History:
         """Assert the bookkeeping.  For tests and simulation."""
         held = loose = count = states = kept = 0
         young: dict[int, int] = {}
+        payloads: dict[str, int] = {}
         for _, found in self._recent:
             young[found.number] = young.get(found.number, 0) + 1
         for slot, found in self._by_slot.items():
@@ -445,6 +470,8 @@ class History:
                     loose += state.datum.size if state.datum is not None else 0
                 else:
                     held += _own_bytes(state)
+                    if state.datum is not None and state.datum.file:
+                        payloads[slot.aspect] = payloads.get(slot.aspect, 0) + 1
             assert not found.held or found.queued, slot
             for version, one in found.kept.items():
                 kept += _own_bytes(one.content)
@@ -453,6 +480,7 @@ class History:
                     assert SlotVersion(slot, version) in self.labels[label]
         assert (self.bytes, self.count, self._loose_bytes) == (held, count, loose)
         assert self._loose == states - count
+        assert self._payloads_held == payloads
         assert self.kept_bytes == kept
         named = {key for versions in self.labels.values() for key in versions}
         assert named == {SlotVersion(f.slot, version) for f in self for version in f.kept}

@@ -68,3 +68,20 @@ def test_history_outside_shared_memory_counts_for_nothing(slots):
     assert slots.history.bytes == MB
     assert slots.make_room(5 * MB) == (5, 5 * MB)
     assert kept(slots, "arm") == [7]
+
+
+def test_payloads_cost_the_history_of_other_aspects_nothing():
+    """A camera at the cap asks for room with each picture; what has no payloads could give none."""
+    policy = Policy(Limits(10, NO_LIMIT, NO_LIMIT), stored=False)
+    slots = SlotMap((), policies={"verdict": policy, "frame": policy})
+    for version in range(1, 5):
+        slots.replace(slot("cam", "verdict"), content(version, size=1, file=False))
+    for version in range(5, 8):
+        slots.replace(slot("cam", "frame"), content(version))
+
+    assert slots.make_room(2 * MB) == (2, 2 * MB)
+
+    replaced = [old.version for old, until_ns in slots.versions(slot("cam", "verdict")) if until_ns]
+    assert replaced == [1, 2, 3]
+    assert kept(slots) == []
+    slots.assert_invariants()

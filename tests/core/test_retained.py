@@ -258,3 +258,36 @@ def test_retention_shows_in_the_counters(cameras):
 
     assert isinstance(answer, Sessions)
     assert {c.name: c.value for c in answer.counters}["retained_bytes"] == 20
+
+
+def test_aspect_of_which_nothing_was_said_retains_less_once_somebody_says_so():
+    """What was retained by default goes with the next commit, in memory and on the disk."""
+    bench = ShardBench()
+    bench.ask(Register("admin", (), (AspectEntry("mask", "int", "durable"),)))
+    bench.hello("ann")
+    for seq in range(1, 5):
+        capture(bench, seq, stamp_ns=100 - seq)
+    bench.ask(Register("admin", (), (AspectEntry("mask", "int", "durable", 1),)))
+
+    capture(bench, 5, stamp_ns=95)
+    bench.wait(TTL_NS // 2, keep=("ann",))
+
+    bench.shard.assert_invariants()
+    history = bench.shard.state.slots.history
+    assert (history.count, history.bytes, bench.recovered(2).history) == (0, 0, [])
+
+
+def test_restart_forgets_what_an_aspect_retains_no_more():
+    """Nothing wrote to the slot between: its rows would stay on the disk for ever."""
+    bench = ShardBench()
+    bench.ask(Register("admin", (), (AspectEntry("mask", "int", "durable"),)))
+    bench.hello("ann")
+    for seq in range(1, 5):
+        capture(bench, seq, stamp_ns=100 - seq)
+    bench.ask(Register("admin", (), (AspectEntry("mask", "int", "durable", 1),)))
+    assert len(bench.recovered(2).history) == 3
+
+    bench.restart()
+    bench.wait(TTL_NS)
+
+    assert bench.recovered(3).history == []
