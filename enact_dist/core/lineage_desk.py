@@ -38,9 +38,8 @@ class LineageDesk:
 
     def _explained(self, message: Explain) -> Iterator[VersionEntry]:
         for slot, version in message.versions:
-            wanted = version or self._state.slots[slot].version
-            found = entries_of(self._state.slots, slot)
-            yield from (entry for entry in found if entry.state.version == wanted)
+            slots = self._state.slots
+            yield from entries_of(slots, slot, version=version or slots[slot].version)
 
     def on_find_effects(self, message: FindEffects, reply_to: int) -> Iterator[Effect]:
         """Return every known version whose cause names one of these data."""

@@ -129,6 +129,13 @@ class SlotHistory:
         kept = self.kept.get(version)
         return kept.content if kept is not None else None
 
+    def find_known(self, version: int) -> Iterator[tuple[Content, int]]:
+        """Yield what `known` tells of one version, without a look at the others."""
+        content = self.find(version)
+        until_ns = self.until_ns_of(version) if content is not None else 0
+        if content is not None and until_ns:
+            yield content, until_ns
+
     def is_held(self, version: int) -> bool:
         """Whether a version is within the slot's retention."""
         return bool(self.held) and self.states[-self.held].version <= version <= (

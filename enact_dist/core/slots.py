@@ -232,16 +232,16 @@ class SlotMap:
             return min(found, key=lambda one: _distance(one, captured_ns))
         return newest if datum is None else _OUTSIDE
 
-    def versions(self, slot: Slot) -> Iterator[tuple[Content, int]]:
+    def versions(self, slot: Slot, *, version: int | None = None) -> Iterator[tuple[Content, int]]:
         """Yield all versions of a slot that are known, oldest first, and until when each was.
 
         The stamp is 0 for the newest one, and the version's own where no later one is known of.
-        What a restart has lost shows as version 0.
+        What a restart has lost shows as version 0.  Of one `version`, the others are not looked at.
         """
         found, newest = self.history.of(slot), self[slot]
         if found is not None:
-            yield from found.known()
-        if newest is not NOTHING:
+            yield from found.known() if version is None else found.find_known(version)
+        if newest is not NOTHING and version in (None, newest.version):
             yield newest, 0
 
     def is_stored(self, slot: Slot, version: int) -> bool:

@@ -16,27 +16,47 @@ if TYPE_CHECKING:
 
 NAMED_MAX: Final = 50_000
 """Versions, and data that their causes name, in one answer; further ones are only counted."""
+NAMED_BYTES_MAX: Final = 14 << 20
+"""Bytes of one answer: below what a frame may have, above what the longest cause needs."""
+_SLOT_BYTES: Final = 48
+"""A slot with its version and stamp in an answer, names left out."""
+_ENTRY_BYTES: Final = 256
+"""The rest of a version in an answer, with its cause, names left out."""
 
 
-def entries_of(slots: SlotMap, slot: Slot) -> Iterator[VersionEntry]:
-    """Yield all known versions of a slot, oldest first."""
+def entries_of(slots: SlotMap, slot: Slot, *, version: int | None = None) -> Iterator[VersionEntry]:
+    """Yield all known versions of a slot, oldest first, or only what is known of one `version`."""
     history = slots.history.of(slot)
     kept = history.kept if history is not None else {}
-    for content, until_ns in slots.versions(slot):
+    for content, until_ns in slots.versions(slot, version=version):
         labels = tuple(sorted(kept[content.version].labels)) if content.version in kept else ()
         shown = state_of(slot, content, with_datum=False)
         yield VersionEntry(shown, until_ns, labels, content.cause)
 
 
 def bounded(state: ShardState, found: Iterable[VersionEntry]) -> Versions:
-    """Return an answer with these entries, as far as there is room for them."""
+    """Return an answer with the first of these entries, as far as there is room for them."""
     entries: list[VersionEntry] = []
-    named = left_out = 0
+    named = size = left_out = 0
     for entry in found:
         cause = entry.cause
         named += 1 + (len(cause.reads) + len(cause.writes) if cause is not None else 0)
         if named <= NAMED_MAX:
+            size += _size_of(entry)
+        if named <= NAMED_MAX and size <= NAMED_BYTES_MAX:
             entries.append(entry)
         else:
             left_out += 1
     return Versions(state.epoch, state.stamp(), tuple(entries), left_out)
+
+
+def _size_of(entry: VersionEntry) -> int:
+    """Return at least how many bytes an entry takes in an answer."""
+    cause = entry.cause
+    slots, names = [entry.state.slot], list(entry.kept)
+    if cause is not None:
+        names += (cause.actor, cause.host, cause.lock.session)
+        slots += [read.slot for read in cause.reads]
+        slots += [written.slot for written in cause.writes]
+    text = "".join([name for slot in slots for name in slot] + names)
+    return _ENTRY_BYTES + _SLOT_BYTES * len(slots) + 3 * len(names) + len(text.encode())

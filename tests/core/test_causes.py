@@ -9,18 +9,24 @@ from shard_bench import MS, S, ShardBench, datum, item, lock_id, slot
 from enact_dist.core.causes import READ_BYTES
 from enact_dist.core.message_parts import READS_MAX
 from enact_dist.core.messages import (
+    AspectEntry,
     Cause,
     Commit,
     DatumRead,
     Explain,
     FindEffects,
     Finish,
+    KeepVersions,
+    ListHistory,
     Refused,
+    Register,
     SlotVersion,
     WriteItem,
 )
 from enact_dist.core.phase import Phase
 from enact_dist.terms import Access
+from enact_dist.wire.frames import encode_frame
+from enact_dist.wire.limits import HEADER_BYTES_MAX
 
 W, R, V = Access.WRITE, Access.READ, Access.VIEW
 READ = DatumRead(slot("view/1", "frame"), 3, 77)
@@ -237,3 +243,39 @@ def test_lineage_counts_in_the_cap_of_history(monkeypatch):
     assert history.count == 3
     assert history.dropped == 3
     assert history.bytes == 3 * (100 * READ_BYTES + 1)
+
+
+def test_answer_of_long_names_fits_into_a_frame():
+    """What the shard could not send, its client would ask for again and again."""
+    bench = ShardBench()
+    bench.hello("ann")
+    entities = [f"e{number:03}/".ljust(200, "e") for number in range(400)]
+    reads = [DatumRead(slot(entity, "f" * 200, "w" * 200), 1, 1) for entity in entities]
+    for seq in range(1, 81):
+        committed(bench, (slot(f"{seq:03}".ljust(200, "e")), "1"), seq=seq, reads=reads)
+
+    answer = bench.ask(ListHistory((), (), ()))
+
+    header, _ = encode_frame(answer)
+    assert len(header) < HEADER_BYTES_MAX
+    assert len(answer.entries) > 40
+    assert len(answer.entries) + answer.left_out == 80
+
+
+def test_each_version_is_explained_as_it_is_listed():
+    """Retained, kept beyond that, replaced within the last two seconds, the newest."""
+    bench = ShardBench()
+    bench.hello("ann")
+    bench.ask(Register("admin", (), (AspectEntry("mask", "int", "durable", 4),)))
+    where = slot(aspect="mask")
+    for seq in range(1, 12):
+        committed(bench, (where, str(seq)), seq=seq)
+        if seq in (2, 3, 11):
+            bench.ask(KeepVersions("ann", "label", (SlotVersion(where, seq),)))
+
+    listed = bench.ask(ListHistory((), (), ("mask",))).entries
+    explained = [entries(bench, SlotVersion(where, version)) for version in range(14)]
+
+    assert [entry.state.version for entry in listed] == [2, 3, 8, 9, 10, 11]
+    assert [one for some in explained[1:] for one in some] == list(listed)
+    assert explained[0] == listed[-1:]
