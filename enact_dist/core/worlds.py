@@ -134,6 +134,9 @@ class WorldDesk:
             )
         if message.source not in state.catalogue.worlds:
             return unknown_world(message.source, state.catalogue.worlds)
+        if message.at_ns <= 0:
+            text = f"{message.source!r} was to be forked as of stamp {message.at_ns}, which is none"
+            return Refused("protocol", text)
         if state.stamps.too_far_ahead(message.at_ns, wall_ns=state.wall_ns):
             ahead_s = (message.at_ns - state.wall_ns) / 1e9
             return Refused(

@@ -630,3 +630,15 @@ def test_late_copy_makes_no_context_when_its_session_was_away(bench):
     assert isinstance(bench.ask(late), Refused)
 
     assert "what_if" not in bench.shard.state.catalogue.worlds
+
+
+@pytest.mark.parametrize("at_ns", [0, -1])
+def test_fork_as_of_no_stamp_is_refused(bench, at_ns):
+    """It would show the present under a stamp before all others, and wait for no commit."""
+    write(bench, "1")
+
+    answer = fork(bench, at_ns=at_ns)
+
+    assert isinstance(answer, Refused)
+    assert "which is none" in answer.text
+    assert "what_if" not in bench.shard.state.catalogue.worlds
