@@ -13,7 +13,7 @@ A listing carries no data: `Version.datum` fetches one when it is asked.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from enact_dist.core.datum import Position, Slot
@@ -23,6 +23,8 @@ from enact_dist.core.messages import (
     ListHistory,
     Refused,
     SlotVersion,
+    Survey,
+    Surveyed,
     Versions,
 )
 from enact_dist.errors import ForgottenError, MisuseError, ProtocolError
@@ -37,7 +39,7 @@ from enact_dist.terms import Aspect, Entity, NullReason, View, checked_name
 from enact_dist.wire.payload import decode_untyped
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Callable, Iterable
 
     from enact_dist.core.messages import Answer, Cause, VersionEntry
     from enact_dist.session import Session
@@ -120,8 +122,7 @@ def versions_of(
     session.client.check_usable()
     shard = session.client.shard_of(entity.name)
     session.settle(shard)
-    request = ListHistory((world.name,), (entity.name,), (aspect.name,), since_ns, count)
-    entries = _entries(session.client.call(shard, request))
+    entries = listed(session, shard, Slot(world.name, entity.name, aspect.name), since_ns, count)
     if not entries:
         session.check_world(world.name)
     return tuple(_version(shard, world, aspect, entry) for entry in entries)
@@ -136,7 +137,12 @@ def kept_versions(
     answers = session.client.call_all([(shard, request) for shard in shards])
     found: dict[str, list[Version[Any]]] = {}
     for shard, answer in zip(shards, answers, strict=True):
-        for entry in _entries(answer):
+        entries = list(_versions(answer).entries)
+        if _versions(answer).left_out:  # more than one answer can say: slot by slot
+            entries = [e for slot in _slots(session, shard) for e in listed(session, shard, slot)]
+        for entry in entries:
+            if not entry.kept:
+                continue
             slot = entry.state.slot
             version = _version(shard, world_of(slot.context), Aspect(slot.aspect, object), entry)
             for label in version.kept:
@@ -204,12 +210,45 @@ def _check_label(label: str) -> None:
         raise MisuseError(str(error)) from None
 
 
-def _entries(answer: Answer) -> Sequence[VersionEntry]:
+def listed(
+    session: Session, shard: str, slot: Slot, since_ns: int = 0, count: int = 0
+) -> list[VersionEntry]:
+    """Return what a shard knows of one slot's versions, by as many answers as that takes.
+
+    Args:
+        session: Who asks.
+        shard: The shard that has the slot.
+        slot: The slot.
+        since_ns: Only versions that were current after this stamp.
+        count: Only so many, the newest ones (0: all).
+
+    Raises:
+        ShardUnreachableError: The shard does not answer.
+    """
+    request = ListHistory((slot.context,), (slot.entity,), (slot.aspect,), since_ns, count)
+    answer = _versions(session.client.call(shard, request))
+    entries = list(answer.entries)
+    while answer.left_out and entries and entries[-1].until_ns:
+        request = replace(request, since_ns=entries[-1].until_ns)
+        answer = _versions(session.client.call(shard, request))
+        entries += answer.entries
+    return entries
+
+
+def _slots(session: Session, shard: str) -> list[Slot]:
+    """Return all slots of a shard."""
+    answer = session.client.call(shard, Survey((), (), ()))
+    if not isinstance(answer, Surveyed):
+        raise ProtocolError(f"{type(answer).__name__} came as the answer to Survey")
+    return [state.slot for state in answer.states]
+
+
+def _versions(answer: Answer) -> Versions:
     if isinstance(answer, Refused):
         raise error_of(answer)
     if not isinstance(answer, Versions):
         raise ProtocolError(f"{type(answer).__name__} came as the answer to ListHistory")
-    return answer.entries
+    return answer
 
 
 def _version(shard: str, world: WorldContext, aspect: Aspect[T], entry: VersionEntry) -> Version[T]:

@@ -15,13 +15,13 @@ from enact_dist.core.messages import (
     AwaitStamp,
     Explain,
     Item,
-    ListHistory,
     Reached,
     Refused,
     SlotVersion,
     Versions,
 )
 from enact_dist.errors import ForgottenError, LeaseLostError, ProtocolError
+from enact_dist.history import listed
 from enact_dist.link.fetching import fetch_all
 from enact_dist.link.refusals import error_of
 from enact_dist.terms import Access
@@ -135,8 +135,7 @@ def between(session: Session, slot: Slot, shard: str, first: int, last: int) -> 
     Raises:
         ShardUnreachableError: The shard does not answer.
     """
-    request = ListHistory((slot.context,), (slot.entity,), (slot.aspect,))
-    states = [entry.state for entry in _asked(session, [(shard, request)])]
+    states = [entry.state for entry in listed(session, shard, slot)]
     return [
         Wanted(state.stamp_ns, slot, state.version, shard)
         for state in states

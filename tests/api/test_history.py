@@ -182,3 +182,26 @@ def test_versions_of_several_shards_are_kept_under_one_label(two_stored):
     assert [(version.entity, version.datum()) for version in kept] == [(LEFT, 1), (RIGHT, 2)]
     cell.let_go("both")
     assert cell.kept() == {}
+
+
+def test_history_beyond_one_answer_comes_in_several(cell, online, monkeypatch):
+    """Nothing of it is left out silently, the newest versions least of all."""
+    for number in range(12):
+        put(online, ARM, number)
+        put(online, LEG, number)
+    cell.keep("label", online.history(ARM, COUNT)[:7])
+    cell.keep("label", online.history(LEG, COUNT)[2:8])
+    monkeypatch.setattr("enact_dist.core.version_list.NAMED_MAX", 9)
+
+    versions = online.history(ARM, COUNT)
+
+    assert [version.version for version in versions] == list(range(1, 13))
+    assert [version.datum() for version in versions] == list(range(12))
+    assert [v.version for v in online.history(ARM, COUNT, count=10)] == list(range(3, 13))
+    since = versions[5].position
+    assert [v.version for v in online.history(ARM, COUNT, since=since)] == list(range(6, 13))
+    kept = cell.kept()["label"]
+    assert [(v.entity, v.version) for v in kept] == [
+        *((ARM, version) for version in range(1, 8)),
+        *((LEG, version) for version in range(3, 9)),
+    ]

@@ -628,7 +628,6 @@ def test_late_copy_makes_no_context_when_its_session_was_away(bench):
     bench.hello("ann")
 
     assert isinstance(bench.ask(late), Refused)
-
     assert "what_if" not in bench.shard.state.catalogue.worlds
 
 
