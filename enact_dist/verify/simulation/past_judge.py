@@ -180,6 +180,8 @@ class PastJudge:
         stamps = [record.stamp_ns for record in recovered.slots]
         stamps += [record.position.stamp_ns for record in recovered.outcomes]
         stamps += [record.position.stamp_ns for record in recovered.decisions]
+        stamps += [record.stamp_ns for record in recovered.prepared]
+        stamps += [record.at_ns for record in recovered.worlds]
         picture.started_ns = max(host.wall_ns, *stamps, 0)
         picture.promised.clear()
         found = {label: set(kept) for label, kept in slots.history.labels.items()}
