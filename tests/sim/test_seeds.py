@@ -26,7 +26,7 @@ KNOWN_BAD = {
     "takes_the_first_views": 30,
     "views_do_not_wait_for_the_undecided": 30,
     "shows_what_was_deleted_outside_retention": 30,
-    "takes_one_slot_for_the_whole_shard": 60,
+    "takes_one_slot_for_the_whole_shard": 80,
     "counts_the_hold_from_its_own_grant": 176,
     "welcomes_early": 210,
     "believes_without_the_list": 235,
