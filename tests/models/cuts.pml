@@ -6,7 +6,7 @@
  *   commits.py:commit, persisted, undecided              the commit that decides, at A
  *   finishing.py:commit                                  its stamp comes after the prepared ones
  *   view_desk.py:on_take_view, _undecided_ns, _viewed    view, and until when it is current
- *   slots.py:shown, at, past.py:at                       the state as of a stamp, if not forgotten
+ *   slots.py:shown, at, slot_history.py:at               the state as of a stamp, if not forgotten
  *   cuts.py:take, settled                                the cut
  *   shard.py:__init__, sessions.py:in_grace              restart; the grace waits for a viewer that
  *                                                        locks, not for an observer
