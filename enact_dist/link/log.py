@@ -23,6 +23,7 @@ import os
 import queue
 import threading
 from contextlib import suppress
+from copy import copy
 from logging.handlers import QueueHandler
 from typing import Final
 
@@ -113,6 +114,7 @@ class _BoundedHandler(QueueHandler):
 
     def prepare(self, record: logging.LogRecord) -> logging.LogRecord:
         """Make the text here, where what it tells of cannot change meanwhile; keep the rest."""
+        record = copy(record)
         record.msg, record.args = record.getMessage(), None
         return record
 
