@@ -40,7 +40,15 @@ from enact_dist.core.messages import (
     SlotVersion,
     WorldEntry,
 )
-from enact_dist.core.records import Persist, Record, Reply, SlotRecord, WorldDropped, WorldRecord
+from enact_dist.core.records import (
+    KeptRecord,
+    Persist,
+    Record,
+    Reply,
+    SlotRecord,
+    WorldDropped,
+    WorldRecord,
+)
 from enact_dist.core.slots import NOTHING, Content
 from enact_dist.core.stamps import AHEAD_NS_MAX
 from enact_dist.terms import Durability
@@ -215,7 +223,16 @@ class WorldDesk:
         state, world = self._state, message.world
         del state.catalogue.worlds[world]
         state.busy_worlds[world] = "being dropped"
-        yield self._persist(act, (WorldDropped(world, state.slots.version_base(world)),))
+        dropped = WorldDropped(world, state.slots.version_base(world))
+        yield self._persist(act, (dropped, *self._labels_without(world)))
+
+    def _labels_without(self, world: str) -> Iterator[KeptRecord]:
+        """Yield what the labels that keep versions of a context keep of others."""
+        history = self._state.slots.history
+        for label, versions in history.labels.items():
+            left = [version for version in versions if version.slot.context != world]
+            if len(left) < len(versions):
+                yield KeptRecord(label, tuple(v for v in left if history.is_stored(v.slot)))
 
     def _drop_refused(self, world: str) -> Answer | None:
         """Return what a drop is answered where nothing is to be done, None where it is."""

@@ -24,6 +24,7 @@ from enact_dist.core.messages import (
     Goodbye,
     Hello,
     Item,
+    KeepVersions,
     Prepare,
     Prepared,
     Refused,
@@ -35,7 +36,7 @@ from enact_dist.core.messages import (
     WorldEntry,
     WriteItem,
 )
-from enact_dist.core.records import SlotRecord, WorldDropped, WorldRecord
+from enact_dist.core.records import KeptRecord, SlotRecord, WorldDropped, WorldRecord
 from enact_dist.core.slots import NOTHING
 from enact_dist.core.worlds import CHANGES_MAX, FORK_WAIT_NS
 from enact_dist.terms import Access, NullReason
@@ -641,3 +642,18 @@ def test_fork_as_of_no_stamp_is_refused(bench, at_ns):
     assert isinstance(answer, Refused)
     assert "which is none" in answer.text
     assert "what_if" not in bench.shard.state.catalogue.worlds
+
+
+def test_dropped_context_leaves_no_label_on_the_disk(bench):
+    """Nobody could let go of it: it is listed nowhere.  What it keeps of others stays."""
+    write(bench, "1")
+    fork(bench)
+    there, here = SlotVersion(of("what_if"), 1), SlotVersion(slot(), 1)
+    bench.ask(KeepVersions("ann", "trial", (there,)))
+    bench.ask(KeepVersions("ann", "both", (there, here)))
+
+    drop(bench)
+
+    assert bench.recovered(2).kept == [KeptRecord("both", (here,))]
+    bench.restart()
+    assert list(bench.shard.state.slots.history.labels) == ["both"]
