@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from enact_dist.core.datum import Datum, Slot
     from enact_dist.core.lock_parts import Reading
-    from enact_dist.core.messages import Request, VersionEntry
+    from enact_dist.core.messages import VersionEntry
     from enact_dist.core.multilock import MultiLock
     from enact_dist.session import Session
 
@@ -115,7 +115,7 @@ def explained(session: Session, wanted: Sequence[Wanted]) -> dict[Wanted, Versio
     by_shard: dict[str, list[SlotVersion]] = {}
     for each in wanted:
         by_shard.setdefault(each.shard, []).append(SlotVersion(each.slot, each.version))
-    calls: list[tuple[str, Request]] = [
+    calls = [
         (shard, Explain(tuple(versions[first : first + EXPLAINED_MAX])))
         for shard, versions in by_shard.items()
         for first in range(0, len(versions), EXPLAINED_MAX)
@@ -143,14 +143,23 @@ def between(session: Session, slot: Slot, shard: str, first: int, last: int) -> 
     ]
 
 
-def _asked(session: Session, calls: Sequence[tuple[str, Request]]) -> list[VersionEntry]:
+def _asked(session: Session, calls: Sequence[tuple[str, Explain]]) -> list[VersionEntry]:
+    """Ask shards about versions, in halves where an answer would be too long."""
     entries: list[VersionEntry] = []
-    for answer in session.client.call_all(calls):
-        if isinstance(answer, Refused):
-            raise error_of(answer)
-        if not isinstance(answer, Versions):
-            raise ProtocolError(f"{type(answer).__name__} came where versions were asked for")
-        entries += answer.entries
+    while calls:
+        halves: list[tuple[str, Explain]] = []
+        for (shard, asked), answer in zip(calls, session.client.call_all(calls), strict=True):
+            if isinstance(answer, Refused):
+                raise error_of(answer)
+            if not isinstance(answer, Versions):
+                raise ProtocolError(f"{type(answer).__name__} came where versions were asked for")
+            half = len(asked.versions) // 2
+            if answer.left_out and half:
+                parts = asked.versions[:half], asked.versions[half:]
+                halves += [(shard, Explain(part)) for part in parts]
+            else:
+                entries += answer.entries
+        calls = halves
     return entries
 
 
