@@ -39,10 +39,14 @@ VANISHED: Final = (0, 0)
 
 
 class _Known(NamedTuple):
-    """What was told last of a slot, and in which epoch of its shard."""
+    """What is known of a slot, in which epoch of its shard, and whether it was told.
+
+    Not told is a slot that was null at the begin: its versions until then are no gap.
+    """
 
     epoch: int
     state: tuple[int, int]
+    told: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,9 +208,11 @@ class Watch:
         states: list[SlotState] = sorted(answer.states, key=lambda state: state.stamp_ns)
         for state in states:
             null = bool(state.null_reason)
-            if null and state.slot not in self._known:
-                continue
             known = _Known(answer.epoch, (state.version, state.stamp_ns))
+            if null and state.slot not in self._known:
+                if not self._following[shard].listed:
+                    self._known[state.slot] = known._replace(told=False)
+                continue
             self._note(shard, state.slot, known, null=null, captured=state.captured_ns)
         self._note_vanished(shard, answer.epoch, {state.slot for state in states})
         self._following[shard] = _Following(answer.epoch, answer.notice_number, listed=True)
@@ -215,8 +221,12 @@ class Watch:
         """Tell of slots that the shard lists no more: it kept them in memory and restarted."""
         for slot, known in list(self._known.items()):
             gone = slot not in listed and known.state != VANISHED
-            if gone and self._client.shard_of(slot.entity) == shard:
+            if not gone or self._client.shard_of(slot.entity) != shard:
+                continue
+            if known.told:
                 self._note(shard, slot, _Known(epoch, VANISHED), null=True)
+            else:
+                del self._known[slot]
 
     def _note(
         self, shard: str, slot: Slot, state: _Known, *, null: bool, captured: int = 0
@@ -227,9 +237,10 @@ class Watch:
         shard, volatile ones start counting again with a later stamp.
         """
         known = self._known.get(slot)
-        self._known[slot] = state
         if known is not None and known.state == state.state:
+            self._known[slot] = state._replace(told=known.told)
             return
+        self._known[slot] = state
         version, stamp_ns = state.state
         if known is None:
             gap = version - 1 if self._following[shard].listed else 0

@@ -167,3 +167,17 @@ def test_notice_that_comes_again_tells_nothing_twice(online):
         assert rest(watch) == []
         assert watch.missed == 0
         assert not watch._feed._copies
+
+
+def test_versions_from_before_the_watch_are_no_gap_where_the_slot_was_null(online):
+    """A slot that was deleted when the watch began is not told of, and nothing of it was missed."""
+    count = Write(online, bench, COUNT)
+    write(count, 1)
+    with Lock(count) as lock:
+        del lock[count]
+    with online.watch("**", COUNT) as watch:
+        assert rest(watch) == []
+        write(count, 3)
+        change = watch.next(SOON_S)
+        assert (change.version, change.gap, change.null) == (3, 0, False)
+        assert watch.missed == 0
