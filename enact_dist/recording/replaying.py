@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 from enact_dist.core.messages import AspectEntry, Item
 from enact_dist.errors import ConfigError, MisuseError
 from enact_dist.recording.reading import Commit, Recording
-from enact_dist.terms import Access
+from enact_dist.terms import Access, checked_name
 from enact_dist.wire.limits import BODY_BYTES_MAX, ITEMS_MAX
 from enact_dist.wire.payload import Encoded
 from enact_dist.writing import Writing
@@ -76,7 +76,8 @@ class Replay:
         overwrite: Also write into world contexts that have data.
 
     Raises:
-        ConfigError: The file is no recording, or `speed` makes no sense.
+        ConfigError: The file is no recording, `speed` makes no sense, or `worlds` names what the
+            recording does not have, what cannot be a name, or one name for two.
     """
 
     def __init__(
@@ -100,11 +101,20 @@ class Replay:
         self._registered: set[str] = set()
         self.summary = ReplaySummary(str(path))
         known = self.recording.facts.get("worlds", "").split()
-        for name in self._worlds:
+        for name, new in self._worlds.items():
             if name not in known:
                 raise ConfigError(
                     f"{path} has no world context {name!r}; it has {', '.join(known) or 'none'}"
                 )
+            try:
+                checked_name("world context", new, slashes=False)
+            except ValueError as error:
+                raise ConfigError(str(error)) from None
+        called = [self._worlds.get(name, name) for name in known]
+        twice = next((new for new in called if called.count(new) > 1), None)
+        if twice is not None:
+            both = ", ".join(name for name, new in zip(known, called, strict=True) if new == twice)
+            raise ConfigError(f"{both} of {path} would all be written into {twice!r}; name others")
 
     def between(self, from_ns: int, to_ns: int = 0) -> None:
         """Take a part of the recording only.
@@ -112,7 +122,13 @@ class Replay:
         Args:
             from_ns: Where to begin, with the state as of that stamp; 0: at the begin.
             to_ns: Stamp of the last commit; 0: at the end.
+
+        Raises:
+            ConfigError: The end lies before the begin.
         """
+        if to_ns and to_ns < from_ns:
+            before_s = (from_ns - to_ns) / 1e9
+            raise ConfigError(f"nothing to replay: the end lies {before_s:.3g} s before the begin")
         self._from_ns, self._to_ns = from_ns, to_ns
 
     def run(
@@ -152,9 +168,11 @@ class Replay:
 
     def _once(self, stop: threading.Event, tell: Callable[[ReplaySummary], None]) -> None:
         begun_s = first_ns = 0.0
+        # Who begins before the recording does not wait for it.
+        begins = self._from_ns > int(self.recording.facts.get("begin_ns", "0"))
         for commit in self._chosen():
             if commit.number and not first_ns:
-                begun_s, first_ns = time.monotonic(), self._from_ns or commit.log_ns
+                begun_s, first_ns = time.monotonic(), self._from_ns if begins else commit.log_ns
             if self._speed and commit.number:
                 due_s = begun_s + (commit.log_ns - first_ns) / 1e9 / self._speed
                 if stop.wait(max(0.0, due_s - time.monotonic())):

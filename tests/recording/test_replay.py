@@ -190,3 +190,35 @@ def test_several_worlds_of_one_commit_stay_one_commit(cell, tmp_path):
     assert replayed(cell, path).commits == 1
     stamps = {cell.world(name).survey()[0].position for name in ("online", "training")}
     assert len(stamps) == 1
+
+
+def test_who_begins_before_the_recording_does_not_wait_for_it(cell, run):
+    """An hour before it nothing was recorded: its first commit comes at once."""
+    replay = Replay(cell, run, speed=1.0)
+    replay.between(BEGIN_NS - 3_600 * 10**9)
+    stop = threading.Event()
+    overdue = threading.Timer(30.0, stop.set)
+    overdue.start()
+    summary = replay.run(stop)
+    overdue.cancel()
+    assert (summary.commits, summary.rounds) == (10, 1)
+
+
+def test_an_end_before_the_begin_is_refused(cell, run):
+    """By how much; nothing is set."""
+    with pytest.raises(ConfigError, match=r"the end lies 2 s before the begin"):
+        Replay(cell, run).between(BEGIN_NS + 3 * 10**9, BEGIN_NS + 10**9)
+
+
+def test_a_name_that_none_can_have_is_refused(cell, run):
+    """Before anything is written."""
+    with pytest.raises(ConfigError, match=r"'a b' cannot name a world context"):
+        Replay(cell, run, worlds={"online": "a b"})
+
+
+def test_two_contexts_are_not_written_into_one(cell, tmp_path):
+    """Their slots would overwrite each other."""
+    path = tmp_path / "run.mcap"
+    file(path, worlds="online training").close({})
+    with pytest.raises(ConfigError, match=r"online, training of .* into 'online'; name others"):
+        Replay(cell, path, worlds={"training": "online"})
