@@ -19,6 +19,7 @@ When = Position | datetime | float
 """A moment: where a commit stands, an aware `datetime`, or seconds since 1970."""
 
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
+_STAMP_NS_MAX: Final = (1 << 63) - 1
 
 
 class Moment(NamedTuple):
@@ -52,14 +53,22 @@ def stamp_of(when: When, *, seen_ns: int = 0) -> int:
         stamp_ns = _wall_ns(when)
         latest_ns = max(seen_ns, time.time_ns())
     if stamp_ns <= 0:
-        raise MisuseError(f"{when!r} lies before 1970, when nothing was known")
-    if stamp_ns > latest_ns:
-        ahead_s = (stamp_ns - latest_ns) / 1e9
         raise MisuseError(
-            f"{when!r} lies {ahead_s:.3g} s in the future, of which nothing is known; a moment is"
+            f"{_shown(when)} lies before 1970, when nothing was known; so long ago is"
+            " time.time() - 30, on a command line -30s"
+        )
+    if stamp_ns > latest_ns or stamp_ns > _STAMP_NS_MAX:
+        ahead_s = (stamp_ns - latest_ns) // 1_000_000 / 1000 if stamp_ns <= _STAMP_NS_MAX else 0.0
+        far = f"{ahead_s:.3g} s" if ahead_s else "centuries"
+        raise MisuseError(
+            f"{_shown(when)} lies {far} in the future, of which nothing is known; a moment is"
             " given in seconds since 1970, as an aware datetime or as the Position of a commit"
         )
     return stamp_ns
+
+
+def _shown(when: When) -> str:
+    return when.isoformat(sep=" ") if isinstance(when, datetime) else repr(when)
 
 
 def _wall_ns(when: datetime | float) -> int:

@@ -64,8 +64,8 @@ def checked_name(kind: str, name: object, *, slashes: bool) -> str:
     for segment in name.split("/") if slashes else [name]:
         if not _SEGMENT.match(segment):
             raise ValueError(
-                f"{name!r} cannot name a {kind}: {segment!r} must be letters, digits, '_', '.' or"
-                " '-' and start with a letter, digit or '_'"
+                f"{name!r} cannot name {'an' if kind[0] in 'ae' else 'a'} {kind}: {segment!r} must"
+                " be letters, digits, '_', '.' or '-' and start with a letter, digit or '_'"
                 + ("; segments are separated by single slashes" if slashes else "")
             )
     return name

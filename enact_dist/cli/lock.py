@@ -20,7 +20,7 @@ from enact_dist.cli.verbs import (
     add_verb,
     open_cell,
     seconds,
-    slot_name,
+    slot_parts,
     verbs_of,
     whole,
 )
@@ -210,7 +210,7 @@ def held(text: str) -> tuple[str, str, str, str]:
         raise argparse.ArgumentTypeError(
             f"{text!r} is not written [WORLD:]ENTITY/ASPECT:read or …:write"
         )
-    entity, aspect = slot_name(found["slot"])
+    entity, aspect = slot_parts(found["slot"])
     try:
         (Entities if "*" in entity else Entity)(entity)
         checked_name("aspect", aspect, slashes=False)

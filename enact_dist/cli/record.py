@@ -16,6 +16,7 @@ from enact_dist.cli.verbs import (
     add_timeout,
     add_verb,
     cell_target,
+    entities,
     is_endpoint,
     open_cell,
     pair,
@@ -55,7 +56,9 @@ def _add_record(nouns: argparse._SubParsersAction[Verb]) -> None:
     _add_cell(record)
     record.add_argument("--out", metavar="FILE", required=True, help="an .mcap file, a new one")
     record.add_argument("--world", action="append", metavar="NAME", help="only these contexts")
-    record.add_argument("--entities", metavar="PATTERN", default="**", help="only these entities")
+    record.add_argument(
+        "--entities", metavar="PATTERN", type=entities, default="**", help="only these entities"
+    )
     record.add_argument("--aspect", action="append", metavar="NAME", help="only these aspects")
     record.add_argument(
         "--seconds", type=seconds, metavar="N", help="end by itself after N seconds"

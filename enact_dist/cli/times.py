@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from enact_dist.moments import When
 
 MOMENT_HELP: Final = (
-    "a moment: -30s (so long ago; ms, s, min, h, d), 2026-11-21T10:00:00, seconds since 1970, or a"
-    " position as printed by world history"
+    "a moment: -30s (so long ago; ms, s, min, h, d), 2026-11-21T10:00:00 (this host's zone, unless"
+    " it ends with one: Z, +01:00), seconds since 1970, or a position as printed by world history"
 )
 _SECONDS: Final = {"ms": 0.001, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
 _AGO: Final = re.compile(r"-(\d+(?:\.\d+)?)(ms|s|min|h|d)\Z")

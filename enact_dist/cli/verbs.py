@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.errors import ConfigError
-from enact_dist.terms import Entities
+from enact_dist.terms import Entities, checked_name
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -112,18 +112,20 @@ def duration(text: str) -> float:
 
 def seconds(text: str) -> float:
     """Read a positive number of seconds; an `argparse` type."""
-    value = float(text)
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
     if not 0.0 < value < float("inf"):
-        raise ValueError(text)
+        raise argparse.ArgumentTypeError(f"{text!r} is no number of seconds above zero")
     return value
 
 
 def whole(text: str) -> int:
     """Read a whole number above zero; an `argparse` type."""
-    value = int(text)
-    if value < 1:
-        raise ValueError(text)
-    return value
+    if not text.isdecimal() or not int(text):
+        raise argparse.ArgumentTypeError(f"{text!r} is no whole number above zero")
+    return int(text)
 
 
 def entities(text: str) -> str:
@@ -156,21 +158,32 @@ def pairs(found: list[tuple[str, str]] | None, option: str) -> dict[str, str]:
     return read
 
 
-def slot_name(text: str) -> tuple[str, str]:
-    """Read ``ENTITY/ASPECT``, split at the last slash; an `argparse` type."""
+def slot_parts(text: str) -> tuple[str, str]:
+    """Read ``ENTITY/ASPECT``, split at the last slash, whatever the two are."""
     entity, slash, aspect = text.rpartition("/")
     if not slash or not entity or not aspect:
         raise argparse.ArgumentTypeError(f"{text!r} is not written ENTITY/ASPECT")
     return entity, aspect
 
 
+def slot_name(text: str) -> tuple[str, str]:
+    """Read ``ENTITY/ASPECT``, two names and no pattern; an `argparse` type."""
+    entity, aspect = slot_parts(text)
+    try:
+        checked_name("entity", entity, slashes=True)
+        checked_name("aspect", aspect, slashes=False)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+    return entity, aspect
+
+
 def slot_version(text: str) -> tuple[str, str, int]:
     """Read ``ENTITY/ASPECT[@VERSION]``, version 0 if none is named; an `argparse` type."""
     name, at, number = text.partition("@")
-    try:
-        return *slot_name(name), whole(number) if at else 0
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} does not name a version as @12") from None
+    slot = slot_name(name)
+    if at and not (number.isdecimal() and int(number)):
+        raise argparse.ArgumentTypeError(f"{text!r} does not name a version as @12")
+    return *slot, int(number or 0)
 
 
 # ---------------------------------------------------------------- the cell

@@ -6,6 +6,7 @@ A folder holds for each datum `ENTITY/ASPECT.npy` (an array), `.json` (plain dat
 
 from __future__ import annotations
 
+import contextlib
 import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,7 +15,7 @@ from enact_dist.cli.output import print_json, shown_bytes
 from enact_dist.cli.record import COMPRESSIONS, shows_of
 from enact_dist.cli.times import MOMENT_HELP, moment
 from enact_dist.cli.verbs import DONE, add_reader, add_verb, open_cell, pair
-from enact_dist.errors import ConfigError
+from enact_dist.errors import ConfigError, EnactError
 
 if TYPE_CHECKING:
     import argparse
@@ -81,7 +82,12 @@ def _into_folder(world: WorldContext, folder: Path, at_ns: int) -> dict[str, obj
         raise ConfigError(
             f"{folder} exists; an export makes a new folder, or a file that ends in .mcap"
         ) from None
-    index = [_save(version, folder) for version in world_as_of(world, at_ns)]
+    try:
+        index = [_save(version, folder) for version in world_as_of(world, at_ns)]
+    except EnactError:
+        with contextlib.suppress(OSError):  # of a folder that has data by now
+            folder.rmdir()
+        raise
     (folder / "index.json").write_text(json.dumps(index, indent=2), encoding="utf-8")
     size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
     return {"path": str(folder), "data": len(index), "size_bytes": size}

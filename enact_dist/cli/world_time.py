@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import time
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +14,7 @@ from enact_dist.cli.verbs import (
     FAILED,
     add_reader,
     add_verb,
+    entities,
     open_cell,
     slot_name,
     slot_version,
@@ -20,11 +22,9 @@ from enact_dist.cli.verbs import (
 )
 from enact_dist.errors import ConfigError, ForgottenError
 from enact_dist.link.refusals import moment_name
-from enact_dist.terms import Aspect, Entities, Entity
+from enact_dist.terms import Aspect, Entity
 
 if TYPE_CHECKING:
-    import argparse
-
     from enact_dist.cli.verbs import Verb
     from enact_dist.history import Version
     from enact_dist.world import WorldContext
@@ -195,19 +195,28 @@ def show_past(arguments: argparse.Namespace) -> int:
     """Print a tree of a past world context, or one datum of it.
 
     Raises:
-        ConfigError: No datum is named to get, or the name is none.
+        ConfigError: No datum is named to get, the name is none, or a tree is to be saved.
     """
-    name = arguments.name
-    if arguments.what == "get" and "/" not in (name or "").strip("/"):
-        raise ConfigError(f"which datum? world at WORLD TIME get ENTITY/ASPECT, not {name!r}")
+    gets = arguments.what == "get"
+    if arguments.out and not gets:
+        raise ConfigError(
+            "--out saves one datum: world at WORLD TIME get ENTITY/ASPECT --out FILE; world export"
+            " --at TIME saves a whole context"
+        )
+    if gets and arguments.name is None:
+        raise ConfigError("which datum? world at WORLD TIME get ENTITY/ASPECT")
+    try:
+        slot = slot_name(arguments.name) if gets else ("", "")
+        pattern = "" if gets else entities(arguments.name or "**")
+    except argparse.ArgumentTypeError as error:
+        raise ConfigError(f"which {'datum' if gets else 'entities'}? {error}") from None
     with open_cell(arguments) as cell:
         past = cell.world(arguments.world).at(arguments.moment)
-        if arguments.what == "get":
-            entity, aspect = slot_name(name)
-            datum = past.raw(Entity(entity), aspect)
+        if gets:
+            datum = past.raw(Entity(slot[0]), slot[1])
             print_datum(datum, out=arguments.out, as_json=arguments.json)
             return DONE
-        infos = past.survey(Entities(name or "**"))
+        infos = past.survey(pattern)
     title = f"{past.name} at {moment_name(past.at_ns)}"
     print_slots(title, infos, as_json=arguments.json, at_ns=past.at_ns)
     return DONE
@@ -277,8 +286,9 @@ def _version(world: WorldContext, entity: str, aspect: str, number: int) -> Vers
         if version.version == number or not number:
             return version
     known = ", ".join(f"v{version.version}" for version in found) or "none"
+    asked = f"version {number}" if number else "version"
     raise ForgottenError(
-        f"{world.name}:{entity}/{aspect} has no version {number} that is known; known: {known}",
+        f"{world.name}:{entity}/{aspect} has no {asked} that is known; known: {known}",
         oldest_ns=found[0].position.stamp_ns if found else 0,
     )
 

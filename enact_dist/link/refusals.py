@@ -140,13 +140,14 @@ def holder_line(holder: Holder) -> str:
 
 
 def moment_name(stamp_ns: int) -> str:
-    """Return a stamp as people read it: date and time of this host's zone."""
+    """Return a stamp as people and `fromisoformat` read it: this host's zone, and which it is."""
     seconds, rest_ns = divmod(stamp_ns, 1_000_000_000)
     try:
-        clock = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(seconds))
+        local = time.localtime(seconds)
+        clock, zone = time.strftime("%Y-%m-%d %H:%M:%S", local), time.strftime("%z", local)
     except (OverflowError, ValueError, OSError):
         return f"stamp {stamp_ns}"
-    return f"{clock}.{rest_ns // 1_000_000:03d}"
+    return f"{clock}.{rest_ns // 1_000_000:03d}{zone[:3]}:{zone[3:5]}"
 
 
 def forgotten(answer: Forgotten) -> ForgottenError:

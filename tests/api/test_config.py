@@ -229,7 +229,7 @@ WRONG = {
     "retention empty": ('name = "c"\n' + SHARD + "[aspects.x]\nretention = {}\n", 5, "Retention() says nothing"),
     "compare": ('name = "c"\n' + SHARD + '[aspects.x]\ncompare = "vocabulary"\n', 5, "'compare' is written package.module:NAME, not 'vocabulary'"),
     "aspect key": ('name = "c"\n' + SHARD + "[aspects]\nx = { durable = true }\n", 5, "unknown key 'durable' in [aspects.x]; did you mean 'durability'?"),
-    "aspect name": ('name = "c"\n' + SHARD + '[aspects."a/b"]\n', 4, "'a/b' cannot name a aspect"),
+    "aspect name": ('name = "c"\n' + SHARD + '[aspects."a/b"]\n', 4, "'a/b' cannot name an aspect"),
     "no class": ('name = "c"\n' + SHARD + "[actors.x]\n", 4, "[actors.x] needs the key 'class'"),
     "class": ('name = "c"\n' + SHARD + '[actors.x]\nclass = "a.b.C"\n', 5, "'class' is written package.module:Class, not 'a.b.C'"),
     "role": ('name = "c"\nworlds = ["online"]\n' + SHARD + '[actors.x]\nclass = "a:B"\nworlds = { now = "onlin" }\n', 7, "role 'now' is bound to unknown world context 'onlin'; did you mean 'online'? (known: online)"),

@@ -305,7 +305,7 @@ def test_deletion_is_a_version_with_a_cause(cell, online):
         (("online", there, COUNT), NullDatumError, "never set"),
         (("online", here, COUNT, 9), MisuseError, "no version 9; the newest is 1"),
         (("online", here, COUNT, -1), MisuseError, "no version -1"),
-        (("online", "a b", COUNT), MisuseError, "cannot name a entity"),
+        (("online", "a b", COUNT), MisuseError, "cannot name an entity"),
     ],
 )
 def test_what_cannot_be_explained_is_refused_by_name(cell, online, arguments, error, words):

@@ -176,3 +176,20 @@ def test_file_that_is_there_is_kept(enact, cell_file, tmp_path):
     out.write_text("precious")
     done = enact("record", cell_file, "--out", out, "--seconds", "0.1")
     assert (done.status, out.read_text()) == (2, "precious")
+
+
+def test_export_that_is_refused_leaves_no_folder(enact, cell_file, put, tmp_path):
+    """So that asking again, as of another moment, is not refused because of it."""
+    put("refused", a=1)
+    words = ("world", "export", "refused", "--cell", cell_file, "--out", tmp_path / "folder")
+    done = enact(*words, "--at", "9000000000000000000@left")
+    assert done.status == 1
+    assert enact(*words).status == 0
+
+
+def test_record_refuses_a_pattern_that_is_none(enact, cell_file, tmp_path, capsys):
+    """As a usage error."""
+    with pytest.raises(SystemExit) as end:
+        enact("record", cell_file, "--out", tmp_path / "run.mcap", "--entities", "[")
+    assert end.value.code == 2
+    assert "'[' is no pattern of entities" in capsys.readouterr().err

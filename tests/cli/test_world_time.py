@@ -1,11 +1,14 @@
 """`enact world history|at|fork|drop|keep|kept|let-go` against two real shards."""
 
 import json
+from datetime import datetime
 from types import SimpleNamespace
 
 import pytest
 
 from enact_dist import Aspect, Entity, Lock, Write, connect
+from enact_dist.cli.times import moment
+from enact_dist.moments import stamp_of
 
 COUNT = Aspect("time_count", int)
 ARM, LEG = Entity("arm"), Entity("system/leg")
@@ -189,3 +192,68 @@ def test_version_that_is_not_known_is_not_kept(at, made):
 
     assert result.status == 1
     assert "has no version 9 that is known; known: v1, v2, v3" in result.err
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("at", "W", "-1ms", "get", "a b/time_count"), "'a b' cannot name an entity"),
+        (("at", "W", "-1ms", "get"), "which datum?"),
+        (("at", "W", "-1ms", "tree", "a**"), "'a**' is no pattern of entities"),
+        (("at", "W", "-1ms", "--out", "x.npz"), "world export --at TIME saves a whole context"),
+    ],
+)
+def test_names_of_the_past_that_cannot_be_are_usage_errors(at, made, words, said):
+    """Said by name, never as a traceback."""
+    done = at(*(made.name if word == "W" else word for word in words))
+
+    assert done.status == 2
+    assert said in done.err
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("history", "w", "arm/*/time_count"), "'arm/*' cannot name an entity"),
+        (("history", "w", "arm/time_count@2"), "'time_count@2' cannot name an aspect"),
+        (("history", "w", "arm/time_count", "--count", "0"), "'0' is no whole number above zero"),
+        (("history", "w", "arm/time_count", "--timeout", "x"), "'x' is no number of seconds"),
+        (("keep", "label", "w", "arm//time_count"), "'arm/' cannot name an entity"),
+    ],
+)
+def test_names_that_cannot_be_are_usage_errors(at, capsys, words, said):
+    """Before the cell is asked."""
+    with pytest.raises(SystemExit) as end:
+        at(*words)
+
+    assert end.value.code == 2
+    assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("time", ["1e300", "99999999999999999999999@left", "2100-01-01"])
+def test_the_future_is_refused_however_far(at, made, time):
+    """As what it is, not as a number that does not fit."""
+    done = at("at", made.name, time)
+
+    assert done.status == 1
+    assert "in the future, of which nothing is known" in done.err
+    assert "datetime.datetime" not in done.err
+
+
+def test_to_keep_what_never_was_names_no_version(at, made):
+    """Version 0 is the command line's word for the newest, nobody's."""
+    done = at("keep", "label", made.name, "nobody/time_count")
+
+    assert done.status == 1
+    assert "nobody/time_count has no version that is known" in done.err
+
+
+def test_printed_time_says_its_zone_and_is_read_back(at, made):
+    """What a table shows can be asked for, on a host of another zone, too."""
+    row = at("history", made.name, "arm/time_count").out.splitlines()[-1].split()
+    printed = f"{row[1]} {row[2]}"
+
+    read = stamp_of(moment(printed))
+
+    assert datetime.fromisoformat(printed).utcoffset() is not None
+    assert 0 <= made.positions[-1].stamp_ns - read < 1_000_000
