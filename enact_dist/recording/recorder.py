@@ -20,12 +20,12 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.config_shows import GUESSED
 from enact_dist.core.datum import Slot
-from enact_dist.errors import ConfigError, LinkError, LockTimeoutError
+from enact_dist.errors import ConfigError, LinkError, LockTimeoutError, UnknownWorldError
 from enact_dist.recording.disk import QUEUE_BYTES_MAX, DiskThread
 from enact_dist.recording.exact import Recorded
-from enact_dist.recording.fetching import Wanted, between, explained, found_of, now_ns
+from enact_dist.recording.fetching import Found, Wanted, between, explained, found_of, now_ns
 from enact_dist.recording.file import CHUNK_BYTES, CHUNK_S, RecordingFile
-from enact_dist.terms import Entities
+from enact_dist.terms import Entities, NullReason
 from enact_dist.watch import Watch
 
 if TYPE_CHECKING:
@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     from enact_dist.config_shows import Shows
     from enact_dist.core.datum import LockId
     from enact_dist.core.messages import AspectEntry, VersionEntry
-    from enact_dist.recording.fetching import Found
     from enact_dist.watch import Change
 
 SETTLE_S: Final = 0.25
@@ -62,6 +61,7 @@ FORGOTTEN: Final = "forgotten before it was fetched"
 DISK_SLOW: Final = "disk too slow"
 UNSEEN: Final = "forgotten before it was noticed"
 UNREACHABLE: Final = "its shard did not answer"
+DROPPED: Final = "its world context was dropped"
 
 
 @dataclass(slots=True)
@@ -153,6 +153,7 @@ class Recorder:
         self._settled_ns = self._stalled_ns = self._last_ns = 0
         self._begin_ns = 0
         self._initial: set[Wanted] = set()
+        self._nulls: set[Wanted] = set()
         self._disk: DiskThread
         self.summary = RecordingSummary(str(path))
 
@@ -267,7 +268,10 @@ class Recorder:
         self._know(change.aspect)
         if change.gap:
             self._fill(slot, shard, change)
-        self._want(Wanted(stamp_ns, slot, change.version, shard))
+        wanted = Wanted(stamp_ns, slot, change.version, shard)
+        if change.null:
+            self._nulls.add(wanted)
+        self._want(wanted)
 
     def _know(self, aspect: str) -> None:
         """Learn of an aspect from the catalogue, before its first datum is written."""
@@ -284,7 +288,7 @@ class Recorder:
         first, last = change.version - change.gap, change.version - 1
         try:
             found = between(self._session, slot, shard, first, last) if first <= last else []
-        except LinkError:
+        except (LinkError, UnknownWorldError):
             found = []
         for wanted in found:
             self._want(wanted)
@@ -295,7 +299,9 @@ class Recorder:
         bisect.insort(self._pending, wanted)
         self._arrived.append((time.monotonic(), wanted.stamp_ns))
         while len(self._pending) > WANTED_MAX:
-            self._miss_one(self._pending.pop(0), DISK_SLOW)
+            oldest = self._pending.pop(0)
+            self._nulls.discard(oldest)
+            self._miss_one(oldest, DISK_SLOW)
 
     def _miss_one(self, wanted: Wanted, reason: str) -> None:
         version = wanted.version
@@ -350,7 +356,11 @@ class Recorder:
         except (LinkError, LockTimeoutError):
             self._session.client.check_usable()
             return  # a shard is away; its history will say what it still has
+        except UnknownWorldError:
+            self._give_up_dropped(batch)
+            return
         del self._pending[: len(batch)]
+        self._nulls.difference_update(batch)
         for wanted in batch:
             if wanted not in found:
                 stalled = wanted.stamp_ns <= self._stalled_ns
@@ -360,12 +370,39 @@ class Recorder:
         if initial:
             self.summary.initial += len(initial)
             self._write(initial, 0, self._begin_ns, entries, found)
-        for group in _commits([w for w in known if w not in self._initial], entries):
+        self._write_commits([w for w in known if w not in self._initial], entries, found)
+
+    def _write_commits(
+        self,
+        known: Sequence[Wanted],
+        entries: Mapping[Wanted, VersionEntry],
+        found: Mapping[Wanted, Found],
+    ) -> None:
+        for group in _commits(known, entries):
             stamp_ns = group[0].stamp_ns
             self.summary.commits += 1
             self.summary.out_of_order += stamp_ns < self._last_ns
             self._last_ns = max(self._last_ns, stamp_ns)
             self._write(group, self.summary.commits, stamp_ns, entries, found)
+
+    def _give_up_dropped(self, batch: list[Wanted]) -> None:
+        """Record of contexts that are dropped that they end; what else waits of them is missing."""
+        for name in sorted({wanted.slot.context for wanted in batch}):
+            some = [wanted for wanted in batch if wanted.slot.context == name]
+            try:
+                explained(self._session, some)
+                found_of(self._session, some)
+            except (LinkError, LockTimeoutError):
+                continue
+            except UnknownWorldError:
+                gone = set(some)
+                self._pending = [wanted for wanted in self._pending if wanted not in gone]
+                for wanted in sorted(gone - self._nulls):
+                    self._miss_one(wanted, DROPPED)
+                ends = sorted(gone & self._nulls)
+                found = {wanted: Found(NullReason.DELETED.name, None) for wanted in ends}
+                self._write_commits(ends, {}, found)
+                self._nulls -= gone
 
     def _write(
         self,

@@ -383,3 +383,23 @@ def test_versions_are_explained_in_parts_where_one_answer_is_too_short(cell, onl
     found = fetching.explained(online.session, wanted)
 
     assert [found[one].cause for one in wanted] == [version.cause for version in versions]
+
+
+def test_a_context_that_is_dropped_does_not_end_the_recording(cell, online, tmp_path, monkeypatch):
+    """What waits of it is named as missing; the others are recorded on."""
+    fork = online.fork("what_if")
+    kept, lost = Write(online, bench, COUNT), Write(fork, bench, COUNT)
+    with Running(cell, tmp_path / "run.mcap") as summary:
+        with monkeypatch.context() as resting:  # so that the drop comes while they wait
+            resting.setattr(recorder, "SETTLE_S", 3600.0)
+            put((kept, 1), (lost, 1))
+            cell.drop_world("what_if")
+        put((kept, 2))
+    assert summary.gaps == {recorder.DROPPED: 1}
+    assert summary.gap_slots == {"what_if:bench/count": 1}
+    found = [v for commit in commits_of(tmp_path / "run.mcap") for v in commit.versions]
+    assert {(v.slot.context, v.version, v.null_reason) for v in found} == {
+        ("online", 1, ""),
+        ("online", 2, ""),
+        ("what_if", 2, "DELETED"),
+    }
