@@ -487,7 +487,10 @@ class History:
 
 
 def _own_bytes(content: Content) -> int:
-    """Return the bytes that a state holds in the memory of the shard alone, lineage included."""
+    """Return the bytes that a state holds in the memory of the shard alone, lineage included.
+
+    What a restart has found in a file is mapped, and read when it is asked for.
+    """
     datum, cause = content.datum, content.cause
-    size = datum.size if datum is not None and not datum.file else 0
+    size = datum.size if datum is not None and not datum.file and datum.fault is None else 0
     return size if cause is None else size + cause_bytes(cause)

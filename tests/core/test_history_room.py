@@ -4,7 +4,8 @@ import pytest
 from shard_bench import slot
 
 from enact_dist.core.datum import Datum
-from enact_dist.core.history import Policy
+from enact_dist.core.history import HELD_BYTES_MAX, Policy
+from enact_dist.core.records import SlotRecord
 from enact_dist.core.retaining import NO_LIMIT, Limits
 from enact_dist.core.slots import Content, SlotMap
 from enact_dist.terms import NullReason
@@ -85,3 +86,19 @@ def test_payloads_cost_the_history_of_other_aspects_nothing():
     assert replaced == [1, 2, 3]
     assert kept(slots) == []
     slots.assert_invariants()
+
+
+def test_restart_drops_no_history_because_it_lies_in_files_now():
+    """Payloads in shared memory had a cap of their own; mapped files take no memory either."""
+    limits = Limits(10, NO_LIMIT, NO_LIMIT)
+    rows = [
+        SlotRecord(slot("cam", "frame"), version, version * 10, datum, "")
+        for version in range(1, 7)
+        for datum in [Datum(b"e", bytes(1), HELD_BYTES_MAX // 2, 0, fault=lambda: "")]
+    ]
+    slots = SlotMap(rows[-1:], policies={"frame": Policy(limits, stored=True)})
+
+    slots.recover_history(rows[:-1], ())
+
+    assert kept(slots) == [1, 2, 3, 4, 5]
+    assert (slots.history.dropped, slots.history.take_forgotten()) == (0, ())
