@@ -15,6 +15,10 @@ COLOURS = ("36", "33", "35", "32", "34", "31", "96", "93", "95", "92")
 """ANSI colours of log prefixes, in turn."""
 
 
+TABLE_PADDING = 3
+"""Columns of a terminal between two cells."""
+
+
 def on_terminal() -> bool:
     """Say whether standard output is a terminal that shows colours."""
     return sys.stdout.isatty() and "NO_COLOR" not in os.environ and os.environ.get("TERM") != "dumb"
@@ -54,11 +58,18 @@ def _rich_table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     from rich.text import Text
 
     table = Table(box=SIMPLE_HEAD, header_style="bold", pad_edge=False)
-    for column in columns:
-        table.add_column(column, overflow="fold")
+    needed = 0
+    for index, column in enumerate(columns):
+        cells = [line[index] for line in (columns, *rows)]
+        longest = max((len(word) for cell in cells for word in cell.split()), default=1)
+        of_words = any(" " in cell for cell in cells)
+        table.add_column(column, overflow="fold", min_width=longest, no_wrap=not of_words)
+        needed += longest + TABLE_PADDING
     for row in rows:
         table.add_row(*(Text(cell) for cell in row))
-    Console().print(table)
+    console = Console()
+    # Where words do not fit, the terminal breaks lines: a position broken here cannot be copied.
+    Console(width=max(console.width, needed)).print(table)
 
 
 def _plain_table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:

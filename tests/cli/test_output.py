@@ -52,3 +52,16 @@ def test_table_and_tree_are_drawn_on_a_terminal(capsys, monkeypatch):
     assert "└── tray/" in out
     assert "count [bold]v1[/]" in out
     assert "[red]a[/]" in out
+
+
+def test_narrow_terminal_breaks_no_word(capsys, monkeypatch):
+    """What one copies from a table, such as a position, stays in one piece."""
+    monkeypatch.setattr(output, "on_terminal", lambda: True)
+    monkeypatch.setenv("COLUMNS", "30")
+    position = "1795295489659705547@right"
+    output.print_table(
+        ("version", "time", "position"), [("v1", "2026-11-21 21:11:29.659", position)], empty=""
+    )
+    shown = capsys.readouterr().out
+    assert position in shown
+    assert "21:11:29.659" in shown
