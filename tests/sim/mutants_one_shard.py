@@ -165,10 +165,11 @@ def tells_before_it_is_kept(patch: Patch) -> None:
     """A commit is applied and told while the disk still works on it."""
 
     def wrong(self: Commits, commit: Any, *, now_ns: int) -> Any:
-        stamp_ns = commit.outcome.position.stamp_ns
-        records = self.records(commit.writes, commit.outcome.versions, stamp_ns)
+        outcome = commit.outcome
+        stamp_ns, cause = outcome.position.stamp_ns, commit.cause
+        records = self.records(commit.writes, outcome.versions, stamp_ns, cause)
         decision = (commit.decision,) if commit.decision is not None else ()
-        yield Persist(0, (*records, commit.outcome, *decision), Durability.DURABLE)
+        yield Persist(0, (*records, outcome, *decision), Durability.DURABLE)
         yield from self._apply(commit, now_ns=now_ns)
 
     patch(Commits, "_make_durable", wrong)
