@@ -82,7 +82,7 @@ class Difference:
             return f"differ{place}{what}"
         unit = f" {self.unit}" if self.unit else ""
         allowed = f" ({self.tolerance:.4g}{unit} allowed)" if self.tolerance else ""
-        return f"{self.distance:.4g}{unit}{allowed}{place}{what}"
+        return f"{self.distance:.4g}{unit} apart{allowed}{place}{what}"
 
 
 EQUAL: Final = Difference(0.0)

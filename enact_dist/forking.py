@@ -214,7 +214,7 @@ def _not_dropped(
         )
     if isinstance(answer, Refused):
         found = error_of(answer)
-        return type(found)(f"{state}: {found}{remedy}")
+        return type(found)(f"{state}: {found}{remedy}") if done else found
     if answer is not None:
         return ProtocolError(f"{type(answer).__name__} came as the answer to DropWorld")
     return ShardUnreachableError(

@@ -51,17 +51,18 @@ def add_diff(verbs: argparse._SubParsersAction[Verb]) -> None:
         verbs, "diff", "compare two world contexts: exit 0 if equal, 4 if they differ",
         run=show_diff,
         example="enact world diff training online\n"
-        "enact world diff online what_if --entities 'tray/**' --aspect surface\n"
+        "enact world diff online what_if 'tray/**' --aspect surface\n"
         "enact world diff online online --at1 -30s --tolerance shift_mm=0.5",
     )  # fmt: skip
     diff.add_argument("left", metavar="WORLD1", help="name of a world context")
     diff.add_argument("right", metavar="WORLD2", help="another one, or the same at another time")
     diff.add_argument(
-        "--entities",
+        "entities",
+        nargs="?",
         metavar="PATTERN",
         type=entities,
         default="**",
-        help="only these (default: all)",
+        help="only entities whose names match (default: all)",
     )
     diff.add_argument("--aspect", action="append", metavar="NAME", help="only these aspects")
     diff.add_argument("--at1", type=moment, metavar="TIME", help=f"the first as of {MOMENT_HELP}")

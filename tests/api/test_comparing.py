@@ -198,7 +198,7 @@ def test_worst_element_of_a_large_array_is_found_beyond_the_first_block():
     found = Tolerance(absolute=0.5, unit="mm")(one, other)
     assert (found.distance, found.where, found.unit) == (3.0, "[2, 11]", "mm")
     assert found.what == "0.0 against -3.0"
-    assert str(found) == "3 mm (0.5 mm allowed) at [2, 11]: 0.0 against -3.0"
+    assert str(found) == "3 mm apart (0.5 mm allowed) at [2, 11]: 0.0 against -3.0"
 
 
 def test_dataclass_names_its_worst_field():

@@ -172,7 +172,7 @@ def test_watch_ends_with_status_0_on_a_signal(spawn, until, at, cell_file, numbe
 
 
 @pytest.mark.parametrize(
-    "verb", [("tree", "online"), ("watch", "online"), ("diff", "online", "training", "--entities")]
+    "verb", [("tree", "online"), ("watch", "online"), ("diff", "online", "training")]
 )
 def test_what_is_no_pattern_is_a_usage_error(at, verb, capsys):
     """A character that no name can have is refused where it is read."""

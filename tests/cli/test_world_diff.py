@@ -96,9 +96,9 @@ def test_table_names_what_differs_and_how(diff):
     assert lines[0] == ["entity", "aspect", "difference", "training", "online"]
     assert lines[1][:5] == ["place/1", "name", "only", "in", "training"]
     assert lines[1][-1] == "-"
-    assert lines[2][:4] == ["place/1", "pose", "1", "at"]
+    assert lines[2][:4] == ["place/1", "pose", "1", "apart"]
     assert ".captured_ns:" in lines[2]
-    assert lines[4][:5] == ["place/2", "pose", "1", "at", ".shift_mm:"]
+    assert lines[4][:6] == ["place/2", "pose", "1", "apart", "at", ".shift_mm:"]
     assert done.out.splitlines()[-1] == "2 changed, 1 only in training, 1 only in online, 1 equal"
 
 
@@ -162,7 +162,7 @@ def test_tolerance_may_be_a_share(diff, cell):
     """Percent of the larger number."""
     for world, value in (("training", 100.0), ("online", 101.0)):
         put(cell.world(world), "scale", Aspect("weight_kg", float), value)
-    asked = ("training", "online", "--entities", "scale")
+    asked = ("training", "online", "scale")
     assert diff(*asked, "--tolerance", "1%").status == 0
     assert diff(*asked, "--tolerance", "0.5%").status == 4
     with pytest.raises(SystemExit):
@@ -174,7 +174,7 @@ def test_one_context_at_two_times(diff, cell):
     online = cell.world("online")
     before = put(online, "clock", COUNT, 1)
     put(online, "clock", COUNT, 5)
-    asked = ("online", "online", "--entities", "clock", "--json")
+    asked = ("online", "online", "clock", "--json")
 
     done = diff(*asked, "--at1", f"{before.stamp_ns}@{before.shard}")
 
@@ -188,9 +188,9 @@ def test_many_slots_of_one_side_are_counted(diff, cell):
     """`--all` lists them; what has changed is always listed."""
     for number in range(15):
         put(cell.world("online"), f"view/{number}", COUNT, 1)
-    few = diff("training", "online", "--entities", "view/*").out.splitlines()
+    few = diff("training", "online", "view/*").out.splitlines()
     assert few == ["only in online: count 15  (--all lists them)", "15 only in online, 0 equal"]
-    assert len(diff("training", "online", "--entities", "view/*", "--all").out.splitlines()) == 17
+    assert len(diff("training", "online", "view/*", "--all").out.splitlines()) == 17
 
 
 def test_equal_contexts_exit_with_0_and_unknown_ones_with_1(diff):
