@@ -11,7 +11,7 @@ import shutil
 from typing import TYPE_CHECKING, Final, NamedTuple, NoReturn
 
 from enact_dist.errors import StoreError
-from enact_dist.link.store_mark import Mark, boot_id, read_mark
+from enact_dist.link.store_mark import Mark, read_mark
 from enact_dist.link.wal_check import check_wal
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ def look_at(folder: Path) -> Found:
         has_mark = mark is not None and not mark.is_first
         if has_mark or has_log or has_blobs(folder):
             refuse(database, "is missing or empty, but the folder has been in use")
-    return Found(mark, is_new, mark is not None and mark.boot != boot_id())
+    return Found(mark, is_new, mark is not None and not mark.same_boot)
 
 
 def has_blobs(folder: Path) -> bool:

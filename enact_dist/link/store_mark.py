@@ -40,10 +40,14 @@ class Mark(NamedTuple):
         """Whether nothing at all was acknowledged yet."""
         return self.written == 0
 
+    @property
+    def same_boot(self) -> bool:
+        """Whether the system has not gone down since; what it does not tell may be another."""
+        return self.boot == boot_id() != _UNKNOWN_BOOT
+
     def needed(self) -> int:
         """Return the number of the batch that must be there now."""
-        same_boot = self.boot == boot_id() != _UNKNOWN_BOOT
-        return self.written if same_boot else self.batch
+        return self.written if self.same_boot else self.batch
 
 
 def boot_id() -> bytes:

@@ -278,6 +278,21 @@ def test_power_cut_takes_unforced_bodies_and_says_so(closed):
     assert len(list((closed / "blobs").iterdir())) == 1
 
 
+def test_system_that_does_not_name_its_boot_may_have_had_a_power_cut(tmp_path, monkeypatch):
+    """Where the boot cannot be read (a sandbox hides it), what was not forced may be gone."""
+    monkeypatch.setattr(store_mark, "_BOOT_ID", tmp_path / "hidden")
+    folder = tmp_path / "folder"
+    store, _ = open_store(folder, unix_s=1)
+    unforced = slot_record("unforced", 6, size=70_000)
+    store.write([persist(unforced, durability=Durability.OS)])
+    store.close()
+
+    spoil(blob_of(folder, "unforced"), "short")
+
+    (found,) = reopened(folder).slots
+    assert (found.datum, found.null_reason) == (None, NullReason.LOST.name)
+
+
 def test_power_cut_does_not_excuse_a_forced_body(closed):
     """What was forced to the disk must be there, power cut or not."""
     spoil(blob_of(closed, "forced"), "short")
