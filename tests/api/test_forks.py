@@ -9,6 +9,7 @@ import pytest
 
 from enact_dist import (
     Aspect,
+    Durability,
     Entities,
     Entity,
     Lock,
@@ -20,6 +21,7 @@ from enact_dist import (
 )
 from enact_dist.core.messages import DropWorld, Fork
 from enact_dist.errors import (
+    ForgottenError,
     LockHeldError,
     MisuseError,
     ShardUnreachableError,
@@ -168,6 +170,24 @@ def test_fork_over_shards_is_one_cut_with_everything_that_was_reported(two_shard
 
         arms = ViewEach(fork, Entities("*/arm"), COUNT)
         assert dict(fork.view(arms)[arms]) == {LEFT: number, RIGHT: number}
+
+
+def test_fork_of_what_one_shard_has_forgotten_is_taken_back(two_shards):
+    """The error names the oldest known moment, and the other shard has nothing of it left."""
+    cell, online = two_shards.cell, two_shards.cell.world("online")
+    fleeting = Aspect("fleeting", int, Durability.VOLATILE, retention=2)
+    put(online, LEFT, 1)
+    then = put(online, RIGHT, 1, fleeting)
+    for number in (2, 3):
+        put(online, RIGHT, number, fleeting)
+    time.sleep(2.1)  # what is replaced stays for cuts for two seconds
+    put(online, RIGHT, 4, fleeting)
+
+    with pytest.raises(ForgottenError, match=r"right/arm/fleeting is older than .* known from"):
+        online.fork("what_if", at=then)
+
+    assert cell.worlds() == ("online", "training")
+    assert value_of(online.fork("what_if"), RIGHT, fleeting) == 4
 
 
 def test_lock_of_somebody_else_keeps_a_context_on_every_shard(two_shards):

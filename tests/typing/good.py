@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from datetime import datetime
 from typing import assert_type
 
 from enact_dist import (
@@ -11,10 +12,13 @@ from enact_dist import (
     Entities,
     Entity,
     Lock,
+    PastContext,
     Read,
     ReadEach,
     Tolerance,
+    Version,
     View,
+    ViewEach,
     World,
     Write,
     WriteEach,
@@ -68,6 +72,25 @@ def count_contacts() -> None:
         assert_type([one.version for one in cell.impact("online", "b", "c").walk()], list[int])
         with online.watch_diff(online.at(-1.0), bench, COUNT) as watch:
             assert_type([row.entity for row in watch], list[Entity])
+
+
+def travel(when: datetime) -> None:
+    with connect("cell.toml") as cell:
+        online = cell.world("online")
+        versions = online.history(bench, COUNT, since=when, count=5)
+        assert_type(versions, tuple[Version[int], ...])
+        assert_type(versions[0].datum(), int)
+        past = online.at(versions[0].position)
+        mesh, each = View(past, piece, MESH), ViewEach(past, Entities("view/*"), MESH)
+        snapshot = past.view(mesh, each)
+        assert_type(snapshot[mesh], Mesh)
+        assert_type(snapshot[each], Mapping[Entity, Mesh])
+        assert_type(online.at(when), PastContext)
+        assert_type(online.at(1763719200.5), PastContext)
+        assert_type(online.at(stamp_ns=17, nearest=True), PastContext)
+        assert_type(online.fork("what_if", at=when).forked_from, tuple[str, int] | None)
+        cell.keep("label", [*versions, *online.history(piece, MESH)])
+        assert_type(cell.drop_world("what_if"), int)
 
 
 class Inspect(Actor):

@@ -54,3 +54,7 @@ Lock(bench)  # wrong: no request
 world.view(bench)  # wrong: no request
 Aspect("label", str, compare=lower)  # wrong: comparator of another type
 world.diff("training")  # wrong: a name is no world context
+world.at("yesterday")  # wrong: no moment
+world.at()  # wrong: neither a moment nor a capture stamp
+world.history(bench, COUNT)[0].datum().upper()  # wrong: datum type
+Lock(world.at(1.0))  # wrong: no request
