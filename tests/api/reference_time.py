@@ -295,9 +295,12 @@ class TimeModel:
     def captured(
         self, place: Place, captured_ns: int, *, nearest: bool
     ) -> dict[str, Any] | Nothing:
-        """Return the latest listed version captured at a stamp, or nearest to it."""
+        """Return the latest retained version captured at a stamp, or nearest to it.
+
+        What only a label keeps is not found: others of its stamp may have been forgotten.
+        """
         line = self.lines.get(place, Line())
-        found = [s for s in self.history(place) if s["captured_ns"]]
+        found = [s for s in line.states if (s is line.states[-1] or s["held"]) and s["captured_ns"]]
         if not nearest:
             found = [s for s in found if s["captured_ns"] == captured_ns]
         if found:
