@@ -31,7 +31,7 @@ def judge_prefixes(
             shard.assert_invariants()
         host.world.tally["log prefixes replayed"] += 1
         _judge_slots(host, shard, left, picture, durabilities, power_cut=power_cut)
-        _judge_outcomes(host, left)
+        _judge_outcomes(host, left, durabilities)
         _judge_prepared(host, shard, left)
 
 
@@ -60,15 +60,21 @@ def _judge_slots(
             host.world.violation("I15 no prefix loses", slot, version, picture.now(slot))
 
 
-def _judge_outcomes(host: ShardHost, left: Recovered) -> None:
-    """An outcome that is kept has all that it tells of."""
+def _judge_outcomes(host: ShardHost, left: Recovered, durabilities: dict[str, Durability]) -> None:
+    """An outcome that is kept has all that it tells of, unless its context was dropped since."""
     found: dict[Slot, int] = {record.slot: record.version for record in left.slots}
     gone = {record.name: record.version_base for record in left.dropped}
+
+    def dropped(slot: Slot, version: int) -> bool:
+        # A restart between commit and drop has let the versions of volatile slots start again.
+        volatile = durabilities[slot.aspect] is Durability.VOLATILE
+        return slot.context in gone and (volatile or version <= gone[slot.context])
+
     for outcome in left.outcomes:
         missing = [
             slot
             for slot, version in outcome.versions
-            if slot not in found and version > gone.get(slot.context, 0)
+            if slot not in found and not dropped(slot, version)
         ]
         kept = {record.slot for record in left.slots if not record.volatile}
         early = [s for s, version in outcome.versions if s in kept and found[s] < version]
