@@ -24,7 +24,9 @@ STEPS = 100
 FULL_HITS = 50
 """Hits of each cell that the full amount must bring."""
 
-ROUNDS_MORE = 4
+ROUNDS_MORE = 12
+ROUND_SHARE = 4
+"""How often a cell that is rare gets another chance, with so many examples as this part."""
 
 
 def examples(usual: int) -> int:
@@ -51,7 +53,7 @@ def settings_of(max_examples: int, **options: object) -> settings:
 
 
 def run_and_cover(machine: type[RuleBasedStateMachine], count: int, *tables: Coverage) -> list[str]:
-    """Run so many examples, and up to as many again while a cell is owed hits.
+    """Run so many examples, and up to three times as many again while a cell is owed hits.
 
     Returns:
         What is wrong with the cells in the end: chance is given more time, never less to show.
@@ -61,7 +63,7 @@ def run_and_cover(machine: type[RuleBasedStateMachine], count: int, *tables: Cov
     for _ in range(ROUNDS_MORE):
         if all(table.rarest >= wanted for table in tables):
             break
-        run_state_machine_as_test(machine, settings=settings_of(count // ROUNDS_MORE))
+        run_state_machine_as_test(machine, settings=settings_of(count // ROUND_SHARE))
     return [problem for table in tables for problem in table.problems(wanted)]
 
 
