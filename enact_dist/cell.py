@@ -12,6 +12,7 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from enact_dist.cell_info import ActorInfo, AuditInfo, LockInfo, ShardInfo, lock_info
+from enact_dist.closing import Closing
 from enact_dist.core.datum import Position
 from enact_dist.core.messages import (
     Audited,
@@ -37,7 +38,6 @@ from enact_dist.world import WorldContext
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
-    from types import TracebackType
 
     from enact_dist.history import Version
     from enact_dist.lineage import CauseTree, EffectTree, Made
@@ -48,7 +48,7 @@ _open: set[Cell] = set()
 """Held strongly: handles made by a cell work on when nobody keeps the cell itself."""
 
 
-class Cell:
+class Cell(Closing):
     """A connection to a cell.  Use as a context manager, or `close` it.
 
     A cell left open does not hang the interpreter's exit.  After a fork the child must connect
@@ -439,17 +439,6 @@ class Cell:
             if self._host is not None and not self._client.forked:
                 self._host.close()
                 self._host = None
-
-    def __enter__(self) -> Cell:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def __repr__(self) -> str:
         return f"<cell {self.name!r}, {len(self._client.shards())} shards>"

@@ -12,6 +12,7 @@ from collections import deque
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Final
 
+from enact_dist.closing import Following
 from enact_dist.diffing import ATTEMPTS_MAX, DiffKind, Pair, compared, pairs_of
 from enact_dist.errors import LeaseLostError, MisuseError
 from enact_dist.sight import aspects_of, both_in_sight, look, past_ns_of
@@ -20,7 +21,6 @@ from enact_dist.watch import Watch
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
-    from types import TracebackType
 
     from enact_dist.diffing import Comparison
     from enact_dist.sight import Place, Sight, Viewable
@@ -30,7 +30,7 @@ PLACES_MAX: Final = 512
 """Slots that are looked at together; what else has changed waits for the next look."""
 
 
-class DiffWatch:
+class DiffWatch(Following["Comparison"]):
     """An iterator of `Comparison`; also a context manager.  One thread at a time may iterate.
 
     First come the slots that differ now by more than their tolerance, then every slot whose kind
@@ -184,23 +184,3 @@ class DiffWatch:
         self._closed = True
         self._watch.close()
         self._let_go_of_past()
-
-    def __iter__(self) -> DiffWatch:
-        return self
-
-    def __next__(self) -> Comparison:
-        found = self.next()
-        if found is None:
-            raise StopIteration
-        return found
-
-    def __enter__(self) -> DiffWatch:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.close()

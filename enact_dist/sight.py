@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import numpy as np
 
+from enact_dist.closing import Closing
 from enact_dist.core.datum import Slot
 from enact_dist.core.message_parts import CAUSE_FORK, DatumRead
 from enact_dist.core.messages import Explain, Item, SlotVersion, Versions
@@ -23,7 +24,6 @@ from enact_dist.wire.limits import ITEMS_MAX
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
-    from types import TracebackType
 
     from enact_dist.core.datum import Datum
     from enact_dist.core.lock_parts import Reading
@@ -54,7 +54,7 @@ class Viewable(Protocol):
         """By which it is seen."""
 
 
-class Sight:
+class Sight(Closing):
     """What a cut showed, and the way to its data.  Used by one thread.
 
     Attributes:
@@ -89,17 +89,6 @@ class Sight:
     def close(self) -> None:
         """Let go of its data; twice is harmless."""
         self.session.client.release(self._lock)
-
-    def __enter__(self) -> Sight:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.close()
 
 
 def look(worlds: Sequence[Viewable], places: Iterable[Place], *, each: bool) -> Sight:

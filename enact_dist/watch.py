@@ -17,6 +17,7 @@ from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+from enact_dist.closing import Following
 from enact_dist.core.datum import Position, Slot
 from enact_dist.core.epochs import is_kept
 from enact_dist.core.messages import Notice, Survey, Surveyed
@@ -25,8 +26,6 @@ from enact_dist.link.notices import Skipped
 from enact_dist.terms import Durability, Entities, Entity, pattern_matches
 
 if TYPE_CHECKING:
-    from types import TracebackType
-
     from enact_dist.core.messages import SlotState
     from enact_dist.link.client import CellClient
 
@@ -88,7 +87,7 @@ class _Following:
     behind: tuple[tuple[int, int], float] | None = None
 
 
-class Watch:
+class Watch(Following[Change]):
     """An iterator of `Change`; also a context manager.  One thread at a time may iterate."""
 
     def __init__(
@@ -267,23 +266,3 @@ class Watch:
         """End the watch; a `next` that waits returns None within 0.1 s."""
         self._closed.set()
         self._feed.close()
-
-    def __iter__(self) -> Watch:
-        return self
-
-    def __next__(self) -> Change:
-        change = self.next()
-        if change is None:
-            raise StopIteration
-        return change
-
-    def __enter__(self) -> Watch:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.close()
