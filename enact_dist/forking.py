@@ -12,8 +12,8 @@ import logging
 import time
 from typing import TYPE_CHECKING, Final
 
+from enact_dist.asking import present_ns
 from enact_dist.core.messages import (
-    AwaitStamp,
     Dropped,
     DropWorld,
     Forgotten,
@@ -21,7 +21,6 @@ from enact_dist.core.messages import (
     Forked,
     ListLocks,
     Locks,
-    Reached,
     Refused,
     WorldEntry,
 )
@@ -63,7 +62,7 @@ def fork_world(session: Session, source: str, name: str, *, at_ns: int = 0) -> N
     there = client.worlds_at(name)
     if not at_ns:
         _refuse_existing(name, there)
-        at_ns = _present_ns(session)
+        at_ns = present_ns(session.client)
     wanted = WorldEntry(name, source, at_ns)
     _refuse_existing(name, {s: entry for s, entry in there.items() if entry != wanted})
 
@@ -107,14 +106,6 @@ def _refuse_existing(name: str, there: Mapping[str, WorldEntry]) -> None:
                 f" at=Position({at_ns}, {shard!r})"
             )
         raise MisuseError(f"there is a world context {name!r} on shard {shard}, {what}; {remedy}")
-
-
-def _present_ns(session: Session) -> int:
-    """Return a stamp that no commit reported so far exceeds."""
-    client = session.client
-    answers = client.call_all([(shard, AwaitStamp(0, 0)) for shard in client.shards()])
-    stamps_ns = [answer.stamp_ns for answer in answers if isinstance(answer, Reached)]
-    return max(client.core.seen_stamp_ns, *stamps_ns)
 
 
 def _failure(answer: Answer) -> EnactError:

@@ -16,6 +16,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
+from enact_dist.asking import versions_in
 from enact_dist.core.datum import Position, Slot
 from enact_dist.core.messages import (
     KeepVersions,
@@ -25,7 +26,6 @@ from enact_dist.core.messages import (
     SlotVersion,
     Survey,
     Surveyed,
-    Versions,
 )
 from enact_dist.errors import ForgottenError, MisuseError, ProtocolError
 from enact_dist.lineage import Made
@@ -41,7 +41,7 @@ from enact_dist.wire.payload import decode_untyped
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-    from enact_dist.core.messages import Answer, Cause, VersionEntry
+    from enact_dist.core.messages import Cause, VersionEntry
     from enact_dist.session import Session
     from enact_dist.world import WorldContext
 
@@ -137,8 +137,8 @@ def kept_versions(
     answers = session.client.call_all([(shard, request) for shard in shards])
     found: dict[str, list[Version[Any]]] = {}
     for shard, answer in zip(shards, answers, strict=True):
-        entries = list(_versions(answer).entries)
-        if _versions(answer).left_out:  # more than one answer can say: slot by slot
+        entries = list(versions_in(answer).entries)
+        if versions_in(answer).left_out:  # more than one answer can say: slot by slot
             entries = [e for slot in _slots(session, shard) for e in listed(session, shard, slot)]
         for entry in entries:
             if not entry.kept:
@@ -226,11 +226,11 @@ def listed(
         ShardUnreachableError: The shard does not answer.
     """
     request = ListHistory((slot.context,), (slot.entity,), (slot.aspect,), since_ns, count)
-    answer = _versions(session.client.call(shard, request))
+    answer = versions_in(session.client.call(shard, request))
     entries = list(answer.entries)
     while answer.left_out and entries and entries[-1].until_ns:
         request = replace(request, since_ns=entries[-1].until_ns)
-        answer = _versions(session.client.call(shard, request))
+        answer = versions_in(session.client.call(shard, request))
         entries += answer.entries
     return entries
 
@@ -241,14 +241,6 @@ def _slots(session: Session, shard: str) -> list[Slot]:
     if not isinstance(answer, Surveyed):
         raise ProtocolError(f"{type(answer).__name__} came as the answer to Survey")
     return [state.slot for state in answer.states]
-
-
-def _versions(answer: Answer) -> Versions:
-    if isinstance(answer, Refused):
-        raise error_of(answer)
-    if not isinstance(answer, Versions):
-        raise ProtocolError(f"{type(answer).__name__} came as the answer to ListHistory")
-    return answer
 
 
 def _version(shard: str, world: WorldContext, aspect: Aspect[T], entry: VersionEntry) -> Version[T]:

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
+from enact_dist.asking import ask_in_parts, versions_in
 from enact_dist.core.datum import LockId, Position, Slot
 from enact_dist.core.messages import (
     Cause,
@@ -21,12 +22,9 @@ from enact_dist.core.messages import (
     Explain,
     FindEffects,
     ListHistory,
-    Refused,
     SlotVersion,
-    Versions,
 )
-from enact_dist.errors import ForgottenError, MisuseError, NullDatumError, ProtocolError
-from enact_dist.link.refusals import error_of
+from enact_dist.errors import ForgottenError, MisuseError, NullDatumError
 from enact_dist.terms import Entity, NullReason, checked_name
 
 if TYPE_CHECKING:
@@ -261,7 +259,7 @@ class _Search:
         if not 0 < version < newest.version:
             raise MisuseError(f"{slot} has no version {version}; the newest is {newest.version}")
         history = ListHistory((slot.context,), (slot.entity,), (slot.aspect,))
-        (answer,) = self._answers([(self._client.shard_of(slot.entity), history)])
+        answer = versions_in(self._client.call(self._client.shard_of(slot.entity), history))
         oldest = answer.entries[0].state if answer.entries else newest
         raise ForgottenError(
             f"version {version} of {slot} has left its retention; the oldest that is known is"
@@ -313,32 +311,14 @@ class _Search:
     def _asked(
         self, kind: Callable[[Any], Request], parts: Sequence[tuple[str, tuple[Any, ...]]]
     ) -> list[VersionEntry]:
-        """Ask shards about data, all at once; in halves where an answer would be too long."""
+        """Ask shards about data, and note what even the answer to a single one leaves out."""
         entries: list[VersionEntry] = []
-        while parts:
-            calls = [(shard, kind(asked)) for shard, asked in parts]
-            halves: list[tuple[str, tuple[Any, ...]]] = []
-            for (shard, asked), answer in zip(parts, self._answers(calls), strict=True):
-                half = len(asked) // 2
-                if answer.left_out and half:
-                    halves += (shard, asked[:half]), (shard, asked[half:])
-                    continue
-                entries += answer.entries
-                if answer.left_out:
-                    self._left_out[asked[0]] = self._left_out.get(asked[0], 0) + answer.left_out
-            parts = halves
-        return entries
-
-    def _answers(self, calls: Sequence[tuple[str, Request]]) -> list[Versions]:
-        answers: list[Versions] = []
-        for answer in self._client.call_all(calls):
-            if isinstance(answer, Refused):
-                raise error_of(answer)
-            if not isinstance(answer, Versions):
-                raise ProtocolError(f"{type(answer).__name__} came in place of Versions")
+        for asked, answer in ask_in_parts(self._client, kind, parts):
             self._now_ns = max(self._now_ns, answer.stamp_ns)
-            answers.append(answer)
-        return answers
+            entries += answer.entries
+            if answer.left_out:
+                self._left_out[asked[0]] = self._left_out.get(asked[0], 0) + answer.left_out
+        return entries
 
     def made(
         self,

@@ -11,19 +11,11 @@ from __future__ import annotations
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from enact_dist.core.messages import (
-    AwaitStamp,
-    Explain,
-    Item,
-    Reached,
-    Refused,
-    SlotVersion,
-    Versions,
-)
-from enact_dist.errors import ForgottenError, LeaseLostError, ProtocolError
+from enact_dist.asking import ask_in_parts
+from enact_dist.core.messages import Explain, Item, SlotVersion
+from enact_dist.errors import ForgottenError, LeaseLostError
 from enact_dist.history import listed
 from enact_dist.link.fetching import fetch_all
-from enact_dist.link.refusals import error_of
 from enact_dist.terms import Access
 
 if TYPE_CHECKING:
@@ -95,17 +87,6 @@ def viewed(session: Session, items: Iterable[Item], *, at_ns: int = 0) -> Iterat
         client.release(lock)
 
 
-def now_ns(session: Session) -> int:
-    """Return the stamp that the latest of the shards' clocks shows.
-
-    Raises:
-        ShardUnreachableError: A shard does not answer.
-    """
-    client = session.client
-    answers = client.call_all([(shard, AwaitStamp(0, 0)) for shard in client.shards()])
-    return max((a.stamp_ns for a in answers if isinstance(a, Reached)), default=0)
-
-
 def explained(session: Session, wanted: Sequence[Wanted]) -> dict[Wanted, VersionEntry]:
     """Return what the shards list of these versions: those that are retained, without data.
 
@@ -115,14 +96,15 @@ def explained(session: Session, wanted: Sequence[Wanted]) -> dict[Wanted, Versio
     by_shard: dict[str, list[SlotVersion]] = {}
     for each in wanted:
         by_shard.setdefault(each.shard, []).append(SlotVersion(each.slot, each.version))
-    calls = [
-        (shard, Explain(tuple(versions[first : first + EXPLAINED_MAX])))
+    parts = [
+        (shard, tuple(versions[first : first + EXPLAINED_MAX]))
         for shard, versions in by_shard.items()
         for first in range(0, len(versions), EXPLAINED_MAX)
     ]
     found = {
         (state.slot, state.version, state.stamp_ns): entry
-        for entry in _asked(session, calls)
+        for _, answer in ask_in_parts(session.client, Explain, parts)
+        for entry in answer.entries
         for state in (entry.state,)
     }
     keys = {each: (each.slot, each.version, each.stamp_ns) for each in wanted}
@@ -141,26 +123,6 @@ def between(session: Session, slot: Slot, shard: str, first: int, last: int) -> 
         for state in states
         if state.slot == slot and first <= state.version <= last
     ]
-
-
-def _asked(session: Session, calls: Sequence[tuple[str, Explain]]) -> list[VersionEntry]:
-    """Ask shards about versions, in halves where an answer would be too long."""
-    entries: list[VersionEntry] = []
-    while calls:
-        halves: list[tuple[str, Explain]] = []
-        for (shard, asked), answer in zip(calls, session.client.call_all(calls), strict=True):
-            if isinstance(answer, Refused):
-                raise error_of(answer)
-            if not isinstance(answer, Versions):
-                raise ProtocolError(f"{type(answer).__name__} came where versions were asked for")
-            half = len(asked.versions) // 2
-            if answer.left_out and half:
-                parts = asked.versions[:half], asked.versions[half:]
-                halves += [(shard, Explain(part)) for part in parts]
-            else:
-                entries += answer.entries
-        calls = halves
-    return entries
 
 
 def found_of(session: Session, wanted: Sequence[Wanted]) -> dict[Wanted, Found]:

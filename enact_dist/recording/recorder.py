@@ -18,12 +18,13 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
+from enact_dist.asking import present_ns
 from enact_dist.config_shows import GUESSED
 from enact_dist.core.datum import Slot
 from enact_dist.errors import ConfigError, LinkError, LockTimeoutError, UnknownWorldError
 from enact_dist.recording.disk import QUEUE_BYTES_MAX, DiskThread
 from enact_dist.recording.exact import Recorded
-from enact_dist.recording.fetching import Found, Wanted, between, explained, found_of, now_ns
+from enact_dist.recording.fetching import Found, Wanted, between, explained, found_of
 from enact_dist.recording.file import CHUNK_BYTES, CHUNK_S, RecordingFile
 from enact_dist.terms import Entities, NullReason
 from enact_dist.watch import Watch
@@ -179,7 +180,7 @@ class Recorder:
         stop = stop or threading.Event()
         client = self._session.client
         with Watch(client, self._worlds, (str(self._entities),), self._only) as watch:
-            self._begin_ns = now_ns(self._session)
+            self._begin_ns = present_ns(self._session.client)
             file = self._new_file()
             self._disk = DiskThread(file, bytes_max=self._queue_bytes)
             begun_s = time.monotonic()
