@@ -7,7 +7,15 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.cli.output import print_json, print_tree, shown_s
-from enact_dist.cli.verbs import DONE, add_reader, add_verb, open_cell, slot_version, whole
+from enact_dist.cli.verbs import (
+    DONE,
+    add_reader,
+    add_verb,
+    add_world,
+    open_cell,
+    slot_version,
+    whole,
+)
 from enact_dist.lineage import FORGOTTEN, NULL, UNKNOWN
 
 if TYPE_CHECKING:
@@ -52,7 +60,7 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
 
 
 def _add_arguments(verb: Verb, what: str) -> None:
-    verb.add_argument("world", metavar="WORLD", help="name of the world context")
+    add_world(verb)
     verb.add_argument(
         "slot",
         metavar="ENTITY/ASPECT[@VERSION]",

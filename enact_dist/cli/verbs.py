@@ -76,6 +76,11 @@ def add_cell(parser: Verb) -> None:
     )
 
 
+def add_world(parser: Verb) -> None:
+    """Add the name of the world context that a verb is about."""
+    parser.add_argument("world", metavar="WORLD", help="name of the world context")
+
+
 def add_reader(parser: Verb) -> None:
     """Add the options of a verb that only looks."""
     add_cell(parser)

@@ -13,6 +13,7 @@ from enact_dist.cli.verbs import (
     add_noun,
     add_reader,
     add_verb,
+    add_world,
     entities,
     open_cell,
     seconds,
@@ -56,7 +57,7 @@ def _add_tree(verbs: argparse._SubParsersAction[Verb]) -> None:
         verbs, "tree", "show the entities of a world context with their aspects", run=show_tree,
         example="enact world tree online 'tray/**'",
     )  # fmt: skip
-    tree.add_argument("world", metavar="WORLD", help="name of the world context")
+    add_world(tree)
     tree.add_argument(
         "pattern", metavar="PATTERN", type=entities, nargs="?", default="**", help="of entities"
     )
@@ -70,7 +71,7 @@ def _add_get(verbs: argparse._SubParsersAction[Verb]) -> None:
         example="enact world get online system/deviation\n"
         "enact world get training product/surface --out surface.npz",
     )  # fmt: skip
-    get.add_argument("world", metavar="WORLD", help="name of the world context")
+    add_world(get)
     get.add_argument("slot", metavar="ENTITY/ASPECT", type=slot_name, help="which datum")
     get.add_argument(
         "--out", metavar="FILE", help="save it: .npz (arrays), .npy (one array) or .json (the rest)"
@@ -84,7 +85,7 @@ def _add_put(verbs: argparse._SubParsersAction[Verb]) -> None:
         example="enact world put online work_bench/contact_count 3\n"
         "enact world put online camera/intrinsics @intrinsics.npy",
     )  # fmt: skip
-    put.add_argument("world", metavar="WORLD", help="name of the world context")
+    add_world(put)
     put.add_argument("slot", metavar="ENTITY/ASPECT", type=slot_name, help="which datum")
     put.add_argument(
         "value",
@@ -103,7 +104,7 @@ def _add_watch(verbs: argparse._SubParsersAction[Verb]) -> None:
         verbs, "watch", "print what is there and then every change, until Ctrl-C", run=watch_world,
         example="enact world watch online 'tray/**' --aspect surface",
     )  # fmt: skip
-    watch.add_argument("world", metavar="WORLD", help="name of the world context")
+    add_world(watch)
     watch.add_argument(
         "pattern", metavar="PATTERN", type=entities, nargs="?", default="**", help="of entities"
     )

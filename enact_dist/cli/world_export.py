@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from enact_dist.cli.output import print_json, shown_bytes
 from enact_dist.cli.record import COMPRESSIONS, shows_of
 from enact_dist.cli.times import MOMENT_HELP, moment
-from enact_dist.cli.verbs import DONE, add_reader, add_verb, open_cell, pair
+from enact_dist.cli.verbs import DONE, add_reader, add_verb, add_world, open_cell, pair
 from enact_dist.errors import ConfigError, EnactError
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ def add_export(verbs: argparse._SubParsersAction[Verb]) -> None:
         example="enact world export online --out online.mcap\n"
         "enact world export training --at -10min --out training/",
     )  # fmt: skip
-    export.add_argument("world", metavar="WORLD", help="name of the world context")
+    add_world(export)
     export.add_argument(
         "--out", metavar="FILE|FOLDER", required=True, help="a new FILE.mcap, or a new folder"
     )

@@ -14,6 +14,7 @@ from enact_dist.cli.verbs import (
     FAILED,
     add_reader,
     add_verb,
+    add_world,
     entities,
     open_cell,
     slot_name,
@@ -38,17 +39,13 @@ def add_verbs(verbs: argparse._SubParsersAction[Verb]) -> None:
     _add_keeping(verbs)
 
 
-def _add_world(verb: Verb) -> None:
-    verb.add_argument("world", metavar="WORLD", help="name of the world context")
-
-
 def _add_history(verbs: argparse._SubParsersAction[Verb]) -> None:
     history = add_verb(
         verbs, "history", "list the versions of a datum that are still known", run=show_history,
         example="enact world history online system/deviation\n"
         "enact world history online system/deviation --since -5min --count 20",
     )  # fmt: skip
-    _add_world(history)
+    add_world(history)
     history.add_argument("slot", metavar="ENTITY/ASPECT", type=slot_name, help="which datum")
     history.add_argument("--count", type=whole, metavar="N", help="only the newest N")
     history.add_argument(
@@ -64,7 +61,7 @@ def _add_at(verbs: argparse._SubParsersAction[Verb]) -> None:
         "enact world at online 2026-11-21T10:00:00 tree 'tray/**'\n"
         "enact world at online -30s get system/deviation --json",
     )  # fmt: skip
-    _add_world(at)
+    add_world(at)
     at.add_argument("moment", metavar="TIME", type=moment, help=MOMENT_HELP)
     at.add_argument(
         "what", nargs="?", choices=("tree", "get"), default="tree", help="(default: tree)"
@@ -84,7 +81,7 @@ def _add_fork_and_drop(verbs: argparse._SubParsersAction[Verb]) -> None:
         example="enact world fork online what_if\n"
         "enact world fork online what_if --at -30s",
     )  # fmt: skip
-    _add_world(fork)
+    add_world(fork)
     fork.add_argument("name", metavar="NAME", help="of the new world context")
     fork.add_argument("--at", type=moment, metavar="TIME", help=f"as it was; {MOMENT_HELP}")
     add_reader(fork)
@@ -92,7 +89,7 @@ def _add_fork_and_drop(verbs: argparse._SubParsersAction[Verb]) -> None:
         verbs, "drop", "forget a world context with all its data and their history", run=drop_world,
         example="enact world drop what_if",
     )  # fmt: skip
-    _add_world(drop)
+    add_world(drop)
     add_reader(drop)
 
 
@@ -102,7 +99,7 @@ def _add_keeping(verbs: argparse._SubParsersAction[Verb]) -> None:
         example="enact world keep drop-17 online tray/package/3/surface@12 system/deviation",
     )  # fmt: skip
     keep.add_argument("label", metavar="LABEL", help="what let-go names")
-    _add_world(keep)
+    add_world(keep)
     keep.add_argument(
         "slots",
         metavar="ENTITY/ASPECT[@VERSION]",
