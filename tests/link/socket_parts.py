@@ -32,7 +32,10 @@ def ask(near, message, stream=None):
     return decode_frame(header, payload)
 
 
-def speak(carrier, make_peer, session):
-    peer = make_peer(lambda shard, m: carrier.request(shard, m, timeout_s=5), session=session)
+def speak(carrier, make_peer, session, *, timeout_s=5.0):
+    def call(shard, message):
+        return carrier.request(shard, message, timeout_s=timeout_s)
+
+    peer = make_peer(call, session=session)
     peer.hello()
     return peer
