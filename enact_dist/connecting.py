@@ -27,7 +27,12 @@ LOCAL_SHARD: Final = "local"
 
 
 def connect(
-    target: str | Path, *, actor: str = "", timeout_s: float = 5.0, observer: bool = False
+    target: str | Path,
+    *,
+    actor: str = "",
+    timeout_s: float = 5.0,
+    patience_s: float = 10.0,
+    observer: bool = False,
 ) -> Cell:
     """Join a running cell.
 
@@ -36,6 +41,9 @@ def connect(
             shard knows the others.
         actor: Name under which `enact lock ls` and `enact actor ls` show this process.
         timeout_s: How long to wait for a first shard to answer.
+        patience_s: How long a question waits for a shard that does not answer, before it counts as
+            unreachable; locks bring a time of their own, and a commit takes as long as it takes to
+            know its end.
         observer: Only look: no lock can be taken, and a shard keeps no record of the session.
 
     Raises:
@@ -44,6 +52,7 @@ def connect(
     """
     from enact_dist.config_environment import carrier_of
     from enact_dist.link.joining import join
+    from enact_dist.link.zenoh_config import OPEN_S
 
     name, ttl_s = "", TTL_S
     carrier = carrier_of(os.environ)
@@ -57,8 +66,14 @@ def connect(
         endpoints = tuple(e for entry in config.placement_map().shards for e in entry.endpoints)
     client = _client(actor, ttl_s=ttl_s, observer=observer)
     cell_name, cell_client, welcome = join(
-        name, endpoints, client, timeout_s=timeout_s, carrier=carrier
+        name,
+        endpoints,
+        client,
+        timeout_s=timeout_s,
+        open_s=min(OPEN_S, patience_s),
+        carrier=carrier,
     )
+    cell_client.patience_s = patience_s
     try:
         cell_client.start(welcome)
     except BaseException:

@@ -30,7 +30,6 @@ from enact_dist.core.messages import (
 from enact_dist.errors import ForgottenError, MisuseError, ProtocolError
 from enact_dist.lineage import Made
 from enact_dist.link.refusals import error_of, moment_name
-from enact_dist.link.session_client import FINISH_S
 from enact_dist.moments import Moment
 from enact_dist.past_context import PastContext
 from enact_dist.reading import null_error
@@ -194,7 +193,7 @@ def _all_kept(session: Session, label: str, by_shard: dict[str, list[SlotVersion
     answers = []
     for shard, answer in client.ask_each(sorted(by_shard), request_of).items():
         if answer is None:
-            raise client.unreachable(shard, FINISH_S)
+            raise client.unreachable(shard, client.patience_s)
         if isinstance(answer, Refused):
             raise error_of(answer)
         if not isinstance(answer, Kept):

@@ -10,7 +10,7 @@ from enact_dist.core.placement import shard_of
 from enact_dist.core.retaining import said
 from enact_dist.errors import MisuseError, ShardUnreachableError, UnknownWorldError
 from enact_dist.link.datum_cache import DatumCache
-from enact_dist.link.session_client import CALL_S, FINISH_S
+from enact_dist.link.session_client import CALL_S
 from enact_dist.reading import slot_of
 from enact_dist.retention import checked_retention
 from enact_dist.terms import Entity, LockRequest
@@ -44,14 +44,15 @@ class Session:
         aspects: Iterable[Aspect[Any]],
         *,
         requests: Iterable[LockRequest[Any]] | None = None,
-        wait_s: float = FINISH_S,
+        wait_s: float | None = None,
     ) -> None:
         """Make sure that shards know these aspects with these datum types.
 
         Args:
             aspects: The aspects.
             requests: What they are wanted for: only the shards of these are asked; None: all.
-            wait_s: How long the caller would wait; no shard gets less than one call's time.
+            wait_s: How long the caller would wait at most; no shard gets less than one call's
+                time.
 
         Raises:
             DatumTypeError: A shard knows one with another type.
@@ -60,7 +61,8 @@ class Session:
         entries = [self._entry(aspect) for aspect in aspects]
         if self.client.knows(entries):
             return
-        timeout_s = min(FINISH_S, max(wait_s, CALL_S))
+        patience_s = self.client.patience_s
+        timeout_s = patience_s if wait_s is None else min(patience_s, max(wait_s, CALL_S))
         if requests is None:
             self.client.register(aspects=entries)
         else:

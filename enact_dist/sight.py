@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     from enact_dist.link.client import CellClient
     from enact_dist.session import Session
 
-SIGHT_WAIT_S: Final = 10.0
-"""How long a cut waits for its shards before they count as unreachable."""
+SIGHT_S: Final = 10.0
+"""How long a cut over its shards may take."""
 GENERATIONS_MAX: Final = 64
 """How many forks of forks a version is followed through to where it was written."""
 BLOCK_BYTES: Final = 1 << 20
@@ -120,13 +120,13 @@ def look(worlds: Sequence[Viewable], places: Iterable[Place], *, each: bool) -> 
     # A shard may never have held one of these aspects, and would not know its name.
     client.register(aspects=[known[name] for name in {aspect for _, aspect in asked}])
     past_ns = past_ns_of(worlds[0])
-    lock = client.acquire(items, wait_s=SIGHT_WAIT_S, hold_s=SIGHT_WAIT_S, past_ns=past_ns)
+    lock = client.acquire(items, wait_s=client.patience_s, hold_s=SIGHT_S, past_ns=past_ns)
     if lock.parts:
         # For all the commits there was no cut to be had, and read locks stand in for it; nobody
         # shall wait for a comparison, so what they show is looked at as the past that it is now.
         client.release(lock)
         past_ns = client.core.seen_stamp_ns
-        lock = client.acquire(items, wait_s=SIGHT_WAIT_S, hold_s=SIGHT_WAIT_S, past_ns=past_ns)
+        lock = client.acquire(items, wait_s=client.patience_s, hold_s=SIGHT_S, past_ns=past_ns)
     sight = Sight(worlds[0].session, lock, forked=any(map(_is_fork, worlds)))
     try:
         for world in worlds:

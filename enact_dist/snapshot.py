@@ -25,8 +25,8 @@ T = TypeVar("T")
 
 NOW: Final = Moment(0)
 
-VIEW_WAIT_S = 10.0
-"""How long a view waits for its shards before they count as unreachable."""
+VIEW_S = 10.0
+"""How long a view may last."""
 VIEWS_MAX = 3
 """How often a view is taken anew when its data are gone before they were fetched."""
 
@@ -173,7 +173,7 @@ def take_readings(
 ) -> Readings:
     """Take one view, as of a stamp if one is given, and fetch what is large of its `data`."""
     client = session.client
-    lock = client.acquire(items, wait_s=VIEW_WAIT_S, hold_s=VIEW_WAIT_S, past_ns=past_ns)
+    lock = client.acquire(items, wait_s=client.patience_s, hold_s=VIEW_S, past_ns=past_ns)
     try:
         readings = Readings(client, session.cache, lock.lock, lock.states, lambda: None)
         if data:

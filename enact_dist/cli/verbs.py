@@ -25,6 +25,7 @@ DIFFERENT: Final = 4
 
 CELL_VARIABLE: Final = "ENACT_CELL"
 CELL_DEFAULT: Final = "cell.toml"
+TIMEOUT_S: Final = 5.0
 
 Verb = argparse.ArgumentParser
 """A parser of one verb, as `add_verb` returns it."""
@@ -94,9 +95,9 @@ def add_timeout(parser: Verb) -> None:
         "--timeout",
         dest="timeout_s",
         type=seconds,
-        default=5.0,
+        default=TIMEOUT_S,
         metavar="S",
-        help="seconds to wait for a first shard (default: 5)",
+        help="seconds to wait for a shard that does not answer (default: 5)",
     )
 
 
@@ -245,10 +246,12 @@ def open_cell(arguments: argparse.Namespace, *, observer: bool = True, actor: st
     """
     from enact_dist.connecting import connect
 
+    timeout_s = getattr(arguments, "timeout_s", TIMEOUT_S)
     return connect(
         cell_target(arguments),
         actor=actor or "enact",
-        timeout_s=getattr(arguments, "timeout_s", 5.0),
+        timeout_s=timeout_s,
+        patience_s=timeout_s,
         observer=observer,
     )
 

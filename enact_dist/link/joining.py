@@ -9,6 +9,7 @@ from enact_dist.errors import LinkError
 from enact_dist.link.client import CellClient
 from enact_dist.link.socket_carrier import SocketCarrier
 from enact_dist.link.zenoh_carrier import ZenohCarrier
+from enact_dist.link.zenoh_config import OPEN_S
 from enact_dist.link.zenoh_discovery import discover
 
 if TYPE_CHECKING:
@@ -19,7 +20,13 @@ if TYPE_CHECKING:
 
 
 def join(
-    name: str, endpoints: Sequence[str], client: Client, *, timeout_s: float, carrier: str = "auto"
+    name: str,
+    endpoints: Sequence[str],
+    client: Client,
+    *,
+    timeout_s: float,
+    open_s: float = OPEN_S,
+    carrier: str = "auto",
 ) -> tuple[str, CellClient, Welcome]:
     """Return the cell's name, a client with its carrier open, and a shard's welcome.
 
@@ -28,6 +35,7 @@ def join(
         endpoints: Where shards listen; one that answers is enough.
         client: The session to bring in.
         timeout_s: How long to wait for a first answer.
+        open_s: How long a shard has to answer a connection.
         carrier: How messages travel, one of `CARRIERS`.
 
     Raises:
@@ -49,6 +57,7 @@ def join(
         client.actor,
         tuple(dict.fromkeys((*endpoints, *reachable))),
         ttl_s=client.ttl_ns / 1e9,
+        open_s=open_s,
     )
     way: Carrier = zenoh
     try:

@@ -54,7 +54,7 @@ CALL_S: Final = 1.0
 BYTES_PER_S_MIN: Final = 10e6
 """A call that carries data gets this much more time per byte."""
 FINISH_S: Final = 10.0
-"""How long calls are made again before their shard counts as unreachable."""
+"""How long calls are made again before their shard counts as unreachable, unless said otherwise."""
 
 FIRST_STAGED: Final = 1 << 60
 """Numbers of payloads that travel in slices; files that a client fills itself begin at 1."""
@@ -80,7 +80,11 @@ os.register_at_fork(after_in_child=_after_fork)
 
 
 class SessionClient:
-    """Calls, catalogue and life of one session of this process with one cell."""
+    """Calls, catalogue and life of one session of this process with one cell.
+
+    Attributes:
+        patience_s: How long a call is made again that nobody gave another time.
+    """
 
     def __init__(
         self,
@@ -94,6 +98,7 @@ class SessionClient:
         self.core = client
         self.forked = False
         self.closed = False
+        self.patience_s = FINISH_S
         self.notice_numbers: dict[str, tuple[int, int]] = {}
         self.counters: dict[str, int] = {}
         self.staged_numbers = itertools.count(FIRST_STAGED)
@@ -155,22 +160,23 @@ class SessionClient:
 
     # ---------------------------------------------------------------- calls
 
-    def call(self, shard: str, request: Request, *, timeout_s: float = FINISH_S) -> Answer:
+    def call(self, shard: str, request: Request, *, timeout_s: float | None = None) -> Answer:
         """Make one idempotent call, again until it is answered.
 
         Raises:
-            ShardUnreachableError: No answer within `timeout_s`.
+            ShardUnreachableError: No answer within `timeout_s` (None: `patience_s`).
         """
         return self.call_all([(shard, request)], timeout_s=timeout_s)[0]
 
     def call_all(
-        self, calls: Sequence[tuple[str, Request]], *, timeout_s: float = FINISH_S
+        self, calls: Sequence[tuple[str, Request]], *, timeout_s: float | None = None
     ) -> list[Answer]:
         """Make idempotent calls at once, each again until it is answered.
 
         Raises:
             ShardUnreachableError: One stays without an answer for `timeout_s`.
         """
+        timeout_s = self.patience_s if timeout_s is None else timeout_s
         answers = self.call_each(calls, timeout_s=timeout_s)
         for (shard, _), answer in zip(calls, answers, strict=True):
             if answer is None:
@@ -178,11 +184,12 @@ class SessionClient:
         return [answer for answer in answers if answer is not None]
 
     def call_each(
-        self, calls: Sequence[tuple[str, Request]], *, timeout_s: float = FINISH_S
+        self, calls: Sequence[tuple[str, Request]], *, timeout_s: float | None = None
     ) -> list[Answer | None]:
         """Make idempotent calls at once, each again until it is answered or the time is over."""
         self.check_usable()
         answers: list[Answer | None] = [None] * len(calls)
+        timeout_s = self.patience_s if timeout_s is None else timeout_s
         deadline_ns = self._now_ns() + int(min(timeout_s, CALLS_S_MAX) * 1e9)
         pause_s = 0.02
         while True:
@@ -202,7 +209,7 @@ class SessionClient:
         shards: Iterable[str],
         request_of: Callable[[str, int, int], Request],
         *,
-        timeout_s: float = FINISH_S,
+        timeout_s: float | None = None,
     ) -> dict[str, Answer | None]:
         """Make one call to each shard that only a known session may make; greet where needed.
 
@@ -213,6 +220,7 @@ class SessionClient:
             timeout_s: How long they may take; None stands for no answer then.
         """
         answers: dict[str, Answer | None] = dict.fromkeys(shards)
+        timeout_s = self.patience_s if timeout_s is None else timeout_s
         deadline_ns = self._now_ns() + int(timeout_s * 1e9)
         while True:
             left = [shard for shard, answer in answers.items() if answer is None]
@@ -302,7 +310,7 @@ class SessionClient:
         """Return the shard on which an entity of that name lies."""
         return shard_of(entity, self.core.placement)
 
-    def greet(self, *, timeout_s: float = FINISH_S) -> None:
+    def greet(self, *, timeout_s: float | None = None) -> None:
         """Say hello to every shard (again), which refreshes the catalogue."""
         hellos = [(shard, self.core.hello(shard)) for shard in self.shards()]
         for answer in self.call_all(hellos, timeout_s=timeout_s):
@@ -331,7 +339,7 @@ class SessionClient:
         worlds: Iterable[str] = (),
         aspects: Iterable[AspectEntry] = (),
         needed: Callable[[], Iterable[str]] | None = None,
-        timeout_s: float = FINISH_S,
+        timeout_s: float | None = None,
     ) -> None:
         """Make sure that shards know these world contexts and aspects.
 

@@ -36,7 +36,13 @@ from enact_dist.link.carrier import check_usable, read_answer
 from enact_dist.link.inside import Inside
 from enact_dist.link.notices import NoticeQueue
 from enact_dist.link.zenoh_bulk import BulkWay
-from enact_dist.link.zenoh_config import QUEUED_MAX, close_session, keep_after_fork, open_session
+from enact_dist.link.zenoh_config import (
+    OPEN_S,
+    QUEUED_MAX,
+    close_session,
+    keep_after_fork,
+    open_session,
+)
 from enact_dist.link.zenoh_presence import ShardPresence
 from enact_dist.wire.frames import decode_frame, encode_frame
 from enact_dist.wire.keys import notice_key, request_key, token_key, verb_of
@@ -109,6 +115,7 @@ class ZenohCarrier:
         endpoints: Where to connect first; one that answers is enough.
         ttl_s: The session's lease; a link counts as lost after half of it.
         connect_s: How long to wait for the first connection.
+        open_s: How long a shard has to answer a connection; the end waits for one under way.
 
     Raises:
         ShardUnreachableError: Nothing could be connected.
@@ -125,12 +132,14 @@ class ZenohCarrier:
         *,
         ttl_s: float,
         connect_s: float = CONNECT_S,
+        open_s: float = OPEN_S,
     ) -> None:
         self.fetch_bytes = FETCH_BYTES
         self._cell = cell
         self._session = session
         self._actor = actor or NAMELESS
         self._lease_s = ttl_s / 2
+        self._open_s = open_s
         self._pid = os.getpid()
         self._closed = False
         self._mutex = threading.Lock()
@@ -302,7 +311,7 @@ class ZenohCarrier:
         return None
 
     def _open_link(self, endpoints: tuple[str, ...]) -> _Link:
-        session = open_session(connect=endpoints, lease_s=self._lease_s)
+        session = open_session(connect=endpoints, lease_s=self._lease_s, open_s=self._open_s)
         token = session.liveliness().declare_token(token_key(self._cell, self._session))
         link = _Link(session, endpoints, token, BulkWay(endpoints, self._lease_s))
         with self._mutex:

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from enact_dist.session import Session
 
 VIEW_S: Final = 10.0
-"""How long a view may wait for undecided commits."""
+"""How long a view may last."""
 EXPLAINED_MAX: Final = 64
 """So many versions are explained by one answer: each cause may name a thousand reads."""
 
@@ -80,7 +80,7 @@ def viewed(session: Session, items: Iterable[Item], *, at_ns: int = 0) -> Iterat
         ShardUnreachableError: A shard does not answer.
     """
     client = session.client
-    lock = client.acquire(items, wait_s=VIEW_S, hold_s=VIEW_S, past_ns=at_ns)
+    lock = client.acquire(items, wait_s=client.patience_s, hold_s=VIEW_S, past_ns=at_ns)
     try:
         yield View(session, lock)
     finally:

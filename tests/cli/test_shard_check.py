@@ -79,7 +79,10 @@ def test_nobody_there_is_status_3(enact, write_cell):
 
 @pytest.mark.slow
 def test_a_hung_shard_is_not_alive_and_does_not_hide_the_other(enact, write_cell, spawn, until):
-    """Its port is still open and its kernel answers; its dispatcher does not."""
+    """Its port is still open and its kernel answers; its dispatcher does not.
+
+    Whoever looks at the whole cell waits for it as long as was said, and no longer.
+    """
     file = write_cell()
     shards = [spawn("shard", "run", name, "--cell", file) for name in ("left", "right")]
     for shard in shards:
@@ -87,11 +90,15 @@ def test_a_hung_shard_is_not_alive_and_does_not_hide_the_other(enact, write_cell
     shards[0].send_signal(signal.SIGSTOP)
 
     result = enact("shard", "check", "--cell", file, "--json", "--timeout", "1")
+    look = enact("world", "ls", "--cell", file, "--timeout", "1")
     shards[0].send_signal(signal.SIGCONT)
     again = enact("shard", "check", "left", "--cell", file)
 
     assert result.status == 3
     assert {each["name"]: each["alive"] for each in result.json} == {"left": False, "right": True}
+    assert look.status == 3
+    assert "shard left" in look.err
+    assert "did not answer for 1.0 s" in look.err
     assert again.status == 0
 
 
