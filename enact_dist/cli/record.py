@@ -139,7 +139,7 @@ def _add_json(parser: Verb) -> None:
 
 
 def run_record(arguments: argparse.Namespace) -> int:
-    """Record until a signal or for so many seconds; fail where versions are missing."""
+    """Record until a signal or for so many seconds; fail where versions or aspects are missing."""
     from enact_dist.recording import Recorder
 
     line = _Line()
@@ -168,7 +168,7 @@ def run_record(arguments: argparse.Namespace) -> int:
             print(f"  missing {count} of {slot}")
         for name, count in summary.counts.items():
             print(f"  {name}: {count}")
-    return FAILED if summary.missing else DONE
+    return FAILED if summary.missing or summary.unknown_aspects else DONE
 
 
 def shows_of(arguments: argparse.Namespace) -> dict[str, Shows]:
@@ -197,6 +197,7 @@ def _recorded_line(summary: RecordingSummary) -> str:
         f"{shown_bytes(summary.size_bytes)} in {summary.chunks} chunks",
     ]
     parts += [f"{count} MISSING ({reason})" for reason, count in summary.gaps.items()]
+    parts += [f"the cell knows NO ASPECT {name!r}" for name in summary.unknown_aspects]
     return ", ".join(parts)
 
 

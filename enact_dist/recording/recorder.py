@@ -81,6 +81,7 @@ class RecordingSummary:
         gap_slots: Versions that are missing, by slot.
         out_of_order: Commits whose notice came so late that they stand behind later ones.
         counts: What else happened, by name (see `file.RecordingFile`).
+        unknown_aspects: Aspects that were asked for and that the cell does not know so far.
     """
 
     path: str
@@ -94,6 +95,7 @@ class RecordingSummary:
     gap_slots: dict[str, int] = field(default_factory=dict)
     out_of_order: int = 0
     counts: dict[str, int] = field(default_factory=dict)
+    unknown_aspects: tuple[str, ...] = ()
 
     @property
     def missing(self) -> int:
@@ -185,6 +187,7 @@ class Recorder:
             self._disk = DiskThread(file, bytes_max=self._queue_bytes)
             begun_s = time.monotonic()
             try:
+                self._meet_aspects()
                 self._begin(watch)
                 while not stop.is_set():
                     self.summary.seconds = time.monotonic() - begun_s
@@ -227,6 +230,8 @@ class Recorder:
         summary = self.summary
         summary.size_bytes, summary.chunks = file.size, file.chunks
         summary.counts = dict(file.counts)
+        known = self._session.client.aspect_entries()
+        summary.unknown_aspects = tuple(name for name in self._only if name not in known)
 
     def _end_facts(self) -> dict[str, str]:
         summary = self.summary
@@ -273,6 +278,12 @@ class Recorder:
         if change.null:
             self._nulls.add(wanted)
         self._want(wanted)
+
+    def _meet_aspects(self) -> None:
+        """Ask all shards once more for what was asked for by name and is not known."""
+        if not set(self._only) <= self._session.client.aspect_entries().keys():
+            with contextlib.suppress(LinkError):  # of a shard that is away
+                self._session.client.greet()
 
     def _know(self, aspect: str) -> None:
         """Learn of an aspect from the catalogue, before its first datum is written."""
@@ -427,6 +438,7 @@ class Recorder:
         for wanted in self._pending:
             self._miss_one(wanted, DISK_SLOW if not self._disk.has_room else UNREACHABLE)
         self._pending.clear()
+        self._meet_aspects()
 
 
 def _stamp(wanted: Wanted) -> int:

@@ -49,6 +49,18 @@ def test_record_and_replay(enact, cell_file, put, tmp_path):
     assert "4 data" in again.out
 
 
+def test_an_aspect_that_nobody_knows_is_named(enact, cell_file, put, tmp_path):
+    """A misspelt name must not look like data that did not change."""
+    put("misspelt", a=1)
+    words = ("record", cell_file, "--world", "misspelt", "--seconds", "0.1", "--aspect", "count")
+    good = enact(*words, "--out", tmp_path / "good.mcap", "--json")
+    bad = enact(*words, "--aspect", "coutn", "--out", tmp_path / "bad.mcap")
+    assert (good.status, good.json["unknown_aspects"]) == (0, [])
+    assert bad.status == 1
+    assert "1 versions" in bad.out
+    assert "NO ASPECT 'coutn'" in bad.out
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_the_recording_whole(enact, spawn, cell_file, put, tmp_path, until, number):
     """What was committed before it is in the file, which has its end."""
