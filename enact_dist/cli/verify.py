@@ -85,7 +85,8 @@ def add_chaos(verify: Verb) -> None:
     what.add_argument(
         "--chaos",
         action="store_true",
-        help="kill, stop and cut off real processes for a minute, and check what they saw",
+        help="kill, stop and cut off real processes for a minute, on hosts of their own and a"
+        " network that is slow and loses frames now and then, and check what they saw",
     )
     what.add_argument(
         "--history", type=Path, metavar="FOLDER", help="check what a run has kept once more"
@@ -98,7 +99,7 @@ def add_chaos(verify: Verb) -> None:
     chaos.add_argument(
         "--require-namespaces",
         action="store_true",
-        help="fail where there are no network namespaces, instead of leaving partitions out",
+        help="fail where there are no namespaces, instead of leaving out what needs a network",
     )
 
 

@@ -33,7 +33,7 @@ SECONDS = float(os.environ.get("ENACT_CHAOS_SECONDS", "55"))
 def _namespaces():
     """Skip where the system has no namespaces; the root conftest makes that a failure in CI."""
     try:
-        open_hosts(("one",), other_clock="one", required=True).close()
+        open_hosts(("one",), required=True).close()
     except LinkError as error:
         pytest.skip(str(error))
 

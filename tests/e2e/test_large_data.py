@@ -10,11 +10,6 @@ from enact_dist.verify.chaos.hosts import open_hosts
 
 pytestmark = pytest.mark.slow
 PROGRAM = str(Path(__file__).with_name("large_data_program.py"))
-OWN_MEMORY = (
-    "unshare", "--mount", "sh", "-c",
-    'mount -t tmpfs none /dev/shm && exec "$@"', "own-memory",
-)  # fmt: skip
-"""Runs what follows with a /dev/shm of its own, as on another host."""
 TTL_S = 12.0
 CUT_S = 6.5
 """Longer than the lease of a link (TTL_S / 2); the lock and the patience of a transfer (10 s)
@@ -25,7 +20,7 @@ outlive it and one more second or two, in which a repeated SYN finds the way ope
 def hosts():
     """Two hosts with a shard each, the second with a client's program, and one far from both."""
     try:
-        opened = open_hosts(("s0", "s1", "far"), other_clock="far", required=True)
+        opened = open_hosts(("s0", "s1", "far"), required=True)
     except LinkError as error:
         pytest.skip(str(error))
     yield opened
@@ -49,8 +44,7 @@ def run(hosts, tmp_path, make_process):
     )
 
     def start(host, *arguments):
-        own = OWN_MEMORY if host == "far" else ()
-        return make_process(*arguments, before=(*hosts.before(host), *own))
+        return make_process(*arguments, before=hosts.before(host))
 
     for name in ("s0", "s1"):
         start(name, "-m", "enact_dist.cli.main", "shard", "run", name, "--cell", cell).expect(

@@ -290,7 +290,7 @@ def test_folder_of_something_else_is_refused(tmp_path):
 def test_without_namespaces_what_is_left_out_is_named(monkeypatch):
     """On a system without the tools the cell runs on the loopback, and says what is missing."""
     monkeypatch.setenv("PATH", "")
-    found = hosts.open_hosts(("s0", "g0"), other_clock="g0")
+    found = hosts.open_hosts(("s0", "g0"))
 
     assert isinstance(found, hosts.Loopback)
     assert any(
@@ -299,7 +299,7 @@ def test_without_namespaces_what_is_left_out_is_named(monkeypatch):
     with pytest.raises(LinkError, match="one host"):
         found.cut("s0", "g0")
     with pytest.raises(LinkError, match="not installed"):
-        hosts.open_hosts(("s0", "g0"), other_clock="g0", required=True)
+        hosts.open_hosts(("s0", "g0"), required=True)
 
 
 def test_told_has_the_words_of_the_journal():

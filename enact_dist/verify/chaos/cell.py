@@ -91,7 +91,6 @@ class TestedCell:
             'name = "chaos"',
             f"worlds = [{worlds}]",
             f"session_ttl_s = {ttl_s}",
-            'carrier = "zenoh"',  # namespaces share memory: a socket would lead around a cut
             f'data_folder = "{folder}/data"',
         ]
         for name in shards:
@@ -108,7 +107,8 @@ class TestedCell:
             self.start_shard(name)
         self.wait_ready()
         words = (str(self.file), str(self._folder), str(self._ttl_s))
-        self.watcher = self._run(WATCHER_MODULE, words, WATCHER, watcher_host)
+        ahead_ns = str(self._hosts.clock_ahead_ns[watcher_host])
+        self.watcher = self._run(WATCHER_MODULE, (*words, ahead_ns), WATCHER, watcher_host)
         for name, host in clients.items():
             self.start_client(name, host)
         self.watcher.expect("started")

@@ -9,6 +9,8 @@ set wall clock          the same with a wall clock that is wrong until the next 
                         0.4 s ahead, or an hour behind
 partition               two hosts, or a host and all shards, lose each other
 one-way partition       one of them hears the other no more
+slow network            whatever a host sends and gets takes 5 to 50 ms, each way
+lossy network           of whatever a host sends and gets 1 to 10 % is lost
 ======================  =======================================================================
 
 A deck has every kind as often as `DECK` says, so that no kind is missing in a short run.
@@ -26,6 +28,7 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.errors import LinkError
 from enact_dist.verify.chaos.cell import END_S
+from enact_dist.verify.chaos.switch import Cable
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -38,6 +41,7 @@ KILL_SHARD, KILL_CLIENT = "kill shard", "kill client"
 STOP_SHARD, STOP_CLIENT = "stop shard", "stop client"
 RESTART, WALL_CLOCK = "restart shard", "set wall clock"
 PARTITION, ONE_WAY = "partition", "one-way partition"
+SLOW, LOSSY = "slow network", "lossy network"
 DECK: Final = {
     KILL_SHARD: 3,
     KILL_CLIENT: 3,
@@ -47,9 +51,13 @@ DECK: Final = {
     WALL_CLOCK: 1,
     PARTITION: 2,
     ONE_WAY: 3,
+    SLOW: 1,
+    LOSSY: 1,
 }
 AHEAD_S_MAX: Final = 0.4
 BEHIND_S: Final = -3600.0
+DELAY_S: Final = (0.005, 0.05)
+LOSS: Final = (0.01, 0.1)
 PAUSE_S: Final = (0.7, 1.9)
 """Between the begin of one fault and the next."""
 POLL_S: Final = 0.02
@@ -91,7 +99,7 @@ class Injector:
         self._cards = [
             kind
             for kind, count in deck.items()
-            if apart or kind not in (PARTITION, ONE_WAY)
+            if apart or kind not in (PARTITION, ONE_WAY, SLOW, LOSSY)
             for _ in range(count)
         ]
 
@@ -140,6 +148,8 @@ class Injector:
             WALL_CLOCK: lambda: self._restart(WALL_CLOCK),
             PARTITION: lambda: self._partition(one_way=False),
             ONE_WAY: lambda: self._partition(one_way=True),
+            SLOW: lambda: self._spoil(SLOW),
+            LOSSY: lambda: self._spoil(LOSSY),
         }
         if not carried_out[kind]():
             self._deck.insert(self._draw.randint(0, len(self._deck)), kind)
@@ -293,3 +303,32 @@ class Injector:
 
         self._after(draw.choice((0.4, 1.0, 2.0, 3.0)) * self._ttl_s, heal)
         return True
+
+    def _spoil(self, kind: str) -> bool:
+        """Let all cables of one host be slow or lossy for a while."""
+        if not self._busy.isdisjoint((SLOW, LOSSY)):  # the end of one would end the other
+            return False
+        self._busy.add(kind)
+        draw = self._draw
+        host = draw.choice((*self._groups, *self._cell.shards))
+        if kind == SLOW:
+            delay_s = draw.uniform(*DELAY_S)
+            cable = Cable(delay_s, jitter_s=delay_s / 4)
+        else:
+            cable = Cable(loss=draw.uniform(*LOSS))
+        from_ns = time.monotonic_ns()
+        self._lay(host, cable)
+
+        def mend() -> None:
+            self._lay(host, Cable())
+            self._note(kind, [host], from_ns)
+            self._busy.discard(kind)
+
+        self._after(draw.choice((1.0, 2.0, 4.0)) * self._ttl_s, mend)
+        return True
+
+    def _lay(self, host: str, cable: Cable) -> None:
+        for other in (*self._groups, *self._cell.shards):
+            if other != host:
+                self._hosts.lay(host, other, cable)
+                self._hosts.lay(other, host, cable)

@@ -13,7 +13,14 @@ from typing import TYPE_CHECKING, Any, Final
 
 from enact_dist.terms import Access
 from enact_dist.verify.chaos.chains import History
-from enact_dist.verify.chaos.faults import KILL_CLIENT, ONE_WAY, PARTITION, STOP_CLIENT
+from enact_dist.verify.chaos.faults import (
+    KILL_CLIENT,
+    LOSSY,
+    ONE_WAY,
+    PARTITION,
+    SLOW,
+    STOP_CLIENT,
+)
 from enact_dist.verify.chaos.workload import UNEXPECTED
 from enact_dist.verify.checker import Anomaly, Told
 
@@ -153,9 +160,9 @@ def _overlapping(evidence: Evidence, from_ns: int, until_ns: int) -> Iterable[Fa
 
 
 def _disturbed(evidence: Evidence, restart: Restart, until_ns: int, ttl_ns: int) -> bool:
-    """Whether a client was dead, stopped or cut off about a restart, or another shard down."""
+    """Whether a client was dead, stopped or badly connected, or another shard down."""
     return any(
-        fault.kind in (KILL_CLIENT, STOP_CLIENT, PARTITION, ONE_WAY)
+        fault.kind in (KILL_CLIENT, STOP_CLIENT, PARTITION, ONE_WAY, SLOW, LOSSY)
         or restart.shard not in fault.targets
         for fault in _overlapping(evidence, restart.down_ns - 2 * ttl_ns, until_ns)
     )

@@ -1,11 +1,11 @@
-"""The hosts of a cell under test: network namespaces on one bridge, or else the loopback.
+"""The hosts of a cell under test: Linux namespaces on a switch of our own, or else the loopback.
 
 ::
 
-    s0 ──┐            one namespace per shard, per group of clients and for the watcher, each
-    s1 ──┤            with an address of 198.18.77.0/24; the bridge stands in one of its own.
-    g0 ──┼── bridge   A cut from A to B lets B drop what comes from A: nobody is told.
-    g1 ──┘
+    s0 ──┐            one host per shard, per group of clients and for the watcher, each with an
+    s1 ──┤            address of 198.18.77.0/24, a name, a /dev/shm, a monotonic clock and a boot
+    g0 ──┼── switch   id of its own; files and processes they share.  A cut from A to B loses what
+    g1 ──┘            A sends to B: nobody is told.
 
 Each namespace lives as long as a child that waits for the end of its standard input: when this
 process ends, however it ends, all of them are gone.  Without root they stand in a user namespace.
@@ -13,27 +13,33 @@ process ends, however it ends, all of them are gone.  Without root they stand in
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import subprocess
+import tempfile
+import uuid
+from dataclasses import astuple
+from pathlib import Path
 from typing import TYPE_CHECKING, Final, Protocol
 
 from enact_dist.errors import LinkError
-from enact_dist.verify.daemons import free_port
+from enact_dist.verify.chaos import switch
+from enact_dist.verify.chaos.switch import Cable, Counts
+from enact_dist.verify.daemons import LineProcess, free_port
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
 CLOCK_AHEAD_S: Final = 100_000
-"""By how much the one host with a monotonic clock of its own is ahead."""
+"""By how much each host's monotonic clock is ahead of the one before."""
 COMMAND_S: Final = 10.0
 _PORT: Final = 7447
 _DIE_WITH_PARENT: Final = ("setpriv", "--pdeathsig", "KILL")
-_RULES: Final = """
-table inet enact_chaos {
-    set cut { type ipv4_addr; }
-    chain arriving { type filter hook input priority 0; ip saddr @cut drop; }
-}
+_MAKE_HOST: Final = """
+hostname "$1" && mount -t tmpfs -o size=1g tmpfs /dev/shm && echo "$2" >/dev/shm/boot &&
+mount --bind /dev/shm/boot /proc/sys/kernel/random/boot_id && rm /dev/shm/boot &&
+echo $$ && exec cat >/dev/null
 """
 
 
@@ -60,17 +66,21 @@ class Hosts(Protocol):
     def heal(self, source: str, target: str) -> None:
         """End a cut."""
 
+    def lay(self, source: str, target: str, cable: Cable) -> None:
+        """Let what goes from one host to the other go through this cable."""
+
     def close(self) -> None:
         """Remove everything."""
 
 
 class Loopback:
-    """All on this host: no partitions, no clocks of its own."""
+    """All on this host: no network of its own, one clock."""
 
     def __init__(self, hosts: Sequence[str], *, why: str) -> None:
         self.missing: tuple[str, ...] = (
             f"partitions ({why})",
-            f"another monotonic clock ({why})",
+            f"slow, lossy and narrow networks ({why})",
+            f"other monotonic clocks ({why})",
         )
         self.clock_ahead_ns = dict.fromkeys(hosts, 0)
         self._ports = {host: free_port() for host in hosts}
@@ -91,63 +101,80 @@ class Loopback:
         """Refuse, as `cut` does."""
         self.cut(source, target)
 
+    def lay(self, source: str, target: str, cable: Cable) -> None:
+        """Refuse, as `cut` does."""
+        self.cut(source, target)
+
     def close(self) -> None:
         """Do nothing: processes end by themselves."""
 
 
 class Namespaces:
-    """One network namespace per host, joined by a bridge.
+    """One set of namespaces per host, joined by a switch.
 
     Args:
         hosts: Their names.
-        other_clock: The host that gets a monotonic clock of its own.
+        seed: What the network loses and delays by chance is drawn from it.
 
     Raises:
         LinkError: The system does not allow it; the message says which step.
     """
 
-    def __init__(self, hosts: Sequence[str], *, other_clock: str) -> None:
+    def __init__(self, hosts: Sequence[str], *, seed: int = 0) -> None:
         self.missing: tuple[str, ...] = ()
-        self.clock_ahead_ns = dict.fromkeys(hosts, 0)
-        self.clock_ahead_ns[other_clock] = CLOCK_AHEAD_S * 10**9
+        self._names = tuple(hosts)
+        self._ahead_s = {h: (1 + i) * CLOCK_AHEAD_S for i, h in enumerate(hosts)}
+        self.clock_ahead_ns = {host: ahead * 10**9 for host, ahead in self._ahead_s.items()}
         self._own_user = os.geteuid() != 0
-        self._clocks = {other_clock}
         self._holders: dict[str, subprocess.Popen[bytes]] = {}
         self._pids: dict[str, int] = {}
         self._addresses = {host: f"198.18.77.{10 + index}" for index, host in enumerate(hosts)}
+        self._folder = Path(tempfile.mkdtemp(prefix="enact-switch-"))
         try:
-            for tool in ("unshare", "nsenter", "setpriv", "ip", "nft"):
+            for tool in ("unshare", "nsenter", "setpriv", "ip"):
                 if shutil.which(tool) is None:
                     raise LinkError(f"the program {tool} is not installed")
             self._hold("", [])
-            self._ip("", "link add bridge type bridge", "link set bridge up")
             for index, host in enumerate(hosts):
                 self._add(index, host)
+            before = (*self._enter(""), *_DIE_WITH_PARENT)
+            words = (str(seed), str(len(hosts)))
+            log = self._folder / "switch.log"
+            self._switch = LineProcess(switch.MODULE, words, log, before=before)
+            self._switch.expect("started")
         except BaseException:
             self.close()
             raise
 
     def _add(self, index: int, host: str) -> None:
-        time = ["--time", f"--monotonic={CLOCK_AHEAD_S}", f"--boottime={CLOCK_AHEAD_S}"]
-        self._hold(host, time if host in self._clocks else [])
+        ahead_s = self._ahead_s[host]
+        more = ["--mount", "--uts", "--time", f"--monotonic={ahead_s}", f"--boottime={ahead_s}"]
+        self._hold(host, more)
+        port = f"v{index}"
         self._ip(
             "",
-            f"link add v{index} type veth peer name eth0 netns {self._pids[host]}",
-            f"link set v{index} master bridge up",
+            f"link add {port} type veth peer name eth0 netns {self._pids[host]}"
+            f" address {switch.address(index)}",
+            f"link set {port} addrgenmode none up",
         )
-        address = self._addresses[host]
-        self._ip(host, "link set lo up", f"addr add {address}/24 dev eth0", "link set eth0 up")
-        self._run(self._enter(host), ["nft", "-f", "-"], given=_RULES)
+        self._ip(
+            host,
+            "link set lo up",
+            "link set eth0 addrgenmode none gso_max_segs 1",  # or it hands over many frames as one
+            f"addr add {self._addresses[host]}/24 dev eth0",
+            "link set eth0 up",
+        )
 
     def _hold(self, host: str, more: list[str]) -> None:
-        """Start the child that keeps a namespace."""
+        """Start the child that keeps the namespaces of a host; "": those of the switch."""
         user = self._enter("") if self._pids else []
         if self._own_user and not self._pids:
             more = ["--user", "--map-root-user", *more]
-        # The child of a fork is the first to have the clock; both write their ids.
+        script = _MAKE_HOST if host else "echo $$ && exec cat >/dev/null"
+        # The child of a fork is the first to have the clock.
         command = [*user, "unshare", "--net", *more, "--fork", "--kill-child"]
         holder = subprocess.Popen(
-            [*command, "sh", "-c", "echo $$; exec cat >/dev/null"],
+            [*command, "sh", "-c", script, "host", host, str(uuid.uuid4())],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
@@ -165,6 +192,9 @@ class Namespaces:
         command = ["nsenter", "--target", str(self._pids[host]), "--net"]
         if self._own_user:
             command += ["--user", "--preserve-credentials"]
+        if host:
+            # In another mount namespace the working folder has to be found anew.
+            command += ["--mount", "--uts", "--time", "env", f"--chdir={Path.cwd()}"]
         return command
 
     def _ip(self, host: str, *lines: str) -> None:
@@ -187,10 +217,7 @@ class Namespaces:
 
     def before(self, host: str) -> tuple[str, ...]:
         """Return the command that runs what follows it on a host."""
-        command = self._enter(host)
-        if host in self._clocks:
-            command.append("--time")
-        return (*command, *_DIE_WITH_PARENT)
+        return (*self._enter(host), *_DIE_WITH_PARENT)
 
     def endpoint(self, host: str) -> str:
         """Return where a shard on this host listens."""
@@ -198,19 +225,33 @@ class Namespaces:
 
     def cut(self, source: str, target: str) -> None:
         """Lose whatever goes from one host to the other."""
-        self._change("add", source, target)
+        self._change("cut", source, target)
 
     def heal(self, source: str, target: str) -> None:
         """End a cut."""
-        self._change("delete", source, target)
+        self._change("heal", source, target)
 
-    def _change(self, verb: str, source: str, target: str) -> None:
-        element = f"{{ {self._addresses[source]} }}"
-        command = ["nft", verb, "element", "inet", "enact_chaos", "cut", element]
-        self._run(self._enter(target), command)
+    def lay(self, source: str, target: str, cable: Cable) -> None:
+        """Let what goes from one host to the other go through this cable."""
+        self._change("cable", source, target, *astuple(cable))
+
+    def counts(self) -> Counts:
+        """Return what became of all frames so far."""
+        self._tell("count")
+        return Counts(**json.loads(self._switch.expect("count")))
+
+    def _change(self, word: str, source: str, target: str, *rest: float) -> None:
+        self._tell(word, self._names.index(source), self._names.index(target), *rest)
+        self._switch.expect("done")
+
+    def _tell(self, *words: object) -> None:
+        self._switch.tell(json.dumps(words))
 
     def close(self) -> None:
         """Let the children end, and with them the namespaces; twice is harmless."""
+        if hasattr(self, "_switch"):
+            self._switch.end()
+        shutil.rmtree(self._folder, ignore_errors=True)
         for holder in self._holders.values():
             holder.kill()
             holder.wait()
@@ -220,19 +261,19 @@ class Namespaces:
         self._holders.clear()
 
 
-def open_hosts(hosts: Sequence[str], *, other_clock: str, required: bool = False) -> Hosts:
+def open_hosts(hosts: Sequence[str], *, seed: int = 0, required: bool = False) -> Hosts:
     """Return namespaces where the system allows them, else the loopback.
 
     Args:
         hosts: Names of the hosts.
-        other_clock: The host that gets a monotonic clock of its own.
+        seed: What the network loses and delays by chance is drawn from it.
         required: Whether to fail where there are no namespaces.
 
     Raises:
         LinkError: `required`, and the system allows none.
     """
     try:
-        return Namespaces(hosts, other_clock=other_clock)
+        return Namespaces(hosts, seed=seed)
     except LinkError as error:
         if required:
             raise

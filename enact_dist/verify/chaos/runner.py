@@ -69,7 +69,7 @@ def run(settings: ChaosSettings, folder: Path, *, progress: Callable[[str, float
     groups = tuple(f"g{index}" for index in range(-(-settings.actors // CLIENTS_PER_HOST)))
     hosts = open_hosts(
         (*shards, *groups, WATCHER_HOST),
-        other_clock=groups[-1],
+        seed=settings.seed,
         required=settings.namespaces_required,
     )
     log = Journal(folder / FAULTS)

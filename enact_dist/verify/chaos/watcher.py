@@ -1,9 +1,9 @@
 """Looks at the shards of a cell under test ten times a second, and last of all at every slot.
 
-``python -m enact_dist.verify.chaos.watcher CELL FOLDER TTL_S``; told `final` it reads everything
-under one lock and says `final committed`, told `rest S` it waits until no lock is left for at most
-S seconds and says `left N`, told anything else it says `done` and ends.  What it sees on the way
-is in ``FOLDER/watcher.log``:
+``python -m enact_dist.verify.chaos.watcher CELL FOLDER TTL_S AHEAD_NS``; told `final` it reads
+everything under one lock and says `final committed`, told `rest S` it waits until no lock is left
+for at most S seconds and says `left N`, told anything else it says `done` and ends.  What it sees
+on the way is in ``FOLDER/watcher.log``:
 
 =========  =====================================================================================
 word       then
@@ -39,10 +39,10 @@ COUNTERS_EVERY: Final = 5
 class Watcher:
     """Looks at a cell; see the module."""
 
-    def __init__(self, cell: Cell, folder: Path, *, ttl_s: float) -> None:
+    def __init__(self, cell: Cell, folder: Path, *, ttl_s: float, ahead_ns: int) -> None:
         self._cell, self._client = cell, cell._client  # noqa: SLF001 - one call, unlike `cell.locks()`
-        self._folder, self._ttl_s = folder, ttl_s
-        self._log = Journal(folder / LOG)
+        self._folder, self._ttl_s, self._ahead_ns = folder, ttl_s, ahead_ns
+        self._log = Journal(folder / LOG, ahead_ns=ahead_ns)
         self._doubts: dict[tuple[str, str], tuple[int, int]] = {}
         self._looks = 0
         self.locks_left = 0
@@ -80,7 +80,7 @@ class Watcher:
 
     def final(self) -> str:
         """Read everything under one lock; return what it was told."""
-        journal = Journal(self._folder / f"final{SUFFIX}")
+        journal = Journal(self._folder / f"final{SUFFIX}", ahead_ns=self._ahead_ns)
         work = Workload(self._cell, journal, "final", seed=0, ttl_s=self._ttl_s)
         told = work.take_all()
         journal.close()
@@ -98,7 +98,7 @@ class Watcher:
 
 def main() -> None:
     """Look until told to end."""
-    file, folder, ttl_s = sys.argv[1:]
+    file, folder, ttl_s, ahead_ns = sys.argv[1:]
     lines: SimpleQueue[str] = SimpleQueue()
 
     def listen() -> None:
@@ -108,7 +108,7 @@ def main() -> None:
 
     threading.Thread(target=listen, daemon=True).start()
     with connect(file, actor="watcher", timeout_s=20.0) as cell:
-        watcher = Watcher(cell, Path(folder), ttl_s=float(ttl_s))
+        watcher = Watcher(cell, Path(folder), ttl_s=float(ttl_s), ahead_ns=int(ahead_ns))
         print("started", flush=True)
         while True:
             try:
