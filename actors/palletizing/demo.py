@@ -1,13 +1,14 @@
 """`enact demo palletizing`: the whole cell as processes, watched from outside and scored.
 
-Two shard daemons and eight actors run as processes of their own under `enact up`; this process
-only looks: it shows progress, and at the end sets the verdicts beside the truth.  Files in `out`:
+Two shard daemons and eight actors run as processes of their own, under `enact up` or in containers;
+this process only looks: it shows progress, and at the end sets the verdicts beside the truth.
+Files in `out`:
 
 ===================  =========================================================
 model_<product>.png  the trained surface, each planar patch in its colour
 tray_<n>.png         each tray with the deviating regions in red
 report.json          the table
-cell.toml, cell.log  what ran, and what it said
+cell.toml, cell.log  what ran, and what it said, if it ran here
 ===================  =========================================================
 """
 
@@ -15,11 +16,12 @@ from __future__ import annotations
 
 import sys
 import time
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from actors.geometry.files import write_whole
 from actors.geometry.picture import png_bytes
-from actors.palletizing.demo_cell import DemoError, RunningCell
+from actors.palletizing.demo_cell import DemoCell, DemoError, RunningCell, watched_cell
 from actors.palletizing.demo_lineage import show_lineage
 from actors.palletizing.demo_pictures import latest, model_picture, tray_picture
 from actors.palletizing.demo_report import difference_of, report_bytes, rows_of, score_of, table_of
@@ -43,10 +45,11 @@ from actors.palletizing.vocabulary import (
     place_entity,
 )
 from enact_dist import View, ViewEach
+from enact_dist.errors import ShardUnreachableError
 from enact_dist.link.signals import StopSignals
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     from rich.console import Console
@@ -54,6 +57,7 @@ if TYPE_CHECKING:
     from actors.palletizing.demo_pictures import Picture
     from actors.palletizing.demo_report import Row
     from actors.palletizing.simulation.packages import Package
+    from actors.palletizing.vocabulary import Notice
     from enact_dist import Cell
 
 LOOK_S: Final = 0.2
@@ -76,25 +80,53 @@ def run_demo(*, out: Path, packages: int = 12, seed: int = SEED, keep_running: b
     Returns:
         Exit status: 0 done, 1 the cell failed; wrong verdicts are the score's matter.
     """
-    from rich.console import Console
-
-    console = Console(highlight=False)
     if packages < 1:
         print(f"--packages is {packages}; at least one has to come", file=sys.stderr)
         return 1
-    started_s = time.monotonic()
     out.mkdir(parents=True, exist_ok=True)
-    truths = package_sequence(packages, seed=seed)
+    return _shown(
+        RunningCell(out, packages=packages, seed=seed),
+        out,
+        up="cell up: 2 shards, 8 actors, each a process",
+        keep_running=keep_running,
+    )
+
+
+def watch_demo(config: Path, *, out: Path) -> int:
+    """Watch the demonstration in a cell that others run, and report.
+
+    Args:
+        config: The `cell.toml` of that cell.
+        out: Folder for pictures and report; made if missing.
+
+    Returns:
+        Exit status as of `run_demo`.
+
+    Raises:
+        ConfigError: The file cannot be used, or is not of a simulated palletizing cell.
+    """
+    running = watched_cell(config)
+    out.mkdir(parents=True, exist_ok=True)
+    return _shown(running, out, up="watching a cell that runs already", keep_running=False)
+
+
+def _shown(demo: DemoCell, out: Path, *, up: str, keep_running: bool) -> int:
+    """Show a run and write its files; return the exit status."""
+    from rich.console import Console
+
+    console = Console(highlight=False)
+    started_s = time.monotonic()
+    truths = package_sequence(demo.packages, seed=demo.seed)
     try:
-        with RunningCell(out, packages=packages, seed=seed) as running, running.joined() as cell:
-            console.print(f"cell up: 2 shards, 8 actors, each a process; log in {running.log}")
+        with demo as running, running.joined() as cell:
+            console.print(f"{up}; log in {running.log}")
             _follow(cell, running, truths, console)
             rows = _outcome(cell, truths)
             console.print("\n", table_of(rows), f"\n{score_of(rows)}", sep="")
             planned = cell.world("training").diff(cell.world("online"), PLACES, [STANDING])
             console.print("", difference_of(planned), "", sep="\n")
             show_lineage(cell, rows[-1].product, console)
-            _write_files(cell, out, report_bytes(rows, seed=seed))
+            _write_files(cell, out, report_bytes(rows, seed=running.seed))
             console.print(f"pictures in {out}; {time.monotonic() - started_s:.0f} s in all")
             if keep_running:
                 console.print(f"the cell stays up: enact world tree --cell {running.config}")
@@ -105,7 +137,7 @@ def run_demo(*, out: Path, packages: int = 12, seed: int = SEED, keep_running: b
     return 0
 
 
-def _follow(cell: Cell, running: RunningCell, truths: Sequence[Package], console: Console) -> None:
+def _follow(cell: Cell, running: DemoCell, truths: Sequence[Package], console: Console) -> None:
     """Show progress until the user was told of every package.
 
     Raises:
@@ -113,11 +145,9 @@ def _follow(cell: Cell, running: RunningCell, truths: Sequence[Package], console
     """
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
-    training, online = cell.world("training"), cell.world("online")
-    notices, scans = View(online, USER, NOTICES), ViewEach(training, PRODUCTS, SCAN)
     told: set[str] = set()
     trained: set[str] = set()
-    moved_s, before = time.monotonic(), (0, 0, 0)
+    moved_s, before, away = time.monotonic(), (0, 0, 0), False
     columns = TextColumn("{task.description:<22}"), BarColumn(), MofNCompleteColumn()
     with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
         views_bar = progress.add_task("training: views", total=None)
@@ -125,25 +155,61 @@ def _follow(cell: Cell, running: RunningCell, truths: Sequence[Package], console
         packages_bar = progress.add_task("online: packages", total=len(truths))
         while len(told) < len(truths):
             running.check()
-            snapshot = online.view(notices).get(notices, {})
-            for place, notice in snapshot.items():
-                if place not in told:
-                    console.print(notice.text)
-            told |= snapshot.keys()
-            views = len(training.survey(VIEWS, ("surface",)))
-            models = {slot.entity.name for slot in training.survey(PRODUCTS, ("surface",))}
-            for product in sorted(models - trained):
-                console.print(f"{product} is trained")
-            trained |= models
-            orders = training.view(scans)[scans]
-            progress.update(views_bar, completed=views, total=sum(orders.values()) or None)
-            progress.update(models_bar, completed=len(models), total=len(orders) or None)
-            progress.update(packages_bar, completed=len(told))
-            now = views, len(models), len(told)
-            moved_s, before = (moved_s, before) if now == before else (time.monotonic(), now)
             if time.monotonic() - moved_s > STALL_S:
                 raise DemoError(f"nothing moved for {STALL_S:.0f} s; see {running.log}")
+            try:
+                seen = _look(cell)
+            except ShardUnreachableError as error:  # whoever runs it starts it again
+                if not away:
+                    console.print(f"waiting: {error}")
+                away = True
+                continue
+            away = False
+            for place, notice in seen.notices.items():
+                if place not in told:
+                    console.print(notice.text)
+            told |= seen.notices.keys()
+            for product in sorted(seen.models - trained):
+                console.print(f"{product} is trained")
+            trained |= seen.models
+            progress.update(views_bar, completed=seen.views, total=seen.views_ordered or None)
+            progress.update(models_bar, completed=len(trained), total=seen.models_ordered or None)
+            progress.update(packages_bar, completed=len(told))
+            now = seen.views, len(trained), len(told)
+            moved_s, before = (moved_s, before) if now == before else (time.monotonic(), now)
             time.sleep(LOOK_S)
+
+
+@dataclass(frozen=True, slots=True)
+class _Seen:
+    """How far a run is.
+
+    Attributes:
+        notices: What the user was told, by place.
+        models: Products that are trained.
+        models_ordered: How many shall be.
+        views: How many views are reconstructed.
+        views_ordered: How many shall be.
+    """
+
+    notices: Mapping[str, Notice]
+    models: set[str]
+    models_ordered: int
+    views: int
+    views_ordered: int
+
+
+def _look(cell: Cell) -> _Seen:
+    training, online = cell.world("training"), cell.world("online")
+    notices, scans = View(online, USER, NOTICES), ViewEach(training, PRODUCTS, SCAN)
+    orders = training.view(scans)[scans]
+    return _Seen(
+        notices=online.view(notices).get(notices, {}),
+        models={slot.entity.name for slot in training.survey(PRODUCTS, ("surface",))},
+        models_ordered=len(orders),
+        views=len(training.survey(VIEWS, ("surface",))),
+        views_ordered=sum(orders.values()),
+    )
 
 
 def _outcome(cell: Cell, truths: Sequence[Package]) -> list[Row]:
@@ -191,7 +257,7 @@ def _tray_pictures(cell: Cell) -> dict[int, Picture]:
     return pictures
 
 
-def _until_interrupted(running: RunningCell) -> None:
+def _until_interrupted(running: DemoCell) -> None:
     """Wait for Ctrl-C or SIGTERM, or until the cell goes down by itself."""
     with StopSignals() as signals:
         while not signals.event.wait(1.0):

@@ -1,7 +1,7 @@
-"""The cell of one demonstration: its `cell.toml` and the processes that `enact up` starts.
+"""The cell of one demonstration: one that runs already, or processes that `enact up` starts.
 
-Rule a change must keep: every process ends with the demonstration, also when that is killed, and
-a run starts from an empty data folder of its own.
+Rule a change must keep: every process that was started here ends with the demonstration, also when
+that is killed, and such a run starts from an empty data folder of its own.
 """
 
 from __future__ import annotations
@@ -17,76 +17,53 @@ import tempfile
 import time
 import tomllib
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Self
+from urllib.parse import parse_qsl
 
 from actors.geometry.files import write_whole
 from enact_dist import connect
-from enact_dist.errors import LinkError
+from enact_dist.config import load_config
+from enact_dist.errors import ConfigError, LinkError
 
 if TYPE_CHECKING:
-    from types import TracebackType
-
     from enact_dist import Cell
 
 TEMPLATE: Final = Path(__file__).with_name("cell.toml")
 UP_S: Final = 30.0
 """How long the shards may take to answer; one needs half a second on an idle machine."""
+TRY_S: Final = 2.0
+"""How long one try to join takes; after each it is looked whether the processes still run."""
 DOWN_S: Final = 20.0
 """How long actors and shards may take to drain."""
+_SENSORS: Final = "actors.palletizing.simulation.sensors"
+_EYE: Final = "online-perception"
 
 
 class DemoError(RuntimeError):
     """The demonstration cannot go on; the message says where to look."""
 
 
-class RunningCell:
-    """The palletizing cell, up between entering and leaving the block.
+class DemoCell:
+    """A palletizing cell that others run; a context manager that leaves it as it is.
 
-    Args:
-        out: Folder for `cell.toml` and `cell.log`.
+    Attributes:
+        config: Its `cell.toml`.
         packages: How many packages come.
         seed: Seed of all simulated sensors.
+        log: Where to read what its processes said.
     """
 
-    def __init__(self, out: Path, *, packages: int, seed: int) -> None:
-        self.config = out / "cell.toml"
-        self.log = out / "cell.log"
-        self._packages, self._seed = packages, seed
-        self._data = Path()
-        self._process: subprocess.Popen[bytes] | None = None
+    def __init__(self, config: Path, *, packages: int, seed: int, log: str) -> None:
+        self.config, self.packages, self.seed, self.log = config, packages, seed, log
 
-    def __enter__(self) -> RunningCell:
-        self._data = Path(tempfile.mkdtemp(prefix="enact-palletizing-"))
-        text = configured(
-            TEMPLATE.read_text(), packages=self._packages, seed=self._seed, data=self._data
-        )
-        write_whole({self.config: text.encode()})
-        command = [sys.executable, "-m", "enact_dist.cli.main", "up", str(self.config)]
-        with self.log.open("wb") as log:
-            self._process = subprocess.Popen(
-                command,
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=subprocess.STDOUT,
-                env={**os.environ, "ENACT_SUPERVISOR_PID": str(os.getpid())},
-                process_group=0,  # Ctrl-C is this process's to pass on
-            )
+    def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        if self._process is not None:
-            self._process.send_signal(signal.SIGTERM)
-            try:
-                self._process.wait(DOWN_S)
-            except subprocess.TimeoutExpired:
-                self._process.kill()
-                self._process.wait()
-        shutil.rmtree(self._data, ignore_errors=True)
+    def __exit__(self, *_: object) -> None:
+        """Leave it as it is."""
+
+    def check(self) -> None:
+        """Raise `DemoError` if it is known to be gone."""
 
     def joined(self) -> Cell:
         """Join the cell as soon as its shards answer.
@@ -98,16 +75,87 @@ class RunningCell:
         while True:
             self.check()
             try:
-                return connect(self.config, actor="demo", timeout_s=2.0)
+                return connect(self.config, actor="demo", timeout_s=TRY_S)
             except LinkError as error:
                 if time.monotonic() > deadline_s:
                     raise DemoError(f"no shard within {UP_S:.0f} s: {error}") from error
 
+
+class RunningCell(DemoCell):
+    """A palletizing cell that is up between entering and leaving the block.
+
+    Args:
+        out: Folder for `cell.toml` and `cell.log`.
+        packages: How many packages come.
+        seed: Seed of all simulated sensors.
+    """
+
+    def __init__(self, out: Path, *, packages: int, seed: int) -> None:
+        self._log = out / "cell.log"
+        super().__init__(out / "cell.toml", packages=packages, seed=seed, log=str(self._log))
+        self._data = Path()
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def __enter__(self) -> Self:
+        self._data = Path(tempfile.mkdtemp(prefix="enact-palletizing-"))
+        text = configured(
+            TEMPLATE.read_text(), packages=self.packages, seed=self.seed, data=self._data
+        )
+        write_whole({self.config: text.encode()})
+        command = [sys.executable, "-m", "enact_dist.cli.main", "up", str(self.config)]
+        with self._log.open("wb") as log:
+            self._process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                env={**os.environ, "ENACT_SUPERVISOR_PID": str(os.getpid())},
+                process_group=0,  # Ctrl-C is this process's to pass on
+            )
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._process is not None:
+            self._process.send_signal(signal.SIGTERM)
+            try:
+                self._process.wait(DOWN_S)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.wait()
+        shutil.rmtree(self._data, ignore_errors=True)
+
     def check(self) -> None:
         """Raise `DemoError` with the end of the log if the processes are gone."""
         if self._process is not None and self._process.poll() is not None:
-            lines = self.log.read_text(errors="replace").splitlines()[-8:]
+            lines = self._log.read_text(errors="replace").splitlines()[-8:]
             raise DemoError("\n".join([f"the cell went down; the end of {self.log}:", *lines]))
+
+
+def watched_cell(config: Path) -> DemoCell:
+    """Return a palletizing cell that runs already, in containers for instance.
+
+    Args:
+        config: Its `cell.toml`; the simulated sensor of `online-perception` says in there how many
+            packages come, and of which seed they are.
+
+    Raises:
+        ConfigError: The file cannot be used, or the sensor is not the simulated one, of which
+            alone the truth is known.
+    """
+    loaded = load_config(config)
+    address = next(
+        (str(actor.options.get("sensor")) for actor in loaded.actors if actor.name == _EYE), ""
+    )
+    found = dict(parse_qsl(address.partition("?")[2]))
+    try:
+        packages, seed = int(found["packages"]), int(found["seed"])
+    except (KeyError, ValueError):
+        raise ConfigError(
+            f"{config}: the sensor of {_EYE} is {address!r}, which names no packages and seed; only"
+            f" of a simulated one is the truth known: {_SENSORS}:tray_sensor?packages=12&seed=59",
+            path=str(config),
+        ) from None
+    return DemoCell(config, packages=packages, seed=seed, log="the logs of its processes")
 
 
 def configured(template: str, *, packages: int, seed: int, data: Path) -> str:
@@ -125,15 +173,14 @@ def configured(template: str, *, packages: int, seed: int, data: Path) -> str:
         config["shards"].values(), _free_ports(len(config["shards"])), strict=True
     ):
         shard["listen"] = f"tcp/127.0.0.1:{port}"
-    sensors = "actors.palletizing.simulation.sensors"
-    overhead = f"{sensors}:tray_sensor?packages={packages}&seed={seed}"
+    overhead = f"{_SENSORS}:tray_sensor?packages={packages}&seed={seed}"
     actors = config["actors"]
     actors["planning"]["options"]["packages"] = packages
     actors["training-perception"]["options"] = {
-        "sensor": f"{sensors}:orbit_sensor?seed={seed}",
+        "sensor": f"{_SENSORS}:orbit_sensor?seed={seed}",
         "tray_sensor": overhead,
     }
-    actors["online-perception"]["options"] = {"sensor": overhead}
+    actors[_EYE]["options"] = {"sensor": overhead}
     return _toml(config)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import socket
 import time
 from typing import TYPE_CHECKING, Final
 
@@ -176,8 +177,9 @@ def _farewell(name: str, statistics: ActorStatistics) -> str:
 
 def list_actors(arguments: argparse.Namespace) -> int:
     """Print every session but this one; one line per reporting actor."""
+    me = socket.gethostname(), os.getpid()  # a number alone is that of others in their containers
     with open_cell(arguments) as cell:
-        infos = [info for info in cell.actors() if info.pid != os.getpid()]
+        infos = [info for info in cell.actors() if (info.host, info.pid) != me]
     if arguments.json:
         print_json(infos)
         return DONE

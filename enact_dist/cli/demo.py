@@ -26,6 +26,7 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
         "actors train a model of a package, watch a tray and report damaged packages",
         run=run_palletizing,
         example="enact demo palletizing --packages 6 --seed 1 --out demo\n"
+        "enact demo palletizing --cell cell.toml --out demo\n"
         "enact demo palletizing --views redwood_rgbd --out surface\n"
         "enact demo palletizing --model milk.pcd --scene table.pcd --out pose",
     )
@@ -34,6 +35,12 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
     demo.add_argument("--out", type=Path, metavar="DIR", help="where pictures and tables go")
     demo.add_argument(
         "--keep-running", action="store_true", help="leave the cell up afterwards, until Ctrl-C"
+    )
+    demo.add_argument(
+        "--cell",
+        type=Path,
+        metavar="FILE",
+        help="the cell.toml of a palletizing cell that runs already, to be watched and scored",
     )
     real = demo.add_argument_group("real recordings instead of the simulated sensor")
     real.add_argument("--views", type=Path, metavar="DIR", help="train from an RGB-D recording")
@@ -62,8 +69,10 @@ def _run(arguments: argparse.Namespace) -> int:
         from actors.palletizing.real_input import run_match
 
         return run_match(arguments.model, arguments.scene, out)
-    from actors.palletizing.demo import run_demo
+    from actors.palletizing.demo import run_demo, watch_demo
 
+    if arguments.cell:
+        return watch_demo(arguments.cell, out=out)
     chosen = {"packages": arguments.packages, "seed": arguments.seed}
     given = {name: value for name, value in chosen.items() if value is not None}
     return run_demo(out=out, keep_running=arguments.keep_running, **given)
@@ -79,9 +88,13 @@ def _refuse_mixture(arguments: argparse.Namespace) -> None:
         for name in ("packages", "seed", "keep_running")
         if getattr(arguments, name) not in {None, False}
     ]
-    if simulated and (arguments.views or arguments.model):
-        option = simulated[0].replace("_", "-")
-        raise ConfigError(f"--{option} belongs to the simulated sensor, not to real recordings")
+    option = f"--{simulated[0].replace('_', '-')}" if simulated else ""
+    if arguments.cell and (arguments.views or arguments.model):
+        raise ConfigError("--cell watches a cell that runs; recordings need none")
+    if arguments.cell and option:
+        raise ConfigError(f"{option} is the choice of whoever starts the cell, not of --cell")
+    if option and (arguments.views or arguments.model):
+        raise ConfigError(f"{option} belongs to the simulated sensor, not to real recordings")
 
 
 def _missing(error: ImportError) -> ConfigError:

@@ -83,7 +83,8 @@ class FolderLock:
         if len(words) != 2:
             return "another process"
         pid, host = words
-        return f"process {pid} on host {host}" + (" (this one)" if pid == str(os.getpid()) else "")
+        mine = words == [str(os.getpid()), socket.gethostname()]
+        return f"process {pid} on host {host}" + (" (this one)" if mine else "")
 
     def close(self) -> None:
         """Let the folder go; twice is harmless."""

@@ -87,6 +87,21 @@ def test_run_takes_options_and_roles_from_the_command_line(module, spawn, until,
     assert "stopped: actor heart after" in rest
 
 
+def test_an_actor_of_another_host_with_the_number_of_this_process_is_listed(
+    module, spawn, until, cell_file, enact, monkeypatch
+):
+    """In containers most processes have the same few numbers."""
+    words = ("my_actors:Beat", "--world", "online=training")
+    actor = spawn("actor", "run", *words, "--cell", cell_file)
+    until(actor, "ready: actor Beat")
+    monkeypatch.setattr("os.getpid", lambda: actor.pid)
+    monkeypatch.setattr("socket.gethostname", lambda: "another")
+
+    listed = enact("actor", "ls", "--json", "--cell", cell_file).json
+
+    assert [(info["actor"], info["pid"]) for info in listed] == [("Beat", actor.pid)]
+
+
 @pytest.mark.parametrize(
     ("words", "reason"),
     [

@@ -13,6 +13,8 @@ import pytest
         (("--views", "d", "--model", "m", "--scene", "s"), "--views trains"),
         (("--views", "d", "--packages", "3"), "--packages belongs to the simulated sensor"),
         (("--views", "d", "--keep-running"), "--keep-running belongs to the simulated sensor"),
+        (("--cell", "c", "--seed", "3"), "--seed is the choice of whoever starts the cell"),
+        (("--cell", "c", "--views", "d"), "--cell watches a cell that runs"),
     ],
 )
 def test_options_that_do_not_fit_are_refused(enact, words, reason):

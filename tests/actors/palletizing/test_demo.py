@@ -11,13 +11,14 @@ pytest.importorskip("open3d", exc_type=ImportError)
 
 from actors.geometry.shapes import Surface
 from actors.palletizing.demo import SEED, run_demo
-from actors.palletizing.demo_cell import TEMPLATE, configured
+from actors.palletizing.demo_cell import TEMPLATE, configured, watched_cell
 from actors.palletizing.demo_pictures import model_picture, tray_picture
 from actors.palletizing.demo_report import report_bytes, rows_of, score_of
 from actors.palletizing.feedback import sentence
 from actors.palletizing.simulation.packages import KINDS, package_sequence
 from actors.palletizing.simulation.products import product_mesh
 from actors.palletizing.vocabulary import Deviation, Notice
+from enact_dist.errors import ConfigError
 
 
 def flag(verdict, product="milk_carton"):
@@ -111,6 +112,26 @@ def test_tray_picture_shows_the_region_in_red(tray):
 
     assert red(with_region) > 0.003
     assert red(without) == 0.0
+
+
+def test_a_watched_cell_says_what_comes(tmp_path):
+    """Packages and seed of a cell that others run are those of its own sensor."""
+    file = tmp_path / "cell.toml"
+    file.write_text(configured(TEMPLATE.read_text(), packages=5, seed=3, data=tmp_path))
+
+    watched = watched_cell(file)
+
+    assert (watched.packages, watched.seed) == (5, 3)
+
+
+def test_a_cell_whose_truth_nobody_knows_is_not_scored(tmp_path):
+    """A real sensor in the place of the simulated one is named."""
+    file = tmp_path / "cell.toml"
+    simulated = "actors.palletizing.simulation.sensors:tray_sensor?packages=12&seed=59"
+    file.write_text(TEMPLATE.read_text().replace(simulated, "plant.camera:overhead"))
+
+    with pytest.raises(ConfigError, match=r"'plant\.camera:overhead', which names no packages"):
+        watched_cell(file)
 
 
 def test_demo_refuses_to_run_without_packages(tmp_path, capsys):
