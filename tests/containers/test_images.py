@@ -1,0 +1,119 @@
+"""Both images: built without a network, small, without rights, and able to do their work."""
+
+import json
+
+import pytest
+
+pytestmark = pytest.mark.containers
+
+MEGABYTES_MAX = {"core": 300, "perception": 850}
+BARE = ("run", "--rm", "--network", "none", "--read-only", "--cap-drop", "ALL", "--tmpfs", "/tmp")
+"""A container without network, rights, or a place to write but /tmp."""
+
+
+@pytest.fixture(scope="module")
+def inspect(engine, images):
+    """Return what the engine knows of an image."""
+
+    def ask(target):
+        return json.loads(engine.docker("image", "inspect", f"enact-{target}").stdout)[0]
+
+    return ask
+
+
+@pytest.mark.parametrize("target", MEGABYTES_MAX)
+def test_an_image_is_small(inspect, target):
+    size = inspect(target)["Size"] / 1e6
+
+    assert size <= MEGABYTES_MAX[target], f"enact-{target}: {size:.0f} MB"
+
+
+@pytest.mark.parametrize("target", MEGABYTES_MAX)
+def test_an_image_says_what_it_is_and_starts_enact_without_a_shell(inspect, target):
+    config = inspect(target)["Config"]
+
+    assert config["User"] == "10001:10001"
+    assert config["Entrypoint"] == ["enact"]
+    assert config["Labels"]["org.opencontainers.image.title"] == f"enact-{target}"
+
+
+@pytest.mark.parametrize("target", MEGABYTES_MAX)
+def test_enact_runs_without_rights_on_a_read_only_root(engine, images, target):
+    said = engine.docker(*BARE, f"enact-{target}", "--version").stdout
+
+    assert said.startswith("enact-dist ")
+
+
+def python(engine, target, text, *options):
+    """Run Python in a container; return the process."""
+    return engine.docker(
+        *BARE, *options, "--entrypoint", "python", f"enact-{target}", "-c", text, check=False
+    )
+
+
+def test_perception_loads_open3d_and_computes_with_it(engine, images):
+    """Its shared libraries are there, and what was left out of the image is not missed."""
+    done = python(
+        engine,
+        "perception",
+        "import os, open3d as o3d, cv2, scipy.ndimage;"
+        "cloud = o3d.geometry.TriangleMesh.create_sphere().sample_points_uniformly(500);"
+        "cloud.estimate_normals();"
+        "print(os.getuid(), len(cloud.normals))",
+    )
+
+    assert (done.returncode, done.stdout) == (0, "10001 500\n"), done.stderr
+
+
+def test_core_has_no_open3d(engine, images):
+    done = python(engine, "core", "import open3d")
+
+    assert "No module named 'open3d'" in done.stderr
+
+
+def test_a_write_outside_of_the_volumes_is_refused(engine, images):
+    done = python(engine, "core", "open('/var/lib/enact/note', 'w')")
+
+    assert "Read-only file system" in done.stderr
+
+
+def test_a_fresh_volume_belongs_to_the_user_of_the_image(engine, images):
+    done = python(engine, "core", "open('/var/lib/enact/note', 'w')", "--volume", "/var/lib/enact")
+
+    assert done.returncode == 0, done.stderr
+
+
+def test_everything_is_compiled(engine, images):
+    """On a read-only root a module without its .pyc is compiled at every start."""
+    done = python(
+        engine,
+        "perception",
+        "import sys, os, numpy, zenoh, rich.table, open3d, enact_dist.cli.main;"
+        "print([m.__file__ for m in sys.modules.values() if getattr(m, '__cached__', None)"
+        " and m.__file__.startswith('/opt') and not os.path.exists(m.__cached__)])",
+    )
+
+    assert done.stdout == "[]\n", done.stdout + done.stderr
+
+
+def test_a_shard_in_a_container_answers_its_check(engine, images):
+    """With nothing to write to but its volume."""
+    cell = 'name = "one"\nworlds = ["online"]\n[shards.left]\nlisten = "tcp/127.0.0.1:7447"\n'
+    file = engine.folder / "cell.toml"
+    file.write_text(cell + 'folder = "/var/lib/enact/left"\n', "utf-8")
+    engine.docker(
+        *("run", "--detach", "--name", "left", "--network", "none", "--read-only", "--init"),
+        *("--cap-drop", "ALL", "--tmpfs", "/tmp", "--volume", "/var/lib/enact"),
+        *("--volume", f"{file}:/etc/enact/cell.toml:ro"),
+        *("enact-core", "shard", "run", "left", "--cell", "/etc/enact/cell.toml"),
+    )
+    try:
+        asked = engine.docker(
+            *("exec", "left", "enact", "shard", "check", "left"),
+            *("--cell", "/etc/enact/cell.toml", "--ready", "--timeout", "30s"),
+            check=False,
+        )
+        log = engine.docker("logs", "left").stderr
+        assert asked.returncode == 0, asked.stdout + asked.stderr + log
+    finally:
+        engine.docker("rm", "--force", "--volumes", "left")
