@@ -7,6 +7,8 @@ recipe.  A folder appears whole or not at all, so an interrupted run leaves noth
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import hashlib
 import os
 import platform
@@ -14,7 +16,7 @@ import re
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from environment import PYTHON, ROOT, give_up, say
@@ -51,20 +53,25 @@ def kept(name: str, recipe: str, make: Callable[[Path], None]) -> Path:
         make: Fills the folder that it is given; what it raises leaves nothing behind.
     """
     place = cache() / f"{name}-{hashlib.sha256(recipe.encode()).hexdigest()[:16]}"
-    if place.is_dir():
-        return place
-    place.parent.mkdir(parents=True, exist_ok=True)
-    part = Path(tempfile.mkdtemp(prefix=f"{name}.part-", dir=place.parent))
-    try:
-        make(part)
-        part.chmod(0o755)
-        part.rename(place)
-    except OSError:
-        if not place.is_dir():  # else another run was faster
-            raise
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
+    with alone(name):
+        if not place.is_dir():
+            part = Path(tempfile.mkdtemp(prefix=f"{name}.part-", dir=place.parent))
+            try:
+                make(part)
+                part.chmod(0o755)
+                part.rename(place)
+            finally:
+                shutil.rmtree(part, ignore_errors=True)
     return place
+
+
+@contextlib.contextmanager
+def alone(name: str) -> Iterator[None]:
+    """Let one process at a time work on something; others wait, and find it done."""
+    cache().mkdir(parents=True, exist_ok=True)
+    with (cache() / f"{name}.lock").open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
 
 
 def run(*words: str, cwd: Path | None = None) -> None:
@@ -107,7 +114,7 @@ def base() -> Path:
 
 def pip() -> list[str]:
     """Return how pip is called here."""
-    for python in (shutil.which("python3"), str(PYTHON)):
+    for python in (shutil.which("python3"), shutil.which(PYTHON)):
         words = [str(python), "-m", "pip", "--disable-pip-version-check"]
         if (
             python
@@ -143,15 +150,22 @@ def wheels() -> Path:
 
 def fill_wheels() -> None:
     """Make deploy/wheels hold exactly what a build without network needs."""
-    shutil.rmtree(WHEELS, ignore_errors=True)
-    WHEELS.mkdir()
-    for file in (*wheels().glob("*.whl"), *base().glob("*.deb")):
-        shutil.copy2(file, WHEELS)
+    files = [*wheels().glob("*.whl"), *base().glob("*.deb")]
+    with alone("filling"):
+        shutil.rmtree(WHEELS, ignore_errors=True)
+        WHEELS.mkdir()
+        for file in files:
+            try:
+                os.link(file, WHEELS / file.name)
+            except OSError:  # another file system
+                shutil.copy2(file, WHEELS)
 
 
 def compose_plugin() -> Path:
     """Return the program docker-compose of Debian's first release that has version 2."""
     found = Path("/etc/apt/sources.list.d/debian.sources")
+    if not found.is_file():
+        give_up("no compose plugin: install docker-compose-v2 or docker-compose-plugin")
 
     def make(folder: Path) -> None:
         say("fetching the compose plugin (13 MB, once)")

@@ -1,8 +1,10 @@
 """Both images: built without a network, small, without rights, and able to do their work."""
 
 import json
+import re
 
 import pytest
+from engine import ROOT
 
 pytestmark = pytest.mark.containers
 
@@ -63,6 +65,21 @@ def test_perception_loads_open3d_and_computes_with_it(engine, images):
     )
 
     assert (done.returncode, done.stdout) == (0, "10001 500\n"), done.stderr
+
+
+@pytest.mark.parametrize("target", MEGABYTES_MAX)
+def test_an_image_misses_nothing_but_what_was_left_out(engine, images, target):
+    """The locks were made for another machine: here the packages themselves are asked."""
+    done = engine.docker(
+        *(*BARE, "--entrypoint", "pip", f"enact-{target}"),
+        *("--python", "/opt/venv/bin/python", "check"),
+        check=False,
+    )
+    missing = set(re.findall(r"requires (\S+), which is not installed", done.stdout))
+    left_out = (ROOT / "deploy" / "requirements" / "left_out.txt").read_text("utf-8")
+
+    assert missing == (set() if target == "core" else set(re.findall(r"^[\w-]+", left_out, re.M)))
+    assert missing or done.returncode == 0, done.stdout + done.stderr
 
 
 def test_core_has_no_open3d(engine, images):

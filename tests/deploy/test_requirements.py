@@ -1,0 +1,71 @@
+"""What images install is what pyproject.toml asks for, pinned to files that cannot change."""
+
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+ROOT = Path(__file__).parents[2]
+FOLDER = ROOT / "deploy" / "requirements"
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
+IN_THE_IMAGE = {"sys_platform": "linux", "platform_machine": "x86_64", "python_version": "3.11"}
+REMEDY = "run ./deploy/images --lock"
+
+
+def pins(lock):
+    """Return the version of each package in a lock file."""
+    text = (FOLDER / lock).read_text("utf-8")
+    return dict(re.findall(r"^([\w.-]+)==(\S+)", text, re.MULTILINE))
+
+
+def asked(lock):
+    """Return what pyproject.toml asks for in the place that a lock file serves."""
+    project = PROJECT["project"]
+    extras = project["optional-dependencies"]
+    texts = {
+        "build.txt": PROJECT["build-system"]["requires"],
+        "core.txt": project["dependencies"],
+        "perception.txt": project["dependencies"] + extras["actors"] + extras["record"],
+    }[lock]
+    found = [Requirement(text) for text in texts]
+    return [one for one in found if one.marker is None or one.marker.evaluate(IN_THE_IMAGE)]
+
+
+@pytest.mark.parametrize("lock", ["build.txt", "core.txt", "perception.txt"])
+def test_a_lock_holds_what_the_project_asks_for(lock):
+    pinned = pins(lock)
+    for requirement in asked(lock):
+        version = pinned.get(canonicalize_name(requirement.name))
+        assert version in requirement.specifier, f"{requirement}: {version} in {lock}; {REMEDY}"
+
+
+@pytest.mark.parametrize("lock", ["build.txt", "core.txt", "perception.txt"])
+def test_every_pin_names_the_hashes_of_its_files(lock):
+    entries = re.split(r"^(?=[\w.-]+==)", (FOLDER / lock).read_text("utf-8"), flags=re.MULTILINE)
+
+    assert len(entries) > 1
+    assert [entry for entry in entries[1:] if "--hash=sha256:" not in entry] == []
+
+
+def test_both_images_have_the_same_core():
+    """An image is the other one and more: a cell mixes them."""
+    perception = pins("perception.txt")
+
+    assert {name: perception.get(name) for name in pins("core.txt")} == pins("core.txt")
+
+
+def test_what_is_left_out_is_in_no_lock():
+    left_out = re.findall(r"^[\w-]+", (FOLDER / "left_out.txt").read_text("utf-8"), re.MULTILINE)
+
+    assert left_out
+    assert set(left_out) & set(pins("perception.txt")) == set(), REMEDY
+
+
+def test_build_tools_are_asked_for_in_one_way():
+    """The lock is made from a file of its own, as no tool reads the table `build-system`."""
+    text = (FOLDER / "build.in").read_text("utf-8")
+
+    assert text.split() == PROJECT["build-system"]["requires"]
