@@ -16,4 +16,4 @@ while read -r pattern; do
     find . -path "./$pattern" -prune -exec rm -r {} +
 done <"$here/unused.txt"
 # Compiled here, as nothing can be compiled later on a read-only root: programs start at once.
-"$python" -m compileall -q -j 0 --invalidation-mode unchecked-hash .
+"$python" -m compileall -q -j 0 .

@@ -78,7 +78,9 @@ def test_an_image_misses_nothing_but_what_was_left_out(engine, images, target):
     missing = set(re.findall(r"requires (\S+), which is not installed", done.stdout))
     left_out = (ROOT / "deploy" / "requirements" / "left_out.txt").read_text("utf-8")
 
-    assert missing == (set() if target == "core" else set(re.findall(r"^[\w-]+", left_out, re.M)))
+    assert missing == (
+        set() if target == "core" else set(re.findall(r"^[\w-]+", left_out, re.MULTILINE))
+    )
     assert missing or done.returncode == 0, done.stdout + done.stderr
 
 
@@ -127,7 +129,7 @@ def test_a_shard_in_a_container_answers_its_check(engine, images):
     try:
         asked = engine.docker(
             *("exec", "left", "enact", "shard", "check", "left"),
-            *("--cell", "/etc/enact/cell.toml", "--ready", "--timeout", "30s"),
+            *("--cell", "/etc/enact/cell.toml", "--ready", "--timeout", "30"),
             check=False,
         )
         log = engine.docker("logs", "left").stderr
