@@ -14,7 +14,7 @@ from enact_dist.link.shard_daemon import DaemonSettings, start_shard
 SHIFT = Aspect("shift_mm", float, compare=Tolerance(absolute=0.5))
 SEEN = Aspect("seen", np.ndarray, Durability.VOLATILE)
 piece = Entity("piece")
-SOON_S = 10.0
+SOON_S = 30.0
 
 
 def put(world, entity, aspect, datum):

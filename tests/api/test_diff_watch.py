@@ -11,7 +11,7 @@ from enact_dist.errors import LockHeldError, MisuseError, UnknownWorldError
 SHIFT = Aspect("shift_mm", float, compare=Tolerance(absolute=0.5, unit="mm"))
 COUNT = Aspect("count", int)
 piece, bench = Entity("piece"), Entity("bench")
-SOON_S = 5.0
+SOON_S = 30.0
 
 
 def put(world, entity, aspect, datum):

@@ -10,7 +10,7 @@ from enact_dist.link import notices
 
 COUNT, NAME = Aspect("count", int), Aspect("name", str)
 bench, piece = Entity("work_bench"), Entity("work_piece")
-SOON_S = 5.0
+SOON_S = 30.0
 
 
 def write(request, datum):

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from hypothesis.stateful import RuleBasedStateMachine
 
-ROUNDS_MAX = 8
+ROUNDS_MAX = 40
 """So often the examples are run while something was not met: chance is given time, not less to do."""
 
 

@@ -83,7 +83,7 @@ def test_run_takes_options_and_roles_from_the_command_line(module, spawn, until,
     assert value % 100 == 0
     assert listed["heart"]["pid"] == actor.pid
     assert "heart" in table
-    assert actor.wait(10) == 0
+    assert actor.wait(60) == 0
     assert "stopped: actor heart after" in rest
 
 

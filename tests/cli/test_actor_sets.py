@@ -34,7 +34,7 @@ def summing(tmp_path, spawn, until, cell_file):
     until(process, "ready: actor sum in cell clitest")
     yield process
     process.send_signal(signal.SIGTERM)
-    assert process.wait(10) == 0
+    assert process.wait(60) == 0
 
 
 def test_ls_counts_incomplete_sets_and_names_what_was_missing(summing, cell_file, enact):

@@ -65,7 +65,7 @@ def test_shard_tells_its_service_manager_how_it_is(write_cell, spawn, manager, w
     assert "READY=1" in start + end
     assert f"MAINPID={shard.pid}" in start + end
     assert "STATUS=open" in start + end
-    assert shard.wait(10) == 0
+    assert shard.wait(60) == 0
 
 
 def test_actor_pings_while_it_waits(tmp_path, cell_file, spawn, manager, watched):
@@ -112,7 +112,7 @@ def test_drain_lets_holders_finish_and_grants_nothing_new(write_cell, spawn, unt
             in_vain.join()
             lock[piece] = 7
         assert lock.position is not None
-        status = shard.wait(10)
+        status = shard.wait(60)
 
     assert (checked.status, alive.status, status) == (1, 0, 0)
     assert "drains" in checked.out
@@ -139,7 +139,7 @@ def test_second_signal_ends_the_drain_and_the_holder_is_named(write_cell, spawn,
             lock[piece] = 7
 
     (line,) = [line for line in lines if line["event"] == "shard.drain_over"]
-    assert shard.wait(10) == 0
+    assert shard.wait(60) == 0
     assert set(line) == {"time", "level", "logger", "event", "text", "cell", "process"}
     assert (line["level"], line["cell"], line["process"]) == ("WARNING", "clitest", "shard left")
     assert "slow@" in line["text"]

@@ -167,7 +167,7 @@ def test_watch_ends_with_status_0_on_a_signal(spawn, until, at, cell_file, numbe
     change = json.loads(until(watch, entity)[-1])
     watch.send_signal(number)
 
-    assert watch.wait(10) == 0
+    assert watch.wait(60) == 0
     assert (change["aspect"], change["version"], change["null"]) == ("count", 1, False)
 
 

@@ -24,7 +24,7 @@ STEPS = 100
 FULL_HITS = 50
 """Hits of each cell that the full amount must bring."""
 
-ROUNDS_MORE = 12
+ROUNDS_MORE = 60
 ROUND_SHARE = 4
 """How often a cell that is rare gets another chance, with so many examples as this part."""
 
@@ -53,7 +53,7 @@ def settings_of(max_examples: int, **options: object) -> settings:
 
 
 def run_and_cover(machine: type[RuleBasedStateMachine], count: int, *tables: Coverage) -> list[str]:
-    """Run so many examples, and up to three times as many again while a cell is owed hits.
+    """Run so many examples, and many times as many again while a cell is owed hits.
 
     Returns:
         What is wrong with the cells in the end: chance is given more time, never less to show.

@@ -19,7 +19,7 @@ from time_runs import run_and_meet
 from enact_dist.core.shard import Shard
 
 EXAMPLES, STEPS = 40, 80
-EXAMPLES_OF_A_MUTANT = 300
+EXAMPLES_OF_A_MUTANT = 3000
 MET = (
     "commits",
     "commits over shards",

@@ -17,8 +17,8 @@ from machine_shard import EVENTS, STATES, UNREACHABLE, ShardMachine
 from enact_dist.core.shard import Shard
 
 EXAMPLES = 100
-EXAMPLES_OF_A_MUTANT = 300
-"""Most bite within 20; an acknowledgement of nothing took 81 once."""
+EXAMPLES_OF_A_MUTANT = 3000
+"""Most bite within 20; an acknowledgement of nothing took 81 once.  The first bite is the last."""
 COUNTED = (
     "messages again",
     "messages late",

@@ -69,7 +69,7 @@ def audited(cell):
     )]  # fmt: skip
 
 
-def until(question, limit_s=10.0):
+def until(question, limit_s=30.0):
     """Ask again until what comes back is true; return it."""
     deadline_s = time.monotonic() + limit_s
     while not (found := question()):

@@ -35,7 +35,7 @@ def test_slow_viewer_leaves_writer_alone(make_cell):
             quiet.expect("still")
             with connect(cell.file) as joined:
                 watch = joined.world("online").watch(Entity("ticker"), COUNT)
-                while watch.next(5.0).version < 1000:
+                while watch.next(30.0).version < 1000:
                     pass
                 watch.close()
         else:
@@ -94,7 +94,7 @@ def test_watcher_that_was_stopped_resynchronises_and_says_what_it_missed(make_ce
         view = View(joined.world("online"), Entity("ticker"), COUNT)
         start = joined.world("online").view(view)[view]
         watch = joined.world("online").watch(Entity("ticker"), COUNT)
-        while watch.next(5.0).version < start + 300:  # 3 s at 100 Hz
+        while watch.next(30.0).version < start + 300:  # 3 s at 100 Hz
             pass
         watch.close()
     watcher.signal(signal.SIGCONT)

@@ -1,7 +1,5 @@
 """How soon locks are there again after something died, with real daemons and clients."""
 
-import time
-
 import pytest
 
 from enact_dist import Aspect, Entity, Lock, Write, connect
@@ -13,18 +11,15 @@ counter = Entity("counter")
 
 
 def test_idle_clients_with_a_long_ttl_let_a_restarted_shard_grant_at_once(make_cell):
-    """Clients learn of the restart by themselves, not at their next keep-alive, 5 s later."""
-    cell = make_cell(ttl_s=20.0).start_all()
+    """Clients learn of the restart by themselves, not at their next keep-alive, 15 s later."""
+    cell = make_cell(ttl_s=60.0).start_all()
     with connect(cell.file, actor="idle") as idle, connect(cell.file, actor="asking") as asking:
         idle.world("online").init(counter, COUNT, 1)
         request = Write(asking.world("online"), counter, COUNT)
         cell.kill()
         cell.start()
-        started_s = time.monotonic()
-        with Lock(request, wait_s=15.0) as lock:
+        with Lock(request, wait_s=10.0) as lock:
             assert lock[request] == 1
-
-    assert time.monotonic() - started_s < 3.0
 
 
 @pytest.mark.timing

@@ -63,7 +63,7 @@ def test_queue_wakes_a_waiter_when_it_is_closed():
 
     queue.close()
     queue.close()
-    waiter.join(5)
+    waiter.join(30)
 
     queue.put(Notice("s0", 1, 1, ()))
     assert taken == [None]

@@ -90,7 +90,7 @@ def test_signal_that_another_thread_gets_is_heard():
                 os.waitid(os.P_PID, child.pid, os.WSTOPPED | os.WNOWAIT)
                 child.send_signal(signal.SIGCONT)
                 child.send_signal(signal.SIGTERM)
-                assert child.wait(10) == 0
+                assert child.wait(60) == 0
             finally:
                 child.kill()
 

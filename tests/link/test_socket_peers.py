@@ -2,7 +2,6 @@
 
 import os
 import socket
-import statistics
 import threading
 import time
 
@@ -68,46 +67,48 @@ for name in os.listdir("/proc/self/fd"):
 """
 
 
-def next_grant_s(endpoint, before):
-    """Wait for the lock on the cup while `before()` happens; return how long the grant took."""
+@pytest.fixture
+def long_leases(monkeypatch):
+    """What a lease alone frees, it frees after three times as long as the next one waits."""
+    monkeypatch.setenv("ENACT_SESSION_TTL_S", "60")
+
+
+def wait_while(endpoint, happens):
+    """Wait for the lock on the cup while `happens()`, until it is granted."""
     with connect(endpoint, actor="next") as cell:
         request = Write(cell.world("online"), CUP, COUNT)
         add_one(cell, Entity("warm"))
-        started = threading.Event()
-        granted_s = []
+        granted = []
 
         def wait():
-            started.set()
             with Lock(request, wait_s=20.0):
-                granted_s.append(time.monotonic())
+                granted.append(request)
 
         waiting = threading.Thread(target=wait)
         waiting.start()
-        started.wait()
         while not any(not lock.granted for lock in cell.locks()):
-            time.sleep(0.002)
-        killed_s = time.monotonic()
-        before()
+            assert waiting.is_alive()
+        happens()
         waiting.join()
-        return granted_s[0] - killed_s
+        assert granted
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("long_leases")
 def test_killed_holder_loses_its_lock_at_once(daemon, endpoint, program):
     """The kernel says that the process is gone: nobody waits for the lease."""
     shard = daemon(endpoint)
-    waits_s = []
     for _ in range(5):
         process = program(HOLDER, endpoint, "socket", "pass")
         assert process.stdout.readline() == "held\n", process.stderr.read()
-        waits_s.append(next_grant_s(endpoint, process.kill))
+        wait_while(endpoint, process.kill)
 
-    assert statistics.median(waits_s) < 0.1, waits_s
     assert counters(shard)["sessions_died"] == 5
     assert "leases_expired" not in counters(shard)
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("long_leases")
 def test_killed_holder_loses_its_lock_though_a_forked_child_lives(daemon, endpoint, program):
     """A child that has inherited the connections does not keep the session alive."""
     shard = daemon(endpoint)
@@ -115,7 +116,8 @@ def test_killed_holder_loses_its_lock_though_a_forked_child_lives(daemon, endpoi
     process.stdout.readline()
     assert process.stdout.readline() == "held\n"
 
-    assert next_grant_s(endpoint, process.kill) < 0.5
+    wait_while(endpoint, process.kill)
+
     assert counters(shard)["sessions_died"] == 1
 
 
@@ -130,7 +132,7 @@ def test_living_holder_keeps_its_lock_whatever_happens_to_its_sockets(
     assert process.stdout.readline() == "held\n", process.stderr.read()
     time.sleep(1.0)
 
-    output, errors = process.communicate("\n", timeout=20)
+    output, errors = process.communicate("\n", timeout=60)
 
     assert output == "done\n", errors
     assert "sessions_died" not in counters(shard)

@@ -371,12 +371,12 @@ def _write(peer, writer, stream, number):
 
 
 def test_service_ends_in_time_though_its_threads_do_not(raw, monkeypatch):
-    """Connections that cannot be ended share one time to end; a signal has to be over in 2 s."""
+    """Connections that cannot be ended share half a second to end: 60 take no half minute."""
     monkeypatch.setattr(socket_connection.SocketConnection, "end", lambda _: None)
-    kept = [raw(f"stubborn{number}") for number in range(6)]
+    kept = [raw(f"stubborn{number}") for number in range(60)]
     started_s = time.monotonic()
 
     raw.shard._sockets.close()
 
-    assert time.monotonic() - started_s < 1.6
-    assert len(kept) == 6
+    assert time.monotonic() - started_s < 15.0
+    assert len(kept) == 60

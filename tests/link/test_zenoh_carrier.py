@@ -51,13 +51,13 @@ def test_carrier_keeps_many_calls_in_flight_at_once(daemon, carry, endpoint):
     """100 parked calls and one quick one are under way together; the quick one comes at once."""
     daemon(endpoint)
     carrier = carry(endpoint)
-    parked = [("s0", AwaitStamp(2**62, 200_000_000))] * 100
+    parked = [("s0", AwaitStamp(2**62, 900_000_000))] * 100  # 90 s one by one
     started_s = time.monotonic()
 
-    answers = carrier.request_all([*parked, ("s0", ListLocks())], timeout_s=5)
+    answers = carrier.request_all([*parked, ("s0", ListLocks())], timeout_s=30)
 
     assert [type(answer) for answer in answers] == [*[Reached] * 100, Locks]
-    assert time.monotonic() - started_s < 2.0
+    assert time.monotonic() - started_s < 20.0
 
 
 @both
@@ -77,10 +77,10 @@ def test_carrier_says_unknown_at_once_when_the_shard_is_away(daemon, carry, endp
     carrier = carry(endpoint)
     started_s = time.monotonic()
 
-    answer = carrier.request("s9", ListLocks(), timeout_s=30)
+    answer = carrier.request("s9", ListLocks(), timeout_s=600)
 
     assert answer is None
-    assert time.monotonic() - started_s < 5
+    assert time.monotonic() - started_s < 30
 
 
 def test_carrier_names_the_endpoint_when_nobody_is_there(carry, endpoint):
@@ -247,7 +247,7 @@ def test_carrier_wakes_pending_calls_when_it_is_closed(daemon, carry, endpoint):
     feed = carrier.subscribe()
 
     carrier.close()
-    waiting.join(5)
+    waiting.join(30)
 
     assert answers == [None]
     assert feed.get(None) is None
@@ -419,7 +419,7 @@ sys.stdin.read()
 
 @pytest.mark.slow
 def test_shard_sees_at_once_when_a_client_is_killed(daemon, carry, endpoint, program, until):
-    """The token of a process killed with -9 vanishes within a second, long before its lease."""
+    """The token of a process killed with -9 vanishes by itself, long before its lease of 60 s."""
     daemon(endpoint)
     watcher = carry(endpoint)
     process = program(KILLED, endpoint)
@@ -432,4 +432,4 @@ def test_shard_sees_at_once_when_a_client_is_killed(daemon, carry, endpoint, pro
     until(present)
     process.kill()
 
-    until(lambda: not present(), limit_s=1.0)
+    until(lambda: not present(), limit_s=20.0)
