@@ -79,22 +79,25 @@ class Engine:
         """Run `docker compose WORDS` as `docker` does."""
         return self.docker("compose", *words, check=check, wait_s=wait_s)
 
-    def on_network_of(self, container: str, *words: object):
-        """Run a program of this host (`ip`, `iptables`, `tc`) in a container's network; return it."""
-        inner = self.docker("inspect", "--format", "{{.State.Pid}}", container).stdout.strip()
-        return subprocess.run(
-            [*self._enter(), "nsenter", "--target", inner, "--net", *map(str, words)],
-            capture_output=True,
-            text=True,
-            check=True,
-            timeout=30,
-        )
-
-    def _enter(self) -> list[str]:
-        """Return how a command gets to see the engine's processes."""
+    def daemon(self) -> int:
+        """Return the number of the process that all of the engine's die with."""
         children = f"/proc/{self._process.pid}/task/{self._process.pid}/children"
-        first = Path(children).read_text("utf-8").split()[0]
-        return ["nsenter", "--target", first, "--mount", "--pid"]
+        return int(Path(children).read_text("utf-8").split()[0])
+
+    def inside(self, *words: object, network_of: str | None = None):
+        """Run a program of this host (`ip`, `iptables`, `tc`) among the engine's processes.
+
+        Args:
+            words: The program and its arguments.
+            network_of: The container whose network it sees; the engine's own if not given.
+        """
+        enter = ["nsenter", "--target", str(self.daemon()), "--mount", "--pid", "--net"]
+        if network_of is not None:
+            number = self.docker("inspect", "--format", "{{.State.Pid}}", network_of).stdout
+            enter += ["nsenter", "--target", number.strip(), "--net"]
+        return subprocess.run(
+            [*enter, *map(str, words)], capture_output=True, text=True, check=True, timeout=30
+        )
 
     def end(self) -> None:
         """Kill all of it and remove what it left."""
@@ -115,7 +118,8 @@ def start() -> Engine:
         NoEngineError: Something that it needs is missing here, or the engine itself gave up.
     """
     sweep()
-    if shutil.which("dockerd") is None:
+    path = f"{os.environ['PATH']}:/usr/sbin:/sbin"
+    if shutil.which("dockerd", path=path) is None:
         raise NoEngineError("dockerd: command not found (Debian package docker.io)")
     command = kept.docker_command()
     if command is None:
@@ -144,13 +148,15 @@ def start() -> Engine:
             stdout=log,
             stderr=log,
             start_new_session=True,
+            env={**os.environ, "PATH": path},
         )
     engine = Engine(folder, process, command)
     try:
         wait_until_it_answers(engine, process)
         asked = engine.compose("version", check=False)
         if asked.returncode:
-            raise NoEngineError(f"docker compose: {asked.stderr.strip().splitlines()[0]}")
+            said = asked.stderr.strip().splitlines()[0]
+            raise NoEngineError(f"{said} (./deploy/images --fetch fetches it)")
     except BaseException:
         engine.end()
         raise
