@@ -28,6 +28,7 @@ from typing import TYPE_CHECKING, Final
 import zenoh
 
 from enact_dist.errors import ConfigError, LinkError, MisuseError
+from enact_dist.link.zenoh_lingering import LingerWatch
 from enact_dist.wire.limits import BODY_BYTES_MAX, HEADER_BYTES_MAX
 
 if TYPE_CHECKING:
@@ -127,6 +128,8 @@ def open_session(
     except zenoh.ZError as error:
         raise _open_error(error, listen) from None
     _open_sessions.append((os.getpid(), session))
+    _watches[session] = watch = LingerWatch(session)
+    keep_after_fork(watch)
     return session
 
 
@@ -150,6 +153,7 @@ def _reason(error: zenoh.ZError) -> str:
 
 _open_sessions: list[tuple[int, zenoh.Session]] = []
 _owners: weakref.WeakSet[object] = weakref.WeakSet()
+_watches: dict[zenoh.Session, LingerWatch] = {}
 
 
 def close_session(session: zenoh.Session) -> None:
@@ -158,6 +162,7 @@ def close_session(session: zenoh.Session) -> None:
     if mine in _open_sessions:
         _open_sessions.remove(mine)
         session.close()  # type: ignore[no-untyped-call]  # Zenoh's stub lacks it
+        _watches.pop(session).join()
 
 
 def keep_after_fork(owner: object) -> None:
