@@ -10,7 +10,9 @@ relay between peers).  Reasons for the settings, measured with 1.10 on a loopbac
   5 s; a client waits longer, since only its own thread does, and a busy shard must not lose it.
 - `max_wait_before_drop_fragments` 2 s: slices of a large datum over a slow network are not
   dropped after 50 ms; only senders of their own ever wait for it.
-- Reconnection every 50 ms: a restarted shard is back in use after 0.1 s, not 1 s.
+- Reconnection every 50 ms: a restarted shard is back in use after 0.1 s, not 1 s.  After a cut it
+  takes up to 1 s, as often as the kernel repeats a connection that nobody answers.
+- Lost connections close at once: see `zenoh_lingering`.
 
 Sessions must be closed before the interpreter ends (it hangs otherwise), and must never be closed
 or freed in a forked child (that hangs too): `close_session` and `keep_after_fork` see to both.

@@ -44,6 +44,7 @@ class Watcher:
         self._folder, self._ttl_s, self._ahead_ns = folder, ttl_s, ahead_ns
         self._log = Journal(folder / LOG, ahead_ns=ahead_ns)
         self._doubts: dict[tuple[str, str], tuple[int, int]] = {}
+        self._final: Workload | None = None
         self._looks = 0
         self.locks_left = 0
 
@@ -80,11 +81,10 @@ class Watcher:
 
     def final(self) -> str:
         """Read everything under one lock; return what it was told."""
-        journal = Journal(self._folder / f"final{SUFFIX}", ahead_ns=self._ahead_ns)
-        work = Workload(self._cell, journal, "final", seed=0, ttl_s=self._ttl_s)
-        told = work.take_all()
-        journal.close()
-        return told.value
+        if self._final is None:
+            journal = Journal(self._folder / f"final{SUFFIX}", ahead_ns=self._ahead_ns)
+            self._final = Workload(self._cell, journal, "final", seed=0, ttl_s=self._ttl_s)
+        return self._final.take_all().value
 
     def rest(self, limit_s: float) -> int:
         """Wait until no lock is held, awaited or in doubt; return how many are left."""
