@@ -1,10 +1,11 @@
-"""`enact shard run|ls|check`."""
+"""`enact shard run|ls|check`; what is done to folders of shards stands in modules of its own."""
 
 from __future__ import annotations
 
 import os
 from typing import TYPE_CHECKING, Final
 
+from enact_dist.cli import shard_rebalance
 from enact_dist.cli.output import print_json, print_table, shown_bytes, shown_s
 from enact_dist.cli.verbs import (
     DONE,
@@ -98,6 +99,7 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
     asks.add_argument("--alive", action="store_true", help="it answers")
     add_reader(check)
     check.set_defaults(timeout_s=CHECK_S)
+    shard_rebalance.add_to(verbs)
 
 
 def run_shard(arguments: argparse.Namespace) -> int:

@@ -12,8 +12,10 @@ from typing import TYPE_CHECKING
 from enact_dist.core.records import (
     AspectRecord,
     AuditRecord,
+    BasesMoved,
     DecisionDone,
     DecisionRecord,
+    EntitiesMoved,
     ForcedEnded,
     ForcedRecord,
     HistoryForgotten,
@@ -30,7 +32,7 @@ from enact_dist.core.records import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable
 
     from enact_dist.core.datum import LockId, Slot
     from enact_dist.core.records import Record
@@ -71,6 +73,11 @@ class Ledger:
                 self.worlds[record.name] = record
             case WorldDropped():
                 self._drop(record)
+            case BasesMoved():
+                self.dropped[record.world.name] = record.world
+            case EntitiesMoved():
+                gone = frozenset(record.entities)
+                self._keep_only(lambda slot: slot.entity not in gone)
             case AspectRecord():
                 self.aspects[record.entry.name] = record
             case SessionRecord():
@@ -103,12 +110,11 @@ class Ledger:
     def _drop(self, record: WorldDropped) -> None:
         self.worlds.pop(record.name, None)
         self.dropped[record.name] = record
-        self.slots = {
-            slot: found for slot, found in self.slots.items() if slot.context != record.name
-        }
-        self.history = {
-            key: found for key, found in self.history.items() if key[0].context != record.name
-        }
+        self._keep_only(lambda slot: slot.context != record.name)
+
+    def _keep_only(self, stays: Callable[[Slot], bool]) -> None:
+        self.slots = {slot: found for slot, found in self.slots.items() if stays(slot)}
+        self.history = {key: found for key, found in self.history.items() if stays(key[0])}
 
     def recovered(self, epoch: int) -> Recovered:
         """Return everything as a store gives it back at the start of an epoch."""

@@ -42,11 +42,27 @@ class WorldRecord:
 class WorldDropped:
     """A world context and all states of its slots are gone.
 
-    If it is made again, its versions start above `version_base`: none is ever used twice.
+    If it is made again, its versions start above `version_base`: none is ever used twice.  Those of
+    `entity_bases` were moved here with slots of another shard, where they started above these.
     """
 
     name: str
     version_base: int
+    entity_bases: tuple[tuple[str, int], ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class BasesMoved:
+    """What is known of a context that was dropped once, now that entities move; drops nothing."""
+
+    world: WorldDropped
+
+
+@dataclass(frozen=True, slots=True)
+class EntitiesMoved:
+    """All slots of these entities lie at another shard: forget them with their history."""
+
+    entities: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,6 +195,8 @@ Record = (
     | SessionEnded
     | WorldRecord
     | WorldDropped
+    | BasesMoved
+    | EntitiesMoved
     | AspectRecord
     | SlotRecord
     | HistoryForgotten

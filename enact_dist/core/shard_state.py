@@ -106,7 +106,7 @@ class ShardState:
             policies=self.catalogue.policies,
             since_ns=max(self.stamps.last_ns, wall_ns),
             answer_bytes_max=ANSWER_FETCHES * settings.fetch_bytes_max,
-            version_bases={record.name: record.version_base for record in recovered.dropped},
+            dropped=recovered.dropped,
         )
         self.slots.recover_history(recovered.history, recovered.kept)
         self.sessions = SessionTable(recovered.sessions, outcomes=recovered.outcomes, now_ns=now_ns)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from enact_dist.core.history import Policy
     from enact_dist.core.messages import Item
-    from enact_dist.core.records import KeptRecord, SlotRecord
+    from enact_dist.core.records import KeptRecord, SlotRecord, WorldDropped
 
 INLINE_BYTES_MAX: Final = 64 * 1024
 """Data up to this size travel with the grant; larger ones are fetched when they are read."""
@@ -69,12 +69,13 @@ class SlotMap:
         policies: How much of its history each aspect retains; may change.
         since_ns: Stamp of the start of this epoch: what is lost is lost from then on.
         answer_bytes_max: So many bytes of small data travel with one answer.
-        version_bases: The largest version of each context that was dropped.
+        dropped: The contexts that were dropped, and above which versions theirs start now.
     """
 
     __slots__ = (
         "_answer_bytes_max",
         "_columns",
+        "_entity_bases",
         "_lost",
         "_payloads",
         "_since_ns",
@@ -91,9 +92,13 @@ class SlotMap:
         policies: Mapping[str, Policy] | None = None,
         since_ns: int = 0,
         answer_bytes_max: int = ANSWER_BYTES_MAX,
-        version_bases: Mapping[str, int] | None = None,
+        dropped: Iterable[WorldDropped] = (),
     ) -> None:
-        self._version_bases = dict(version_bases or {})
+        self._version_bases: dict[str, int] = {}
+        self._entity_bases: dict[str, dict[str, int]] = {}
+        for world in dropped:
+            self._version_bases[world.name] = world.version_base
+            self._entity_bases[world.name] = dict(world.entity_bases)
         self._answer_bytes_max = answer_bytes_max
         self._since_ns = since_ns
         self._columns: dict[Column, dict[str, Content]] = {}
@@ -134,7 +139,7 @@ class SlotMap:
         In a context that was dropped before, the first one lies above all that it had then.
         """
         version = self[slot].version
-        return (version or self._version_bases.get(slot.context, 0)) + 1
+        return version + 1 if version else self._first_version(slot)
 
     def version_base(self, context: str) -> int:
         """Return the largest version of a context, the nulls of a drop counted as versions."""
@@ -145,6 +150,7 @@ class SlotMap:
         """Forget all slots of a context with their past, and return them."""
         gone = list(self.of_context(context))
         self._version_bases[context] = self.version_base(context)
+        self._entity_bases[context] = {}
         self.history.drop(slot for slot, _ in gone)
         for slot, content in gone:
             self._lost.discard(slot)
@@ -197,7 +203,10 @@ class SlotMap:
         return found.states[0] if found is not None and found.states else newest
 
     def _first_version(self, slot: Slot) -> int:
-        return self._version_bases.get(slot.context, 0) + 1
+        base = self._version_bases.get(slot.context, 0)
+        if base:
+            base = self._entity_bases[slot.context].get(slot.entity, base)
+        return base + 1
 
     def forgotten(self, items: Iterable[Item], at_ns: int) -> Forgotten | None:
         """Return what is asked and not known any more as of a stamp, None if all is known."""

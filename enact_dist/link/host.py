@@ -25,6 +25,7 @@ import logging
 import threading
 import time
 from collections import deque
+from contextlib import ExitStack
 from typing import TYPE_CHECKING, Final, cast
 
 from enact_dist.core.epochs import state_of, unkept_epoch
@@ -100,7 +101,7 @@ def open_host(
     """Open a shard's folder and run the shard; without a folder nothing outlives the process.
 
     Raises:
-        StoreError: The folder is in use, unreadable or corrupt.
+        StoreError: The folder is in use, unreadable or corrupt, or has entities of other shards.
     """
     clock = clock or SystemClock()
     wall_ns = clock.wall_ns()
@@ -108,8 +109,13 @@ def open_host(
         store, recovered = None, Recovered(epoch=unkept_epoch(wall_ns))
     else:
         from enact_dist.link.store import open_store
+        from enact_dist.link.store_folder import refuse_strangers
 
         store, recovered = open_store(folder, unix_s=wall_ns // 1_000_000_000)
+        with ExitStack() as undo:
+            undo.callback(store.close)
+            refuse_strangers(folder, recovered, settings.name, settings.placement)
+            undo.pop_all()
     shard = Shard(settings, recovered, now_ns=clock.monotonic_ns(), wall_ns=wall_ns)
     return ShardHost(
         shard,

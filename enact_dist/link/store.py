@@ -27,15 +27,23 @@ stays one when it is replaced.  Rules that a change must keep:
 from __future__ import annotations
 
 import sqlite3
+from contextlib import closing, contextmanager
 from typing import TYPE_CHECKING, Final
 
+from enact_dist.core.records import Recovered
 from enact_dist.errors import StoreError
 from enact_dist.link.blobs import Blob, BlobFolder
 from enact_dist.link.folder_lock import FolderLock, check_format, sync_folder
 from enact_dist.link.store_batch import Batch
 from enact_dist.link.store_database import Database, DatabaseRow
 from enact_dist.link.store_errors import store_error
-from enact_dist.link.store_folder import BLOB_FOLDER, DATABASE_FILE, check_log, look_at
+from enact_dist.link.store_folder import (
+    BLOB_FOLDER,
+    DATABASE_FILE,
+    check_log,
+    look_at,
+    refuse_moving,
+)
 from enact_dist.link.store_mark import MarkFile
 from enact_dist.link.store_outcomes import Outcomes
 from enact_dist.link.store_recovery import Contents, open_database, put_together, read_blobs
@@ -49,22 +57,23 @@ from enact_dist.link.store_rows import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
 
-    from enact_dist.core.records import Persist, Recovered
+    from enact_dist.core.records import Persist
 
 LOG_BYTES: Final = 8 << 20
 """About so much is written to the log before it is carried into the database."""
 _ROW_LOG_BYTES: Final = 8 << 10
 
 
-def open_store(folder: Path, *, unix_s: int) -> tuple[Store, Recovered]:
+def open_store(folder: Path, *, unix_s: int, moving: bool = False) -> tuple[Store, Recovered]:
     """Open the data folder of a shard, checked (see `store_recovery`), in a new, durable epoch.
 
     Args:
         folder: Made if it does not exist.
         unix_s: The wall clock, seconds since 1970; the epoch is this or one more than the last.
+        moving: Whether entities may be on their way from or to the folder.
 
     Returns:
         The store, and everything it holds; large bodies are read-only maps of their files.
@@ -78,6 +87,8 @@ def open_store(folder: Path, *, unix_s: int) -> tuple[Store, Recovered]:
     except OSError as failure:
         raise store_error(folder, failure) from failure
     try:
+        if not moving:
+            refuse_moving(folder)
         return _open_locked(folder, lock, unix_s)
     except BaseException as failure:
         lock.close()
@@ -86,7 +97,28 @@ def open_store(folder: Path, *, unix_s: int) -> tuple[Store, Recovered]:
         raise
 
 
-def _open_locked(folder: Path, lock: FolderLock, unix_s: int) -> tuple[Store, Recovered]:
+@contextmanager
+def read_store(folder: Path) -> Iterator[Recovered]:
+    """Show what a folder holds, checked as `open_store` does; its epoch is the stored one.
+
+    The folder stays as it is, and locked meanwhile.  One that is not there holds nothing.
+
+    Raises:
+        StoreError: As `open_store`.
+    """
+    if not folder.exists():
+        yield Recovered(epoch=0)
+        return
+    with closing(FolderLock(folder)):
+        try:
+            database, contents = _read_locked(folder)
+        except (OSError, sqlite3.Error) as failure:
+            raise store_error(folder, failure) from failure
+        with closing(database):
+            yield contents.recovered
+
+
+def _read_locked(folder: Path) -> tuple[Database, Contents]:
     found = look_at(folder)
     check_format(folder, is_new=found.is_new)
     check_log(folder, power_cut=found.power_cut)
@@ -96,12 +128,21 @@ def _open_locked(folder: Path, lock: FolderLock, unix_s: int) -> tuple[Store, Re
         sync_folder(folder)
     database, contents = open_database(folder, found)
     try:
-        epoch = max(contents.recovered.epoch + 1, unix_s)
         (folder / BLOB_FOLDER).mkdir(exist_ok=True)
-        blobs = BlobFolder(folder / BLOB_FOLDER, epoch=epoch)
+        blobs = BlobFolder(folder / BLOB_FOLDER, epoch=contents.recovered.epoch)
         read_blobs(contents, blobs, power_cut=found.power_cut)
         put_together(contents, folder / DATABASE_FILE)
-        contents.recovered.epoch = epoch
+    except BaseException:
+        database.close()
+        raise
+    return database, contents
+
+
+def _open_locked(folder: Path, lock: FolderLock, unix_s: int) -> tuple[Store, Recovered]:
+    database, contents = _read_locked(folder)
+    try:
+        epoch = contents.recovered.epoch = max(contents.recovered.epoch + 1, unix_s)
+        blobs = BlobFolder(folder / BLOB_FOLDER, epoch=epoch)
         store = Store(folder, lock=lock, database=database, blobs=blobs, contents=contents)
         store._begin(contents, wall_ns=unix_s * 1_000_000_000)  # noqa: SLF001 - its constructor
     except BaseException:
@@ -165,6 +206,16 @@ class Store:
                 acknowledged, and the store takes no more.
         """
         self._guarded(lambda: self._write(batch))
+
+    def raise_epoch(self, epoch: int) -> None:
+        """Let every later start come after `epoch`, in which another shard had some of its data.
+
+        Raises:
+            StoreError: As in `write`.
+        """
+        self._epoch = max(self._epoch, epoch)
+        changes: dict[Key, bytes | None] = {EPOCH_KEY: epoch_body(self._epoch)}
+        self._guarded(lambda: self._commit(changes, forced=True))
 
     def rest(self) -> None:
         """Do what can wait until a batch is acknowledged: unlink files, shorten the log.

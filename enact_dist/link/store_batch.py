@@ -12,8 +12,10 @@ from typing import TYPE_CHECKING, NamedTuple
 from enact_dist.core.records import (
     AspectRecord,
     AuditRecord,
+    BasesMoved,
     DecisionDone,
     DecisionRecord,
+    EntitiesMoved,
     ForcedEnded,
     ForcedRecord,
     HistoryForgotten,
@@ -60,6 +62,8 @@ from enact_dist.link.store_states import State, States
 from enact_dist.terms import Durability
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from enact_dist.core.datum import LockId, Slot
     from enact_dist.core.messages import Cause
     from enact_dist.core.records import Persist, Record
@@ -130,6 +134,8 @@ class Batch:
                         self._forget(slot, version)
                 case WorldDropped():
                     self._drop(record)
+                case EntitiesMoved():
+                    self._move_out(frozenset(record.entities))
                 case PreparedRecord():
                     self._prepare(record, durable=durable)
                 case PreparedEnded():
@@ -167,10 +173,16 @@ class Batch:
 
     def _drop(self, record: WorldDropped) -> None:
         self.changes[key_of(Kind.WORLD, record.name)] = None
-        for key in self._states.of_context(record.name):
-            self._remove(key)
+        self._remove_slots(lambda slot: slot.context == record.name)
         key, body = dropped_row(record)
         self.changes[key] = body
+
+    def _move_out(self, entities: frozenset[str]) -> None:
+        self._remove_slots(lambda slot: slot.entity in entities)
+
+    def _remove_slots(self, goes: Callable[[Slot], bool]) -> None:
+        for key in self._states.take_out(goes):
+            self._remove(key)
 
     def _remove(self, key: Key) -> None:
         """Let a state's row go; what it names goes once everything else is settled."""
@@ -231,6 +243,8 @@ class Batch:
                 key, body = outcome_row(record)
             case WorldRecord():
                 key, body = world_row(record)
+            case BasesMoved():
+                key, body = dropped_row(record.world)
             case AspectRecord():
                 key, body = aspect_row(record.entry)
             case KeptRecord():

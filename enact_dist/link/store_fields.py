@@ -43,6 +43,11 @@ class Fields:
         """Whether there is no field at all."""
         return not self._fields
 
+    @property
+    def at_end(self) -> bool:
+        """Whether all fields were taken."""
+        return self._next == len(self._fields)
+
     def next(self, asked: type[T]) -> T:
         """Take the next field, which must be of this type."""
         if self._next >= len(self._fields):
@@ -63,7 +68,7 @@ class Fields:
 
     def end(self) -> None:
         """Make sure that nothing is left."""
-        if self._next != len(self._fields):
+        if not self.at_end:
             raise DamagedRowError(f"{reprlib.repr(self._fields)} has more than {self._next} fields")
 
     def slot(self) -> Slot:

@@ -6,20 +6,27 @@ each check ends in a `StoreError` that names the file and the way out.
 
 from __future__ import annotations
 
+import json
 import logging
 import shutil
 from typing import TYPE_CHECKING, Final, NamedTuple, NoReturn
 
+from enact_dist.core.moving import NAMED_MAX, strangers
 from enact_dist.errors import StoreError
+from enact_dist.link.folder_lock import FORMAT_FILE
 from enact_dist.link.store_mark import Mark, read_mark
 from enact_dist.link.wal_check import check_wal
 
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from enact_dist.core.messages import PlacementMap
+    from enact_dist.core.records import Recovered
+
 DATABASE_FILE: Final = "store.db"
 LOG_FILE: Final = "store.db-wal"
 BLOB_FOLDER: Final = "blobs"
+MOVING_FILE: Final = "moving"
 _REFUSED_SUFFIX: Final = ".refused"
 
 _RESTORE: Final = (
@@ -42,6 +49,67 @@ class Found(NamedTuple):
     def is_first(self) -> bool:
         """Whether no start before this one ever came to its end: nothing was acknowledged."""
         return self.mark.is_first if self.mark is not None else self.is_new
+
+
+class MovingMark(NamedTuple):
+    """That entities are being moved from or to a folder.
+
+    Attributes:
+        number: Tells one rebalance from another.
+        shards: All shards whose folders take part.
+    """
+
+    number: str
+    shards: tuple[str, ...]
+
+
+def moving_mark(folder: Path) -> MovingMark | None:
+    """Return the mark of a rebalance that was begun and has not come to its end.
+
+    Raises:
+        StoreError: There is one that cannot be read.
+    """
+    path = folder / MOVING_FILE
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        return MovingMark(str(found["rebalance"]), tuple(map(str, found["shards"])))
+    except FileNotFoundError:
+        return None
+    except (ValueError, TypeError, KeyError):
+        refuse(path, "is damaged")
+
+
+def refuse_moving(folder: Path) -> None:
+    """Refuse a folder of which some entities may be on their way.
+
+    Raises:
+        StoreError: A rebalance was begun and has not come to its end.
+    """
+    mark = moving_mark(folder)
+    if mark is not None:
+        refuse(
+            folder,
+            f"is in the midst of a rebalance with those of {', '.join(mark.shards)}",
+            "let `enact shard rebalance` come to its end",
+        )
+
+
+def refuse_strangers(folder: Path, stored: Recovered, shard: str, placement: PlacementMap) -> None:
+    """Refuse a folder with entities that nobody would look for there.
+
+    Raises:
+        StoreError: By the cell's placement some live on other shards.
+    """
+    found = strangers(stored, shard, placement)
+    if found:
+        named = ", ".join(f"{entity} (of {owner})" for entity, owner in found[:NAMED_MAX])
+        more = f" and {len(found) - NAMED_MAX} more" if len(found) > NAMED_MAX else ""
+        refuse(
+            folder,
+            f"holds entities that by the cell.toml do not live on {shard}: {named}{more}",
+            "move them with `enact shard rebalance` while the cell is stopped, or let the cell have"
+            " the shards and pins that it had",
+        )
 
 
 def refuse(path: Path, found: str, remedy: str = _RESTORE) -> NoReturn:
@@ -70,6 +138,11 @@ def look_at(folder: Path) -> Found:
         if has_mark or has_log or has_blobs(folder):
             refuse(database, "is missing or empty, but the folder has been in use")
     return Found(mark, is_new, mark is not None and not mark.same_boot)
+
+
+def holds_store(folder: Path) -> bool:
+    """Whether a shard has ever been started on a folder."""
+    return (folder / FORMAT_FILE).is_file()
 
 
 def has_blobs(folder: Path) -> bool:

@@ -31,6 +31,7 @@ from enact_dist.core.records import (
 )
 from enact_dist.link.blobs import Blob
 from enact_dist.link.store_fields import (
+    DamagedRowError,
     Fields,
     pack,
     packed_cause,
@@ -118,7 +119,8 @@ def world_row(record: WorldRecord) -> tuple[Key, bytes]:
 
 def dropped_row(record: WorldDropped) -> tuple[Key, bytes]:
     """Return the row of a world context that there was."""
-    return key_of(Kind.DROPPED, record.name), pack([record.version_base])
+    moved = [[list(base) for base in record.entity_bases]] if record.entity_bases else []
+    return key_of(Kind.DROPPED, record.name), pack([record.version_base, *moved])
 
 
 def aspect_row(entry: AspectEntry) -> tuple[Key, bytes]:
@@ -226,7 +228,14 @@ def read_world(key: Key, body: bytes) -> WorldRecord:
 
 def read_dropped(key: Key, body: bytes) -> WorldDropped:
     """Read the row of a world context that there was."""
-    return WorldDropped(Fields(key.name).last(str), Fields(body).last(int))
+    name, fields = Fields(key.name).last(str), Fields(body)
+    version_base = fields.next(int)
+    if fields.at_end:
+        return WorldDropped(name, version_base)
+    bases = [Fields(entry) for entry in fields.last(list)]
+    if not bases:
+        raise DamagedRowError("bases of entities were expected, found none")
+    return WorldDropped(name, version_base, tuple((b.next(str), b.last(int)) for b in bases))
 
 
 def read_aspect(key: Key, body: bytes) -> AspectEntry:

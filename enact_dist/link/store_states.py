@@ -10,7 +10,7 @@ from collections import Counter
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from enact_dist.core.datum import LockId, Slot
     from enact_dist.core.records import SlotRecord
@@ -59,11 +59,11 @@ class States:
             return old
         return newest.key if old is None else None
 
-    def of_context(self, context: str) -> Iterator[Key]:
-        """Yield the rows of all states of a world context, and forget them."""
-        for slot in [slot for slot in self.newest if slot.context == context]:
+    def take_out(self, goes: Callable[[Slot], bool]) -> Iterator[Key]:
+        """Yield the rows of all states of the slots that go, and forget them."""
+        for slot in [slot for slot in self.newest if goes(slot)]:
             yield self.newest.pop(slot).key
-        for slot in [slot for slot in self.history if slot.context == context]:
+        for slot in [slot for slot in self.history if goes(slot)]:
             yield from self.history.pop(slot).values()
 
     def name_blob(self, key: Key, blob: Blob) -> None:

@@ -15,8 +15,10 @@ from enact_dist.core.messages import AspectEntry, Cause, DatumRead, Item, SlotVe
 from enact_dist.core.records import (
     AspectRecord,
     AuditRecord,
+    BasesMoved,
     DecisionDone,
     DecisionRecord,
+    EntitiesMoved,
     ForcedEnded,
     ForcedRecord,
     HistoryForgotten,
@@ -106,6 +108,7 @@ def prepared(draw):
 
 LOCKED = st.sampled_from(LOCKS)
 NAMES = st.sampled_from(("x", "y"))
+BASES = st.sampled_from(((), (("a", 3),), (("a", 0), ("b", 7))))
 RECORDS = st.one_of(
     *(states() for _ in range(6)),
     *(forks() for _ in range(6)),
@@ -115,6 +118,8 @@ RECORDS = st.one_of(
     st.builds(KeptRecord, NAMES, MANY_VERSIONS),
     st.builds(WorldRecord, st.sampled_from(CONTEXTS), NAMES, STAMPS),
     st.builds(WorldDropped, st.sampled_from(CONTEXTS), STAMPS),
+    st.builds(BasesMoved, st.builds(WorldDropped, st.sampled_from(CONTEXTS), STAMPS, BASES)),
+    st.builds(EntitiesMoved, st.sampled_from((("a",), ("b",), ("a", "b"), ("c",)))),
     st.builds(SessionRecord, NAMES, STAMPS),
     st.builds(SessionEnded, NAMES, STAMPS),
     st.builds(AspectRecord, st.builds(AspectEntry, NAMES, NAMES, NAMES, STAMPS, STAMPS, STAMPS)),

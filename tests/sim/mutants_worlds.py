@@ -124,7 +124,7 @@ def forgets_versions_at_a_restart(patch: Patch) -> None:
     init = SlotMap.__init__
 
     def wrong(self: SlotMap, *args: Any, **options: Any) -> None:
-        init(self, *args, **{**options, "version_bases": None})
+        init(self, *args, **{**options, "dropped": ()})
 
     patch(SlotMap, "__init__", wrong)
 

@@ -1,0 +1,279 @@
+"""Which entities lie on a shard that is not theirs any more, and which records bring them home.
+
+For a cell that is stopped: all that its shards have stored goes in, a plan comes out.  Rules that a
+change must keep:
+
+- An entity moves whole: all its slots in all contexts, with history, labels and causes, in one
+  batch of its new shard; then one batch of the old one forgets it.  Cut off between the two, it is
+  on both, and the next plan only lets the old one forget.
+- What all shards must know before the first entity moves, every one of them learns first: contexts,
+  forks, aspects, and above which versions those of dropped contexts start.
+- Where that cannot be done without losing something there is no plan, but what stands in the way.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from enact_dist.core.messages import SlotVersion
+from enact_dist.core.placement import shard_of
+from enact_dist.core.records import (
+    AspectRecord,
+    BasesMoved,
+    EntitiesMoved,
+    KeptRecord,
+    SlotRecord,
+    WorldDropped,
+    WorldRecord,
+)
+from enact_dist.core.retaining import covers, with_larger
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping
+
+    from enact_dist.core.datum import Slot
+    from enact_dist.core.messages import AspectEntry, PlacementMap
+    from enact_dist.core.records import Record, Recovered
+
+NAMED_MAX: Final = 5
+"""So many entities are named where more stand in the way."""
+
+
+class Move(NamedTuple):
+    """An entity on its way.
+
+    Attributes:
+        entity: Its name.
+        source: The shard that is to forget it.
+        target: The shard that it belongs to.
+        states: How many states of its slots there are, replaced ones included.
+        size: Bytes of their data.
+        copied: Whether `target` has it already.
+    """
+
+    entity: str
+    source: str
+    target: str
+    states: int
+    size: int
+    copied: bool
+
+
+@dataclass(slots=True)
+class Plan:
+    """What a rebalance does.
+
+    Attributes:
+        first: What each shard must learn before anything moves; none that knows all.
+        moves: The entities, in order of their names.
+        obstacles: Why nothing may be done at all, for people; then the rest means nothing.
+    """
+
+    first: dict[str, tuple[Record, ...]] = field(default_factory=dict)
+    moves: list[Move] = field(default_factory=list)
+    obstacles: list[str] = field(default_factory=list)
+
+
+class Shards:
+    """What the shards of a stopped cell have stored, by entity.
+
+    Args:
+        stores: What each one has stored; shards that leave the cell are among them.
+        placement: Where entities are to live.
+        under_way: Whether a rebalance was cut off; only then may an entity be on two shards.
+    """
+
+    def __init__(
+        self, stores: Mapping[str, Recovered], placement: PlacementMap, *, under_way: bool
+    ) -> None:
+        self._stores = stores
+        self._placement = placement
+        self._under_way = under_way
+        self._states: dict[str, dict[str, dict[Slot, list[SlotRecord]]]] = {}
+        self._kept: dict[str, dict[str, set[SlotVersion]]] = {}
+        for name, stored in stores.items():
+            self._kept[name] = {record.label: set(record.versions) for record in stored.kept}
+            for record in (*stored.history, *stored.slots):
+                holders = self._states.setdefault(record.slot.entity, {})
+                holders.setdefault(name, {}).setdefault(record.slot, []).append(record)
+
+    # ---------------------------------------------------------------- what is to be done
+
+    def plan(self) -> Plan:
+        """Return what is to be done, or why it cannot be."""
+        plan = Plan()
+        plan.obstacles += self._undecided()
+        for entity in sorted(self._states):
+            self._plan_entity(entity, plan)
+        worlds, aspects = self._worlds(plan.obstacles), self._aspects(plan.obstacles)
+        if plan.obstacles:
+            return plan
+        bases = self._bases()
+        for shard in (entry.name for entry in self._placement.shards):
+            stored = self._stores[shard]
+            here = {record.name for record in stored.worlds}
+            known = {entry.name: entry for entry in stored.aspects}
+            records: list[Record] = [world for world in worlds if world.name not in here]
+            records += [AspectRecord(entry) for entry in aspects if known.get(entry.name) != entry]
+            records += [BasesMoved(base) for base in bases[shard] if base not in stored.dropped]
+            if records:
+                plan.first[shard] = tuple(records)
+        return plan
+
+    def _plan_entity(self, entity: str, plan: Plan) -> None:
+        holders, owner = self._states[entity], shard_of(entity, self._placement)
+        versions = {shard: _versions(slots) for shard, slots in holders.items()}
+        if len({frozenset(found) for found in versions.values()}) > 1 or (
+            len(holders) > 1 and not self._under_way
+        ):
+            plan.obstacles.append(
+                f"the entity {entity} is on {' and '.join(sorted(holders))}, and nobody can say"
+                " which of them is right; let the shard that should not have it begin with an empty"
+                " folder, or a backup from before it had it"
+            )
+            return
+        copied = owner in holders
+        for source in sorted(holders.keys() - {owner}):
+            states = [state for slot in holders[source].values() for state in slot]
+            size = sum(state.datum.size for state in states if state.datum is not None)
+            plan.moves.append(Move(entity, source, owner, len(states), size, copied))
+            copied = True
+
+    def _undecided(self) -> Iterator[str]:
+        for name, stored in self._stores.items():
+            count = len(stored.prepared) + len(stored.decisions)
+            if count:
+                yield (
+                    f"{count} commits over shards are not settled on {name}: start all shards of"
+                    " the cell as it was, wait until `enact lock ls` shows none, and stop them"
+                )
+
+    # ---------------------------------------------------------------- what all must know
+
+    def _worlds(self, obstacles: list[str]) -> list[WorldRecord]:
+        """Return the contexts that some shard has stored; a fork must be whole."""
+        worlds: dict[str, WorldRecord] = {}
+        for name, stored in self._stores.items():
+            for record in stored.worlds:
+                known = worlds.setdefault(record.name, record)
+                if known != record:
+                    obstacles.append(
+                        f"the world context {record.name} is another one on {name} than elsewhere:"
+                        " drop it where the cell still runs as it was"
+                    )
+        for world in worlds.values():
+            lacking = [name for name in self._stores if self._lacks_part(name, world)]
+            if world.source and lacking:
+                obstacles.append(
+                    f"the fork {world.name} of {world.source} is not whole, {', '.join(lacking)}"
+                    " lacks it: complete or drop it in the cell as it was"
+                )
+        return list(worlds.values())
+
+    def _lacks_part(self, shard: str, world: WorldRecord) -> bool:
+        """Whether a shard has no part of a fork and should; a new one should not."""
+        stored = self._stores[shard]
+        had_source = any(record.slot.context == world.source for record in stored.slots) or any(
+            record.name in (world.source, world.name) for record in stored.dropped
+        )
+        return had_source and all(record.name != world.name for record in stored.worlds)
+
+    def _aspects(self, obstacles: list[str]) -> list[AspectEntry]:
+        """Return the aspects of all shards, each with the largest retention."""
+        aspects: dict[str, AspectEntry] = {}
+        for name, stored in self._stores.items():
+            for entry in stored.aspects:
+                known = aspects.setdefault(entry.name, entry)
+                if known[:3] != entry[:3]:
+                    obstacles.append(
+                        f"the aspect {entry.name} is {known.fingerprint} {known.durability} on one"
+                        f" shard and {entry.fingerprint} {entry.durability} on {name}: start the"
+                        " cell as it was once, with the same cell.toml for all"
+                    )
+                elif not covers(known, entry):
+                    aspects[entry.name] = with_larger(known, entry)
+        return list(aspects.values())
+
+    def _bases(self) -> dict[str, list[WorldDropped]]:
+        """Return above which versions those of dropped contexts start, alike on all shards.
+
+        What was made since the drop began above the base of its own shard, and goes on so.
+        """
+        bases: dict[str, list[WorldDropped]] = {entry.name: [] for entry in self._placement.shards}
+        names = sorted({drop.name for stored in self._stores.values() for drop in stored.dropped})
+        for name in names:
+            by_shard = {
+                shard: next((d for d in stored.dropped if d.name == name), WorldDropped(name, 0))
+                for shard, stored in self._stores.items()
+            }
+            top = max(dropped.version_base for dropped in by_shard.values())
+            moved = {e: base for dropped in by_shard.values() for e, base in dropped.entity_bases}
+            own: dict[str, dict[str, int]] = {shard: {} for shard in bases}
+            for entity, holders in self._states.items():
+                for shard, slots in holders.items():
+                    base = moved.get(entity, by_shard[shard].version_base)
+                    if base < top and any(slot.context == name for slot in slots):
+                        own[shard_of(entity, self._placement)][entity] = base
+            for shard, found in bases.items():
+                found.append(WorldDropped(name, top, tuple(sorted(own[shard].items()))))
+        return bases
+
+    # ---------------------------------------------------------------- records
+
+    def brought(self, target: str, entities: Iterable[str], source: str) -> tuple[Record, ...]:
+        """Return what `target` stores to have these entities, and note that it has."""
+        records: list[Record] = []
+        files: dict[int, SlotVersion] = {}
+        for entity in entities:
+            slots = self._states[entity][source]
+            self._states[entity][target] = slots
+            for slot in sorted(slots):
+                records += _copied(slots[slot], files)
+        moved = self._kept_of(source, entities)
+        for label, versions in moved.items():
+            here = self._kept[target].setdefault(label, set())
+            here |= versions
+            records.append(KeptRecord(label, tuple(sorted(here))))
+        return tuple(records)
+
+    def left(self, source: str, entities: tuple[str, ...]) -> tuple[Record, ...]:
+        """Return what `source` stores to forget these entities, and note that it has."""
+        records: list[Record] = [EntitiesMoved(entities)]
+        for label, versions in self._kept_of(source, entities).items():
+            rest = self._kept[source][label] - versions
+            self._kept[source][label] = rest
+            records.append(KeptRecord(label, tuple(sorted(rest))))
+        for entity in entities:
+            del self._states[entity][source]
+        return tuple(records)
+
+    def _kept_of(self, shard: str, entities: Iterable[str]) -> dict[str, set[SlotVersion]]:
+        names = frozenset(entities)
+        found = {
+            label: {version for version in versions if version.slot.entity in names}
+            for label, versions in self._kept[shard].items()
+        }
+        return {label: versions for label, versions in found.items() if versions}
+
+
+def strangers(stored: Recovered, shard: str, placement: PlacementMap) -> list[tuple[str, str]]:
+    """Return the entities that a shard has stored and that live elsewhere, and where."""
+    entities = dict.fromkeys(record.slot.entity for record in stored.slots)
+    found = ((entity, shard_of(entity, placement)) for entity in entities)
+    return [(entity, owner) for entity, owner in found if owner != shard]
+
+
+def _versions(slots: Mapping[Slot, list[SlotRecord]]) -> set[tuple[Slot, int, int]]:
+    return {(s.slot, s.version, s.stamp_ns) for states in slots.values() for s in states}
+
+
+def _copied(states: list[SlotRecord], files: dict[int, SlotVersion]) -> Iterator[SlotRecord]:
+    """Yield the states of a slot, oldest first; bytes that were there before are named."""
+    for state in states:
+        same_as = None
+        if state.datum is not None:
+            here = SlotVersion(state.slot, state.version)
+            first = files.setdefault(id(state.datum.body), here)
+            same_as = first if first is not here else None
+        yield replace(state, history=state is not states[0], same_as=same_as)
