@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.cli import shard_rebalance
+from enact_dist.cli import shard_backup, shard_rebalance
 from enact_dist.cli.output import print_json, print_table, shown_bytes, shown_s
 from enact_dist.cli.verbs import (
     DONE,
@@ -100,6 +100,7 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
     add_reader(check)
     check.set_defaults(timeout_s=CHECK_S)
     shard_rebalance.add_to(verbs)
+    shard_backup.add_to(verbs)
 
 
 def run_shard(arguments: argparse.Namespace) -> int:

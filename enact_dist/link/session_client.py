@@ -439,12 +439,7 @@ class SessionClient:
 
 def bytes_with(writes: Iterable[Sequence[WriteItem]]) -> int:
     """Return how many bytes of data travel with the messages that write these."""
-    size = 0
-    for each in writes:
-        for _, datum in each:
-            if datum is not None and not datum.file:
-                size += datum.size
-    return size
+    return sum(w.datum.size for each in writes for w in each if w.datum and not w.datum.file)
 
 
 def _patience_s(request: Request) -> float:

@@ -1,0 +1,311 @@
+"""Backs a shard's folder up, while the shard runs too, and restores it.
+
+How a copy of files that change becomes one state: the database is copied first and its log after
+it.  While the log's header stays what it was, all that was carried into the database meanwhile is
+in the log as well, and replaces what was copied torn.  Else both are copied again.  Large bodies
+are files that never change; links of ours hold all that are there just before and just after the
+log is read, for the shard unlinks what it replaces.  The mark is copied before all, so the copy is
+refused if it lacks anything that was acknowledged then.  A copy has its name only when every byte
+of it was checked and is on the disk.
+
+A shard that is restored begins with an epoch above that of its backup, of what was there before,
+and the wall clock: whoever knew a later state is told that the shard has started anew, and no lock
+or commit of before counts.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import time
+from contextlib import closing, suppress
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.errors import StoreError
+from enact_dist.link.blobs import BlobFolder
+from enact_dist.link.folder_lock import FORMAT_FILE, FolderLock, replace_file, sync_folder
+from enact_dist.link.store import open_store, read_store
+from enact_dist.link.store_errors import store_error
+from enact_dist.link.store_folder import (
+    BLOB_FOLDER,
+    DATABASE_FILE,
+    LOG_FILE,
+    holds_store,
+    look_at,
+    refuse_moving,
+)
+from enact_dist.link.store_mark import MARK_FILE
+from enact_dist.link.store_recovery import open_database, put_together, read_blobs
+from enact_dist.link.wal_check import HEADER_BYTES, check_wal
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from enact_dist.core.records import Recovered
+
+BACKUP_FILE: Final = "backup.json"
+TRIES_MAX: Final = 50
+"""So often the files are copied anew because the shard has begun its log anew meanwhile."""
+_HELD_FOLDER: Final = "backup.held"
+
+
+@dataclass(frozen=True, slots=True)
+class Backup:
+    """What a backup says of itself.
+
+    Attributes:
+        cell: Name of the cell.
+        shard: Name of the shard.
+        unix_s: When it was begun, seconds since 1970: all that was acknowledged then is in it.
+        epoch: The shard's epoch then.
+        entities: How many entities it has.
+        states: How many states of their slots, replaced ones included.
+        size: Bytes of their data.
+    """
+
+    cell: str
+    shard: str
+    unix_s: int
+    epoch: int
+    entities: int
+    states: int
+    size: int
+
+
+# ---------------------------------------------------------------- back up
+
+
+def back_up(folder: Path, into: Path, *, cell: str, shard: str, unix_s: int) -> Backup:
+    """Copy the folder of a shard, whether it runs or not, to a new folder.
+
+    Raises:
+        StoreError: There is no data, it is damaged or in the midst of a rebalance, the copy cannot
+            be written, or `into` is there.
+    """
+    if not holds_store(folder):
+        raise StoreError(f"no shard has its data in {folder}", path=str(folder))
+    if into.exists():
+        raise StoreError(f"{into} is there already; name a new folder", path=str(into))
+    refuse_moving(folder)
+    partial, held = into.with_name(into.name + ".partial"), folder / _HELD_FOLDER
+    try:
+        for path in (partial, held):
+            shutil.rmtree(path, ignore_errors=True)
+            path.mkdir(parents=True)
+        try:
+            stored = _copied(folder, held, partial)
+        finally:
+            shutil.rmtree(held, ignore_errors=True)
+        backup = _told(stored, cell=cell, shard=shard, unix_s=unix_s)
+        replace_file(partial / BACKUP_FILE, json.dumps(asdict(backup)).encode())
+        _sync(partial)
+        partial.rename(into)
+        sync_folder(into.parent)
+    except OSError as failure:
+        raise store_error(into, failure) from failure
+    return backup
+
+
+def _copied(folder: Path, held: Path, partial: Path) -> Recovered:
+    """Copy a state of a folder; return it, with all of its bytes checked."""
+    for _ in range(TRIES_MAX):
+        if not _copy_database(folder, held, partial):
+            continue
+        database, contents = open_database(partial, look_at(partial))
+        with closing(database):
+            names = {blob.name for blob in contents.states.blobs.values()}
+            if not names <= _names(held):
+                continue
+            (partial / BLOB_FOLDER).mkdir(exist_ok=True)
+            for name in names:
+                shutil.copyfile(held / name, partial / BLOB_FOLDER / name)
+            blobs = BlobFolder(partial / BLOB_FOLDER, epoch=0)
+            read_blobs(contents, blobs, power_cut=False)
+            put_together(contents, partial / DATABASE_FILE)
+            _check_bodies(contents.recovered)
+        return contents.recovered
+    raise StoreError(
+        f"{folder} changed so fast that no copy of it came to its end in {TRIES_MAX} tries; back it"
+        " up while less is written, or stopped",
+        path=str(folder),
+    )
+
+
+def _copy_database(folder: Path, held: Path, partial: Path) -> bool:
+    """Copy rows and log; False if the log was begun anew meanwhile, so that they do not fit."""
+    for name in (FORMAT_FILE, MARK_FILE):
+        shutil.copyfile(folder / name, partial / name)
+    log, copy = folder / LOG_FILE, partial / LOG_FILE
+    header = _header(log)
+    shutil.copyfile(folder / DATABASE_FILE, partial / DATABASE_FILE)
+    copy.unlink(missing_ok=True)
+    _hold(folder / BLOB_FOLDER, held)
+    with suppress(FileNotFoundError):
+        shutil.copyfile(log, copy)
+    _hold(folder / BLOB_FOLDER, held)
+    if _header(log) != header:
+        return False
+    if header:
+        # Behind its end the copy may have frames that were half written as they were read.
+        os.truncate(copy, check_wal(copy).end)
+    return True
+
+
+def _header(log: Path) -> bytes:
+    try:
+        with log.open("rb") as file:
+            return file.read(HEADER_BYTES)
+    except FileNotFoundError:
+        return b""
+
+
+def _hold(blobs: Path, held: Path) -> None:
+    """Link all files of large bodies that are not linked yet, so that they stay."""
+    for name in _names(blobs) - _names(held):
+        with suppress(FileNotFoundError):
+            os.link(blobs / name, held / name)
+
+
+def _names(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}
+
+
+def _check_bodies(stored: Recovered) -> None:
+    """Read all bytes that nobody has read yet.
+
+    Raises:
+        StoreError: Some are not as they were written.
+    """
+    for record in (*stored.history, *stored.slots):
+        fault = record.datum.fault if record.datum is not None else None
+        found = fault() if fault is not None else ""
+        if found:
+            raise StoreError(f"{found}; it has version {record.version} of {record.slot}")
+
+
+def _told(stored: Recovered, *, cell: str, shard: str, unix_s: int) -> Backup:
+    states = (*stored.history, *stored.slots)
+    size = sum(state.datum.size for state in states if state.datum is not None)
+    entities = len({state.slot.entity for state in states})
+    return Backup(cell, shard, unix_s, stored.epoch, entities, len(states), size)
+
+
+def _sync(folder: Path) -> None:
+    for path in folder.rglob("*"):
+        if path.is_file():
+            with path.open("rb") as file:
+                os.fsync(file.fileno())
+    for path in (folder / BLOB_FOLDER, folder):
+        sync_folder(path)
+
+
+# ---------------------------------------------------------------- restore
+
+
+def read_backup(path: Path) -> Backup:
+    """Return what a backup says of itself.
+
+    Raises:
+        StoreError: It is none.
+    """
+    try:
+        return Backup(**json.loads((path / BACKUP_FILE).read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError) as failure:
+        raise StoreError(
+            f"{path} is no backup of a shard: its {BACKUP_FILE} cannot be read ({failure})",
+            path=str(path),
+        ) from failure
+
+
+def restore(
+    source: Path, folder: Path, *, cell: str, shard: str, unix_s: int, replace: bool = False
+) -> tuple[Backup, Path | None]:
+    """Make the folder of a stopped shard what a backup has.
+
+    Args:
+        source: The backup.
+        folder: The shard's folder.
+        cell: Name of the cell; the backup must be of it.
+        shard: Name of the shard, as `cell`.
+        unix_s: The wall clock, seconds since 1970.
+        replace: Whether a folder that is there goes aside; it is not removed.
+
+    Returns:
+        The backup, and where what was there before is now.
+
+    Raises:
+        StoreError: The backup is of another shard, damaged or from the future; the folder is in
+            use, or is there and not to be replaced; or it cannot be written.
+    """
+    backup = read_backup(source)
+    if (backup.cell, backup.shard) != (cell, shard):
+        raise StoreError(
+            f"{source} is a backup of shard {backup.shard} of cell {backup.cell}, not of {shard} of"
+            f" {cell}"
+        )
+    if unix_s < backup.unix_s:
+        raise StoreError(
+            f"the clock of this host says {_time(unix_s)}, the backup is of {_time(backup.unix_s)};"
+            " the restored shard must begin later than all that clients have seen of it: set the"
+            " clock first"
+        )
+    partial = folder.with_name(folder.name + ".restoring")
+    try:
+        shutil.rmtree(partial, ignore_errors=True)
+        if not folder.exists() or not any(folder.iterdir()):
+            _build(source, partial, backup, unix_s=unix_s, epoch=_epoch_before(folder))
+            shutil.rmtree(folder, ignore_errors=True)
+            partial.rename(folder)
+            sync_folder(folder.parent)
+            return backup, None
+        if not replace:
+            raise StoreError(
+                f"{folder} has data; say --replace to put the backup in its place, what is there"
+                " now is kept beside it",
+                path=str(folder),
+            )
+        epoch = _epoch_before(folder)
+        with closing(FolderLock(folder)):
+            _build(source, partial, backup, unix_s=unix_s, epoch=epoch)
+            aside = folder.with_name(f"{folder.name}.replaced-{unix_s}")
+            folder.rename(aside)
+            partial.rename(folder)
+            sync_folder(folder.parent)
+    except OSError as failure:
+        raise store_error(folder, failure) from failure
+    return backup, aside
+
+
+def _build(source: Path, partial: Path, backup: Backup, *, unix_s: int, epoch: int) -> None:
+    """Make a folder of a backup, checked whole, whose next epoch is above `epoch`."""
+    shutil.copytree(source, partial, ignore=shutil.ignore_patterns(BACKUP_FILE))
+    with read_store(partial) as stored:
+        _check_bodies(stored)
+        found = _told(stored, cell=backup.cell, shard=backup.shard, unix_s=backup.unix_s)
+    if found != backup:
+        raise StoreError(
+            f"{source} is not what it was when it was made: {found.states} states with"
+            f" {found.size} bytes are there of {backup.states} with {backup.size}; copy it again",
+            path=str(source),
+        )
+    store, _ = open_store(partial, unix_s=unix_s)
+    with closing(store):
+        store.raise_epoch(epoch)
+    _sync(partial)
+
+
+def _epoch_before(folder: Path) -> int:
+    """Return the largest epoch that a folder and those that were replaced are known to have had."""
+    epochs = [0]
+    for path in (folder, *folder.parent.glob(f"{folder.name}.replaced-*")):
+        if holds_store(path):
+            # A folder that cannot be read is a reason to restore one; then the clock has to do.
+            with suppress(StoreError), read_store(path) as stored:
+                epochs.append(stored.epoch)
+    return max(epochs)
+
+
+def _time(unix_s: int) -> str:
+    return time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(unix_s))
