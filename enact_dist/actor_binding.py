@@ -7,7 +7,7 @@ the pattern stands for the triggering entity, that entity.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from enact_dist.actor import Actor, Declared, same_data, stands_for_trigger
 from enact_dist.actor_lock import ActorLock
@@ -23,6 +23,9 @@ if TYPE_CHECKING:
     from enact_dist.cell import Cell
     from enact_dist.terms import Aspect
     from enact_dist.world import WorldContext
+
+ENTITIES_MAX: Final = 1024
+"""Triggering entities for which the bound requests are kept."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +55,7 @@ class BoundActor:
         UnknownWorldError: The cell has no world context of such a name.
     """
 
-    __slots__ = ("actor", "cell", "contexts", "declaration")
+    __slots__ = ("_by_entity", "actor", "cell", "contexts", "declaration")
 
     def __init__(self, actor: Actor, cell: Cell, worlds: Mapping[str, str] | None = None) -> None:
         if not isinstance(actor, Actor) or type(actor).update is Actor.update:
@@ -66,6 +69,7 @@ class BoundActor:
         names = self._names(worlds)
         self.contexts = {role: cell.world(name) for role, name in names.items()}
         self._check(names)
+        self._by_entity: dict[Entity | None, Mapping[Declared, Declared]] = {}
 
     def lock(
         self,
@@ -83,12 +87,8 @@ class BoundActor:
             stop: Ends the waiting once it is set.
             captured_ns: Capture stamp of the set that triggered it; 0 without one.
         """
-        bound = {
-            declared: self._bound(declared, entity)
-            for declared in self.declaration.requests.values()
-        }
         return ActorLock(
-            bound,
+            self._bound_for(entity),
             entity=entity,
             wait_s=self.actor.wait_s if wait_s is None else wait_s,
             hold_s=self.actor.hold_s,
@@ -143,6 +143,17 @@ class BoundActor:
                 )
             )
         return tuple(watched)
+
+    def _bound_for(self, entity: Entity | None) -> Mapping[Declared, Declared]:
+        """Return what each declared request stands for; made once for each entity."""
+        found = self._by_entity.get(entity)
+        if found is None:
+            requests = self.declaration.requests.values()
+            found = {declared: self._bound(declared, entity) for declared in requests}
+            if len(self._by_entity) >= ENTITIES_MAX:
+                self._by_entity.clear()
+            self._by_entity[entity] = found
+        return found
 
     def _bound(self, declared: Declared, entity: Entity | None) -> Declared:
         named: Entity | Entities = declared.entity

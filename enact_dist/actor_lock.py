@@ -56,7 +56,7 @@ class ActorLock(Lock):
         self._together = together
         self._captured_ns = captured_ns
         views = together.requests if together is not None else ()
-        self._in_set: tuple[Any, ...] = tuple(bound[view] for view in views)
+        self._in_set: dict[Any, None] = {bound[view]: None for view in views}
 
     def _item_of(self, request: LockRequest[Any]) -> Item:
         captured_ns = self._captured_ns if request in self._in_set else 0
