@@ -6,12 +6,13 @@ import socket
 import sys
 import time
 from collections import Counter
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.cli.output import print_json, print_table, shown_bytes, shown_s
 from enact_dist.cli.verbs import DONE, add_cell, add_verb, cell_config, pair, pairs
-from enact_dist.errors import ConfigError
+from enact_dist.errors import ConfigError, StoreError
 
 if TYPE_CHECKING:
     import argparse
@@ -76,6 +77,7 @@ def run_rebalance(arguments: argparse.Namespace) -> int:
         print_json({"done": not arguments.dry_run, "resumed": found.resumed, "moves": moves})
     else:
         _print(found, dry_run=arguments.dry_run)
+    _name_others(config, folders)
     return DONE
 
 
@@ -98,6 +100,27 @@ def _folders(config: CellConfig, stores: dict[str, str], new: list[str]) -> dict
     if len({folder.resolve() for folder in folders.values()}) < len(folders):
         raise ConfigError("two shards have the same folder; give each its own with --store")
     return folders
+
+
+def _name_others(config: CellConfig, folders: dict[str, Path]) -> None:
+    """Say where else entities lie: a shard that has left the cell must be named to be emptied."""
+    from enact_dist.link.store import read_store
+    from enact_dist.link.store_copy import ASIDE
+    from enact_dist.link.store_folder import holds_store
+
+    parent = config.data_folder
+    known = {folder.resolve() for folder in folders.values()}
+    for path in sorted(parent.iterdir()) if parent is not None and parent.is_dir() else ():
+        if path.resolve() in known or not holds_store(path) or ASIDE in path.name:
+            continue
+        with suppress(StoreError), read_store(path) as stored:
+            count = len({record.slot.entity for record in stored.slots})
+            if count:
+                print(
+                    f"enact: {path} has {count} entities of a shard that is not in {config.path};"
+                    f" if it was one of this cell, say --store {path.name}={path}",
+                    file=sys.stderr,
+                )
 
 
 def _folder(shard: ShardConfig, stores: dict[str, str], new: list[str], config: CellConfig) -> Path:

@@ -49,6 +49,8 @@ BACKUP_FILE: Final = "backup.json"
 TRIES_MAX: Final = 50
 """So often the files are copied anew because the shard has begun its log anew meanwhile."""
 _HELD_FOLDER: Final = "backup.held"
+ASIDE: Final = ".replaced-"
+"""In the names of folders that were put aside, before the second in which they were."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -269,7 +271,7 @@ def restore(
         epoch = _epoch_before(folder)
         with closing(FolderLock(folder)):
             _build(source, partial, backup, unix_s=unix_s, epoch=epoch)
-            aside = folder.with_name(f"{folder.name}.replaced-{unix_s}")
+            aside = folder.with_name(f"{folder.name}{ASIDE}{unix_s}")
             folder.rename(aside)
             partial.rename(folder)
             sync_folder(folder.parent)
@@ -299,7 +301,7 @@ def _build(source: Path, partial: Path, backup: Backup, *, unix_s: int, epoch: i
 def _epoch_before(folder: Path) -> int:
     """Return the largest epoch that a folder and those that were replaced are known to have had."""
     epochs = [0]
-    for path in (folder, *folder.parent.glob(f"{folder.name}.replaced-*")):
+    for path in (folder, *folder.parent.glob(f"{folder.name}{ASIDE}*")):
         if holds_store(path):
             # A folder that cannot be read is a reason to restore one; then the clock has to do.
             with suppress(StoreError), read_store(path) as stored:

@@ -1,5 +1,6 @@
 """A cell of real daemons that gets a third shard, and one of which goes back to a backup."""
 
+import json
 import signal
 
 import numpy as np
@@ -76,6 +77,11 @@ def test_a_third_shard_gets_its_entities_and_a_backup_comes_back(make_cell):
     assert done.returncode == 0, done.stderr
     assert "moved" in done.stdout
     assert cell.enact("shard", "rebalance").stdout == "every entity is where it belongs\n"
+    whole = cell.file.read_text()
+    cell.file.write_text(whole.replace(third, ""))
+    told = cell.enact("shard", "rebalance", "--dry-run", "--json")
+    assert (json.loads(told.stdout)["moves"], "say --store s2=" in told.stderr) == ([], True)
+    cell.file.write_text(whole)
 
     cell.start_all()
     with connect(cell.file) as joined:
