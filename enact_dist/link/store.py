@@ -101,12 +101,13 @@ def open_store(folder: Path, *, unix_s: int, moving: bool = False) -> tuple[Stor
 def read_store(folder: Path) -> Iterator[Recovered]:
     """Show what a folder holds, checked as `open_store` does; its epoch is the stored one.
 
-    The folder stays as it is, and locked meanwhile.  One that is not there holds nothing.
+    The folder stays as it is, and locked meanwhile.  An empty one holds nothing, nor one that is
+    not there.
 
     Raises:
         StoreError: As `open_store`.
     """
-    if not folder.exists():
+    if not folder.exists() or not any(folder.iterdir()):
         yield Recovered(epoch=0)
         return
     with closing(FolderLock(folder)):

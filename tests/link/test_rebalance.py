@@ -222,6 +222,24 @@ def test_what_would_lose_something_is_refused(tmp_path, left, right, said):
     open_store(folders["left"], unix_s=1)[0].close()
 
 
+def test_a_look_changes_nothing(tmp_path):
+    """Not even a folder for a new shard, made by hand, is anything but empty."""
+    folders = two_stores(tmp_path, left=[HERE])
+    epochs = {name: stored_epoch(folder) for name, folder in folders.items()}
+    folders["third"] = tmp_path / "third"
+    folders["third"].mkdir()
+    where = placement("left", "right", "third", pins=[("**", "third")])
+    assert [move.target for move in look(folders, where).moves] == ["third"]
+    assert not any(folders.pop("third").iterdir())
+    assert {name: stored_epoch(folder) for name, folder in folders.items()} == epochs
+
+
+def stored_epoch(folder):
+    """Return the epoch that a folder has."""
+    with read_store(folder) as found:
+        return found.epoch
+
+
 def test_a_folder_in_use_is_refused(tmp_path):
     """By a daemon, say."""
     folders = two_stores(tmp_path)
