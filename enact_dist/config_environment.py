@@ -80,6 +80,16 @@ def with_environment(config: CellConfig, environment: Mapping[str, str]) -> Cell
     return dataclasses.replace(config, shards=shards)
 
 
+def without_overrides(environment: Mapping[str, str]) -> dict[str, str]:
+    """Return `environment` for processes that are to do what their `cell.toml` says, no less."""
+    overrides = set(_CELL_NAMES) - {"ENACT_SHARED_FOLDER"}
+    return {
+        name: text
+        for name, text in environment.items()
+        if name not in overrides and not name.startswith(_SHARD_PREFIX)
+    }
+
+
 def variable_of(shard: str, key: str) -> str:
     """Return the name of the variable that overrides `key` of the shard called `shard`."""
     return f"{_SHARD_PREFIX}{re.sub('[.-]', '_', shard).upper()}_{key}"

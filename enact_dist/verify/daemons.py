@@ -16,10 +16,11 @@ import threading
 import time
 from typing import TYPE_CHECKING, Final
 
+from enact_dist.config_environment import without_overrides
 from enact_dist.errors import LinkError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
 LINE_S: Final = 30.0
@@ -43,6 +44,7 @@ class LineProcess:
         words: See `module`.
         log: Gets what it writes to its standard error.
         before: A command that ends by running the one that follows it, such as `nsenter`.
+        environment: Its variables; those of this process unless given.
 
     Attributes:
         started_s: Monotonic time just before it was started.
@@ -50,13 +52,20 @@ class LineProcess:
     """
 
     def __init__(
-        self, module: str, words: Sequence[str], log: Path, *, before: Sequence[str] = ()
+        self,
+        module: str,
+        words: Sequence[str],
+        log: Path,
+        *,
+        before: Sequence[str] = (),
+        environment: Mapping[str, str] | None = None,
     ) -> None:
         self.name = f"{module} {' '.join(words)}"
         self.started_s = time.monotonic()
         self.ready_s = 0.0
         self._log = log
         self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+        surroundings = os.environ if environment is None else environment
         with log.open("ab") as errors:
             self._popen = subprocess.Popen(
                 [*before, sys.executable, "-m", module, *words],
@@ -64,7 +73,7 @@ class LineProcess:
                 stdout=subprocess.PIPE,
                 stderr=errors,
                 text=True,
-                env={**os.environ, "PYTHONUNBUFFERED": "1"},
+                env={**surroundings, "PYTHONUNBUFFERED": "1"},
             )
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
@@ -149,6 +158,8 @@ class LineProcess:
 class CellProcesses:
     """The shards of one cell on the loopback, and clients that join it.  A context manager.
 
+    All of them do as the cell's file says, whatever this process has been told otherwise.
+
     Args:
         folder: Existing and empty: for `cell.toml`, data and logs.
         shards: Their names.
@@ -198,7 +209,8 @@ class CellProcesses:
         return self._start(module, (str(self.file), *words), log)
 
     def _start(self, module: str, words: Sequence[str], log: str) -> LineProcess:
-        process = LineProcess(module, words, self.folder / log)
+        surroundings = without_overrides(os.environ)
+        process = LineProcess(module, words, self.folder / log, environment=surroundings)
         self._all.append(process)
         return process
 

@@ -199,6 +199,20 @@ def test_volatile_slot_starts_anew_with_its_shard(recorded):
     assert history.anomalies() == []
 
 
+def test_promise_may_be_applied_after_two_restarts(recorded):
+    """Told committed before both, which each empty the slot before it: no time order is broken."""
+    recorded.lock("a.1", writes=[(FRAME, 1, "a.1"), (OTHER, 1, "a.1")])
+    recorded.restart("s0", 8, down_ns=recorded.now + 1)
+    recorded.restart("s0", 9, down_ns=recorded.now + 1)
+    recorded.lock("b.1", reads=[(FRAME, 1, "a.1"), (OTHER, 1, "a.1")])
+
+    history = chains.History(recorded.loaded())
+
+    names = [f"restart {epoch} of s0 under a.1" for epoch in (8, 9)]
+    assert [state.writer for state in history.chains[FRAME]] == [*names, "a.1"]
+    assert history.anomalies() == []
+
+
 def test_volatile_datum_that_outlives_its_shard_is_named(recorded):
     """Seen before the restart and after it: it was written once."""
     recorded.lock("a.1", writes=[(FRAME, 1, "a.1")]).lock("b.1", reads=[(FRAME, 1, "a.1")])

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import threading
 import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+from enact_dist.config_environment import without_overrides
 from enact_dist.errors import LinkError
 from enact_dist.verify.chaos import daemon
 from enact_dist.verify.chaos.journal import SUFFIX
@@ -181,7 +183,13 @@ class TestedCell:
 
     def _run(self, module: str, words: tuple[str, ...], name: str, host: str) -> LineProcess:
         log = self._folder / f"{name}.output"
-        process = LineProcess(module, words, log, before=self._hosts.before(host))
+        process = LineProcess(
+            module,
+            words,
+            log,
+            before=self._hosts.before(host),
+            environment=without_overrides(os.environ),  # what is tested is what the file says
+        )
         self._all.append(process)
         return process
 

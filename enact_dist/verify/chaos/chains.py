@@ -144,10 +144,16 @@ class History:
         """Return who set a volatile slot to null at a restart.
 
         A promise holds over it: its commit may have been told before the restart and be applied
-        after it, so of this slot nothing says when it was emptied.
+        after it, or after a later one, so of this slot nothing says when it was emptied.
         """
         first = self._seen[slot].get((restart.epoch, 1), ())
         promised = [w for w in first if self._claimed.get((w, slot), (0, 0))[0] < restart.epoch]
+        promised += [
+            writer
+            for (epoch, _), writers in self._seen[slot].items()
+            for writer in writers
+            if self._claimed.get((writer, slot), (epoch, 0))[0] < restart.epoch < epoch
+        ]
         if not promised:
             return _name_of(restart)
         name = f"{_name_of(restart)} under {promised[0]}"
