@@ -1,16 +1,56 @@
-"""Rules for all tests: nothing skipped in CI, Ctrl-C as at a terminal, no lock left behind."""
+"""Rules for all tests: nothing skipped in CI, Ctrl-C as at a terminal, no lock left behind.
+
+And over which carrier each of them runs, see `carriers.py` beside this file.
+"""
 
 import os
 import signal
+import sys
+from collections import Counter
+from pathlib import Path
 
 import pytest
 
 from enact_dist import lock
 
+sys.path.insert(0, str(Path(__file__).parent))
+import carriers
 
-def pytest_configure():
+
+def pytest_configure(config):
     """Take SIGINT as a program at a terminal does: in the background a shell has it ignored."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        carriers.choice()
+    except ValueError as error:
+        raise pytest.UsageError(str(error)) from None
+
+
+def pytest_generate_tests(metafunc):
+    """Run over both carriers what has to."""
+    ways = carriers.ways(metafunc.definition)
+    if len(ways) > 1:
+        metafunc.parametrize("carrier", ways, indirect=True)
+
+
+@pytest.fixture(autouse=True)
+def carrier(request, monkeypatch):
+    """How this test and the processes that it starts talk to shards, see `carriers.py`."""
+    way = getattr(request, "param", None) or carriers.ways(request.node)[0]
+    if way in carriers.BOTH:
+        monkeypatch.setenv("ENACT_CARRIER", way)
+    else:  # what a cell.toml says holds
+        monkeypatch.delenv("ENACT_CARRIER", raising=False)
+    request.node.user_properties.append(("carrier", way))
+    return way
+
+
+def pytest_terminal_summary(terminalreporter):
+    """Say what ran over what, and how to have it again."""
+    reports = [*terminalreporter.getreports("passed"), *terminalreporter.getreports("failed")]
+    drawn = Counter(dict(report.user_properties).get("carrier") for report in reports)
+    told = ", ".join(f"{drawn[way]} over {way}" for way in carriers.BOTH)
+    terminalreporter.line(f"carriers: {told}; again with {carriers.VARIABLE}={carriers.choice()}")
 
 
 @pytest.fixture(autouse=True)
@@ -25,6 +65,10 @@ def pytest_runtest_makereport(item, call):
     """Turn a skip into a failure where CI is set: there, every environment has to be present."""
     outcome = yield
     report = outcome.get_result()
+    if report.failed:
+        way = dict(item.user_properties).get("carrier")
+        again = f"{carriers.VARIABLE}={carriers.choice()}"
+        report.sections.append(("Carrier", f"{way}; drawn again with {again}"))
     if report.skipped and os.environ.get("CI") and not hasattr(report, "wasxfail"):
         report.outcome = "failed"
         reason = report.longrepr[2] if isinstance(report.longrepr, tuple) else report.longrepr

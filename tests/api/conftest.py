@@ -1,4 +1,4 @@
-"""A cell inside the test's own process, or one shard behind a socket, with two world contexts."""
+"""A cell inside the test's own process, or with one shard beside it, with two world contexts."""
 
 import socket
 
@@ -7,30 +7,11 @@ import pytest
 from enact_dist import connect, local
 
 WORLDS = ("online", "training")
-OVER_A_SOCKET_TOO = (
-    "test_lock",
-    "test_world",
-    "test_watch",
-    "test_history",
-    "test_past",
-    "test_forks",
-    "test_diff",
-    "test_diff_watch",
-)
-"""What a user may rely on, wherever the shard is."""
-
-
-def pytest_generate_tests(metafunc):
-    """Run these modules over a socket, too."""
-    module = metafunc.module.__name__.rpartition(".")[2]
-    if "cell" in metafunc.fixturenames and module in OVER_A_SOCKET_TOO:
-        metafunc.parametrize("cell", ["local", "socket"], indirect=True)
 
 
 @pytest.fixture
-def cell(request, tmp_path, monkeypatch):
-    """The paper's mode; parametrised indirectly with "socket" or "zenoh", a shard beside it."""
-    carrier = getattr(request, "param", "local")
+def cell(carrier, tmp_path, monkeypatch):
+    """The paper's mode where the test's carrier is "local"; else a shard behind that carrier."""
     if carrier == "local":
         with local(worlds=list(WORLDS)) as opened:
             yield opened
@@ -39,7 +20,6 @@ def cell(request, tmp_path, monkeypatch):
     from enact_dist.core.shard_state import ShardSettings
     from enact_dist.link.shard_daemon import DaemonSettings, start_shard
 
-    monkeypatch.setenv("ENACT_CARRIER", carrier)
     monkeypatch.setenv("ENACT_SHARED_FOLDER", str(tmp_path))
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
@@ -106,7 +86,7 @@ def _two_ports():
 
 @pytest.fixture
 def two_shards(tmp_path, monkeypatch):
-    """A cell of two shards in memory, connected to over whatever carrier is the usual one."""
+    """A cell of two shards in memory."""
     monkeypatch.setenv("ENACT_SHARED_FOLDER", str(tmp_path))
     running = TwoShards()
     try:

@@ -30,6 +30,8 @@ from enact_dist.terms import Aspect, Entities, Entity, View, World, Write
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+pytestmark = pytest.mark.carrier("local", "drawn")
+
 online = World("online")
 VIEWS = Entities("view/*")
 CLOUD, SURFACE, COUNT = Aspect("cloud", int), Aspect("surface", int), Aspect("count", int)

@@ -26,6 +26,7 @@ class Counter(Actor):
 
 
 @pytest.mark.timing
+@pytest.mark.carrier("local")
 def test_actor_ends_within_a_fifth_of_a_second_when_stopped_in_a_lock_wait(cell, online):
     """`stop` ends an attempt that waits for its lock; nothing waits at the shard, no refusal."""
     stop, ended = threading.Event(), []

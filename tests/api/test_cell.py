@@ -16,6 +16,8 @@ from enact_dist.errors import (
     UnknownWorldError,
 )
 
+pytestmark = pytest.mark.carrier("local", "drawn")
+
 COUNT = Aspect("count", int)
 bench, piece = Entity("work_bench"), Entity("work_piece")
 
@@ -207,6 +209,7 @@ def test_shards_show_what_a_shard_is_doing(cell, online):
     assert abs(shard.clock_ahead_s) < 1.0
 
 
+@pytest.mark.carrier("local")
 def test_actors_show_the_newest_report(cell):
     """A report reaches the shard at once where that is in the process."""
     cell.set_report(msgpack.packb({"updates": 3}))

@@ -11,6 +11,8 @@ from enact_dist.comparing import Difference, Tolerance
 from enact_dist.diffing import DiffKind
 from enact_dist.errors import DatumTypeError, LockHeldError, MisuseError, UnknownWorldError
 
+pytestmark = pytest.mark.carrier("local", "drawn")
+
 SHIFT = Aspect("shift_mm", float, compare=Tolerance(absolute=0.5, unit="mm"))
 COUNT, NAME = Aspect("count", int), Aspect("name", str)
 LARGE = Aspect("large", np.ndarray)

@@ -8,6 +8,8 @@ from enact_dist import Aspect, Entity, Lock, Write, local
 from enact_dist.comparing import Tolerance
 from enact_dist.errors import LockHeldError, MisuseError, UnknownWorldError
 
+pytestmark = pytest.mark.carrier("local", "drawn")
+
 SHIFT = Aspect("shift_mm", float, compare=Tolerance(absolute=0.5, unit="mm"))
 COUNT = Aspect("count", int)
 piece, bench = Entity("piece"), Entity("bench")

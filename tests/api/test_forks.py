@@ -29,6 +29,8 @@ from enact_dist.errors import (
 )
 from enact_dist.link.session_client import SessionClient
 
+pytestmark = pytest.mark.carrier("local", "drawn")
+
 COUNT = Aspect("count", int)
 CLOUD = Aspect("cloud", np.ndarray)
 LEFT, RIGHT = Entity("left/arm"), Entity("right/arm")
@@ -261,7 +263,7 @@ def test_nothing_is_forked_or_dropped_while_a_shard_is_away(two_stored, monkeypa
 
 
 def _in_a_second(client, calls, *, timeout_s=1.0, _whole=SessionClient.call_all):
-    return _whole(client, calls, timeout_s=min(timeout_s, 1.0))
+    return _whole(client, calls, timeout_s=min(timeout_s or 1.0, 1.0))
 
 
 def test_fork_on_one_shard_alone_is_told_and_completed_later(two_shards, deaf):

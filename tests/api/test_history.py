@@ -8,6 +8,8 @@ import pytest
 from enact_dist import Aspect, Durability, Entity, Lock, Write
 from enact_dist.errors import ForgottenError, MisuseError, NullDatumError, UnknownWorldError
 
+pytestmark = pytest.mark.carrier("local", "drawn")
+
 COUNT = Aspect("count", int)
 CLOUD = Aspect("cloud", np.ndarray, Durability.VOLATILE)
 FLEETING = Aspect("fleeting", int, Durability.VOLATILE, retention=2)

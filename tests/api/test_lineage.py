@@ -21,6 +21,8 @@ from enact_dist.errors import ForgottenError, MisuseError, NullDatumError, Unkno
 from enact_dist.lineage import DEPTH_MAX, EffectTree
 from enact_dist.testing import ManualClock, run_once, worlds
 
+pytestmark = pytest.mark.carrier("local", "drawn")
+
 COUNT = Aspect("count", int)
 SUM = Aspect("sum", int)
 FEW = Aspect("few", int, retention=2)
@@ -165,6 +167,7 @@ def test_set_comes_from_the_versions_that_bear_its_stamp():
         assert causes(cell) == ["online:a/1/count v1", "online:b/1/count v1"]
 
 
+@pytest.mark.carrier("local")  # a limit of the core; over a carrier it is the same and takes long
 def test_more_reads_than_a_commit_names_are_counted(cell, online):
     """Of 1,100 data 1,024 are named, and the tree says how many more there were."""
     each, target = WriteEach(online, Entities("part/*"), COUNT), Write(online, total, SUM)

@@ -32,6 +32,8 @@ from enact_dist.errors import (
     UnknownWorldError,
 )
 
+pytestmark = pytest.mark.carrier("local", "socket", "zenoh")
+
 COUNT = Aspect("count", int)
 NAME = Aspect("name", str)
 CLOUD = Aspect("cloud", np.ndarray)

@@ -33,6 +33,8 @@ from enact_dist.errors import (
 )
 from enact_dist.link import lanes
 
+pytestmark = pytest.mark.carrier("local", "drawn")
+
 COUNT = Aspect("count", int)
 bench, piece = Entity("work_bench"), Entity("work_piece")
 
@@ -190,6 +192,7 @@ def test_nothing_is_held_when_ctrl_c_strikes_before_the_commit(cell, online, mon
     assert_nothing_left(cell, online)
 
 
+@pytest.mark.carrier("local")
 def test_shard_in_process_decides_whole_when_ctrl_c_strikes_within(cell, online):
     """Ctrl-C inside the shard's code is raised when the decision is made, never half way."""
     shard = cell._host._shard

@@ -11,6 +11,8 @@ from enact_dist.errors import CommitUnknownError
 from enact_dist.link import client as link_client
 from enact_dist.link.lanes import KEPT_MAX, Lanes
 
+pytestmark = pytest.mark.carrier("local", "drawn")
+
 COUNT = Aspect("count", int)
 counter = Entity("counter")
 

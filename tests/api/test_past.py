@@ -29,6 +29,8 @@ from enact_dist.errors import (
     UnknownWorldError,
 )
 
+pytestmark = pytest.mark.carrier("local", "drawn")
+
 COUNT = Aspect("count", int)
 CLOUD = Aspect("cloud", np.ndarray, Durability.VOLATILE)
 FLEETING = Aspect("fleeting", int, Durability.VOLATILE, retention=3)

@@ -26,7 +26,7 @@ from enact_dist import (
 )
 
 piece = Entity("work_piece")
-CARRIERS = pytest.mark.parametrize("cell", ["local", "socket", "zenoh"], indirect=True)
+CARRIERS = pytest.mark.carrier("local", "socket", "zenoh")
 ROWS = pytest.mark.parametrize("rows", [4, 3_000, 400_000], ids=["grant", "fetch", "slices"])
 """With the grant; fetched in one; 4.8 MB, which the carriers fetch in slices."""
 

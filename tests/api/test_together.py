@@ -40,6 +40,8 @@ from enact_dist.link.shard_daemon import DaemonSettings, start_shard
 from enact_dist.together import captured_versions
 from enact_dist.watch import Change
 
+pytestmark = pytest.mark.carrier("local", "drawn")
+
 PATIENCE_S = 30.0
 KEPT = 4
 LEFT, RIGHT, SYSTEM = Entity("camera/left"), Entity("camera/right"), Entity("system")

@@ -8,6 +8,8 @@ from enact_dist import Aspect, Entities, Entity, Lock, Write
 from enact_dist.errors import MisuseError
 from enact_dist.link import notices
 
+pytestmark = pytest.mark.carrier("local", "socket", "zenoh")
+
 COUNT, NAME = Aspect("count", int), Aspect("name", str)
 bench, piece = Entity("work_bench"), Entity("work_piece")
 SOON_S = 30.0

@@ -14,7 +14,7 @@ import pytest
 from enact_dist.cli.main import main
 
 ENACT = (sys.executable, "-m", "enact_dist.cli.main")
-SURROUNDINGS = {**os.environ, "PYTHONUNBUFFERED": "1", "PYTHONPATH": str(Path(__file__).parents[2])}
+SURROUNDINGS = {"PYTHONUNBUFFERED": "1", "PYTHONPATH": str(Path(__file__).parents[2])}
 
 
 def free_ports(count):
@@ -52,7 +52,7 @@ listen = "tcp/127.0.0.1:{right}"
 def start(*words, **options):
     """Start `enact` as a process of its own, its output readable line by line."""
     options = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True} | options
-    env = SURROUNDINGS | options.pop("env", {})
+    env = os.environ | SURROUNDINGS | options.pop("env", {})
     return subprocess.Popen([*ENACT, *map(str, words)], env=env, **options)
 
 

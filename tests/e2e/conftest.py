@@ -90,9 +90,8 @@ class Process:
 class Cell:
     """Shard daemons of one cell, and workers that join it."""
 
-    def __init__(self, folder, *, shards=("s0",), ttl_s=2.0, aspects="", pins="", carrier="auto"):
+    def __init__(self, folder, *, shards=("s0",), ttl_s=2.0, aspects="", pins=""):
         self.folder = folder
-        self.variables = {"ENACT_CARRIER": carrier}
         self.ports = {name: free_port() for name in shards}
         self.file = folder / "cell.toml"
         lines = ['name = "e2e"', 'worlds = ["online", "training"]', f"session_ttl_s = {ttl_s}"]
@@ -105,7 +104,7 @@ class Cell:
 
     def start(self, name="s0", *, launcher=("-m", "enact_dist.cli.main")):
         arguments = [*launcher, "shard", "run", name, "--cell", str(self.file)]
-        daemon = Process(arguments, self.folder / f"{name}.log", **self.variables)
+        daemon = Process(arguments, self.folder / f"{name}.log")
         self.processes.append(daemon)
         self.daemons[name] = daemon
         daemon.expect("ready:")
@@ -123,7 +122,7 @@ class Cell:
     def worker(self, role, *arguments):
         log = self.folder / f"{role}.{len(self.processes)}.log"
         line = [str(WORKER), role, str(self.file), *map(str, arguments)]
-        process = Process(line, log, **self.variables)
+        process = Process(line, log)
         self.processes.append(process)
         return process
 
@@ -144,19 +143,13 @@ class Cell:
 
 
 @pytest.fixture
-def carrier(request):
-    """How messages travel; parametrise it indirectly, or leave it to the processes."""
-    return getattr(request, "param", "auto")
-
-
-@pytest.fixture
-def make_cell(tmp_path, carrier):
+def make_cell(tmp_path):
     cells = []
 
     def make(**options):
         folder = tmp_path / f"cell{len(cells)}"
         folder.mkdir()
-        cells.append(Cell(folder, **{"carrier": carrier, **options}))
+        cells.append(Cell(folder, **options))
         return cells[-1]
 
     yield make

@@ -32,7 +32,7 @@ def total(cell):
             return lock[one] + lock[two]
 
 
-@pytest.mark.parametrize("carrier", ["zenoh", "auto"], indirect=True)
+@pytest.mark.carrier("socket", "zenoh")
 def test_transfers_between_shards_keep_the_sum_when_shards_are_killed(cell):
     """4 processes move numbers between two shards that are killed: no view sees another sum."""
     kills = int(os.environ.get("ENACT_KILLS", "8"))

@@ -8,7 +8,8 @@ import pytest
 from enact_dist.errors import LinkError
 from enact_dist.verify.chaos.hosts import open_hosts
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.carrier("auto")]
+"""One program is on the host of a shard, the other far away: each takes what there is."""
 PROGRAM = str(Path(__file__).with_name("large_data_program.py"))
 TTL_S = 12.0
 CUT_S = 6.5

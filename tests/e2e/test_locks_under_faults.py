@@ -23,7 +23,7 @@ def counted(cell, entity=counter):
         return joined.world("online").view(view).get(view, 0)
 
 
-both = pytest.mark.parametrize("carrier", ["zenoh", "socket"], indirect=True)
+both = pytest.mark.carrier("socket", "zenoh")
 """What has to hold however messages travel."""
 
 

@@ -28,6 +28,9 @@ LAUNCH = "import os, sys; os.execvp(sys.argv[1], sys.argv[1:])"
 CAP_S = float(os.environ.get("ENACT_TEST_CAP_S", "6"))
 """How long the cap is tried; 600 is the full run, under a cap of 1 GiB."""
 piece = Entity("piece")
+both = pytest.mark.carrier("socket", "zenoh")
+some_without = pytest.mark.carrier("auto")
+"""Some of these processes see no socket of the shard, others do."""
 
 
 @pytest.fixture
@@ -57,7 +60,7 @@ def run(tmp_path):
         if before:
             line = ["-c", LAUNCH, *before, sys.executable, *line]
         log = tmp_path / f"worker{len(started)}.log"
-        process = Process(line, log, **{**cell.variables, **variables})
+        process = Process(line, log, **variables)
         started.append(process)
         return process
 
@@ -102,6 +105,7 @@ def seen(run, cell, name="array", **options):
 # ---------------------------------------------------------------- deaths
 
 
+@both
 @pytest.mark.parametrize("way", ["put", "new"])
 def test_writer_killed_while_it_fills_leaves_nothing(make_cell, run, root, way):
     """Readers keep the datum before; the draft's memory comes back while the shard lives on."""
@@ -120,6 +124,7 @@ def test_writer_killed_while_it_fills_leaves_nothing(make_cell, run, root, way):
         until(lambda: used(root) < before + PAGE_BYTES)
 
 
+@both
 def test_reader_killed_while_it_maps_leaves_nothing(make_cell, run, root):
     """Its map of a replaced version was the last: the memory comes back at once."""
     cell = make_cell().start_all()
@@ -158,6 +163,7 @@ def test_replaced_version_stays_whole_for_whoever_maps_it(make_cell, run, root):
     until(lambda: used(root) < SMALL + PAGE_BYTES)
 
 
+@both
 @pytest.mark.parametrize("name", ["array", "kept"])
 def test_shard_killed_leaves_nothing_after_its_next_start(make_cell, run, root, name):
     """Drafts and payloads of the old start are swept; whoever maps one keeps it."""
@@ -273,6 +279,7 @@ def namespace(*commands):
             holder.stdin.close()
 
 
+@some_without
 def test_namespaces_without_common_memory_give_the_same(make_cell, run, root):
     """Both ways over the network, and nobody but a counter notices."""
     cell = make_cell().start_all()
@@ -287,6 +294,7 @@ def test_namespaces_without_common_memory_give_the_same(make_cell, run, root):
             assert seen(run, cell).startswith(f"{SMALL} {value} {value} ")
 
 
+@some_without
 def test_folder_of_another_incarnation_is_not_used(make_cell, run, root, tmp_path):
     """The same name and files, and another nonce: what is in there is somebody else's."""
     cell = make_cell().start_all()
@@ -305,6 +313,7 @@ def test_folder_of_another_incarnation_is_not_used(make_cell, run, root, tmp_pat
         assert seen(run, cell, before=enter) == f"{SMALL} 1 1 copied"
 
 
+@some_without
 def test_folder_that_can_only_be_read_gives_maps_and_takes_nothing(make_cell, run, root):
     """As in a container whose root is read-only: readers map, writers take the network."""
     cell = make_cell().start_all()
@@ -319,6 +328,7 @@ def test_folder_that_can_only_be_read_gives_maps_and_takes_nothing(make_cell, ru
         assert seen(run, cell, before=enter).startswith(f"{SMALL} 2 2 ")
 
 
+@some_without
 def test_user_of_the_group_shares_and_a_stranger_does_not(make_cell, run, root):
     """Two users of one group read and write in place; another user takes the network."""
     if os.geteuid() != 0:
@@ -338,7 +348,7 @@ def test_user_of_the_group_shares_and_a_stranger_does_not(make_cell, run, root):
     assert seen(run, cell, **stranger) == f"{SMALL} 2 2 copied"
 
 
-@pytest.mark.parametrize("carrier", ["zenoh"], indirect=True)
+@pytest.mark.carrier("zenoh")
 @pytest.mark.parametrize("way", ["put", "new"])
 def test_data_are_shared_whatever_carries_the_messages(make_cell, run, root, way):
     """A cell without sockets shares memory as well."""

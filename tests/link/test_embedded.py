@@ -19,21 +19,21 @@ def host(make_settings):
 
 
 @pytest.fixture
-def carrier(host):
+def embedded(host):
     opened = EmbeddedCarrier(host, "me")
     yield opened
     opened.close()
 
 
-def test_carrier_answers_all_requests_in_their_order(carrier, make_peer):
+def test_carrier_answers_all_requests_in_their_order(embedded, make_peer):
     """Answers come in the order of the requests, whatever was parked between."""
-    peer = make_peer(lambda shard, message: carrier.request(shard, message, timeout_s=5))
+    peer = make_peer(lambda shard, message: embedded.request(shard, message, timeout_s=5))
     peer.hello()
     peer.acquire("cup")
     waiter = make_peer(peer.call)
     waiter.hello()
 
-    answers = carrier.request_all(
+    answers = embedded.request_all(
         [("s0", ListLocks()), ("s0", waiter.acquire_message("cup", wait_s=9)), ("s0", ListLocks())],
         timeout_s=0.05,
     )
@@ -41,9 +41,9 @@ def test_carrier_answers_all_requests_in_their_order(carrier, make_peer):
     assert [type(answer) for answer in answers] == [Locks, type(None), Locks]
 
 
-def test_carrier_waits_for_a_parked_answer_from_another_thread(carrier, make_peer):
+def test_carrier_waits_for_a_parked_answer_from_another_thread(embedded, make_peer):
     """A request in one thread is answered when another thread releases what it waits for."""
-    call = lambda shard, message: carrier.request(shard, message, timeout_s=10)  # noqa: E731
+    call = lambda shard, message: embedded.request(shard, message, timeout_s=10)  # noqa: E731
     holder, waiter = make_peer(call), make_peer(call)
     holder.hello()
     waiter.hello()
@@ -60,10 +60,10 @@ def test_carrier_waits_for_a_parked_answer_from_another_thread(carrier, make_pee
 
 def test_carrier_shows_its_session_as_present_until_it_is_closed(host, make_peer):
     """The token of an embedded session is there as long as its carrier is open."""
-    carrier = EmbeddedCarrier(host, "me")
+    embedded = EmbeddedCarrier(host, "me")
     watcher = EmbeddedCarrier(host, "watcher")
     peer = make_peer(
-        lambda shard, message: carrier.request(shard, message, timeout_s=5), session="me"
+        lambda shard, message: embedded.request(shard, message, timeout_s=5), session="me"
     )
     peer.hello()
 
@@ -72,31 +72,31 @@ def test_carrier_shows_its_session_as_present_until_it_is_closed(host, make_peer
         return {info.session: info.token_present for info in sessions}["me"]
 
     before = present()
-    carrier.close()
+    embedded.close()
 
     assert before
     assert not present()
 
 
-def test_carrier_refuses_a_shard_that_is_not_here(carrier):
+def test_carrier_refuses_a_shard_that_is_not_here(embedded):
     """A request for another shard is an error that names both, never an empty answer."""
     with pytest.raises(ShardUnreachableError, match=r"s9 is not in this process.*s0"):
-        carrier.request("s9", ListLocks(), timeout_s=1)
+        embedded.request("s9", ListLocks(), timeout_s=1)
 
 
-def test_carrier_refuses_to_be_used_after_its_end(carrier):
+def test_carrier_refuses_to_be_used_after_its_end(embedded):
     """A closed carrier says so."""
-    carrier.close()
+    embedded.close()
 
     with pytest.raises(MisuseError, match="closed"):
-        carrier.request("s0", ListLocks(), timeout_s=1)
+        embedded.request("s0", ListLocks(), timeout_s=1)
 
 
-def test_carrier_feeds_notices_until_the_feed_is_closed(carrier, make_peer):
+def test_carrier_feeds_notices_until_the_feed_is_closed(embedded, make_peer):
     """A feed has every commit; a closed feed gets none and the others go on."""
-    peer = make_peer(lambda shard, message: carrier.request(shard, message, timeout_s=5))
+    peer = make_peer(lambda shard, message: embedded.request(shard, message, timeout_s=5))
     peer.hello()
-    feed, closed = carrier.subscribe(), carrier.subscribe()
+    feed, closed = embedded.subscribe(), embedded.subscribe()
     closed.close()
 
     peer.write("cup", b"1")
@@ -108,13 +108,13 @@ def test_carrier_feeds_notices_until_the_feed_is_closed(carrier, make_peer):
     assert closed.get(0) is None
 
 
-def test_carrier_raises_in_a_forked_child(carrier):
+def test_carrier_raises_in_a_forked_child(embedded):
     """A child that uses its parent's cell is told so, and neither hangs nor answers."""
     reader, writer = os.pipe()
     child = os.fork()
     if child == 0:
         try:
-            carrier.request("s0", ListLocks(), timeout_s=1)
+            embedded.request("s0", ListLocks(), timeout_s=1)
             os.write(writer, b"answered")
         except MisuseError as error:
             os.write(writer, str(error).encode())

@@ -16,6 +16,8 @@ from enact_dist.link.socket_frames import Kind, Stream, prefixed, send_frame
 from enact_dist.terms import Access
 from enact_dist.wire.frames import encode_frame
 
+pytestmark = pytest.mark.carrier("socket")
+
 THREADS, VISITS = 6, 25
 
 

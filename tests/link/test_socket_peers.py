@@ -12,6 +12,8 @@ from enact_dist import Entity, Lock, Write, connect
 from enact_dist.errors import LinkError
 from enact_dist.link.socket_peers import Deaths, check_peer, peer_of
 
+pytestmark = pytest.mark.carrier("socket")
+
 
 def test_peer_of_another_user_is_refused_by_name():
     """The kernel says who is there; a stranger is named."""

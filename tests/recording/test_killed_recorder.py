@@ -18,7 +18,7 @@ from enact_dist import Aspect, Entity, Lock, Write, connect
 from enact_dist.recording.reading import Recording
 
 HERE = Path(__file__).parent
-ENVIRONMENT = {**os.environ, "PYTHONPATH": str(HERE.parents[1]), "PYTHONUNBUFFERED": "1"}
+ENVIRONMENT = {"PYTHONPATH": str(HERE.parents[1]), "PYTHONUNBUFFERED": "1"}
 ROUNDS = 8
 
 
@@ -30,7 +30,7 @@ def started():
     def start(*words, ready):
         process = subprocess.Popen(
             [sys.executable, *map(str, words)],
-            env=ENVIRONMENT,
+            env=os.environ | ENVIRONMENT,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
