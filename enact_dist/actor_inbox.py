@@ -308,15 +308,13 @@ class OwnWatch(Watching):
     def take(self, wait_s: float) -> Trigger | None:
         """Return the next run that is due, following the watch for at most `wait_s`; else None."""
         until_ns = monotonic_ns() + round(wait_s * 1e9)
-        self._follow_for(0.0)
         while True:
-            trigger = self._inbox.take(0.0)
-            now_ns = monotonic_ns()
-            if trigger is not None or now_ns >= until_ns:
-                return trigger
             due_ns = self._inbox.due_ns()
             wake_ns = until_ns if due_ns is None else min(due_ns, until_ns)
-            self._follow_for(max(0, wake_ns - now_ns) / 1e9)
+            self._follow_for(max(0, wake_ns - monotonic_ns()) / 1e9)
+            trigger = self._inbox.take(0.0)
+            if trigger is not None or monotonic_ns() >= until_ns:
+                return trigger
 
     def _follow_for(self, wait_s: float) -> None:
         """Wait so long for a change, and note all that have arrived by then."""
@@ -333,7 +331,7 @@ class OwnWatch(Watching):
                     return
                 self._refused = 0
                 self._note_in_all(self._group, change)
-                change = self._watch.next(timeout_s=0.0)
+                change = self._watch.next_here()
             if change is not None:
                 self._note_in_all(self._group, change)
         except LinkError as error:

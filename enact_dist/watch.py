@@ -22,8 +22,8 @@ from enact_dist.core.datum import Position, Slot
 from enact_dist.core.epochs import is_kept
 from enact_dist.core.messages import Notice, Survey, Surveyed
 from enact_dist.errors import ShardUnreachableError
-from enact_dist.link.notices import Skipped
-from enact_dist.terms import Durability, Entities, Entity, pattern_matches
+from enact_dist.link.notices import Interest, Skipped
+from enact_dist.terms import Durability, Entities, Entity
 
 if TYPE_CHECKING:
     from enact_dist.core.messages import SlotState
@@ -98,9 +98,9 @@ class Watch(Following[Change]):
         aspects: tuple[str, ...],
     ) -> None:
         self._client = client
-        self._contexts, self._aspects = contexts, aspects
-        self._patterns = tuple(str(Entities(pattern)) for pattern in patterns)
-        self._survey = Survey(contexts, self._patterns, aspects)
+        named = tuple(str(Entities(pattern)) for pattern in patterns)
+        self._survey = Survey(contexts, named, aspects)
+        self._interest = Interest(self._survey)
         self._known: dict[Slot, _Known] = {}
         self._following: dict[str, _Following] = {}
         self._pending: deque[Change] = deque()
@@ -137,10 +137,7 @@ class Watch(Following[Change]):
             left_s = POLL_S if deadline_s is None else deadline_s - time.monotonic()
             notice = self._feed.get(timeout_s=max(0.0, min(POLL_S, left_s)))
             if notice is not None:
-                if isinstance(notice, Skipped):
-                    self._pass_over(notice)
-                else:
-                    self._take(notice)
+                self._account_for(notice)
                 continue
             # A closed cell's feed answers None at once: without this the loop would spin.
             self._client.check_usable()
@@ -148,6 +145,21 @@ class Watch(Following[Change]):
             if left_s <= 0 and not self._pending:
                 return None
         return None
+
+    def next_here(self) -> Change | None:
+        """Return the next change of those that came with an earlier one, None if there is none."""
+        while not self._pending:
+            notice = None if self._closed.is_set() else self._feed.get_here()
+            if notice is None:
+                return None
+            self._account_for(notice)
+        return self._pending.popleft()
+
+    def _account_for(self, notice: Notice | Skipped) -> None:
+        if isinstance(notice, Skipped):
+            self._pass_over(notice)
+        else:
+            self._take(notice)
 
     def _take(self, notice: Notice) -> None:
         following = self._following.get(notice.shard)
@@ -161,7 +173,7 @@ class Watch(Following[Change]):
             return
         following.number = notice.number
         for slot, version, stamp_ns, null, captured_ns in notice.changes:
-            if self._covers(slot):
+            if self._interest.wants(slot):
                 known = _Known(notice.epoch, (version, stamp_ns))
                 self._note(notice.shard, slot, known, null=null, captured=captured_ns)
 
@@ -174,13 +186,6 @@ class Watch(Following[Change]):
             and skipped.after <= following.number < skipped.number
         ):
             following.number = skipped.number
-
-    def _covers(self, slot: Slot) -> bool:
-        return (
-            slot.context in self._contexts
-            and (not self._aspects or slot.aspect in self._aspects)
-            and any(pattern_matches(pattern, slot.entity) for pattern in self._patterns)
-        )
 
     def _look_for_missed_tail(self) -> None:
         """Compare with what the keep-alives know; they come every quarter of a TTL."""

@@ -76,6 +76,9 @@ class NoticeFeed(Protocol):
         after so long without one, or once closed.
         """
 
+    def get_here(self) -> Notice | Skipped | None:
+        """Return the next of those that are here already, None if there is none; never waits."""
+
     def close(self) -> None:
         """End the feed and wake whoever waits in `get`; twice is harmless."""
 

@@ -9,7 +9,6 @@ the numbers are passed on (`Skipped`), so that a gap remains a gap.
 
 from __future__ import annotations
 
-import contextlib
 import os
 import select
 import threading
@@ -59,9 +58,10 @@ class Interest:
 
     def covers(self, notice: Notice) -> bool:
         """Whether a notice tells of one of them."""
-        return any(self._is_wanted(change[0]) for change in notice.changes)
+        return any(self.wants(change[0]) for change in notice.changes)
 
-    def _is_wanted(self, slot: Slot) -> bool:
+    def wants(self, slot: Slot) -> bool:
+        """Whether a slot is one of them."""
         known = self._known.get(slot)
         if known is None:
             wanted = self.wanted
@@ -95,26 +95,35 @@ class Source(Protocol):
         """
 
 
-class _Bell:
-    """Wakes a thread that polls; rings on until it is heard."""
+class _Ear:
+    """Waits for a source, or for a bell that other threads ring; it rings on until it is heard."""
 
-    __slots__ = ("_descriptor",)
+    __slots__ = ("_bell", "_poll", "on_end", "source")
 
-    def __init__(self) -> None:
-        self._descriptor = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+    def __init__(self, source: Source, on_end: Callable[[Exception], None]) -> None:
+        self.source, self.on_end = source, on_end
+        self._bell = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+        self._poll = select.poll()
+        self._poll.register(self._bell, select.POLLIN)
+        self._poll.register(source, select.POLLIN)
 
-    def fileno(self) -> int:
-        return self._descriptor
+    def wait(self, wait_s: float | None) -> list[int]:
+        """Return what can be heard: descriptors, that of the bell among others."""
+        return [one for one, _ in self._poll.poll(None if wait_s is None else wait_s * 1e3)]
 
     def ring(self) -> None:
-        os.eventfd_write(self._descriptor, 1)
+        os.eventfd_write(self._bell, 1)
 
-    def heard(self) -> None:
-        with contextlib.suppress(BlockingIOError):
-            os.eventfd_read(self._descriptor)
+    def heard_bell(self, ready: list[int]) -> bool:
+        """Whether the bell is in `ready`, which it is no more; the mutex of who rings is held."""
+        rang = self._bell in ready
+        if rang:
+            ready.remove(self._bell)
+            os.eventfd_read(self._bell)
+        return rang
 
     def __del__(self) -> None:
-        os.close(self._descriptor)
+        os.close(self._bell)
 
 
 class NoticeQueue:
@@ -138,12 +147,11 @@ class NoticeQueue:
         self.late_s = 0.0
         self.on_close: Callable[[], None] | None = None
         self._newest: dict[str, tuple[int, int]] = {}
-        self._changed = threading.Condition(threading.Lock())
+        self._mutex = threading.Lock()
+        self._changed = threading.Condition(self._mutex)
         self._closed = False
         self._dropped = 0
-        self._source: Source | None = None
-        self._on_end: Callable[[Exception], None] | None = None
-        self._bell: _Bell | None = None
+        self._ear: _Ear | None = None
         self._polling = False
 
     @property
@@ -153,25 +161,29 @@ class NoticeQueue:
 
     def put(self, notice: Notice) -> None:
         """Add a notice; one that came already (over a second connection) is ignored."""
-        with self._changed:
-            number = (notice.epoch, notice.number)
-            if self._closed or number <= self._newest.get(notice.shard, (0, 0)):
-                return
-            self._newest[notice.shard] = number
-            if self._interest is not None and not self._interest.covers(notice):
-                self._skip(Skipped(notice.shard, notice.epoch, notice.number - 1, notice.number))
-                return
-            if len(self._notices) >= self._notices_max:
-                self._notices.popleft()
-                self._dropped += 1
-            self._notices.append(notice)
-            self._wake()
+        with self._mutex:
+            wanted = self._interest is None or self._interest.covers(notice)
+            self._put(notice, wanted=wanted)
+
+    def _put(self, notice: Notice, *, wanted: bool) -> None:
+        number = (notice.epoch, notice.number)
+        if self._closed or number <= self._newest.get(notice.shard, (0, 0)):
+            return
+        self._newest[notice.shard] = number
+        if not wanted:
+            self._skip(Skipped(notice.shard, notice.epoch, notice.number - 1, notice.number))
+            return
+        if len(self._notices) >= self._notices_max:
+            self._notices.popleft()
+            self._dropped += 1
+        self._notices.append(notice)
+        self._wake()
 
     def _wake(self) -> None:
         """Wake whoever waits in `get`.  The mutex is held."""
         self._changed.notify_all()
-        if self._bell is not None and self._polling:
-            self._bell.ring()
+        if self._ear is not None and self._polling:
+            self._ear.ring()
 
     def read_from(self, source: Source, on_end: Callable[[Exception], None]) -> bool:
         """Let `get` read this source, too; say no if there is one, or the feed is closed.
@@ -180,29 +192,24 @@ class NoticeQueue:
             source: What is read while somebody waits; what comes at other times waits there.
             on_end: Called once by `get`, with the reason, when the source has ended.
         """
-        with self._changed:
-            if self._closed or self._source is not None:
+        with self._mutex:
+            if self._closed or self._ear is not None:
                 return False
-            self._source, self._on_end = source, on_end
-            self._bell = self._bell or _Bell()
+            self._ear = _Ear(source, on_end)
             self._wake()
             return True
 
     def take(self, found: Iterable[Notice | Skipped]) -> None:
-        """Add what came from a shard."""
-        for one in found:
-            if isinstance(one, Skipped):
-                self.skip(one)
-            else:
-                self.put(one)
-
-    def skip(self, skipped: Skipped) -> None:
-        """Add the numbers of notices that were of no interest; wakes nobody."""
-        with self._changed:
-            if not self._closed:
-                self._skip(skipped)
+        """Add what came from a shard that passes over what is of no interest by itself."""
+        with self._mutex:
+            for one in found:
+                if not isinstance(one, Skipped):
+                    self._put(one, wanted=True)
+                elif not self._closed:
+                    self._skip(one)
 
     def _skip(self, skipped: Skipped) -> None:
+        """Add the numbers of notices that were of no interest; wakes nobody."""
         last = self._notices[-1] if self._notices else None
         if isinstance(last, Skipped) and (last.shard, last.epoch, last.number) == skipped[:3]:
             self._notices[-1] = last._replace(number=skipped.number)
@@ -216,53 +223,61 @@ class NoticeQueue:
         """
         deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
         while True:
-            left_s = None if deadline_s is None else max(0.0, deadline_s - time.monotonic())
-            with self._changed:
-                self._changed.wait_for(
-                    lambda: self._notices or self._closed or self._source is not None, left_s
-                )
-                if self._notices and not self._closed:
+            with self._mutex:
+                if self._ear is None:
+                    self._changed.wait_for(self._has_news, _left_s(deadline_s))
+                if self._closed:
+                    return None
+                if self._notices:
                     return self._notices.popleft()
-                source, bell = self._source, self._bell
-                if self._closed or source is None or bell is None:
+                ear = self._ear
+                if ear is None:
                     return None
                 self._polling = True
-            if not self._read(source, bell, left_s):
+            if not self._read(ear, _left_s(deadline_s)):
                 return None
 
-    def _read(self, source: Source, bell: _Bell, wait_s: float | None) -> bool:
+    def get_here(self) -> Notice | Skipped | None:
+        """Return the next of those that are here already, None if there is none."""
+        with self._mutex:
+            return self._notices.popleft() if self._notices and not self._closed else None
+
+    def _has_news(self) -> bool:
+        return bool(self._notices) or self._closed or self._ear is not None
+
+    def _read(self, ear: _Ear, wait_s: float | None) -> bool:
         """Wait for the source or the bell, and take what has come; False: nothing did."""
         try:
-            poll = select.poll()
-            poll.register(bell, select.POLLIN)
-            poll.register(source, select.POLLIN)
-            ready = [one for one, _ in poll.poll(None if wait_s is None else wait_s * 1e3)]
-            with self._changed:
+            ready = ear.wait(wait_s)
+            with self._mutex:
                 self._polling = False
-                bell.heard()
-            if self._closed or not [one for one in ready if one != bell.fileno()]:
-                return bool(ready)
-            found = source.take_notices()
+                rang = ear.heard_bell(ready)
+            if self._closed or not ready:
+                return rang
+            found = ear.source.take_notices()
         except (EnactError, EOFError, OSError, ValueError) as error:
-            self._ended(source, error)
+            self._ended(ear, error)
             return True
         self.take(found)
         return True
 
-    def _ended(self, source: Source, error: Exception) -> None:
-        with self._changed:
-            if self._source is not source:
+    def _ended(self, ear: _Ear, error: Exception) -> None:
+        with self._mutex:
+            if self._ear is not ear:
                 return
-            self._source, on_end, self._on_end = None, self._on_end, None
-        if on_end is not None:
-            on_end(error)
+            self._ear = None
+        ear.on_end(error)
 
     def close(self) -> None:
         """End the feed and wake whoever waits in `get`; twice is harmless."""
-        with self._changed:
+        with self._mutex:
             if self._closed:
                 return
             self._closed = True
             self._wake()
         if self.on_close is not None:
             self.on_close()
+
+
+def _left_s(deadline_s: float | None) -> float | None:
+    return None if deadline_s is None else max(0.0, deadline_s - time.monotonic())
