@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import ItemsView, Iterator, Mapping, ValuesView
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from enact_dist.core.datum import Slot
 from enact_dist.core.messages import DatumRead
@@ -64,7 +64,7 @@ class Readings:
         self._cache = cache
         self._lock = lock
         self._readings = {reading.state.slot: reading for reading in readings}
-        self.looked_at: dict[Slot, object] = {}
+        self.looked_at: dict[Slot, Any] = {}
         self._kept: dict[Slot, Datum] = {}
         self._fetched_alone = 0
         self.asked: Iterable[LockRequest[Any]] = ()
@@ -145,20 +145,19 @@ class Readings:
         self._kept.update(self._fetched(named))
 
     def value(self, slot: Slot, aspect: Aspect[T]) -> T:
-        """Return the decoded datum of a slot.
+        """Return the decoded datum of a slot; whoever asks has made sure that it is `usable`.
 
         Raises:
             NullDatumError: The slot is null.
         """
-        self.usable()
-        value = self.looked_at.get(slot, UNSET)
+        value: T = self.looked_at.get(slot, UNSET)
         if value is UNSET:
-            state = self.state(slot)
-            if state is None or is_null(state):
-                raise null_error(slot, state)
+            reading = self._readings.get(slot)
+            if reading is None or reading.state.null_reason:
+                raise null_error(slot, self.state(slot))
             value = self.looked_at[slot] = decode_datum(self.datum(slot), aspect.datum_type)
             self.decoded += 1
-        return cast("T", value)
+        return value
 
     def matching(self, request: LockRequest[Any]) -> list[Slot]:
         """Return the slots of a pattern request that are not null, in order of their names."""
@@ -222,8 +221,8 @@ class EachData(Mapping[Entity, T]):
         slot = self._slots.get(entity)
         if slot is None:
             raise KeyError(entity)
+        self._data.usable()
         if self._data.bytes_to_come(slot):
-            self._data.usable()
             self._fetch(slot)
         return self._data.value(slot, self._request.aspect)
 

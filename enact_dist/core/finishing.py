@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
     from enact_dist.core.datum import LockId
+    from enact_dist.core.lock_parts import Part
     from enact_dist.core.messages import (
         DatumRead,
         PlacementMap,
@@ -62,7 +63,8 @@ class Finishing:
 
     def __post_init__(self) -> None:
         self.primary = min(self.writes, default="")
-        self.left = dict.fromkeys(shard for shard in self.tokens if shard != self.primary)
+        self.left = dict.fromkeys(self.tokens)
+        self.left.pop(self.primary, None)
 
     def votes_to_ask(self, seen_stamp_ns: int) -> list[tuple[str, Request]]:
         """Return what to ask the shards that have not said yes."""
@@ -140,10 +142,10 @@ def _is_named(write: WriteItem) -> bool:
     return datum is not None and bool(datum.file) and len(datum.body) == datum.size
 
 
-def tokens_of(
-    held: Iterable[tuple[str, Token | None]], expected_at: Iterable[tuple[str, int]]
-) -> dict[str, Token]:
-    """Return the tokens of a lock, and epochs as tokens where it only expects something."""
-    tokens = {shard: Token(epoch, 0) for shard, epoch in expected_at}
-    tokens.update((shard, token) for shard, token in held if token is not None)
+def tokens_of(parts: Iterable[Part], epochs: Mapping[str, int]) -> dict[str, Token]:
+    """Return the tokens of a lock, and `epochs` as tokens where it only expects something."""
+    tokens = {shard: Token(epoch, 0) for shard, epoch in epochs.items()}
+    for part in parts:
+        if part.token is not None:
+            tokens[part.shard] = part.token
     return tokens

@@ -101,12 +101,12 @@ class MultiLock:
     parts: list[Part] = field(default_factory=list)
     slice_ns: int = WAIT_SLICE_NS
     lane_free: bool = False
+    farewells: list[tuple[str, Request]] = field(default_factory=list)
     cut: Cut | None = None
     _finishing: Finishing | None = None
     _free_calls: int = FREE_CALLS
     _retry_at_ns: int = 0
     _retry_ns: int = RETRY_NS_MIN
-    _farewells: list[tuple[str, Request]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.parts = [Part(shard, items) for shard, items in self.plan.locks]
@@ -177,7 +177,7 @@ class MultiLock:
 
     def take_farewells(self) -> list[tuple[str, Request]]:
         """Return releases to send without waiting for their answers; the shard needs none."""
-        farewells, self._farewells = self._farewells, []
+        farewells, self.farewells = self.farewells, []
         return farewells
 
     # ---------------------------------------------------------------- what came back
@@ -373,7 +373,7 @@ class MultiLock:
         if phase not in (Phase.COMMITTED, Phase.UNKNOWN):
             touched = [part.shard for part in self.parts]
             touched += [shard for shard, _ in self.plan.views if shard not in touched]
-            self._farewells += [(shard, Release(self.lock)) for shard in touched]
+            self.farewells += [(shard, Release(self.lock)) for shard in touched]
         self.client.ended(self)
 
     # ---------------------------------------------------------------- the end
@@ -403,12 +403,10 @@ class MultiLock:
         self.give_up_ns = give_up_ns
         self._free_calls = self._retry_at_ns = 0
         expected = by_shard(expects, self.plan.placement)
+        tokens = tokens_of(self.parts, {shard: self._epoch_viewed(shard) for shard in expected})
         self._finishing = Finishing(
             self.lock,
-            tokens_of(
-                ((part.shard, part.token) for part in self.parts),
-                ((shard, self._epoch_viewed(shard)) for shard in expected),
-            ),
+            tokens,
             {shard: tuple(items) for shard, items in writes.items() if items},
             expected,
             tuple(reads),
@@ -433,7 +431,7 @@ class MultiLock:
         else:
             if not self.parts and any(r.state.large or r.state.same for r in self.states):
                 # The shards keep large data of a lock of views alone.
-                self._farewells += [(shard, Release(self.lock)) for shard, _ in self.plan.views]
+                self.farewells += [(shard, Release(self.lock)) for shard, _ in self.plan.views]
             self._end(Phase.COMMITTED)
 
     def _on_vote(self, shard: str, answer: Answer) -> None:

@@ -178,17 +178,16 @@ class CellClient(SessionClient):
                 lock.release()
             raise
         finally:
-            self._say_farewell(lock)
+            if lock.farewells:
+                self._say_farewell(lock)
 
     def _say_farewell(self, lock: MultiLock) -> None:
         """Send the releases of a lock that rests; the keep-alives repair what gets lost."""
-        farewells = lock.take_farewells()
-        if farewells:
-            try:
-                self.carrier.request_all(farewells, timeout_s=CALL_S)
-            except EnactError as error:
-                self.count("releases_unsent")
-                _log.info("lock %s was not released by message: %s", lock.lock, error)
+        try:
+            self.carrier.request_all(lock.take_farewells(), timeout_s=CALL_S)
+        except EnactError as error:
+            self.count("releases_unsent")
+            _log.info("lock %s was not released by message: %s", lock.lock, error)
 
     def finish(
         self,
@@ -303,7 +302,8 @@ class CellClient(SessionClient):
         try:
             with self._mutex:
                 lock.release()
-            self._say_farewell(lock)
+            if lock.farewells:
+                self._say_farewell(lock)
         finally:
             lock.lane_free = True
             if lock.phase is Phase.UNKNOWN:

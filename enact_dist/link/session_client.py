@@ -439,7 +439,12 @@ class SessionClient:
 
 def bytes_with(writes: Iterable[Sequence[WriteItem]]) -> int:
     """Return how many bytes of data travel with the messages that write these."""
-    return sum(w.datum.size for each in writes for w in each if w.datum and not w.datum.file)
+    size = 0
+    for each in writes:
+        for _, datum in each:
+            if datum is not None and not datum.file:
+                size += datum.size
+    return size
 
 
 def _patience_s(request: Request) -> float:

@@ -6,6 +6,7 @@ from shard_bench import datum, lock_id, slot
 
 from enact_dist.core.datum import Token
 from enact_dist.core.finishing import Finishing, tokens_of
+from enact_dist.core.lock_parts import Part
 from enact_dist.core.messages import Commit, Prepare, Prepared, SlotVersion, Validate, WriteItem
 
 LOCK = lock_id("ann")
@@ -81,6 +82,8 @@ def test_commit_on_one_shard_alone_has_no_participants():
 
 def test_where_something_is_only_expected_the_epoch_stands_for_a_grant():
     """A grant there comes before it, as it says more."""
-    tokens = tokens_of([("a", Token(1, 5)), ("b", None)], [("a", 9), ("d", 4)])
+    parts = [Part("a", (), Token(1, 5)), Part("b", ())]
+
+    tokens = tokens_of(parts, {"a": 9, "d": 4})
 
     assert tokens == {"a": Token(1, 5), "d": Token(4, 0)}
