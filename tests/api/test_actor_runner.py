@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from enact_dist import testing
+from enact_dist import actor_binding, testing
 from enact_dist.actor import Actor
 from enact_dist.actor_binding import BoundActor
 from enact_dist.actor_inbox import Inbox, OwnWatch, Watching, watching
@@ -312,6 +312,23 @@ def test_actor_of_one_world_follows_it_by_its_own_thread(cell):
     bound = BoundActor(Reconstruction(), cell)
 
     assert type(watching(bound, Inbox(per_entity=True))) is OwnWatch
+
+
+def test_requests_are_bound_once_per_entity_and_not_kept_without_end(cell, monkeypatch):
+    """Locks of one entity share their requests, those of another one have their own."""
+    monkeypatch.setattr(actor_binding, "ENTITIES_MAX", 2)
+    bound = BoundActor(Reconstruction(), cell)
+
+    def requests(entity):
+        return list(bound.lock(entity)._bound.values())
+
+    first, other = requests(A), requests(B)
+    assert all(one is again for one, again in zip(first, requests(A), strict=True))
+    assert {request.entity for request in first if request.entity in (A, B)} == {A}
+    assert {request.entity for request in other if request.entity in (A, B)} == {B}
+    requests(Entity("view/third"))
+    assert len(bound._by_entity) == 1
+    assert requests(A) == first
 
 
 def test_inbox_returns_nothing_when_nothing_changes_in_time():

@@ -23,6 +23,25 @@ def test_queue_gives_notices_in_order_when_they_are_taken():
     assert taken == [*notices, None]
 
 
+def test_what_is_here_is_given_without_a_look_at_the_source(piped):
+    """What came with the notice that was taken is here; what still waits in the source is not."""
+    queue, far, _ = piped
+    far.send(b"xx")
+
+    first = queue.get(30.0)
+    far.send(b"x")
+
+    assert [one and one.number for one in (first, queue.get_here(), queue.get_here())] == [
+        1,
+        2,
+        None,
+    ]
+    assert queue.get(30.0).number == 3
+    queue.put(Notice("s1", 1, 1, ()))
+    queue.close()
+    assert queue.get_here() is None
+
+
 def test_queue_drops_the_oldest_and_counts_when_nobody_takes_them():
     """A full queue keeps the newest; `dropped` says how many are gone."""
     queue = NoticeQueue(notices_max=3)
