@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import fcntl
 import os
+import select
 import shutil
 import subprocess
 import sys
@@ -26,6 +27,7 @@ POOL = "base=198.18.64.0/18,size=24"
 """Addresses of networks: of the range for tests of devices, that nothing on the Internet has."""
 
 START_S = 60.0
+END_S = 60.0
 CALL_S = 900.0
 CGROUPS = Path("/sys/fs/cgroup")
 
@@ -80,7 +82,7 @@ class Engine:
         return self.docker("compose", *words, check=check, wait_s=wait_s)
 
     def daemon(self) -> int:
-        """Return the number of the process that all of the engine's die with."""
+        """Return the number of the process that ends last of the engine's, and takes all along."""
         children = f"/proc/{self._process.pid}/task/{self._process.pid}/children"
         return int(Path(children).read_text("utf-8").split()[0])
 
@@ -100,9 +102,16 @@ class Engine:
         )
 
     def end(self) -> None:
-        """Kill all of it and remove what it left."""
+        """Kill all of it, wait until all of it is dead, and remove what it left."""
+        try:
+            daemon = os.pidfd_open(self.daemon())
+        except (OSError, IndexError):  # it has ended by itself
+            daemon = None
         self._process.kill()
         self._process.wait()
+        if daemon is not None:
+            select.select([daemon], [], [], END_S)
+            os.close(daemon)
         remove(self.folder)
 
 
