@@ -193,8 +193,8 @@ def compose_plugin() -> Path:
     return kept("compose", COMPOSE_SUITE + platform.machine(), make) / "docker-compose"
 
 
-def docker_command() -> str | None:
-    """Return a Docker command line with BuildKit: the first in PATH may lack its plugin."""
+def docker_command() -> str:
+    """Return a Docker command line with BuildKit, or nothing: the first in PATH may lack it."""
     surroundings = {**os.environ, "DOCKER_BUILDKIT": "1"}
     for command in (shutil.which("docker"), shutil.which("/usr/bin/docker")):
         words = [command or "", "build", "--help"]
@@ -205,7 +205,7 @@ def docker_command() -> str | None:
             ).returncode
         ):
             return command
-    return None
+    return ""
 
 
 def found_compose_plugin() -> Path | None:

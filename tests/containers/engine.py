@@ -131,7 +131,7 @@ def start() -> Engine:
     if shutil.which("dockerd", path=path) is None:
         raise NoEngineError("dockerd: command not found (Debian package docker.io)")
     command = kept.docker_command()
-    if command is None:
+    if not command:
         raise NoEngineError("docker: no command line with BuildKit (Debian package docker.io)")
     folder = Path(tempfile.mkdtemp(prefix=PREFIX))
     claim(folder)
