@@ -10,9 +10,8 @@ relay between peers).  Reasons for the settings, measured with 1.10 on a loopbac
   5 s; a client waits longer, since only its own thread does, and a busy shard must not lose it.
 - `max_wait_before_drop_fragments` 2 s: slices of a large datum over a slow network are not
   dropped after 50 ms; only senders of their own ever wait for it.
-- Reconnection every 50 ms: a restarted shard is back in use after 0.1 s, not 1 s.  After a cut it
-  takes up to 1 s, as often as the kernel repeats a connection that nobody answers.
-- Lost connections close at once: see `zenoh_lingering`.
+- Reconnection every 50 ms: a restarted shard is back in use after 0.1 s, not 1 s.
+- `zenoh_links` lets lost connections close at once, and be back soon after a cut.
 
 Sessions must be closed before the interpreter ends (it hangs otherwise), and must never be closed
 or freed in a forked child (that hangs too): `close_session` and `keep_after_fork` see to both.
@@ -30,7 +29,7 @@ from typing import TYPE_CHECKING, Final
 import zenoh
 
 from enact_dist.errors import ConfigError, LinkError, MisuseError
-from enact_dist.link.zenoh_lingering import LingerWatch
+from enact_dist.link.zenoh_links import LinkWatch
 from enact_dist.wire.limits import BODY_BYTES_MAX, HEADER_BYTES_MAX
 
 if TYPE_CHECKING:
@@ -130,7 +129,7 @@ def open_session(
     except zenoh.ZError as error:
         raise _open_error(error, listen) from None
     _open_sessions.append((os.getpid(), session))
-    _watches[session] = watch = LingerWatch(session)
+    _watches[session] = watch = LinkWatch(session, connect)
     keep_after_fork(watch)
     return session
 
@@ -155,7 +154,7 @@ def _reason(error: zenoh.ZError) -> str:
 
 _open_sessions: list[tuple[int, zenoh.Session]] = []
 _owners: weakref.WeakSet[object] = weakref.WeakSet()
-_watches: dict[zenoh.Session, LingerWatch] = {}
+_watches: dict[zenoh.Session, LinkWatch] = {}
 
 
 def close_session(session: zenoh.Session) -> None:
@@ -164,7 +163,7 @@ def close_session(session: zenoh.Session) -> None:
     if mine in _open_sessions:
         _open_sessions.remove(mine)
         session.close()  # type: ignore[no-untyped-call]  # Zenoh's stub lacks it
-        _watches.pop(session).join()
+        _watches.pop(session).close()
 
 
 def keep_after_fork(owner: object) -> None:

@@ -169,8 +169,8 @@ def test_frozen_host_wakes_up_believing_and_is_refused(whole):
 def test_shard_is_reached_again_soon_after_a_cut(whole):
     """From the end of a cut longer than a link's lease to the first answer.
 
-    The kernel repeats a connection that nobody answers once a second, so the cuts differ in length;
-    the machine may be busy, so only the best one has to keep the promise of a second.
+    The kernel repeats a connection that nobody answers once a second, so the cuts differ in length.
+    On a machine with much other work only the best of them has to keep the promise of a second.
     """
     ways = whole.between("far", ["s1"])
     took_ms = []

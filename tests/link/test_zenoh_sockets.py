@@ -1,5 +1,7 @@
-"""Zenoh's TCP sockets close at once: a host that is cut off must not hold the receiving threads."""
+"""Zenoh's TCP sockets close at once, and do not wait for the kernel's next try after a cut."""
 
+import os
+import select
 import socket
 import struct
 import time
@@ -7,7 +9,7 @@ import time
 import pytest
 
 from enact_dist.link.zenoh_config import close_session, open_session
-from enact_dist.link.zenoh_lingering import _connections, end_lingering
+from enact_dist.link.zenoh_sockets import connections, end_lingering, give_up, unanswered
 
 LINGER = struct.Struct("ii")
 ZENOHS = (1, 10)
@@ -35,7 +37,7 @@ def test_only_sockets_with_zenohs_linger_time_are_changed(before, lingers):
 def lingering():
     """Return how many TCP sockets of this process wait before they close."""
     count = 0
-    for connection in _connections():
+    for connection in connections():
         with connection:
             count += bool(linger_of(connection)[0])
     return count
@@ -53,3 +55,26 @@ def test_connections_of_sessions_do_not_linger_on_either_side(endpoint):
     finally:
         for session in (*clients, shard):
             close_session(session)
+
+
+def test_connection_that_nobody_answers_is_given_up_and_no_other():
+    """A listener whose queue is full answers nobody: the kernel would try again every second."""
+    with socket.create_server(("127.0.0.1", 0), backlog=0) as full:
+        address, port = full.getsockname()
+        asking = [socket.socket() for _ in range(4)]
+        for one in asking:
+            one.setblocking(False)
+            one.connect_ex((address, port))
+        found = unanswered(address, port)
+        stuck = [one for one in asking if os.fstat(one.fileno()).st_ino in found]
+        try:
+            assert 0 < len(stuck) == len(found) < len(asking)
+            assert unanswered(address, port + 1) == set()
+
+            give_up({os.fstat(stuck[0].fileno()).st_ino})
+
+            assert unanswered(address, port) == found - {os.fstat(stuck[0].fileno()).st_ino}
+            assert select.select([], [stuck[0]], [], 30.0)[1]
+        finally:
+            for one in asking:
+                one.close()
