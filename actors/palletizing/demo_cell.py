@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from enact_dist import Cell
 
 TEMPLATE: Final = Path(__file__).with_name("cell.toml")
-UP_S: Final = 30.0
+UP_S: Final = 60.0
 """How long the shards may take to answer; one needs half a second on an idle machine."""
 TRY_S: Final = 2.0
 """How long one try to join takes; after each it is looked whether the processes still run."""

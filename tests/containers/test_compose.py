@@ -1,0 +1,235 @@
+"""The compose file of the palletizing cell, in an engine, with the faults of a day.
+
+One project for all of it: the conveyor is the last to start, so that the packages come after the
+faults, and their verdicts are those of a run on one machine that had none.
+"""
+
+import functools
+import json
+import subprocess
+import sys
+
+import pytest
+
+pytest.importorskip("open3d", exc_type=ImportError)
+
+from stack import PACKAGES, Stack, until
+
+pytestmark = pytest.mark.containers
+
+SHARDS = ("shard-left", "shard-right")
+ACTORS = (
+    "training-perception",
+    "reconstruction",
+    "fusion",
+    "conveyor",
+    "online-perception",
+    "deviation",
+    "feedback",
+)
+"""Those that go on for ever; the planning is done at once."""
+
+MARK = "view/probe/mark"
+"""A datum of shard-left that no actor of the cell knows."""
+
+BY_REFERENCE = """
+import numpy as np
+from pathlib import Path
+from enact_dist import Aspect, Entity, Lock, Read, Write, connect
+with connect("/etc/enact/cell.toml", actor="probe") as cell:
+    slot = cell.world("training"), Entity("view/probe"), Aspect("large", np.ndarray)
+    {body}
+"""
+WRITE = """write = Write(*slot)
+    with Lock(write) as lock:
+        lock[write] = np.full(4 << 20, {value}, np.int32)"""
+READ = """read = Read(*slot)
+    with Lock(read) as lock:
+        largest = int(lock[read].max())
+        mapped = "/run/enact/" in Path("/proc/self/maps").read_text()
+        print(largest, "mapped" if mapped else "sent")"""
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory):
+    """The same demo on this machine, without containers; its report once it is done."""
+    out = tmp_path_factory.mktemp("alone")
+    words = ("-m", "enact_dist.cli.main", "demo", "palletizing", "--packages", str(PACKAGES))
+    with subprocess.Popen(
+        [sys.executable, *words, "--out", str(out)], stdout=subprocess.PIPE, text=True
+    ) as process:
+
+        @functools.cache
+        def report():
+            said, _ = process.communicate()
+            assert process.returncode == 0, said
+            return judged(out)
+
+        yield report
+        process.terminate()
+
+
+def judged(out):
+    """Return what was found at each place."""
+    packages = json.loads((out / "report.json").read_text("utf-8"))["packages"]
+    return [{**package, "frame_to_feedback_ms": 0.0} for package in packages]
+
+
+@pytest.fixture(scope="module")
+def stack(engine, images, alone, tmp_path_factory):
+    """The project, up, in training, still without its conveyor."""
+    folder = tmp_path_factory.mktemp("compose")
+    with Stack(
+        engine, "cell", folder, "--file", "deploy/compose.yaml", ENACT_SHARED_SIZE="256m"
+    ) as stack:
+        stack.compose("up", "--detach", "--scale", "conveyor=0")
+        for service in SHARDS:
+            stack.log_until(service, "ready: ")
+        stack.enact("world", "put", "training", MARK, "42", "--new")
+        yield stack
+
+
+def test_processes_have_no_rights_and_no_place_to_write(stack):
+    """From inside: a plain user, a read-only root, no capability, none to be gained."""
+    asked = "id -u; touch /usr/x 2>&1; grep -h -e CapEff -e NoNewPrivs /proc/self/status"
+    for service in (*SHARDS, "deviation", "feedback", "demo"):
+        said = stack.docker("exec", service, "sh", "-c", asked)
+
+        assert said.split()[0] == "10001", service
+        assert "Read-only file system" in said, service
+        assert said.split()[-3:] == ["0000000000000000", "NoNewPrivs:", "1"], service
+
+
+@pytest.mark.parametrize("service", SHARDS)
+def test_a_shard_is_healthy_by_a_real_query(stack, service):
+    """What the engine runs every few seconds asks the shard for its state."""
+    health = until(
+        lambda: next(iter(healthy(stack, service)), None),
+        lambda: f"{service} healthy: {stack.state(service)}",
+    )
+
+    assert any("ready (open)" in check["Output"] for check in health["Log"])
+
+
+def healthy(stack, service):
+    """Return the engine's notes on the health of a service that is well."""
+    health = stack.state(service)["Health"]
+    return [health] if health["Status"] == "healthy" else []
+
+
+def test_large_data_are_shared_between_containers(stack):
+    """What one container commits another one maps, as both have the folder in shared memory."""
+    stack.python("feedback", BY_REFERENCE.format(body=WRITE.format(value=1)))
+
+    assert stack.python("fusion", BY_REFERENCE.format(body=READ)) == "1 mapped"
+
+
+def test_with_shared_memory_full_data_travel(stack):
+    """A file that cannot be made costs speed and nothing else; no process gets SIGBUS."""
+    stack.docker("exec", "shard-left", "sh", "-c", "cat /dev/zero >/run/enact/full", check=False)
+
+    stack.python("feedback", BY_REFERENCE.format(body=WRITE.format(value=2)))
+    said = stack.python("fusion", BY_REFERENCE.format(body=READ))
+    left = stack.json("shard", "ls")[0]
+
+    stack.docker("exec", "shard-left", "rm", "/run/enact/full")
+    assert said == "2 sent"
+    assert left["name"] == "left"
+    assert left["counters"]["payload_fallbacks"] >= 1
+
+
+def test_a_killed_shard_comes_back_with_its_data(stack):
+    """Its policy starts it again; what was committed is there."""
+    stack.kill_process("shard-left")
+    stack.log_until("shard-left", "ready: ", times=2)
+
+    assert stack.state("shard-left")["RestartCount"] == 1
+    assert stack.json("world", "get", "training", MARK) == 42
+
+
+def test_a_killed_actor_comes_back(stack):
+    """A death that nobody has ordered is none."""
+    stack.log_until("reconstruction", "ready: ")
+
+    stack.kill_process("reconstruction")
+    stack.log_until("reconstruction", "ready: ", times=2)
+
+    assert stack.state("reconstruction")["RestartCount"] == 1
+
+
+def test_a_frozen_container_loses_its_lock(stack):
+    """Others get it after the TTL of its lease; woken, it is told, and its command ended."""
+    held = ("lock", "hold", f"training:{MARK}:write")
+    words = ("sh", "-c", "echo held; exec sleep 3600")
+    stack.compose("run", "--detach", "--name", stack.name("holder"), "enact", *held, "--", *words)
+    stack.log_until("holder", "held")
+
+    stack.pause("holder")
+    stack.enact(*held, "--wait", "60", "--", "true")
+    stack.docker("unpause", "holder")
+
+    assert stack.ended("holder") == 1
+    assert "lease" in stack.docker("logs", "holder")
+    stack.docker("rm", "holder")
+
+
+def test_a_container_cut_off_is_back_when_the_network_is(stack):
+    """Without a network nobody joins from there; with it, the actor is as before."""
+    network = f"{stack.project}_default"
+    stack.engine.docker("network", "disconnect", network, stack.name("fusion"))
+    asked = stack.enact("actor", "ls", "--timeout", "1", inside="fusion", check=False)
+    stack.engine.docker("network", "connect", network, stack.name("fusion"))
+
+    assert "no shard answers" in asked
+    until(lambda: "fusion" in listed(stack, inside="fusion"), lambda: "fusion in enact actor ls")
+
+
+def listed(stack, *, inside="feedback"):
+    """Return the actors of the cell."""
+    return {info["actor"] for info in stack.json("actor", "ls", inside=inside)}
+
+
+def test_verdicts_are_those_of_one_machine(stack, alone):
+    """After all that not one number is another."""
+    stack.compose("up", "--detach", "--no-recreate", "conveyor")
+
+    assert stack.ended("demo") == 0, stack.docker("logs", "demo")
+    assert judged(stack.out) == alone()
+    assert stack.docker("logs", "feedback").count("place/") == PACKAGES
+    for name in ("model_milk_carton.png", "model_meal_tray.png", "tray_1.png"):
+        assert (stack.out / name).stat().st_size > 20_000
+
+
+def test_started_in_another_order_it_is_as_before(stack):
+    """All end by themselves in time; actors that are first wait for their shards; data are kept."""
+    stack.compose("stop")
+    codes = {service: stack.state(service)["ExitCode"] for service in (*ACTORS, *SHARDS)}
+
+    for service in (*ACTORS, *reversed(SHARDS)):
+        stack.docker("start", service)
+    for service in SHARDS:
+        stack.log_until(service, "ready: ", times=3 if service == "shard-left" else 2)
+    until(lambda: listed(stack) == set(ACTORS), lambda: f"all actors, but {listed(stack)}")
+
+    assert set(codes.values()) == {0}, codes
+    assert len(stack.json("world", "get", "online", "user/notices")) == PACKAGES
+
+
+def test_on_two_machines_the_verdicts_are_the_same(engine, images, alone, tmp_path_factory):
+    """Two projects with nothing in common but the network; the actors are up before the shards."""
+    folder = tmp_path_factory.mktemp("multihost")
+    files = ("--file", "deploy/compose.yaml", "--file", "deploy/compose.multihost.yaml")
+
+    def host(profile):
+        options = (*files, "--profile", profile)
+        return Stack(engine, f"{profile}-pc", folder, *options, SHARD_ADDRESS="127.0.0.1")
+
+    with host("shards") as shards, host("perception") as perception:
+        perception.compose("up", "--detach")
+        shards.compose("up", "--detach")
+
+        assert perception.ended("demo") == 0, perception.docker("logs", "demo")
+        shards.python("feedback", BY_REFERENCE.format(body=WRITE.format(value=3)))
+        assert shards.python("feedback", BY_REFERENCE.format(body=READ)) == "3 mapped"
+        assert perception.python("fusion", BY_REFERENCE.format(body=READ)) == "3 sent"
+        assert judged(perception.out) == alone()

@@ -1,0 +1,34 @@
+"""Every compose file can be read, alone and with the others, as the page of deploy/ calls them."""
+
+import pytest
+
+pytestmark = pytest.mark.containers
+
+ONE = ("--file", "deploy/compose.yaml")
+TWO = ("--env-file", "deploy/multihost.env", *ONE, "--file", "deploy/compose.multihost.yaml")
+
+
+@pytest.mark.parametrize(
+    ("options", "services"),
+    [
+        (ONE, 12),
+        ((*ONE, "--profile", "tools"), 13),
+        ((*TWO, "--profile", "shards"), 5),
+        ((*TWO, "--profile", "perception"), 7),
+    ],
+)
+def test_a_compose_file_is_valid(engine, options, services):
+    """The engine's own check has nothing to say, and nobody was left out."""
+    engine.compose(*options, "config", "--quiet")
+
+    assert len(engine.compose(*options, "config", "--services").stdout.split()) == services
+
+
+def test_the_address_of_the_shards_has_to_be_named(engine):
+    """Without it nothing starts somewhere else in silence."""
+    options = ("--file", "deploy/compose.yaml", "--file", "deploy/compose.multihost.yaml")
+
+    done = engine.compose(*options, "config", "--quiet", check=False)
+
+    assert done.returncode
+    assert "SHARD_ADDRESS" in done.stderr
