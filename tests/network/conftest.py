@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE))
+sys.path.append(str(HERE))  # not first: other folders have a conftest, too
 
 from network_site import SHARDS, Site  # noqa: E402 - found by the line above
 
