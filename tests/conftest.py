@@ -50,7 +50,9 @@ def pytest_terminal_summary(terminalreporter):
     reports = [*terminalreporter.getreports("passed"), *terminalreporter.getreports("failed")]
     drawn = Counter(dict(report.user_properties).get("carrier") for report in reports)
     told = ", ".join(f"{drawn[way]} over {way}" for way in carriers.BOTH)
-    terminalreporter.line(f"carriers: {told}; again with {carriers.VARIABLE}={carriers.choice()}")
+    again = f"{carriers.VARIABLE}={carriers.choice()}"
+    if any(drawn[way] for way in carriers.BOTH):
+        terminalreporter.line(f"carriers: {told}; again with {again}")
 
 
 @pytest.fixture(autouse=True)
