@@ -17,7 +17,6 @@ import json
 import os
 import shutil
 import subprocess
-import tempfile
 import uuid
 from dataclasses import astuple
 from pathlib import Path
@@ -129,7 +128,7 @@ class Namespaces:
         self._holders: dict[str, subprocess.Popen[bytes]] = {}
         self._pids: dict[str, int] = {}
         self._addresses = {host: f"198.18.77.{10 + index}" for index, host in enumerate(hosts)}
-        self._folder = Path(tempfile.mkdtemp(prefix="enact-switch-"))
+        self._log = os.memfd_create("switch.log")  # no file is left, however this process ends
         try:
             for tool in ("unshare", "nsenter", "setpriv", "ip"):
                 if shutil.which(tool) is None:
@@ -139,7 +138,7 @@ class Namespaces:
                 self._add(index, host)
             before = (*self._enter(""), *_DIE_WITH_PARENT)
             words = (str(seed), str(len(hosts)))
-            log = self._folder / "switch.log"
+            log = Path(f"/proc/{os.getpid()}/fd/{self._log}")
             self._switch = LineProcess(switch.MODULE, words, log, before=before)
             self._switch.expect("started")
         except BaseException:
@@ -251,7 +250,9 @@ class Namespaces:
         """Let the children end, and with them the namespaces; twice is harmless."""
         if hasattr(self, "_switch"):
             self._switch.end()
-        shutil.rmtree(self._folder, ignore_errors=True)
+        if self._log >= 0:
+            os.close(self._log)
+            self._log = -1
         for holder in self._holders.values():
             holder.kill()
             holder.wait()
