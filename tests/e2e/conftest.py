@@ -14,7 +14,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parent))
 
 WORKER = Path(__file__).with_name("worker.py")
-READY_S = 60.0
+READY_S = 180.0
 
 
 def free_port():

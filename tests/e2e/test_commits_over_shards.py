@@ -28,7 +28,7 @@ def total(cell):
     with connect(cell.file) as joined:
         world = joined.world("online")
         one, two = Write(world, LEFT, COUNT), Write(world, RIGHT, COUNT)
-        with Lock(one, two, wait_s=10.0) as lock:
+        with Lock(one, two, wait_s=60.0) as lock:
             return lock[one] + lock[two]
 
 

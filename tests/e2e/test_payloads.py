@@ -11,7 +11,6 @@ import time
 from pathlib import Path
 
 import pytest
-from conftest import Process
 
 from enact_dist import Entity, Lock, View, Write, connect
 from enact_dist.core.messages import Survey
@@ -50,23 +49,17 @@ def root(monkeypatch, request):
 
 
 @pytest.fixture
-def run(tmp_path):
+def run(make_process):
     """Start payload workers: `run(cell, role, …)`, those with `before` in another namespace."""
-    started = []
 
     def start(cell, role, *words, before=(), **variables):
         # By the endpoint: another user may not read the file.
         line = [WORKER, role, f"tcp/127.0.0.1:{cell.ports['s0']}", *map(str, words)]
         if before:
             line = ["-c", LAUNCH, *before, sys.executable, *line]
-        log = tmp_path / f"worker{len(started)}.log"
-        process = Process(line, log, **variables)
-        started.append(process)
-        return process
+        return make_process(*line, **variables)
 
-    yield start
-    for process in started:
-        process.end()
+    return start
 
 
 def used(root):

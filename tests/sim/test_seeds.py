@@ -13,7 +13,7 @@ import pytest
 
 from enact_dist.verify.simulation.command import told
 from enact_dist.verify.simulation.scenario import Result, Scenario
-from enact_dist.verify.simulation.series import fresh_seed, run_series
+from enact_dist.verify.simulation.series import Totals, fresh_seed, run_series
 from enact_dist.verify.simulation.shrink import shrink
 
 KNOWN_BAD = {
@@ -43,6 +43,8 @@ SECONDS = float(os.environ.get("ENACT_SIM_SECONDS", "10"))
 HALVES = 2
 SEEDS_MIN = 150
 """Even on a slow machine so many seeds run; fewer would prove nothing about rare events."""
+SEEDS_MORE, SEEDS_MAX = 50, 3000
+"""While something has not happened yet, so many run again, up to a number that shows it never does."""
 SHRINK_S = 20.0
 
 HAPPENED = (
@@ -152,6 +154,11 @@ def fail(result: Result) -> None:
     pytest.fail("\n".join(told(shrink(result, seconds=SHRINK_S))), pytrace=False)
 
 
+def missing(totals: Totals) -> list[str]:
+    """Return what never happened."""
+    return [name for name in HAPPENED if not totals.tally[name]]
+
+
 @pytest.mark.parametrize("seed", sorted(set(KNOWN_BAD.values())))
 def test_seed_that_once_failed_passes(seed):
     """What was fixed stays fixed."""
@@ -167,6 +174,9 @@ def test_seeds_break_no_rule_and_meet_every_fault(half, record_property):
     first = (fresh_seed() // HALVES * HALVES if named is None else int(named)) + half
 
     totals = run_series(first, seconds=SECONDS, at_least=SEEDS_MIN, step=HALVES)
+    while not totals.failures and missing(totals) and totals.seeds < SEEDS_MAX:
+        after = first + totals.seeds * HALVES
+        totals.join(run_series(after, count=SEEDS_MORE, step=HALVES))
 
     for result in totals.failures:
         fail(result)
@@ -178,6 +188,5 @@ def test_seeds_break_no_rule_and_meet_every_fault(half, record_property):
         f" commits, {tally['commits'] / totals.cpu_s:.0f} per second of one core,"
         f" {totals.crashes} crashes, {totals.partitions} partitions, 0 violations"
     )
-    missing = [name for name in HAPPENED if not tally[name]]
-    assert not missing, f"never happened in {totals.seeds} seeds: {missing}"
+    assert not missing(totals), f"never happened in {totals.seeds} seeds: {missing(totals)}"
     assert tally["commits"] >= 50 * totals.seeds * 0.9

@@ -54,6 +54,15 @@ class Totals:
         if result.violation:
             self.failures.append(result)
 
+    def join(self, other: Totals) -> None:
+        """Add what a series that went on from this one has shown."""
+        self.seeds += other.seeds
+        self.simulated_s += other.simulated_s
+        self.wall_s += other.wall_s
+        self.cpu_s += other.cpu_s
+        self.tally += other.tally
+        self.failures += other.failures
+
     @property
     def crashes(self) -> int:
         """Shards that died, and clients that were killed."""
