@@ -64,7 +64,7 @@ def _commits_row(run: Run, pid: int, writes: list[Write[int]]) -> Row:
     points: list[tuple[float, float]] = []
     total_s = SETTLE_S + run.seconds_s
     begin_s = time.perf_counter()
-    while (passed_s := time.perf_counter() - begin_s) < total_s:
+    while (passed_s := time.perf_counter() - begin_s) < total_s or len(points) < 2:
         _write(writes[commits % 4 : commits % 4 + 1])
         commits += 1
         due_s = SETTLE_S + len(points) * run.seconds_s / SAMPLES
