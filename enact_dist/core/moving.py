@@ -198,7 +198,8 @@ class Shards:
     def _bases(self) -> dict[str, list[WorldDropped]]:
         """Return above which versions those of dropped contexts start, alike on all shards.
 
-        What was made since the drop began above the base of its own shard, and goes on so.
+        What was made since the drop began above the base of its own shard, and goes on so; who has
+        it before it moves is told as well, as a run that is cut off may leave it there.
         """
         bases: dict[str, list[WorldDropped]] = {entry.name: [] for entry in self._placement.shards}
         names = sorted({drop.name for stored in self._stores.values() for drop in stored.dropped})
@@ -214,7 +215,8 @@ class Shards:
                 for shard, slots in holders.items():
                     base = moved.get(entity, by_shard[shard].version_base)
                     if base < top and any(slot.context == name for slot in slots):
-                        own[shard_of(entity, self._placement)][entity] = base
+                        for place in own.keys() & {shard, shard_of(entity, self._placement)}:
+                            own[place][entity] = base
             for shard, found in bases.items():
                 found.append(WorldDropped(name, top, tuple(sorted(own[shard].items()))))
         return bases

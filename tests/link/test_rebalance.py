@@ -43,6 +43,21 @@ def stored(cell, folders=None):
     return slots, labels, places
 
 
+def bases(cell):
+    """Return above which version the slots of each entity started, by context."""
+    found = {}
+    for folder in cell.folders.values():
+        with read_store(folder) as held:
+            here = {(record.slot.context, record.slot.entity) for record in held.slots}
+            for name, base, moved in (
+                (d.name, d.version_base, d.entity_bases) for d in held.dropped
+            ):
+                starts = {pair: dict(moved).get(pair[1], base) for pair in here if pair[0] == name}
+                assert not starts.keys() & found.keys()
+                found |= starts
+    return found
+
+
 @pytest.mark.parametrize("seed", [1, 2])
 def test_all_is_as_before_and_goes_on(tmp_path, seed):
     """Data, versions, history, labels, causes, forks and the past, to a new shard and back."""
@@ -141,6 +156,8 @@ def test_killed_at_any_act_it_is_taken_up(tmp_path, monkeypatch):
     origin = StoppedCell(tmp_path / "origin", TWO)
     origin.fill(4, rounds=12)
     slots, labels, _ = stored(origin)
+    started = bases(origin)
+    assert len(set(started.values())) > 1
     assert all(len(states) == 1 for states in slots.values())
     number, was_killed = 0, True
     while was_killed:
@@ -155,6 +172,7 @@ def test_killed_at_any_act_it_is_taken_up(tmp_path, monkeypatch):
         found, kept, places = stored(cell)
         assert found == slots, number
         assert kept == labels, number
+        assert bases(cell) == started, number
         assert all(where == {shard_of(entity, THREE)} for entity, where in places.items()), number
         assert look(cell.folders, THREE) == ([], False, 0.0)
         shutil.rmtree(cell.folder)
