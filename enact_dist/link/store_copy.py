@@ -15,6 +15,7 @@ or commit of before counts.
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
@@ -258,16 +259,16 @@ def restore(
         shutil.rmtree(partial, ignore_errors=True)
         if not folder.exists() or not any(folder.iterdir()):
             _build(source, partial, backup, unix_s=unix_s, epoch=_epoch_before(folder))
-            shutil.rmtree(folder, ignore_errors=True)
-            partial.rename(folder)
+            try:
+                partial.rename(folder)  # an empty folder gives way, one begun meanwhile does not
+            except OSError as failure:
+                if failure.errno in {errno.ENOTEMPTY, errno.EEXIST}:
+                    raise _has_data(folder) from failure
+                raise
             sync_folder(folder.parent)
             return backup, None
         if not replace:
-            raise StoreError(
-                f"{folder} has data; say --replace to put the backup in its place, what is there"
-                " now is kept beside it",
-                path=str(folder),
-            )
+            raise _has_data(folder)
         epoch = _epoch_before(folder)
         with closing(FolderLock(folder)):
             _build(source, partial, backup, unix_s=unix_s, epoch=epoch)
@@ -278,6 +279,14 @@ def restore(
     except OSError as failure:
         raise store_error(folder, failure) from failure
     return backup, aside
+
+
+def _has_data(folder: Path) -> StoreError:
+    return StoreError(
+        f"{folder} has data; say --replace to put the backup in its place, what is there now is"
+        " kept beside it",
+        path=str(folder),
+    )
 
 
 def _build(source: Path, partial: Path, backup: Backup, *, unix_s: int, epoch: int) -> None:

@@ -127,6 +127,25 @@ def test_a_log_begun_anew_while_it_is_copied_is_copied_again(folder, tmp_path, m
     assert versions(tmp_path / "copy") == {"a": 1, "b": 1}
 
 
+def test_a_shard_that_starts_during_a_restore_loses_nothing(folder, tmp_path, monkeypatch):
+    """An empty folder may have data by the time that the backup is read."""
+    back_up(folder, tmp_path / "copy", unix_s=100, **NAMES)
+    new, build = tmp_path / "new", store_copy._build
+    new.mkdir()
+
+    def meanwhile(*arguments, **more):
+        build(*arguments, **more)
+        fill(new, 5)
+
+    monkeypatch.setattr(store_copy, "_build", meanwhile)
+    with pytest.raises(StoreError, match="has data; say --replace"):
+        restore(tmp_path / "copy", new, unix_s=100, **NAMES)
+    assert versions(new) == {"a": 5, "b": 5}
+    monkeypatch.undo()
+    assert restore(tmp_path / "copy", new, unix_s=100, replace=True, **NAMES)[1] is not None
+    assert versions(new) == {"a": 1, "b": 1}
+
+
 def test_what_must_not_be_restored_is_refused(folder, tmp_path):
     """Another shard's, one from the future, a changed one, and onto a folder in use."""
     copy = tmp_path / "copy"
