@@ -54,7 +54,8 @@ class Stack:
 
     def json(self, *words, inside="feedback"):
         """Return what a reader of the command line says as JSON."""
-        return json.loads(self.enact(*words, "--json", inside=inside))
+        name = self.name(inside)
+        return json.loads(self.engine.docker("exec", name, "enact", *words, "--json").stdout)
 
     def python(self, service, text):
         """Run Python beside a service; return what it wrote."""
