@@ -163,7 +163,9 @@ def close_session(session: zenoh.Session) -> None:
     if mine in _open_sessions:
         _open_sessions.remove(mine)
         session.close()  # type: ignore[no-untyped-call]  # Zenoh's stub lacks it
-        _watches.pop(session).close()
+        watch = _watches.pop(session, None)
+        if watch is not None:  # else nothing could be declared any more when it was opened
+            watch.join()
 
 
 def keep_after_fork(owner: object) -> None:

@@ -52,25 +52,23 @@ class LinkWatch:
     def _run(self, events: zenoh.Handler[zenoh.LinkEvent]) -> None:
         try:
             while True:
-                event: zenoh.LinkEvent | None = events.recv()
-                while event is not None:
-                    if event.kind == zenoh.SampleKind.PUT:
-                        end_lingering()
-                    elif self._connect:
-                        self._knock(events)
-                    event = events.try_recv()
+                came, lost = _counted(events, events.recv())
+                if came:
+                    end_lingering()
+                if lost and self._connect:
+                    self._knock(events, lost)
         except zenoh.ZError:  # the session is closed
             return
 
-    def _knock(self, events: zenoh.Handler[zenoh.LinkEvent]) -> None:
+    def _knock(self, events: zenoh.Handler[zenoh.LinkEvent], lost: int) -> None:
         """Look at what waits for an answer until every lost connection is back."""
-        hosts, lost, pause_s = list(_hosts_of(self._connect)), 1, LOOK_S
+        hosts, pause_s = list(_hosts_of(self._connect)), LOOK_S
         waited: set[int] = set()
         while not self._closing.wait(pause_s):
-            while (event := events.try_recv()) is not None:
-                lost += -1 if event.kind == zenoh.SampleKind.PUT else 1
+            came, lost = _counted(events, events.try_recv(), lost)
+            if came:
                 end_lingering()
-            if lost <= 0:
+            if not lost:
                 return
             began_s = time.thread_time()
             waiting = {host: unanswered(*host) for host in hosts}
@@ -80,10 +78,25 @@ class LinkWatch:
                     give_up(inodes & waited)
             waited = set().union(*waiting.values())
 
-    def close(self) -> None:
+    def join(self) -> None:
         """Wait for the end of the thread, which follows that of the session."""
         self._closing.set()
         self._thread.join(JOIN_S)
+
+
+def _counted(
+    events: zenoh.Handler[zenoh.LinkEvent], event: zenoh.LinkEvent | None, lost: int = 0
+) -> tuple[bool, int]:
+    """Take all events that are here; return whether a connection came, and how many are lost now.
+
+    A thousand clients that connect at once are looked at together: each look lists all descriptors.
+    """
+    came = False
+    while event is not None:
+        is_new = event.kind == zenoh.SampleKind.PUT
+        came, lost = came or is_new, max(0, lost - 1) if is_new else lost + 1
+        event = events.try_recv()
+    return came, lost
 
 
 def _hosts_of(endpoints: Iterable[str]) -> Iterable[tuple[str, int]]:

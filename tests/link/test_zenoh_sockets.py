@@ -5,10 +5,13 @@ import select
 import socket
 import struct
 import time
+from types import SimpleNamespace
 
 import pytest
+import zenoh
 
 from enact_dist.link.zenoh_config import close_session, open_session
+from enact_dist.link.zenoh_links import _counted
 from enact_dist.link.zenoh_sockets import connections, end_lingering, give_up, unanswered
 
 LINGER = struct.Struct("ii")
@@ -55,6 +58,37 @@ def test_connections_of_sessions_do_not_linger_on_either_side(endpoint):
     finally:
         for session in (*clients, shard):
             close_session(session)
+
+
+LEFT_OPEN = """
+import sys
+from enact_dist.link import zenoh_links
+from enact_dist.link.zenoh_config import open_session
+zenoh_links.JOIN_S = 3600.0
+kept = [open_session(listen=[endpoint], lease_s=1.0) for endpoint in sys.argv[1:]]
+"""
+
+
+def test_sessions_that_were_left_open_are_closed_before_their_threads_are_waited_for(
+    program, endpoint, free
+):
+    """The threads end with the sessions; the other way round each would cost a second."""
+    process = program(LEFT_OPEN, endpoint, free(), free())
+
+    assert process.wait(timeout=60.0) == 0
+
+
+@pytest.mark.parametrize(
+    ("kinds", "came", "lost"),
+    [("+-", True, 1), ("-+", True, 0), ("++-", True, 1), ("--", False, 2)],
+)
+def test_events_that_are_here_are_counted_at_once(kinds, came, lost):
+    """Of a hundred connections that come together none is looked at alone."""
+    kind_of = {"+": zenoh.SampleKind.PUT, "-": zenoh.SampleKind.DELETE}
+    events = iter([SimpleNamespace(kind=kind_of[kind]) for kind in kinds])
+    waiting = SimpleNamespace(try_recv=lambda: next(events, None))
+
+    assert _counted(waiting, waiting.try_recv()) == (came, lost)
 
 
 def test_connection_that_nobody_answers_is_given_up_and_no_other():
