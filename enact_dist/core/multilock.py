@@ -176,7 +176,7 @@ class MultiLock:
         )
 
     def take_farewells(self) -> list[tuple[str, Request]]:
-        """Return releases to send without waiting for their answers; the shard needs none."""
+        """Return releases to send once, whose answers say nothing: what gets lost is repaired."""
         farewells, self.farewells = self.farewells, []
         return farewells
 
