@@ -10,11 +10,16 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 from enact_dist import lock
 
 sys.path.insert(0, str(Path(__file__).parent))
 import carriers
+
+# How long an example takes says more about the machine than about what is tested.
+settings.register_profile("load", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("load")
 
 
 def pytest_configure(config):

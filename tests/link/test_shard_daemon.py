@@ -112,14 +112,14 @@ def test_daemon_refuses_and_counts_what_it_cannot_read(daemon, carry, endpoint, 
     carrier = carry(endpoint)
     session = open_session(connect=[endpoint], lease_s=1.0)
     try:
-        carrier.request("s0", ListLocks(), timeout_s=5)
+        carrier.request("s0", ListLocks(), timeout_s=30)
         replies = session.get("enact/cell/s0/acquire/x", attachment=header, timeout=5)
         sample = replies.recv().ok
         answer = decode_frame(bytes(sample.attachment), bytes(sample.payload))
     finally:
         close_session(session)
 
-    counters = carrier.request("s0", ListSessions(), timeout_s=5).counters
+    counters = carrier.request("s0", ListSessions(), timeout_s=30).counters
 
     assert isinstance(answer, Refused)
     assert answer.code == "protocol"
@@ -262,10 +262,10 @@ session = secrets.token_hex(16)
 carrier = ZenohCarrier("cell", session, "stopped", [sys.argv[1]], ttl_s=4.0)
 feed = carrier.subscribe()
 hello = Hello(session, 0, 4_000_000_000, "stopped", "h", 1, False)
-epoch = carrier.request("s0", hello, timeout_s=5).epoch
+epoch = carrier.request("s0", hello, timeout_s=30).epoch
 lock = LockId(session, 0, 1)
 item = Item(int(Access.VIEW), "online", "cloud", "count")
-state = carrier.request("s0", TakeView(lock, epoch, 1, 1, (item,), 0), timeout_s=5).states[0]
+state = carrier.request("s0", TakeView(lock, epoch, 1, 1, (item,), 0), timeout_s=30).states[0]
 size = carrier.fetch_bytes
 calls = [
     ("s0", Fetch(lock, epoch, state.slot, state.version, start, size))

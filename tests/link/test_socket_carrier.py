@@ -167,10 +167,10 @@ def test_late_answer_never_meets_the_next_call(daemon, carry, endpoint):
 
     for _ in range(5):
         assert carrier.request("s0", AwaitStamp(2**62, 150_000_000), timeout_s=0.05) is None
-        assert isinstance(carrier.request("s0", ListLocks(), timeout_s=5), Locks)
+        assert isinstance(carrier.request("s0", ListLocks(), timeout_s=30), Locks)
     time.sleep(0.2)
 
-    assert isinstance(carrier.request("s0", ListLocks(), timeout_s=5), Locks)
+    assert isinstance(carrier.request("s0", ListLocks(), timeout_s=30), Locks)
     assert carrier.calls["zenoh"] <= 1  # the first hello
 
 
@@ -180,11 +180,11 @@ def test_calls_beyond_the_connections_of_a_client_take_zenoh(daemon, carry, endp
     daemon(endpoint)
     carrier = carry(endpoint)
 
-    answers = carrier.request_all([("s0", AwaitStamp(2**62, 300_000_000))] * 120, timeout_s=5)
+    answers = carrier.request_all([("s0", AwaitStamp(2**62, 300_000_000))] * 120, timeout_s=30)
 
     assert {type(answer) for answer in answers} == {Reached}
     assert carrier.calls["socket"] == 100
-    assert isinstance(carrier.request("s0", ListLocks(), timeout_s=5), Locks)
+    assert isinstance(carrier.request("s0", ListLocks(), timeout_s=30), Locks)
 
 
 # ---------------------------------------------------------------- many threads
@@ -261,7 +261,8 @@ def test_carrier_says_what_went_over_what(daemon, endpoint, until):
     with connect(endpoint, actor="one") as cell:
 
         def sessions():
-            answer = carrier_of(cell).request("s0", ListSessions(), timeout_s=5)
+            answer = carrier_of(cell).request("s0", ListSessions(), timeout_s=30)
+            assert answer is not None
             return [(info.actor, info.token_present) for info in answer.sessions]
 
         assert until(lambda: sessions() == [("one", True)], limit_s=30.0)
@@ -272,7 +273,7 @@ def test_folder_of_the_shard_is_the_one_of_its_welcome(daemon, carry, endpoint):
     """What a WELCOME says can be opened."""
     shard = daemon(endpoint)
     hello = Hello("me", 0, 2_000_000_000, "me", "h", 1, True)
-    welcome = carry(endpoint).request("s0", hello, timeout_s=5)
+    welcome = carry(endpoint).request("s0", hello, timeout_s=30)
 
     opened = open_shared(welcome.shared, welcome.shared_nonce)
 
@@ -327,8 +328,8 @@ def test_call_on_a_connection_that_was_just_closed_takes_the_other_way(daemon, c
     carrier = carry(endpoint)
     carrier._lines["s0"]._idle[-1].socket.close()
 
-    answers = carrier.request_all([("s0", ListLocks())], timeout_s=5)
-    answers.append(carrier.request("s0", ListLocks(), timeout_s=5))
+    answers = carrier.request_all([("s0", ListLocks())], timeout_s=30)
+    answers.append(carrier.request("s0", ListLocks(), timeout_s=30))
 
     assert [type(answer) for answer in answers] == [Locks, Locks]
 

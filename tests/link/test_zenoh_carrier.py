@@ -31,7 +31,9 @@ both = pytest.mark.parametrize("carry", ["zenoh", "socket"], indirect=True)
 
 def speak(carrier, make_peer, **options):
     """Return a session that has said hello over `carrier`."""
-    peer = make_peer(lambda shard, message: carrier.request(shard, message, timeout_s=5), **options)
+    peer = make_peer(
+        lambda shard, message: carrier.request(shard, message, timeout_s=30), **options
+    )
     peer.hello()
     return peer
 
@@ -41,7 +43,7 @@ def test_carrier_brings_an_answer_from_a_shard(daemon, carry, endpoint):
     """A request travels to the daemon and its answer back."""
     daemon(endpoint)
 
-    answer = carry(endpoint).request("s0", ListLocks(), timeout_s=5)
+    answer = carry(endpoint).request("s0", ListLocks(), timeout_s=30)
 
     assert isinstance(answer, Locks)
 
@@ -146,7 +148,7 @@ def test_carrier_holds_its_token_while_it_is_open(daemon, carry, make_peer, endp
     speak(mine, make_peer, session="mine")
 
     def present():
-        sessions = watcher.request("s0", ListSessions(), timeout_s=5).sessions
+        sessions = watcher.request("s0", ListSessions(), timeout_s=30).sessions
         return {info.session: info.token_present for info in sessions}["mine"]
 
     until(present)
@@ -166,7 +168,7 @@ def test_carrier_reaches_further_shards_when_it_learns_of_them(daemon, carry, en
 
     carrier.add_endpoints([ShardEntry("s0", (endpoint,)), ShardEntry("s1", (second,))])
 
-    answers = carrier.request_all([("s0", ListLocks()), ("s1", ListLocks())], timeout_s=5)
+    answers = carrier.request_all([("s0", ListLocks()), ("s1", ListLocks())], timeout_s=30)
     assert [type(answer) for answer in answers] == [Locks, Locks]
     assert carrier.endpoint_of("s1") == second
 
@@ -204,7 +206,7 @@ def test_carrier_tells_when_a_shard_comes_into_reach_again(daemon, carry, endpoi
     daemon(endpoint)
 
     assert came.get(timeout=5) == "s0"
-    assert isinstance(carrier.request("s0", ListLocks(), timeout_s=5), Locks)
+    assert isinstance(carrier.request("s0", ListLocks(), timeout_s=30), Locks)
     carrier.close()
     assert "enact-presence" not in {thread.name for thread in threading.enumerate()}
 
@@ -217,7 +219,7 @@ def test_carrier_keeps_its_link_when_a_shard_advertises_another_address(daemon, 
 
     carrier.add_endpoints([ShardEntry("s0", ("tcp/127.0.0.1:1",))])
 
-    assert isinstance(carrier.request("s0", ListLocks(), timeout_s=5), Locks)
+    assert isinstance(carrier.request("s0", ListLocks(), timeout_s=30), Locks)
 
 
 @both
@@ -225,7 +227,7 @@ def test_carrier_reconnects_by_itself_when_a_shard_comes_back(daemon, carry, end
     """After a restart at the same endpoint calls are answered again, by the new epoch."""
     before = daemon(endpoint)
     carrier = carry(endpoint)
-    old = carrier.request("s0", ListLocks(), timeout_s=5)
+    old = carrier.request("s0", ListLocks(), timeout_s=30)
     before.stop(drain_s=0.0)
     assert carrier.request("s0", ListLocks(), timeout_s=1) is None
 
@@ -275,7 +277,7 @@ def test_carrier_raises_when_an_answer_cannot_be_read(impostor, carry, endpoint)
     impostor(lambda query: query.reply(query.key_expr, b"", attachment=b"\xff\x00garbage"))
 
     with pytest.raises(ProtocolError):
-        carry(endpoint).request("s0", ListLocks(), timeout_s=5)
+        carry(endpoint).request("s0", ListLocks(), timeout_s=30)
 
 
 def test_carrier_raises_when_a_request_comes_back_as_answer(impostor, carry, endpoint):
@@ -285,7 +287,7 @@ def test_carrier_raises_when_a_request_comes_back_as_answer(impostor, carry, end
     )
 
     with pytest.raises(ProtocolError, match="ListLocks"):
-        carry(endpoint).request("s0", ListLocks(), timeout_s=5)
+        carry(endpoint).request("s0", ListLocks(), timeout_s=30)
 
 
 def test_carrier_raises_when_two_daemons_answer_one_request(impostor, carry, endpoint, until):
@@ -301,7 +303,7 @@ def test_carrier_raises_when_two_daemons_answer_one_request(impostor, carry, end
 
     def alarmed():
         try:
-            carrier.request("s0", ListLocks(), timeout_s=5)
+            carrier.request("s0", ListLocks(), timeout_s=30)
         except ProtocolError as error:
             return str(error)
         return ""
@@ -316,7 +318,7 @@ def test_discovery_learns_cell_and_shard_from_one_endpoint(daemon, endpoint):
     """Whoever knows one endpoint finds out which shard of which cell is there."""
     daemon(endpoint, cell="palletizing")
 
-    found = find_shards([endpoint], timeout_s=5)
+    found = find_shards([endpoint], timeout_s=30)
 
     assert found == (FoundShard("palletizing", "s0"),)
 
@@ -387,7 +389,7 @@ if child == 0:
         print("open:", error, flush=True)
     sys.exit(3)
 status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-answer = carrier.request("s0", ListLocks(), timeout_s=5)
+answer = carrier.request("s0", ListLocks(), timeout_s=30)
 print("child", status, "parent", type(answer).__name__, flush=True)
 carrier.close()
 """
@@ -411,7 +413,7 @@ import sys
 from enact_dist.core.messages import Hello
 from enact_dist.link.zenoh_carrier import ZenohCarrier
 carrier = ZenohCarrier("cell", "victim", "tester", [sys.argv[1]], ttl_s=60.0)
-carrier.request("s0", Hello("victim", 0, 60_000_000_000, "victim", "h", 1, False), timeout_s=5)
+carrier.request("s0", Hello("victim", 0, 60_000_000_000, "victim", "h", 1, False), timeout_s=30)
 print("open", flush=True)
 sys.stdin.read()
 """
@@ -426,7 +428,7 @@ def test_shard_sees_at_once_when_a_client_is_killed(daemon, carry, endpoint, pro
     process.stdout.readline()
 
     def present():
-        sessions = watcher.request("s0", ListSessions(), timeout_s=5).sessions
+        sessions = watcher.request("s0", ListSessions(), timeout_s=30).sessions
         return any(info.session == "victim" and info.token_present for info in sessions)
 
     until(present)
