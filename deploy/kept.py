@@ -36,6 +36,8 @@ BASE_HOOKS = (
     'for n in python python3; do ln -sf /usr/bin/python3 "$1"/usr/local/bin/$n; done',
     'ln -sf /usr/bin/pip3 "$1"/usr/local/bin/pip',
 )
+RETRIES = 3
+"""So often a download is tried again that fails for the moment."""
 LEFT_OUT = ("/usr/share/man/*", "/usr/share/locale/*", "/usr/share/doc/*")
 
 
@@ -104,6 +106,7 @@ def base() -> Path:
     def make(folder: Path) -> None:
         say(f"making a base image of Debian {SUITE} (a minute, once)")
         out = (
+            f'--aptopt=Acquire::Retries "{RETRIES}"',
             f"--customize-hook=sync-out /libraries {folder}",
             '--customize-hook=rm -r "$1"/libraries',
         )
@@ -183,6 +186,7 @@ def compose_plugin() -> Path:
                 "-o", "Dir::Etc::sourcelist=/dev/null",
                 "-o", f"Dir::Etc::sourceparts={own}/sources",
                 "-o", "APT::Sandbox::User=root",
+                "-o", f"Acquire::Retries={RETRIES}",
             ]  # fmt: skip
             run(*apt, "update")
             run(*apt, "download", "docker-compose", cwd=own)
