@@ -29,11 +29,12 @@ class BulkWay:
     Args:
         endpoints: Where that session connects to.
         lease_s: Its link lease.
+        open_s: How long a shard has to answer a connection.
     """
 
-    def __init__(self, endpoints: Sequence[str], lease_s: float) -> None:
+    def __init__(self, endpoints: Sequence[str], lease_s: float, open_s: float) -> None:
         self._endpoints = endpoints
-        self._lease_s = lease_s
+        self._lease_s, self._open_s = lease_s, open_s
         self._mutex = threading.Lock()
         self._closed = False
         self._session: zenoh.Session | None = None
@@ -46,7 +47,9 @@ class BulkWay:
             with self._mutex:
                 if self._session is None and not self._closed:
                     recycle_blocks()
-                    self._session = open_session(connect=self._endpoints, lease_s=self._lease_s)
+                    self._session = open_session(
+                        connect=self._endpoints, lease_s=self._lease_s, open_s=self._open_s
+                    )
                 session = self._session
         return session if session is not None and session.info.peers_zid() else None
 

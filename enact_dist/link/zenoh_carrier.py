@@ -313,7 +313,7 @@ class ZenohCarrier:
     def _open_link(self, endpoints: tuple[str, ...]) -> _Link:
         session = open_session(connect=endpoints, lease_s=self._lease_s, open_s=self._open_s)
         token = session.liveliness().declare_token(token_key(self._cell, self._session))
-        link = _Link(session, endpoints, token, BulkWay(endpoints, self._lease_s))
+        link = _Link(session, endpoints, token, BulkWay(endpoints, self._lease_s, self._open_s))
         with self._mutex:
             self._links.append(link)
             for feed, pumps in self._feeds.items():

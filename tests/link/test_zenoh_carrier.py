@@ -21,6 +21,7 @@ from enact_dist.core.messages import (
     Welcome,
 )
 from enact_dist.errors import MisuseError, ProtocolError, ShardUnreachableError
+from enact_dist.link import zenoh_bulk, zenoh_carrier
 from enact_dist.link.zenoh_config import close_session, open_session
 from enact_dist.link.zenoh_discovery import FoundShard, discover, find_shards
 from enact_dist.wire.frames import encode_frame
@@ -309,6 +310,26 @@ def test_carrier_raises_when_two_daemons_answer_one_request(impostor, carry, end
         return ""
 
     assert "two daemons" in until(alarmed)
+
+
+def test_connection_for_large_data_is_awaited_no_longer_than_that_for_calls(
+    daemon, endpoint, monkeypatch
+):
+    """Whoever has little patience closes as soon while either is under way."""
+    daemon(endpoint)
+    waits_s = []
+
+    def noted(*, open_s=None, **options):
+        waits_s.append(open_s)
+        return open_session(open_s=open_s, **options)
+
+    for module in (zenoh_bulk, zenoh_carrier):
+        monkeypatch.setattr(module, "open_session", noted)
+    carrier = zenoh_carrier.ZenohCarrier("cell", "me", "me", [endpoint], ttl_s=2.0, open_s=1.5)
+    carrier._links[0].bulk.session()
+    carrier.close()
+
+    assert waits_s == [1.5, 1.5]
 
 
 # ---------------------------------------------------------------- first contact
