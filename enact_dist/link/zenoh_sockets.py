@@ -10,7 +10,6 @@ import contextlib
 import logging
 import os
 import socket
-import stat
 import struct
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -78,7 +77,10 @@ def _state(connection: socket.socket) -> int:
 
 
 def connections() -> Iterator[socket.socket]:
-    """Yield this process's sockets, each by a descriptor of our own: others may close theirs."""
+    """Yield this process's sockets, each by a descriptor of our own: others may close theirs.
+
+    Nothing that a descriptor stands for is asked: a file of a host that was cut off never answers.
+    """
     try:
         entries = list(_DESCRIPTORS.iterdir())
     except OSError as error:  # no Linux
@@ -86,16 +88,18 @@ def connections() -> Iterator[socket.socket]:
         return
     for entry in entries:
         with contextlib.suppress(OSError):  # closed meanwhile, or too many are open
-            if not stat.S_ISSOCK(entry.stat().st_mode):
+            if not entry.readlink().name.startswith("socket:"):
                 continue
             mine = os.dup(int(entry.name))
-            blocking = os.get_blocking(mine)
+            # A default timeout of the program lets the next line change what all share.
+            blocking = socket.getdefaulttimeout() is not None and os.get_blocking(mine)
             try:
                 connection = socket.socket(fileno=mine)
             except OSError:
                 os.close(mine)
                 continue
-            os.set_blocking(mine, blocking)  # a default timeout of the program would change it
+            if blocking:
+                os.set_blocking(mine, True)
             if connection.family in _INTERNET and connection.type == socket.SOCK_STREAM:
                 yield connection
             else:

@@ -37,6 +37,34 @@ def test_only_sockets_with_zenohs_linger_time_are_changed(before, lingers):
         assert found == (before == ZENOHS)
 
 
+@pytest.mark.parametrize("default_s", [None, 60.0])
+def test_sockets_of_the_program_go_on_as_it_has_set_them(monkeypatch, default_s):
+    """Whether they block is nobody else's matter, whatever the program sets while we look."""
+    with (
+        socket.create_server(("127.0.0.1", 0)) as listener,
+        socket.create_connection(listener.getsockname()) as connection,
+        socket.create_connection(listener.getsockname()) as blocking,
+    ):
+
+        class Looked(socket.socket):
+            def __init__(self, **options):
+                super().__init__(**options)
+                connection.setblocking(default_s is not None)
+
+        connection.setblocking(default_s is None)
+        before = socket.getdefaulttimeout()
+        socket.setdefaulttimeout(default_s)
+        monkeypatch.setattr(socket, "socket", Looked)
+        try:
+            for one in connections():
+                one.close()
+        finally:
+            socket.setdefaulttimeout(before)
+
+        assert os.get_blocking(connection.fileno()) == (default_s is not None)
+        assert os.get_blocking(blocking.fileno())
+
+
 def lingering():
     """Return how many TCP sockets of this process wait before they close."""
     count = 0
