@@ -4,6 +4,7 @@ import os
 import shutil
 import signal
 import time
+from types import SimpleNamespace
 
 import pytest
 from rebalance_cells import ENTITIES, LATE, POSE, StoppedCell, placement
@@ -16,6 +17,7 @@ from enact_dist.errors import StoreError
 from enact_dist.link import rebalance as module
 from enact_dist.link.rebalance import look, rebalance
 from enact_dist.link.store import open_store, read_store
+from enact_dist.link.store_folder import moving_mark
 
 TWO = placement("left", "right")
 THREE = placement("left", "right", "third", pins=[("part/0", "third")])
@@ -268,9 +270,21 @@ def test_a_folder_in_use_is_refused(tmp_path):
     store.close()
 
 
-def test_leases_of_before_the_stop_end_first(tmp_path):
-    """A client that was cut off in a lock may believe in it for a TTL."""
-    folders = two_stores(tmp_path, left=[HERE, SessionRecord("ann", 300_000_000)])
+def test_leases_of_before_the_stop_end_first(tmp_path, monkeypatch):
+    """A client that was cut off in a lock may believe in it for a TTL; no shard starts until then."""
+    folders = two_stores(tmp_path, left=[HERE, SessionRecord("ann", 600_000_000_000)])
+    slept_s = []
+
+    def sleep(wait_s):
+        slept_s.append(wait_s)
+        for folder in folders.values():
+            assert moving_mark(folder) is not None
+
+    monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=time.monotonic, sleep=sleep))
     started_s = time.monotonic()
     found = rebalance(folders, placement("left", "right", pins=[("**", "right")]), unix_s=1)
-    assert 0.0 < found.waited_s <= 0.3 <= time.monotonic() - started_s
+    took_s = time.monotonic() - started_s
+
+    assert slept_s == [found.waited_s]
+    assert 600.0 - took_s <= found.waited_s <= 600.0
+    assert [moving_mark(folder) for folder in folders.values()] == [None, None]
