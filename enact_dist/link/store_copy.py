@@ -272,7 +272,8 @@ def restore(
         epoch = _epoch_before(folder)
         with closing(FolderLock(folder)):
             _build(source, partial, backup, unix_s=unix_s, epoch=epoch)
-            aside = folder.with_name(f"{folder.name}{ASIDE}{unix_s}")
+            while (aside := folder.with_name(f"{folder.name}{ASIDE}{unix_s}")).exists():
+                unix_s += 1
             folder.rename(aside)
             partial.rename(folder)
             sync_folder(folder.parent)

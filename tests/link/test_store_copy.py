@@ -53,6 +53,7 @@ def test_a_stopped_shard_comes_back_as_it_was(folder, tmp_path):
 
     assert versions(folder) == {"a": 1, "b": 1}
     assert versions(aside) == {"a": 7, "b": 7}
+    assert restore(tmp_path / "copy", folder, unix_s=100, replace=True, **NAMES)[1] != aside
     assert restore(tmp_path / "copy", tmp_path / "new", unix_s=100, **NAMES)[1] is None
 
 
