@@ -260,8 +260,10 @@ class Shards:
 
 
 def strangers(stored: Recovered, shard: str, placement: PlacementMap) -> list[tuple[str, str]]:
-    """Return the entities that a shard has stored and that live elsewhere, and where."""
+    """Return the entities that live elsewhere and that a shard has, or may have soon, and where."""
     entities = dict.fromkeys(record.slot.entity for record in stored.slots)
+    for promise in stored.prepared:
+        entities.update((write.slot.entity, None) for write in promise.writes)
     found = ((entity, shard_of(entity, placement)) for entity in entities)
     return [(entity, owner) for entity, owner in found if owner != shard]
 

@@ -10,14 +10,15 @@ import pytest
 from rebalance_cells import ENTITIES, LATE, POSE, StoppedCell, placement
 from store_writer import persist, slot_record
 
-from enact_dist.core.datum import LockId, Position
+from enact_dist.core.datum import LockId, Position, Token
+from enact_dist.core.messages import SlotVersion, WriteItem
 from enact_dist.core.placement import shard_of
-from enact_dist.core.records import DecisionRecord, SessionRecord, WorldRecord
+from enact_dist.core.records import DecisionRecord, PreparedRecord, SessionRecord, WorldRecord
 from enact_dist.errors import StoreError
 from enact_dist.link import rebalance as module
 from enact_dist.link.rebalance import look, rebalance
 from enact_dist.link.store import open_store, read_store
-from enact_dist.link.store_folder import moving_mark
+from enact_dist.link.store_folder import moving_mark, refuse_strangers
 
 TWO = placement("left", "right")
 THREE = placement("left", "right", "third", pins=[("part/0", "third")])
@@ -219,6 +220,10 @@ def two_stores(tmp_path, **records):
 
 DECISION = DecisionRecord(LockId("ann", 0, 1), Position(5, "left"), ("right",))
 HERE = slot_record("part/1", 1)
+PROMISE = PreparedRecord(
+    LockId("ann", 0, 1), Token(1, 2), (), (WriteItem(HERE.slot, None),),
+    (SlotVersion(HERE.slot, 1),), 77, "right", Token(3, 4),
+)  # fmt: skip
 FORK = WorldRecord("what_if", "online", 7)
 
 
@@ -240,6 +245,17 @@ def test_what_would_lose_something_is_refused(tmp_path, left, right, said):
         with pytest.raises(StoreError, match=f"nothing was moved: .*{said}"):
             act(folders, where)
     open_store(folders["left"], unix_s=1)[0].close()
+
+
+@pytest.mark.parametrize("record", [HERE, PROMISE])
+def test_entities_of_other_shards_are_refused_at_the_start(tmp_path, record):
+    """Also those that a commit over shards has written nothing of yet."""
+    with read_store(two_stores(tmp_path, left=[record])["left"]) as held:
+        refuse_strangers(tmp_path, held, "left", placement("left", "right", pins=[("**", "left")]))
+        with pytest.raises(
+            StoreError, match=r"do not live on left: part/1 \(of right\); the shard"
+        ):
+            refuse_strangers(tmp_path, held, "left", placement("left", "right", pins=[("**", "right")]))  # fmt: skip
 
 
 def test_a_look_changes_nothing(tmp_path):
