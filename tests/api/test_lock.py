@@ -230,18 +230,18 @@ def test_lock_timeout_names_holder(online):
     def hold():
         with Lock(Write(online, bench, COUNT)):
             inside.set()
-            leave.wait(10)
+            leave.wait(60)
 
     holder = threading.Thread(target=hold)
     holder.start()
-    inside.wait(10)
+    inside.wait(60)
     with pytest.raises(LockTimeoutError, match="work_bench/count") as caught:
         Lock(Read(online, bench, COUNT), wait_s=0.05).__enter__()
     leave.set()
     holder.join()
 
     assert "write" in caught.value.holders[0]
-    with Lock(Read(online, bench, COUNT), wait_s=1.0):
+    with Lock(Read(online, bench, COUNT), wait_s=30.0):
         pass
 
 
@@ -251,7 +251,7 @@ def test_waiting_lock_is_granted_when_holder_leaves(online):
     seen = []
 
     def wait():
-        inside.wait(10)
+        inside.wait(60)
         waiting.set()
         with Lock(Read(online, bench, COUNT)) as lock:
             seen.append(lock[Read(online, bench, COUNT)])
@@ -260,7 +260,7 @@ def test_waiting_lock_is_granted_when_holder_leaves(online):
     waiter.start()
     with Lock(Write(online, bench, COUNT)) as lock:
         inside.set()
-        waiting.wait(10)
+        waiting.wait(60)
         lock[Write(online, bench, COUNT)] = 11
     waiter.join()
 
@@ -340,7 +340,7 @@ def test_pattern_write_creates_one_entity_when_two_look_first(online):
     together = threading.Barrier(2)
 
     def perceive():
-        together.wait(10)
+        together.wait(60)
         with Lock(each) as lock:
             packages = lock[each]
             if "milk" not in packages.values():
@@ -408,7 +408,7 @@ def test_statistics_tell_waiting_and_holding(online):
     statistics = lock.statistics()
     assert statistics.granted
     assert statistics.shards == ("local",)
-    assert 0 <= statistics.waited_s < 5
+    assert 0 <= statistics.waited_s < 60
 
 
 def test_local_cell_keeps_durable_data_over_reopening(tmp_path):

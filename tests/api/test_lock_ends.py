@@ -90,11 +90,11 @@ def hold_elsewhere(request):
     def hold():
         with Lock(request):
             inside.set()
-            leave.wait(10)
+            leave.wait(60)
 
     holder = threading.Thread(target=hold)
     holder.start()
-    inside.wait(10)
+    inside.wait(60)
 
     def end():
         leave.set()

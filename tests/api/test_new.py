@@ -164,7 +164,7 @@ def test_view_made_before_the_commit_reaches_nobody_after_it(online):
         cloud = lock.new(write, (1_000_000,), np.uint8)
         cloud[:] = 1
         kept = cloud[10:20]
-    assert leftovers().wait(5.0)
+    assert leftovers().wait(30.0)
 
     kept[:] = 99
 

@@ -222,7 +222,7 @@ def writer(cell):
 
     thread = threading.Thread(target=write)
     thread.start()
-    assert begun.wait(10.0)
+    assert begun.wait(60.0)
     yield
     stop.set()
     thread.join()

@@ -93,7 +93,7 @@ def test_lock_in_doubt_is_shown_given_up_and_audited(cell, monkeypatch):
     assert f"gave up lock {lock['number']} on s1" in done.stdout
     with connect(cell.file) as joined:
         right = Write(joined.world("online"), RIGHT, COUNT)
-        with Lock(right, wait_s=2.0) as free:
+        with Lock(right, wait_s=30.0) as free:
             assert free[right] == 0
             free[right] = 7
     table = cell.enact("lock", "audit", "--timeout", "2").stdout

@@ -32,7 +32,7 @@ def ask(near, message, stream=None):
     return decode_frame(header, payload)
 
 
-def speak(carrier, make_peer, session, *, timeout_s=5.0):
+def speak(carrier, make_peer, session, *, timeout_s=30.0):
     def call(shard, message):
         return carrier.request(shard, message, timeout_s=timeout_s)
 

@@ -46,7 +46,7 @@ class FakeStore:
         self.closed = False
 
     def write(self, batch):
-        assert self.may_write.wait(10)
+        assert self.may_write.wait(60)
         if self.failure is not None:
             raise self.failure
         self.batches.append(list(batch))
@@ -80,7 +80,7 @@ def start(make_settings):
         host.close()
 
 
-def call_of(host, *, timeout_s=5.0):
+def call_of(host, *, timeout_s=30.0):
     """Return a `call(shard, message)` that waits for the answer."""
     carrier = EmbeddedCarrier(host, "caller")
     return lambda shard, message: carrier.request(shard, message, timeout_s=timeout_s)

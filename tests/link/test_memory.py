@@ -43,7 +43,7 @@ def test_map_lasts_as_long_as_a_view_of_it(file, size):
     os.posix_fallocate(file.fileno(), 0, size)
     os.pwrite(file.fileno(), b"x", size - 1)
     gc.collect()  # what earlier tests have left
-    assert leftovers().wait(5.0)
+    assert leftovers().wait(30.0)
     before, ended = maps(), []
     opened = descriptors()
 
@@ -54,7 +54,7 @@ def test_map_lasts_as_long_as_a_view_of_it(file, size):
     assert descriptors() == opened
     del last
     gc.collect()
-    assert leftovers().wait(5.0)
+    assert leftovers().wait(30.0)
     assert (maps(), ended) == (before, [1])
 
 

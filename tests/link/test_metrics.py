@@ -54,7 +54,7 @@ def served(host):
     server = MetricsServer(("127.0.0.1", 0), lambda: page(host, 'cell "a"'))
 
     def ask(path="/metrics"):
-        with DIRECT.open(f"http://127.0.0.1:{server.port}{path}", timeout=5) as answer:
+        with DIRECT.open(f"http://127.0.0.1:{server.port}{path}", timeout=30) as answer:
             assert answer.headers["Content-Type"] == CONTENT_TYPE
             return answer.read().decode()
 

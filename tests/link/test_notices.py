@@ -158,7 +158,7 @@ def got_meanwhile(queue, act):
     while not queue._polling:
         time.sleep(0.001)
     act()
-    waiter.join(10)
+    waiter.join(60)
     return found[0]
 
 

@@ -29,7 +29,9 @@ from enact_dist.wire.frames import decode_frame, encode_frame
 
 def speak(carrier, make_peer, **options):
     """Return a session that has said hello over `carrier`."""
-    peer = make_peer(lambda shard, message: carrier.request(shard, message, timeout_s=9), **options)
+    peer = make_peer(
+        lambda shard, message: carrier.request(shard, message, timeout_s=30), **options
+    )
     peer.hello()
     return peer
 
@@ -113,7 +115,7 @@ def test_daemon_refuses_and_counts_what_it_cannot_read(daemon, carry, endpoint, 
     session = open_session(connect=[endpoint], lease_s=1.0)
     try:
         carrier.request("s0", ListLocks(), timeout_s=30)
-        replies = session.get("enact/cell/s0/acquire/x", attachment=header, timeout=5)
+        replies = session.get("enact/cell/s0/acquire/x", attachment=header, timeout=30)
         sample = replies.recv().ok
         answer = decode_frame(bytes(sample.attachment), bytes(sample.payload))
     finally:
@@ -140,12 +142,12 @@ def test_daemon_answers_who_is_parked_when_it_stops(daemon, carry, make_peer, en
     parked = threading.Event()
     waiter.call = _noting(waiter.call, parked)
     thread.start()
-    parked.wait(5)
+    parked.wait(30)
     while len(holder.call("s0", ListLocks()).holders) < 2:
         continue
 
     shard.stop(drain_s=0.0)
-    thread.join(5)
+    thread.join(30)
 
     assert isinstance(granted, Granted)
     assert [type(answer) for answer in answers] == [Waiting]

@@ -62,10 +62,10 @@ def test_answer_that_another_thread_brings_at_once_is_sent_once(raw, monkeypatch
     def brought_by_another(message, reply):
         answers = queue.SimpleQueue()
         submit(message, answers.put)
-        answer = answers.get(timeout=5)
+        answer = answers.get(timeout=30)
         threads.append(threading.Thread(target=reply, args=(answer,)))
         threads[-1].start()
-        assert sending.wait(5)
+        assert sending.wait(30)
 
     monkeypatch.setattr(socket_connection.SocketConnection, "_send_what_fits", slowly)
     monkeypatch.setattr(raw.shard.host, "submit", brought_by_another)

@@ -73,7 +73,7 @@ def write_until_it_fails(endpoint):
         for number in range(200):
             request = Write(online, Entity(f"e{number}"), KEPT)
             try:
-                with Lock(request, wait_s=5.0) as lock:
+                with Lock(request, wait_s=30.0) as lock:
                     lock[request] = bytes([number]) * BODY_BYTES
             except EnactError as failure:
                 return number, failure
@@ -91,7 +91,7 @@ def check_and_go_on(endpoint, written):
         # The last one was not answered: there whole, or not at all.
         assert snapshot.get(views[-1], None) in {None, bytes([written]) * BODY_BYTES}
         request = Write(online, Entity("after"), KEPT)
-        with Lock(request, wait_s=5.0) as lock:
+        with Lock(request, wait_s=30.0) as lock:
             lock[request] = b"goes on"
 
 

@@ -201,12 +201,12 @@ def test_carrier_tells_when_a_shard_comes_into_reach_again(daemon, carry, endpoi
     came = queue.Queue()
     carrier.tell_returns(came.put)
     carrier.add_endpoints([ShardEntry("s0", (endpoint,))])
-    assert came.get(timeout=5) == "s0"
+    assert came.get(timeout=30) == "s0"
 
     running.stop()
     daemon(endpoint)
 
-    assert came.get(timeout=5) == "s0"
+    assert came.get(timeout=30) == "s0"
     assert isinstance(carrier.request("s0", ListLocks(), timeout_s=30), Locks)
     carrier.close()
     assert "enact-presence" not in {thread.name for thread in threading.enumerate()}
@@ -349,7 +349,7 @@ def test_discovery_brings_the_welcome_of_the_first_shard(daemon, endpoint):
     daemon(endpoint)
 
     cell, welcome = discover(
-        [endpoint], Hello("me", 0, 2_000_000_000, "tester", "h", 1, True), timeout_s=5
+        [endpoint], Hello("me", 0, 2_000_000_000, "tester", "h", 1, True), timeout_s=30
     )
 
     assert cell == "cell"
