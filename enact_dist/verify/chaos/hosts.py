@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 CLOCK_AHEAD_S: Final = 100_000
 """By how much each host's monotonic clock is ahead of the one before."""
-COMMAND_S: Final = 10.0
+COMMAND_S: Final = 60.0
 _PORT: Final = 7447
 _DIE_WITH_PARENT: Final = ("setpriv", "--pdeathsig", "KILL")
 _MAKE_HOST: Final = """
