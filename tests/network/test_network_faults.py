@@ -184,9 +184,21 @@ def test_shard_is_reached_again_soon_after_a_cut(whole):
     assert max(took_ms) < 10_000, took_ms
 
 
-def test_network_did_what_it_was_told(site):
-    """The switch has cut and lost frames; how soon shards were reached is told (`-rP`)."""
-    counts = site.hosts.counts()
+@pytest.mark.parametrize("fault", ["cut", "lost"])
+def test_network_does_what_it_is_told(whole, fault):
+    """The switch counts what it forwards, cuts and loses, in the midst of a cell's work."""
 
-    print(f"{counts}; ms to reach a shard again: {site.noted}")
-    assert min(counts.cut, counts.lost, counts.forwarded) > 0, counts
+    def counted():
+        counts = whole.hosts.counts()
+        return counts.forwarded, getattr(counts, fault)
+
+    before = counted()
+    if fault == "cut":
+        whole.cut(*whole.between("far", SHARDS))
+    else:
+        whole.lay(Cable(loss=0.05))
+    work(1, whole.near)
+
+    until_s = time.monotonic() + LONG_S
+    while not all(now > then for now, then in zip(counted(), before, strict=True)):
+        assert time.monotonic() < until_s, (before, counted())
