@@ -52,9 +52,8 @@ class LinkWatch:
     def _run(self, events: zenoh.Handler[zenoh.LinkEvent]) -> None:
         try:
             while True:
-                came, lost = _counted(events, events.recv())
-                if came:
-                    end_lingering()
+                lost = _counted(events, events.recv())
+                end_lingering()
                 if lost and self._connect:
                     self._knock(events, lost)
         except zenoh.ZError:  # the session is closed
@@ -65,8 +64,9 @@ class LinkWatch:
         hosts, pause_s = list(_hosts_of(self._connect)), LOOK_S
         waited: set[int] = set()
         while not self._closing.wait(pause_s):
-            came, lost = _counted(events, events.try_recv(), lost)
-            if came:
+            event = events.try_recv()
+            if event is not None:
+                lost = _counted(events, event, lost)
                 end_lingering()
             if not lost:
                 return
@@ -86,17 +86,15 @@ class LinkWatch:
 
 def _counted(
     events: zenoh.Handler[zenoh.LinkEvent], event: zenoh.LinkEvent | None, lost: int = 0
-) -> tuple[bool, int]:
-    """Take all events that are here; return whether a connection came, and how many are lost now.
+) -> int:
+    """Take all events that are here; return how many connections are lost now.
 
     A thousand clients that connect at once are looked at together: each look lists all descriptors.
     """
-    came = False
     while event is not None:
-        is_new = event.kind == zenoh.SampleKind.PUT
-        came, lost = came or is_new, max(0, lost - 1) if is_new else lost + 1
+        lost = max(0, lost - 1) if event.kind == zenoh.SampleKind.PUT else lost + 1
         event = events.try_recv()
-    return came, lost
+    return lost
 
 
 def _hosts_of(endpoints: Iterable[str]) -> Iterable[tuple[str, int]]:
