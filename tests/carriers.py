@@ -6,7 +6,8 @@ the test starts: a call never takes the other way unnoticed.  `ENACT_TEST_CARRIE
 
     ENACT_TEST_CARRIER=4711     draw as a run did whose last line names this seed
     ENACT_TEST_CARRIER=zenoh    that carrier for every test; or socket
-    ENACT_TEST_CARRIER=both     each test twice, once over each
+
+`deploy/test --carrier both` runs all of them over the one, then over the other.
 
 Marks say what else:
 
@@ -39,8 +40,8 @@ def choice() -> str:
         ValueError: It says what cannot be.
     """
     said = os.environ.setdefault(VARIABLE, str(secrets.randbelow(10**6)))
-    if said not in {"both", *BOTH} and not said.isdecimal():
-        raise ValueError(f"{VARIABLE}={said!r} is neither both, socket, zenoh nor a seed")
+    if said not in BOTH and not said.isdecimal():
+        raise ValueError(f"{VARIABLE}={said!r} is neither socket, zenoh nor a seed")
     return said
 
 
@@ -55,6 +56,8 @@ def ways(node) -> tuple[str, ...]:
     mark = node.get_closest_marker("carrier")
     if mark is not None:
         wanted = [asked for asked in mark.args if asked != LOCAL or "cell" in node.fixturenames]
+        if choice() in BOTH and set(BOTH) <= set(wanted):
+            wanted = [asked for asked in wanted if asked not in BOTH or asked == choice()]
         return tuple(way for asked in wanted for way in _ways(asked, node))
     folder = node.path.relative_to(Path(__file__).parent).parts[0]
     usual = folder not in FOLDERS or node.get_closest_marker("timing")
@@ -65,6 +68,4 @@ def _ways(asked: str, node) -> tuple[str, ...]:
     if asked != DRAWN:
         return (asked,)
     said = choice()
-    if said == "both":
-        return BOTH
     return (said if said in BOTH else drawn(node.nodeid, said),)

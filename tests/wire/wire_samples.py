@@ -73,7 +73,10 @@ def sample(kind, random):
         inner = next(one for one in typing.get_args(kind) if one is not type(None))
         return sample(inner, random) if random.random() < 0.8 else None
     if typing.get_origin(kind) is tuple:
-        return tuple(sample(typing.get_args(kind)[0], random) for _ in range(random.randint(1, 3)))
+        kinds = typing.get_args(kind)
+        if kinds[1:] == (...,):
+            kinds = kinds[:1] * random.randint(1, 3)
+        return tuple(sample(each, random) for each in kinds)
     if kind is Datum:
         if random.random() < 0.2:
             return Datum(random.randbytes(5), b"", 100_000, 7, f"{'5f' * 16}-1f")
