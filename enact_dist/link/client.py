@@ -183,8 +183,10 @@ class CellClient(SessionClient):
 
     def _say_farewell(self, lock: MultiLock) -> None:
         """Send the releases of a lock that rests; the keep-alives repair what gets lost."""
+        with self._mutex:
+            farewells = lock.take_farewells()
         try:
-            self.carrier.request_all(lock.take_farewells(), timeout_s=CALL_S)
+            self.carrier.request_all(farewells, timeout_s=CALL_S)
         except EnactError as error:
             self.count("releases_unsent")
             _log.info("lock %s was not released by message: %s", lock.lock, error)
