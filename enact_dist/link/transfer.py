@@ -18,7 +18,7 @@ from itertools import chain, zip_longest
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from enact_dist.link.refusals import unreachable
-from enact_dist.link.session_client import BYTES_PER_S_MIN, CALL_S, FINISH_S
+from enact_dist.link.session_client import BYTES_PER_S_MIN, CALL_S
 
 if TYPE_CHECKING:
     from enact_dist.core.messages import Answer, Request
@@ -142,7 +142,7 @@ class Transfer:
     def _recover(self, shard: str) -> None:
         """Wait a little before slices are asked again, unless all is over."""
         silent_s = time.monotonic() - self._heard_s
-        if silent_s >= FINISH_S:
+        if silent_s >= self._client.patience_s:
             raise unreachable(shard, silent_s, self._client.carrier.endpoint_of)
         self._alive()
         self._client.rest(self._pause_s)

@@ -143,6 +143,12 @@ class Cell:
 
 
 @pytest.fixture
+def port():
+    """A port of this host at which nobody listens."""
+    return free_port()
+
+
+@pytest.fixture
 def make_cell(tmp_path):
     cells = []
 

@@ -76,7 +76,7 @@ def run(cell):
     say("view", online.view(view)[view])
 
 
-with connect(sys.argv[1]) as cell:
+with connect(sys.argv[1], patience_s=60.0) as cell:
     if sys.argv[2:] == ["pause"]:
         pause_in_the_midst(cell)
     run(cell)

@@ -13,8 +13,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.carrier("auto")]
 PROGRAM = str(Path(__file__).with_name("large_data_program.py"))
 TTL_S = 12.0
 CUT_S = 6.5
-"""Longer than the lease of a link (TTL_S / 2); the lock and the patience of a transfer (10 s)
-outlive it and one more second or two, in which a repeated SYN finds the way open."""
+"""Longer than the lease of a link (TTL_S / 2); the lock outlives it and some seconds more."""
 
 
 @pytest.fixture

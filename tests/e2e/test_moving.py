@@ -5,7 +5,6 @@ import signal
 
 import numpy as np
 import pytest
-from conftest import free_port
 
 from enact_dist import Aspect, Durability, Entity, Lock, Read, Write, connect
 from enact_dist.errors import LeaseLostError
@@ -48,7 +47,7 @@ def stop(cell):
     cell.daemons.clear()
 
 
-def test_a_third_shard_gets_its_entities_and_a_backup_comes_back(make_cell):
+def test_a_third_shard_gets_its_entities_and_a_backup_comes_back(make_cell, port):
     """All is as before, over all shards; then clients live through a shard's step back."""
     cell = make_cell(shards=("s0", "s1"))
     cell.start_all()
@@ -65,7 +64,7 @@ def test_a_third_shard_gets_its_entities_and_a_backup_comes_back(make_cell):
         online.fork("what_if")
         before = shown(joined)
 
-    third = f'[shards.s2]\nlisten = "tcp/127.0.0.1:{free_port()}"\n'
+    third = f'[shards.s2]\nlisten = "tcp/127.0.0.1:{port}"\n'
     cell.file.write_text(cell.file.read_text() + third)
     cell.ports["s2"] = 0
     refused = cell.enact("shard", "rebalance", "--new", "s2")
