@@ -40,6 +40,8 @@ FETCH_BYTES: Final = 4 << 20
 LATE_S: Final = 1.0
 """How long the numbers of notices of no interest may stay out: four times as a shard says."""
 JOIN_S: Final = 1.0
+FORCED_TRIES: Final = 20
+"""So often a forced socket is tried: a busy shard may not answer one within half a second."""
 
 _log = logging.getLogger("enact.link")
 _open: weakref.WeakSet[SocketCarrier] = weakref.WeakSet()
@@ -201,10 +203,12 @@ class SocketCarrier:
             old.close()
         if line is not None:
             # A connection is there before anybody asks, and with it the kernel's word on our end.
-            line.try_again()
-            connection = line.take()
-            if connection is not None:
-                line.give_back(connection)
+            for _ in range(FORCED_TRIES if self._forced else 1):
+                line.try_again()
+                connection = line.take()
+                if connection is not None:
+                    line.give_back(connection)
+                    break
         self._refuse_if_forced(shard, line)
         for feed in list(self._feeds.values()):
             feed.settle()
