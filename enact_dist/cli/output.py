@@ -6,7 +6,8 @@ import dataclasses
 import json
 import os
 import sys
-from typing import TYPE_CHECKING, Protocol
+import time
+from typing import TYPE_CHECKING, Final, Protocol
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -17,6 +18,9 @@ COLOURS = ("36", "33", "35", "32", "34", "31", "96", "93", "95", "92")
 
 TABLE_PADDING = 3
 """Columns of a terminal between two cells."""
+
+TOLD_EVERY_S: Final = 0.2
+"""How often a line of progress is written over."""
 
 
 def on_terminal() -> bool:
@@ -150,3 +154,23 @@ def shown_bytes(size_bytes: float) -> str:
 def coloured(text: str, index: int) -> str:
     """Return `text` in the colour of that index, where the terminal shows colours."""
     return f"\033[{COLOURS[index % len(COLOURS)]}m{text}\033[0m" if on_terminal() else text
+
+
+class ProgressLine:
+    """A line of progress on a terminal, written over again and again; nothing elsewhere."""
+
+    def __init__(self) -> None:
+        self._shows = sys.stderr.isatty()
+        self._told_s = 0.0
+
+    def show(self, text: str, *, at_once: bool = False) -> None:
+        """Show how far it is, now and then or at once."""
+        now_s = time.monotonic()
+        if self._shows and (at_once or now_s - self._told_s >= TOLD_EVERY_S):
+            self._told_s = now_s
+            print(f"\r\033[K{text}", end="", file=sys.stderr, flush=True)
+
+    def end(self) -> None:
+        """Take the line away."""
+        if self._shows:
+            print("\r\033[K", end="", file=sys.stderr, flush=True)

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import sys
-import time
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.cli.output import print_json, shown_bytes, shown_s
+from enact_dist.cli.output import ProgressLine, print_json, shown_bytes, shown_s
 from enact_dist.cli.times import MOMENT_HELP, moment
 from enact_dist.cli.verbs import (
     CELL_DEFAULT,
@@ -32,7 +30,6 @@ if TYPE_CHECKING:
     from enact_dist.recording import RecordingSummary, ReplaySummary
 
 COMPRESSIONS: Final = ("zstd", "lz4", "none")
-TOLD_EVERY_S: Final = 0.2
 OFFSET_S_MAX: Final = 1e8
 """A larger number is a time in seconds since 1970, a smaller one counts from the begin."""
 
@@ -142,7 +139,7 @@ def run_record(arguments: argparse.Namespace) -> int:
     """Record until a signal or for so many seconds; fail where versions or aspects are missing."""
     from enact_dist.recording import Recorder
 
-    line = _Line()
+    line = ProgressLine()
     with StopSignals() as stop, open_cell(arguments) as cell:
         recorder = Recorder(
             cell,
@@ -208,7 +205,7 @@ def run_replay(arguments: argparse.Namespace) -> int:
     """Commit a recording again until its end or a signal."""
     from enact_dist.recording import Replay
 
-    line = _Line()
+    line = ProgressLine()
     with StopSignals() as stop, open_cell(arguments, observer=False, actor="replay") as cell:
         replay = Replay(
             cell,
@@ -261,23 +258,3 @@ def _replayed_line(summary: ReplaySummary) -> str:
         missing = shown_bytes(summary.missing_bytes)
         parts.append(f"the recording was CUT OFF: {missing} after its last whole chunk not used")
     return ", ".join(parts)
-
-
-class _Line:
-    """A line of progress on a terminal, written over again and again; nothing elsewhere."""
-
-    def __init__(self) -> None:
-        self._shows = sys.stderr.isatty()
-        self._told_s = 0.0
-
-    def show(self, text: str) -> None:
-        """Show how far it is, now and then."""
-        now_s = time.monotonic()
-        if self._shows and now_s - self._told_s >= TOLD_EVERY_S:
-            self._told_s = now_s
-            print(f"\r\033[K{text}", end="", file=sys.stderr, flush=True)
-
-    def end(self) -> None:
-        """Take the line away."""
-        if self._shows:
-            print("\r\033[K", end="", file=sys.stderr, flush=True)

@@ -10,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.cli.output import print_json, print_table, shown_bytes, shown_s
+from enact_dist.cli.output import ProgressLine, print_json, print_table, shown_bytes, shown_s
 from enact_dist.cli.verbs import DONE, add_cell, add_verb, cell_config, pair, pairs
 from enact_dist.errors import ConfigError, StoreError
 
@@ -66,12 +66,11 @@ def run_rebalance(arguments: argparse.Namespace) -> int:
     if arguments.dry_run:
         found = look(folders, placement)
     else:
-        progress = _Terminal() if sys.stderr.isatty() else None
+        progress = _Shown()
         try:
             found = rebalance(folders, placement, unix_s=int(time.time()), progress=progress)
         finally:
-            if progress is not None:
-                progress.clear()
+            progress.line.end()
     if arguments.json:
         moves = [move._asdict() for move in found.moves]
         print_json({"done": not arguments.dry_run, "resumed": found.resumed, "moves": moves})
@@ -172,11 +171,12 @@ def _shown(size: int) -> str:
     return shown_bytes(size) if size else ""
 
 
-class _Terminal:
+class _Shown:
     """Keeps one line of a terminal up to date."""
 
     def __init__(self) -> None:
-        self._line = ""
+        self.line = ProgressLine()
+        self._so_far = ""
 
     def act(self, name: str) -> None:
         """Show what is done next."""
@@ -184,16 +184,11 @@ class _Terminal:
 
     def moved(self, entities: int, size: int) -> None:
         """Show how much is where it belongs."""
-        self._line = f"{entities} entities with {shown_bytes(size)} moved; "
+        self._so_far = f"{entities} entities with {shown_bytes(size)} moved; "
 
     def waits(self, wait_s: float) -> None:
         """Show what is waited for."""
         self._show(f"waiting {shown_s(wait_s)} for leases to end")
 
-    def clear(self) -> None:
-        """Leave the line clean."""
-        self._line = ""
-        self._show("")
-
     def _show(self, text: str) -> None:
-        print(f"\r\033[K{self._line}{text}", end="", file=sys.stderr, flush=True)
+        self.line.show(f"{self._so_far}{text}", at_once=True)

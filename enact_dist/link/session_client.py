@@ -176,11 +176,11 @@ class SessionClient:
         Raises:
             ShardUnreachableError: One stays without an answer for `timeout_s`.
         """
-        timeout_s = self.patience_s if timeout_s is None else timeout_s
         answers = self.call_each(calls, timeout_s=timeout_s)
         for (shard, _), answer in zip(calls, answers, strict=True):
             if answer is None:
-                raise self.unreachable(shard, timeout_s)
+                waited_s = self.patience_s if timeout_s is None else timeout_s
+                raise self.unreachable(shard, waited_s)
         return [answer for answer in answers if answer is not None]
 
     def call_each(
@@ -189,8 +189,7 @@ class SessionClient:
         """Make idempotent calls at once, each again until it is answered or the time is over."""
         self.check_usable()
         answers: list[Answer | None] = [None] * len(calls)
-        timeout_s = self.patience_s if timeout_s is None else timeout_s
-        deadline_ns = self._now_ns() + int(min(timeout_s, CALLS_S_MAX) * 1e9)
+        deadline_ns = self._deadline_ns(timeout_s)
         pause_s = 0.02
         while True:
             left = [index for index, answer in enumerate(answers) if answer is None]
@@ -203,6 +202,11 @@ class SessionClient:
                 return answers
             self._rest(pause_s, self._returns)
             pause_s = min(2 * pause_s, 0.3)
+
+    def _deadline_ns(self, timeout_s: float | None) -> int:
+        """Return when calls are over that may take so long (None: `patience_s`)."""
+        wait_s = self.patience_s if timeout_s is None else timeout_s
+        return self._now_ns() + int(min(wait_s, CALLS_S_MAX) * 1e9)
 
     def ask_each(
         self,
@@ -220,8 +224,7 @@ class SessionClient:
             timeout_s: How long they may take; None stands for no answer then.
         """
         answers: dict[str, Answer | None] = dict.fromkeys(shards)
-        timeout_s = self.patience_s if timeout_s is None else timeout_s
-        deadline_ns = self._now_ns() + int(timeout_s * 1e9)
+        deadline_ns = self._deadline_ns(timeout_s)
         while True:
             left = [shard for shard, answer in answers.items() if answer is None]
             left_s = max(0.0, (deadline_ns - self._now_ns()) / 1e9)
