@@ -86,7 +86,7 @@ class ActorLock(Lock):
         if isinstance(request, Together) and request == self._together:
             self._use()
             self._readings.fetch(slot_of(view) for view in self._in_set)  # all are asked for
-            return tuple(super(ActorLock, self).__getitem__(view) for view in self._in_set)
+            return tuple([super(ActorLock, self).__getitem__(view) for view in self._in_set])
         return super().__getitem__(self._own(request))
 
     def get(self, request: LockRequest[Any], default: Any = None) -> Any:

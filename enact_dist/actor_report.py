@@ -5,14 +5,15 @@
 the session's keep-alive to `enact actor ls`.
 
 Nothing here grows: rates come from the newest `STAMPS_MAX` updates, lock waits from the newest
-`WAITS_MAX`.
+`WAITS_MAX`, in memory that is taken when the actor starts.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import reprlib
-from collections import deque
+from array import array
+from bisect import bisect_left
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
@@ -79,6 +80,37 @@ class ActorStatistics:
     unstamped: int = 0
 
 
+_NAMES: Final = [field.name for field in dataclasses.fields(ActorStatistics)]
+
+
+class _Newest:
+    """The newest integers of many.
+
+    Args:
+        count_max: How many are kept.
+    """
+
+    __slots__ = ("_count", "_ring")
+
+    def __init__(self, count_max: int) -> None:
+        self._ring = array("q", bytes(8 * count_max))
+        self._count = 0
+
+    def add(self, number: int) -> None:
+        """Keep a number, in place of the oldest one if there are too many."""
+        self._ring[self._count % len(self._ring)] = number
+        self._count += 1
+
+    @property
+    def full(self) -> bool:
+        """Whether there may have been more than are kept."""
+        return self._count >= len(self._ring)
+
+    def ascending(self) -> list[int]:
+        """Return what is kept, smallest first."""
+        return sorted(self._ring[: self._count])
+
+
 class RateMeter:
     """Events per second over the last `RATE_WINDOW_NS`."""
 
@@ -86,19 +118,20 @@ class RateMeter:
 
     def __init__(self, *, start_ns: int) -> None:
         self._start_ns = start_ns
-        self._stamps_ns: deque[int] = deque(maxlen=STAMPS_MAX)
+        self._stamps_ns = _Newest(STAMPS_MAX)
 
     def count(self, now_ns: int) -> None:
         """Count one event."""
-        self._stamps_ns.append(now_ns)
+        self._stamps_ns.add(now_ns)
 
     def rate_hz(self, now_ns: int) -> float:
         """Return the rate as of `now_ns`; over the time since the start while that is shorter."""
         since_ns = max(self._start_ns, now_ns - RATE_WINDOW_NS)
-        if len(self._stamps_ns) == STAMPS_MAX:
+        stamps_ns = self._stamps_ns.ascending()
+        if self._stamps_ns.full:
             # A full ring reaches back less than the window: older events are unknown, not absent.
-            since_ns = max(since_ns, self._stamps_ns[0])
-        recent = sum(1 for stamp_ns in tuple(self._stamps_ns) if stamp_ns >= since_ns)
+            since_ns = max(since_ns, stamps_ns[0])
+        recent = len(stamps_ns) - bisect_left(stamps_ns, since_ns)
         span_s = max(now_ns - since_ns, 1_000_000) / 1e9
         return recent / span_s
 
@@ -130,11 +163,11 @@ class ActorRecord:
         self._last_error = ""
         self._last_update_ns = self._last_update_unix_ns = 0
         self._rate = RateMeter(start_ns=now_ns)
-        self._waits_ns: deque[int] = deque(maxlen=WAITS_MAX)
+        self._waits_ns = _Newest(WAITS_MAX)
 
     def waited(self, wait_ns: int) -> None:
         """Record how long a lock took to be granted or refused."""
-        self._waits_ns.append(wait_ns)
+        self._waits_ns.add(wait_ns)
 
     def updated(self, *, took_ns: int, now_ns: int, wall_ns: int) -> None:
         """Record an update that committed."""
@@ -160,7 +193,7 @@ class ActorRecord:
 
     def snapshot(self, now_ns: int) -> ActorStatistics:
         """Return what was recorded so far."""
-        waits_ns = sorted(self._waits_ns)
+        waits_ns = self._waits_ns.ascending()
         return ActorStatistics(
             name=self._name,
             state=self.state,
@@ -192,7 +225,7 @@ def percentile(ascending: list[int], part: float) -> int:
 
 def encode_reports(reports: list[ActorStatistics]) -> bytes:
     """Return the reports of all actors of one session as msgpack."""
-    rows = [dataclasses.asdict(report) for report in reports]
+    rows = [{name: getattr(report, name) for name in _NAMES} for report in reports]
     encoded: bytes = msgpack.packb({"version": REPORT_VERSION, "actors": rows})
     return encoded
 

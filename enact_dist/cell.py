@@ -360,6 +360,7 @@ class Cell(Closing):
 
     def shards(self) -> tuple[ShardInfo, ...]:
         """Return every shard of the cell, unreachable ones too."""
+        self._client.greet_new()  # how calls travel is known from a shard's welcome on
         return tuple(self._shard_info(shard) for shard in self._client.shards())
 
     def _shard_info(self, shard: str) -> ShardInfo:

@@ -12,8 +12,8 @@ PACKAGE = ROOT / "enact_dist"
 LAYERS = ("errors", "comparing", "retention", "terms", "core", "wire", "link", "api")  # low to high
 PURE = {
     "core": {
-        "__future__", "bisect", "collections", "dataclasses", "enum", "hashlib", "heapq", "itertools",
-        "operator", "typing",
+        "__future__", "array", "bisect", "collections", "dataclasses", "enum", "hashlib", "heapq",
+        "itertools", "operator", "typing",
     },
     "wire": {
         "__future__", "collections", "dataclasses", "enum", "functools", "hashlib", "itertools",

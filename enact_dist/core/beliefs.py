@@ -8,6 +8,7 @@ of arrival, or of the newest message sent, would believe too long.
 
 from __future__ import annotations
 
+from array import array
 from typing import Final
 
 from enact_dist.core.sessions import DRIFT_PER_CENT
@@ -28,17 +29,17 @@ class Sendings:
 
     def __init__(self) -> None:
         self.count = 0
-        self._sent: dict[int, int] = {}
+        # Taken whole: a client that has just started does not grow with what it sends.
+        self._sent = array("q", bytes(8 * SENDINGS_KEPT))
 
     def next(self, now_ns: int) -> int:
         """Return the counter for a message that is sent now."""
         self.count = count = self.count + 1
-        self._sent[count] = now_ns
-        if count > SENDINGS_KEPT:
-            del self._sent[count - SENDINGS_KEPT]
+        self._sent[count % SENDINGS_KEPT] = now_ns
         return count
 
     def believe_until_ns(self, count_seen: int, duration_ns: int) -> int:
         """Return until when something granted for `duration_ns` may be believed in (0: not)."""
-        sent_ns = self._sent.get(count_seen)
-        return 0 if sent_ns is None else sent_ns + shortened_ns(duration_ns)
+        if not max(0, self.count - SENDINGS_KEPT) < count_seen <= self.count:
+            return 0
+        return self._sent[count_seen % SENDINGS_KEPT] + shortened_ns(duration_ns)

@@ -207,7 +207,7 @@ class Client:
         live: dict[int, int] = {lane: seq + 1 for lane, seq in self._seqs.items()}
         for lock in self._locks:
             live[lock.lane] = min(lock.seq, live[lock.lane])
-        view = tuple(LaneView(lane, seq) for lane, seq in live.items())
+        view = tuple([LaneView(lane, seq) for lane, seq in live.items()])
         count = self.sendings.next(now_ns)
         return KeepAlive(self.session, self.epoch(shard), count, view, self.report)
 
@@ -271,7 +271,7 @@ class Client:
         plan = self._plans.get(items) if usual else None
         if plan is None:
             plan = self._planned(items, lock_views=lock_views)
-            if usual:
+            if usual and not any(item.captured_ns for item in items):  # a stamp is asked once
                 if len(self._plans) >= PLANS_MAX:
                     self._plans.clear()
                 self._plans[items] = plan
@@ -297,8 +297,8 @@ class Client:
             if set(views) <= {only} and not self.unsettled.stamp_ns(only, here):
                 locks[only] += views.pop(only, [])
         return Plan(
-            tuple((shard, tuple(locks[shard])) for shard in sorted(locks)),
-            tuple((shard, tuple(views[shard])) for shard in sorted(views)),
+            tuple([(shard, tuple(locks[shard])) for shard in sorted(locks)]),
+            tuple([(shard, tuple(views[shard])) for shard in sorted(views)]),
             self.placement,
             max((self.unsettled.stamp_ns(shard, views[shard]) for shard in views), default=0),
         )

@@ -485,7 +485,7 @@ class MultiLock:
         assert self._finishing is not None
         prepared = self._finishing.prepared
         self.position = position
-        self.versions = versions + tuple(v for vote in prepared.values() for v in vote.versions)
+        self.versions = versions + tuple([v for vote in prepared.values() for v in vote.versions])
         self.client.saw_stamp(position.stamp_ns)
         self.client.committed(prepared, position.stamp_ns)
         self._end(Phase.COMMITTED)

@@ -136,8 +136,10 @@ class PrepareDesk:
             return
         stamp_ns = state.stamps.next(seen_ns=message.seen_stamp_ns, wall_ns=state.wall_ns)
         versions = tuple(
-            SlotVersion(write.slot, state.slots.next_version(write.slot))
-            for write in message.writes
+            [
+                SlotVersion(write.slot, state.slots.next_version(write.slot))
+                for write in message.writes
+            ]
         )
         session = state.sessions.by_id[message.lock.session]
         record = PreparedRecord(

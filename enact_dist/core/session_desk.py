@@ -166,9 +166,13 @@ class SessionDesk:
             if lock.seq < lowest.get(lock.lane, 0):
                 del self._state.pins[lock]
         grants = tuple(
-            GrantLeft(tenure.lock, tenure.token, max(0, tenure.hold_end_ns - self._state.now_ns))
-            for tenure in self._state.tenures.of_session(message.session)
-            if tenure.token is not None
+            [
+                GrantLeft(
+                    tenure.lock, tenure.token, max(0, tenure.hold_end_ns - self._state.now_ns)
+                )
+                for tenure in self._state.tenures.of_session(message.session)
+                if tenure.token is not None
+            ]
         )
         yield Reply(
             reply_to,

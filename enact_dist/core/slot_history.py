@@ -178,7 +178,7 @@ class SlotHistory:
             if near is not None:
                 stamp_ns = captures[near][0]
                 found.append(self.captured(stamp_ns, version_max=version_max))
-        return tuple(content for content in found if content is not None)
+        return tuple([content for content in found if content is not None])
 
     def assert_invariants(self) -> None:
         """Assert the bookkeeping.  For tests and simulation."""

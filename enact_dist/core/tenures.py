@@ -23,6 +23,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.datum import Column, Datum, LockId, Slot, Token
+from enact_dist.core.latencies import Latencies
 from enact_dist.core.lock_table import Claim, LockTable, Mode, Resource, join
 from enact_dist.core.messages import Acquire, Granted, Item, Waiting
 from enact_dist.core.records import Effect, Reply, Story
@@ -108,7 +109,11 @@ def wants_of(items: Iterable[Item]) -> dict[Resource, Mode]:
 
 
 class Tenures:
-    """All tenures of one shard."""
+    """All tenures of one shard.
+
+    Attributes:
+        waited: How long locks were in the queue until their grant.
+    """
 
     __slots__ = (
         "_epoch",
@@ -122,6 +127,7 @@ class Tenures:
         "count",
         "describe",
         "table",
+        "waited",
     )
 
     def __init__(
@@ -138,6 +144,7 @@ class Tenures:
         self.by_session: dict[str, dict[LockId, Tenure]] = {}
         self.count = count
         self.describe: Callable[[Tenure, int], Holder]
+        self.waited = Latencies()
 
     def of_session(self, session: str) -> list[Tenure]:
         """Return the tenures of one session."""
@@ -188,9 +195,11 @@ class Tenures:
         assert tenure.parked is not None
         blockers = self.table.blockers(tenure.claim, count_max=BLOCKERS_TOLD_MAX)
         holders = tuple(
-            self.describe(self.by_lock[claim.lock], now_ns)
-            for claim in blockers
-            if claim.lock in self.by_lock
+            [
+                self.describe(self.by_lock[claim.lock], now_ns)
+                for claim in blockers
+                if claim.lock in self.by_lock
+            ]
         )
         reply_to, tenure.parked = tenure.parked, None
         place = self.table.place(tenure.claim)
@@ -209,6 +218,7 @@ class Tenures:
                 heapq.heapify(self._hold_ends)
             heapq.heappush(self._hold_ends, (tenure.hold_end_ns, tenure.lock))
             self.count("locks_granted")
+            self.waited.add((now_ns - tenure.asked_ns) / 1e9)
             if self.table.overtook(claim):
                 self.count("locks_bypassed")
             if tenure.parked is not None:

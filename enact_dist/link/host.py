@@ -30,6 +30,7 @@ from typing import TYPE_CHECKING, Final, cast
 
 from enact_dist.core.epochs import state_of, unkept_epoch
 from enact_dist.core.inspection import counted
+from enact_dist.core.latencies import Latencies
 from enact_dist.core.messages import (
     Acquire,
     AwaitStamp,
@@ -69,7 +70,7 @@ if TYPE_CHECKING:
     from enact_dist.core.shard_state import ShardSettings
     from enact_dist.link.shared_folder import SharedFolder
     from enact_dist.link.store import Store
-    from enact_dist.link.store_thread import Latencies, StoreThread
+    from enact_dist.link.store_thread import StoreThread
 
 TICK_S_MAX: Final = 0.1
 """The timer wakes at least so often: bounds by how much an expiry may be late."""
@@ -231,10 +232,13 @@ class ShardHost:
             "requests_parked": len(self._replies),
         }
 
-    @property
-    def store_latencies(self) -> Latencies | None:
-        """How long the store's writes took; None where nothing is kept."""
-        return self._store_thread.latencies if self._store_thread is not None else None
+    def latencies(self) -> dict[str, Latencies]:
+        """Return how long things took, by name; taken as `figures` are."""
+        written = self._store_thread.latencies if self._store_thread is not None else Latencies()
+        return {
+            "store_write_seconds": written,
+            "lock_wait_seconds": self._shard.state.tenures.waited,
+        }
 
     @property
     def ended(self) -> bool:

@@ -10,12 +10,13 @@ from __future__ import annotations
 from itertools import accumulate
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+from enact_dist.core.latencies import BOUNDS_S
 from enact_dist.link.counters import OF_A_SHARD
-from enact_dist.link.store_thread import BOUNDS_S, Latencies
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from enact_dist.core.latencies import Latencies
     from enact_dist.link.host import ShardHost
 
 CONTENT_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
@@ -29,14 +30,14 @@ class Metric(NamedTuple):
         kind: "counter", "gauge" or "histogram".
         meaning: What it is.
         remedy: What to do where it grows; empty where that is as it should be.
-        figure: Its name among the figures of a `ShardHost`; empty for a histogram.
+        figure: Its name among the figures, or latencies, of a `ShardHost`.
     """
 
     name: str
     kind: str
     meaning: str
-    remedy: str = ""
-    figure: str = ""
+    remedy: str
+    figure: str
 
 
 _NOW: Final = {
@@ -50,12 +51,16 @@ _NOW: Final = {
     "locks_waiting": ("locks that wait", "enact lock ls shows for whom"),
     "requests_parked": ("requests that wait for their answers", ""),
 }
-STORE: Final = Metric(
-    "enact_store_write_seconds",
-    "histogram",
-    "how long batches of records took to be kept, on the disk where an aspect asks for it",
-    "move the shard's folder to a faster disk",
-)
+_TOOK: Final = {
+    "lock_wait_seconds": (
+        "how long locks that were granted had waited here since they were first asked for",
+        "enact lock ls shows who holds; hold locks shorter, or View",
+    ),
+    "store_write_seconds": (
+        "how long batches of records took to be kept, on the disk where an aspect asks for it",
+        "move the shard's folder to a faster disk",
+    ),
+}
 
 
 def _metrics() -> Iterator[Metric]:
@@ -64,7 +69,8 @@ def _metrics() -> Iterator[Metric]:
     for name, counter in OF_A_SHARD.items():
         kind, ending = ("gauge", "") if counter.now else ("counter", "_total")
         yield Metric(f"enact_{name}{ending}", kind, counter.meaning, counter.remedy, name)
-    yield STORE
+    for name, (meaning, remedy) in _TOOK.items():
+        yield Metric(f"enact_{name}", "histogram", meaning, remedy, name)
 
 
 METRICS: Final = tuple(_metrics())
@@ -74,15 +80,15 @@ METRICS: Final = tuple(_metrics())
 def page(host: ShardHost, cell: str) -> str:
     """Return all metrics of a shard as Prometheus reads them; takes no lock of the shard."""
     labels = f'cell="{_escaped(cell)}",shard="{_escaped(host.name)}"'
-    figures = host.figures()
+    figures, latencies = host.figures(), host.latencies()
     lines: list[str] = []
     for metric in METRICS:
         help_ = metric.meaning.replace("\\", r"\\").replace("\n", r"\n")
         lines += [f"# HELP {metric.name} {help_}", f"# TYPE {metric.name} {metric.kind}"]
-        if metric.figure:
-            lines.append(f"{metric.name}{{{labels}}} {_number(figures.get(metric.figure, 0))}")
+        if metric.kind == "histogram":
+            lines += _histogram(metric.name, labels, latencies[metric.figure])
         else:
-            lines += _histogram(metric.name, labels, host.store_latencies or Latencies())
+            lines.append(f"{metric.name}{{{labels}}} {_number(figures.get(metric.figure, 0))}")
     return "\n".join((*lines, ""))
 
 

@@ -212,7 +212,7 @@ class NoticeQueue:
         """Add the numbers of notices that were of no interest; wakes nobody."""
         last = self._notices[-1] if self._notices else None
         if isinstance(last, Skipped) and (last.shard, last.epoch, last.number) == skipped[:3]:
-            self._notices[-1] = last._replace(number=skipped.number)
+            self._notices[-1] = Skipped(last.shard, last.epoch, last.after, skipped.number)
         elif len(self._notices) < self._notices_max:
             self._notices.append(skipped)
 

@@ -26,21 +26,21 @@ import logging
 import os
 import threading
 import weakref
-from collections import OrderedDict
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Final, TypeVar
 
-from enact_dist.core.messages import Refused, Staged
+from enact_dist.core.messages import Refused, Staged, WriteItem
 from enact_dist.link.clock import Clock, SystemClock
 from enact_dist.link.memory import Pages, Plain, body_of, leftovers, map_file, plain_memory
+from enact_dist.link.used_names import UsedNames
 from enact_dist.wire.limits import BODY_BYTES_MAX, PAYLOAD_BYTES_MIN, PAYLOAD_NAME
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from enact_dist.core.datum import Datum
-    from enact_dist.core.messages import Commit, Prepare, Stage, WriteItem
+    from enact_dist.core.messages import Commit, Prepare, Stage
     from enact_dist.link.shared_folder import SharedFolder
 
     _Written = TypeVar("_Written", Commit, Prepare)
@@ -55,8 +55,6 @@ FULL_NS: Final = 100_000_000
 """So long after a payload did not fit, none that is as large is made room for."""
 DRAFT_BYTES_MAX: Final = 2 << 30
 """Bytes of drafts that wait in plain memory for their commits."""
-OVER_MAX: Final = 4096
-"""Names of payloads that were adopted or given up, by which late slices are known."""
 ROOM_S: Final = 1.0
 """How long a new draft waits for files that are on their way out."""
 ROOM_TRIES: Final = 8
@@ -134,7 +132,7 @@ class PayloadDesk:
         self._drafts: dict[str, _Draft] = {}
         self._files: dict[str, int] = {}
         self._adopted: dict[str, weakref.ref[Pages | Plain]] = {}
-        self._over: OrderedDict[str, None] = OrderedDict()
+        self._over = UsedNames()
         self._bytes = self._gone = 0
         self._full = 0, 0
 
@@ -219,14 +217,18 @@ class PayloadDesk:
         until_ns, least = self._full
         if self._clock.monotonic_ns() < until_ns and total >= least:
             return False  # looking through all history again would only delay the others
-        for attempt in range(1, ROOM_TRIES + 1):
+        asked = 0
+        for _ in range(ROOM_TRIES):
             gone = self._gone
-            self._make_room(self._bytes + attempt * total - self._bytes_max)
+            missing = self._bytes + (asked + 1) * total - self._bytes_max
+            if missing > 0:  # else something has gone by itself since
+                self._make_room(missing)
+                asked += 1
             # What is let go of takes a moment to leave.
             leftovers().wait(ROOM_S)
             if self._reserved(total):
                 return True
-            if self._gone == gone:
+            if missing > 0 and self._gone == gone:
                 break  # history has no more to give; else another payload has taken the room
         self._full = self._clock.monotonic_ns() + FULL_NS, total
         return False
@@ -285,13 +287,7 @@ class PayloadDesk:
         """Give a draft up; nothing where there is none."""
         with self._mutex:
             self._drafts.pop(file, None)
-            self._end(file)
-
-    def _end(self, file: str) -> None:
-        """Remember that a name has been used, so that a late slice makes no draft of it again."""
-        self._over[file] = None
-        while len(self._over) > OVER_MAX:
-            self._over.popitem(last=False)
+            self._over.add(file)
 
     # ---------------------------------------------------------------- adoption
 
@@ -303,7 +299,9 @@ class PayloadDesk:
         if not any(write.datum is not None and write.datum.file for write in message.writes):
             return message
         session = message.lock.session
-        return replace(message, writes=tuple(self._adopted_by(w, session) for w in message.writes))
+        return replace(
+            message, writes=tuple([self._adopted_by(w, session) for w in message.writes])
+        )
 
     def _adopted_by(self, write: WriteItem, session: str) -> WriteItem:
         datum = write.datum
@@ -319,7 +317,7 @@ class PayloadDesk:
         body = body_of(memory).toreadonly()
         # Plain memory has a name for its writer alone.
         file = datum.file if shared else ""
-        return write._replace(datum=replace(datum, body=body, file=file))
+        return WriteItem(write.slot, replace(datum, body=body, file=file))
 
     def _adopt(self, file: str, size: int) -> Pages | Plain | None:
         """Return the bytes of a whole payload, for good; None where there is none."""
@@ -333,7 +331,7 @@ class PayloadDesk:
                 return None
             del self._drafts[file]
             self._adopted[file] = weakref.ref(draft.memory)
-            self._end(file)
+            self._over.add(file)
         if draft.shared and self._folder is not None:
             try:
                 os.chmod(file, self._folder.access.file_mode, dir_fd=self._folder.descriptor)

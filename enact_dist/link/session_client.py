@@ -40,6 +40,7 @@ from enact_dist.link.clock import boottime_ns
 from enact_dist.link.lanes import Lanes
 from enact_dist.link.payload_client import SharedPayloads
 from enact_dist.link.refusals import error_of, unreachable
+from enact_dist.link.used_names import SERIES_BITS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -56,7 +57,7 @@ BYTES_PER_S_MIN: Final = 10e6
 FINISH_S: Final = 10.0
 """How long calls are made again before their shard counts as unreachable, unless said otherwise."""
 
-FIRST_STAGED: Final = 1 << 60
+FIRST_STAGED: Final = 1 << SERIES_BITS
 """Numbers of payloads that travel in slices; files that a client fills itself begin at 1."""
 # Tuples: a union would be made anew for each call.
 _GREETINGS: Final = (Welcome, Alive)
@@ -319,6 +320,12 @@ class SessionClient:
         for answer in self.call_all(hellos, timeout_s=timeout_s):
             if isinstance(answer, Refused):
                 raise error_of(answer)
+
+    def greet_new(self) -> None:
+        """Say hello once to each shard that does not know this session yet, if it answers."""
+        new = [shard for shard in self.shards() if self.core.needs_hello(shard)]
+        if new:
+            self.call_once([(shard, self.core.hello(shard)) for shard in new])
 
     def worlds(self) -> dict[str, WorldEntry]:
         """Return the world contexts that every greeted shard knows."""

@@ -225,7 +225,8 @@ class SocketCarrier:
         """Return how calls to a shard travel now, for people: "socket" or "zenoh (why)"."""
         line = self._lines.get(shard)
         if line is None:
-            return "zenoh (the shard offers no socket)"
+            known = shard in self._epochs
+            return f"zenoh (the shard {'offers no socket' if known else 'has not welcomed us yet'})"
         return f"zenoh ({line.problem})" if line.problem else "socket"
 
     def add_endpoints(self, entries: Sequence[ShardEntry]) -> None:

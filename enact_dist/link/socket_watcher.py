@@ -62,7 +62,8 @@ class SocketWatcher:
                 self._skipped = Skipped(notice.shard, notice.epoch, number - 1, number)
                 self._skipped_s = time.monotonic()
             else:
-                self._skipped = self._skipped._replace(number=notice.number)
+                shard, epoch, after, _ = self._skipped
+                self._skipped = Skipped(shard, epoch, after, notice.number)
 
     def tell_skipped(self) -> None:
         """Send the numbers of what was skipped a while ago."""

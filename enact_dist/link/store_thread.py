@@ -9,35 +9,14 @@ from __future__ import annotations
 
 import threading
 import time
-from bisect import bisect_left
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Protocol
+
+from enact_dist.core.latencies import Latencies
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from enact_dist.core.records import Persist
-
-
-BOUNDS_S: Final = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 10.0)
-"""Upper bounds of the classes in which durations of writes are counted, seconds."""
-
-
-class Latencies:
-    """How long something took, counted in classes.  One thread adds, any may read.
-
-    Attributes:
-        counts: One for each of `BOUNDS_S`, and one for what took longer.
-        sum_s: Of all durations.
-    """
-
-    def __init__(self) -> None:
-        self.counts = [0] * (len(BOUNDS_S) + 1)
-        self.sum_s = 0.0
-
-    def add(self, took_s: float) -> None:
-        """Count one duration."""
-        self.counts[bisect_left(BOUNDS_S, took_s)] += 1
-        self.sum_s += took_s
 
 
 class BatchStore(Protocol):

@@ -78,7 +78,7 @@ class BodyReader:
         Raises:
             ProtocolError: It is no datum, or its body is not where the next one must be.
         """
-        if type(raw) is not tuple or tuple(map(type, raw)) != _DATUM:
+        if type(raw) is not tuple or (*map(type, raw),) != _DATUM:
             raise ProtocolError(f"a datum came as {reprlib.repr(raw)}")
         encoding, offset, size, stamp_ns, file = raw
         if len(encoding) > ENCODING_BYTES_MAX + 1 or not 0 <= stamp_ns <= INTEGER_MAX:

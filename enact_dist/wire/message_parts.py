@@ -123,7 +123,8 @@ def reader_of(cls: type[Any]) -> Read:
         build = lambda parts: cls(*parts)  # noqa: E731  # one of two, and short
 
     def read(raw: Any, bodies: BodyReader) -> Any:
-        if type(raw) is not tuple or tuple(map(type, raw)) not in signatures:
+        # Of its length at once: one made of an iterator would end in the interpreter's free lists.
+        if type(raw) is not tuple or (*map(type, raw),) not in signatures:
             raise ProtocolError(_mismatch(cls, raw))
         for index in integers:
             if raw[index] > INTEGER_MAX:

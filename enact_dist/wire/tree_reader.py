@@ -143,7 +143,7 @@ class TreeReader:
             raise ProtocolError(f"a text of a datum is damaged: {error}") from error
 
     def _record(self, content: tuple[Any, ...]) -> RecordNode:
-        if tuple(map(type, content)) != (str, tuple, tuple):
+        if (*map(type, content),) != (str, tuple, tuple):
             raise ProtocolError("a dataclass is [name, fields, nodes]")
         name, fields, nodes = content
         if len(fields) != len(nodes) or not set(map(type, fields)) <= {str}:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import gc
+import sys
+
 import pytest
 
 from enact_dist.actor_report import (
@@ -43,6 +46,35 @@ def test_rate_is_over_the_time_since_the_start_when_an_actor_is_young():
         meter.count(tick * SECOND_NS // 3)
 
     assert meter.rate_hz(SECOND_NS) == pytest.approx(3.0)
+
+
+def test_waits_are_those_of_the_newest_attempts():
+    """A slow beginning is forgotten after 512 attempts, whatever their order was."""
+    record = ActorRecord("fusion", now_ns=0)
+    for wait_ms in (*[1_000] * 300, *range(512, 0, -1)):
+        record.waited(wait_ms * 1_000_000)
+
+    found = record.snapshot(SECOND_NS)
+
+    assert found.lock_wait_p50_ms == pytest.approx(256.0)
+    assert found.lock_wait_p99_ms == pytest.approx(507.0)
+
+
+def test_record_takes_its_memory_when_the_actor_starts():
+    """Waits and updates at 10 Hz for hours leave nothing behind."""
+    record = ActorRecord("fusion", now_ns=0)
+
+    def works(updates):
+        for number in range(updates):
+            record.waited(number * 1_000_000)
+            record.updated(took_ns=number, now_ns=number * 10**9, wall_ns=number * 10**9)
+
+    works(10)
+    gc.collect()
+    before = sys.getallocatedblocks()
+    works(400)
+
+    assert sys.getallocatedblocks() - before < 100
 
 
 def test_percentile_is_the_nearest_rank_when_asked_for_a_part():

@@ -107,6 +107,20 @@ def test_doctor_reports_each_shard_of_a_running_cell(enact, cell_file):
     assert levels["shard left"] in {"ok", "warn"}
 
 
+@pytest.mark.carrier("auto")
+def test_way_to_a_shard_is_found_out_before_it_is_told(enact, cell_file):
+    """Both shards offer a socket; a cell that is joined has met one of them only."""
+    findings = enact("doctor", "--cell", cell_file, "--json").json
+    shards = enact("shard", "ls", "--cell", cell_file, "--json").json
+
+    told = [
+        found["text"] for found in findings if found["subject"] in {"shard left", "shard right"}
+    ]
+    assert len(told) == 2
+    assert all(text.partition(" over ")[2].startswith("socket") for text in told)
+    assert [shard["carrier"] for shard in shards] == ["socket", "socket"]
+
+
 def test_doctor_fails_where_a_shard_is_down(enact, write_cell):
     """A cell that does not run: status 1, each shard with its endpoint and what to start."""
     file = write_cell()

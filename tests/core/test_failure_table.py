@@ -6,8 +6,11 @@ restarts, a message is lost, a message comes twice or late, the lease ends.
 
 from __future__ import annotations
 
+from math import inf
+
 from shard_bench import MS, TTL_NS, S, ShardBench, item, lock_id, slot
 
+from enact_dist.core.latencies import BOUNDS_S
 from enact_dist.core.messages import (
     OUTCOME_COMMITTED,
     OUTCOME_PENDING,
@@ -179,6 +182,25 @@ class TestWaiting:
         assert isinstance(answer, Waiting)
         assert answer.place == 1
         assert [holder.lock for holder in answer.blockers] == [ANN]
+
+    def test_wait_is_counted_from_the_first_request_to_the_grant(self, bench):
+        """However often a waiter asks again; a lock that is free has waited for nothing."""
+        bench.hello("ann", "bob", "cem")
+        bench.granted(ANN, WRITE)
+        bench.acquire(BOB, WRITE)
+        bench.acquire(lock_id("cem"), WRITE)  # and is never granted
+        bench.wait(1_500 * MS, keep=("ann", "bob", "cem"))
+        bench.acquire(BOB, WRITE)
+        bench.wait(500 * MS, keep=("ann", "bob", "cem"))
+        waited = bench.shard.state.tenures.waited
+        assert (sum(waited.counts), waited.sum_s) == (1, 0.0)
+
+        bench.ask(Release(ANN))
+
+        assert waited.sum_s == 2.0
+        assert dict(zip((*BOUNDS_S, inf), waited.counts, strict=True)) == {
+            **dict.fromkeys((*BOUNDS_S, inf), 0), BOUNDS_S[0]: 1, 2.5: 1
+        }  # fmt: skip
 
     def test_waiter_whose_token_vanished_may_ask_again(self, bench):
         """Client cut off: its place is dropped, and the same lock may be asked for again."""

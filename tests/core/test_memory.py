@@ -171,6 +171,22 @@ def test_nothing_grows_with_the_number_of_commits(commits, monkeypatch):
     assert cell.shards["b"].counters["resolved_aborted"] >= 5
 
 
+def test_plans_are_remembered_unless_they_name_a_stamp():
+    """Each set of data with one stamp is asked for once; what is asked over and over is planned."""
+    cell = FastCell()
+    client = FastClient(cell, "ann")
+    usual = [item(Access.VIEW, entity) for entity in client.entities]
+    plan = client.core.plan(usual)
+    before = cell.objects(client.core)
+
+    for stamp_ns in range(1, 100):
+        found = client.core.plan([one._replace(captured_ns=stamp_ns) for one in usual])
+        assert {one.captured_ns for _, items in found.views for one in items} == {stamp_ns}
+
+    assert client.core.plan(usual) is plan
+    assert cell.objects(client.core) == before
+
+
 def test_past_is_bounded_where_the_clock_stands_still(monkeypatch):
     """A wall clock that was set back lets the stamps count by one: nothing gets old."""
     monkeypatch.setattr(history, "LOOSE_STATES_MAX", 100)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -66,15 +68,26 @@ class TestBeliefs:
         """A shard that has seen nothing proves nothing."""
         assert Sendings().believe_until_ns(0, S) == 0
 
-    def test_old_messages_are_forgotten(self):
+    @pytest.mark.parametrize("sent", [1, SENDINGS_KEPT, SENDINGS_KEPT + 1, 3 * SENDINGS_KEPT])
+    def test_exactly_the_newest_messages_give_the_belief_of_their_sending(self, sent):
         """Memory is bounded; forgetting shortens beliefs, which is safe."""
         sendings = Sendings()
-        first = sendings.next(S)
-        for _ in range(2 * SENDINGS_KEPT):
-            sendings.next(S)
+        for number in range(1, sent + 1):
+            assert sendings.next(number * S) == number
 
-        assert sendings.believe_until_ns(first, S) == 0
-        assert len(sendings._sent) == SENDINGS_KEPT
+        for number in range(-1, sent + 2):
+            known = max(0, sent - SENDINGS_KEPT) < number <= sent
+            belief_ns = number * S + shortened_ns(S) if known else 0
+            assert sendings.believe_until_ns(number, S) == belief_ns
+
+    def test_memory_is_taken_before_the_first_message(self):
+        """A client that has just started does not grow by what it sends."""
+        sendings = Sendings()
+        size = sys.getsizeof(sendings._sent)
+        for number in range(3 * SENDINGS_KEPT):
+            sendings.next(number * S)
+
+        assert sys.getsizeof(sendings._sent) == size
 
     @given(st.integers(1, 10**12), st.integers(-10_000, 10_000), st.integers(-10_000, 10_000))
     def test_belief_ends_before_the_lease_for_all_clocks(self, ttl_ns, client_ppm, shard_ppm):

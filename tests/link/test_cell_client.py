@@ -84,6 +84,19 @@ def test_client_locks_on_a_living_shard_when_another_is_away(two):
         add_one(online, there)
 
 
+@pytest.mark.carrier("auto")
+def test_way_to_a_shard_is_that_of_the_next_lock_on_it(two, until):
+    """A shard that is away has told nothing; one that is back is met before its way is told."""
+    two.start("a")
+    with two.connect(observer=True) as cell:
+        assert [shard.reachable for shard in cell.shards()] == [True, False]
+        untold = cell._client.carrier.way_to("b")
+        two.start("b")
+
+        assert untold == "zenoh (the shard has not welcomed us yet)"
+        until(lambda: [shard.carrier for shard in cell.shards()] == ["socket", "socket"])
+
+
 def test_client_registers_its_aspects_again_when_a_shard_forgot_them(two):
     """A shard without a folder restarts empty; locks that name known aspects go on, unwaiting."""
     two.start("a")

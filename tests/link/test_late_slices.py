@@ -6,8 +6,9 @@ import pytest
 
 from enact_dist.core.datum import Datum, LockId, Slot, Token
 from enact_dist.core.messages import Commit, Stage, Staged, WriteItem
-from enact_dist.link.payload_desk import OVER_MAX, PayloadDesk
+from enact_dist.link.payload_desk import PayloadDesk
 from enact_dist.link.shared_folder import SharedFolder
+from enact_dist.link.used_names import NUMBERS_MAX
 
 SIZE = 100_000
 SESSION = "a1b2c3"
@@ -83,7 +84,7 @@ def test_late_slice_makes_no_draft_of_what_was_given_up():
     staged(desk, 0, HALF)
     assert desk.drafts() == {}
 
-    for number in range(OVER_MAX):
+    for number in range(NUMBERS_MAX):
         staged(desk, 0, b"", file=f"{SESSION}-{number + 16:x}", total=0)
     staged(desk, 0, HALF)
     assert desk.drafts() == {FILE: SESSION}

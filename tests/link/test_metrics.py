@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
+from enact_dist.core.latencies import Latencies
 from enact_dist.core.messages import AspectEntry, Committed, PlacementMap, ShardEntry
 from enact_dist.core.shard_state import ShardSettings
 from enact_dist.errors import LinkError
@@ -17,7 +18,6 @@ from enact_dist.link import metrics_server
 from enact_dist.link.host import open_host
 from enact_dist.link.metrics import CONTENT_TYPE, METRICS, page, table
 from enact_dist.link.metrics_server import MetricsServer
-from enact_dist.link.store_thread import Latencies
 
 DOCUMENT = Path(__file__).parents[2] / "deploy" / "metrics.md"
 DIRECT = urllib.request.build_opener(urllib.request.ProxyHandler({}))
@@ -105,6 +105,8 @@ def test_metrics_follow_what_the_shard_does(served, peer):
     assert after["enact_locks_held"] == 0
     assert after["enact_commits_total"] == before["enact_commits_total"] + 1
     assert after["enact_locks_granted_total"] == 1
+    assert after["enact_lock_wait_seconds_count"] == 1
+    assert after["enact_lock_wait_seconds_bucket0.001"] == 1
     assert after["enact_slots"] == 1
     assert after["enact_slot_bytes"] == 5
     written = after["enact_store_write_seconds_count"]

@@ -296,16 +296,49 @@ def test_room_that_another_payload_takes_first_is_made_again(folder):
         asked.append(size)
         kept.pop(0)
         if len(asked) == 1:
-            assert stage(desk, f"{SESSION}-4") == Staged(f"{SESSION}-4", 0, True)
+            assert stage(desk, next_one) == Staged(next_one, 0, True)
 
     desk = PayloadDesk(folder, 2 * SIZE, make_room=make_room)
+    # One that is opened under the same mutex would wait, here for its own thread.
+    mutexes = len(desk._opening)
+    others = (f"{SESSION}-{number}" for number in range(4, 1000))
+    next_one = next(o for o in others if (hash(o) - hash(f"{SESSION}-3")) % mutexes)
     for number in (1, 2):
         stage(desk, f"{SESSION}-{number}", body=b"x" * SIZE)
         kept.append(adopted(desk, f"{SESSION}-{number}"))
 
     assert stage(desk, f"{SESSION}-3") == Staged(f"{SESSION}-3", 0, True)
     assert asked == [SIZE, 2 * SIZE]
-    assert names(folder) == [f"{SESSION}-3", f"{SESSION}-4"]
+    assert names(folder) == sorted([f"{SESSION}-3", next_one])
+
+
+def test_room_that_comes_and_goes_by_itself_ends_no_search_for_more(folder, monkeypatch):
+    """Nothing had to go for it then, which does not mean that history has nothing to give."""
+    kept, asked = [], []
+
+    def make_room(size):
+        asked.append(size)
+        kept.clear()
+
+    desk = PayloadDesk(folder, 2 * SIZE, make_room=make_room)
+    stage(desk, f"{SESSION}-1", body=b"x" * SIZE)
+    kept.append(adopted(desk, f"{SESSION}-1"))
+    stage(desk, f"{SESSION}-2")
+    take, looks = desk._reserved, []
+
+    def reserved(total):
+        looks.append(total)
+        if len(looks) == 2:
+            assert take(total)  # another payload is faster
+        found = take(total)
+        if len(looks) == 1:
+            desk.drop(f"{SESSION}-2")
+            assert leftovers().wait(5.0)
+        return found
+
+    monkeypatch.setattr(desk, "_reserved", reserved)
+    assert stage(desk, f"{SESSION}-3") == Staged(f"{SESSION}-3", 0, True)
+    assert (asked, len(looks)) == ([SIZE], 3)
 
 
 def test_client_that_asks_again_and_again_delays_nobody(folder):

@@ -10,7 +10,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from enact_dist.core import lock_table, multilock, tenures
-from enact_dist.core.beliefs import Sendings
+from enact_dist.core.beliefs import SENDINGS_KEPT, Sendings
 from enact_dist.core.catalogue import Catalogue
 from enact_dist.core.client import Client
 from enact_dist.core.commits import Commits
@@ -122,7 +122,7 @@ def believes_from_newest_sending(patch: Patch) -> None:
     """A client counts its belief from the newest message it sent, seen or not."""
 
     def wrong(self: Sendings, _count_seen: int, duration_ns: int) -> int:
-        return self._sent.get(self.count, 0) + duration_ns
+        return self._sent[self.count % SENDINGS_KEPT] + duration_ns
 
     patch(Sendings, "believe_until_ns", wrong)
 

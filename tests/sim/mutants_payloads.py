@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from enact_dist.link import payload_desk
 from enact_dist.link.payload_desk import PayloadDesk
+from enact_dist.link.used_names import UsedNames
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -61,4 +62,4 @@ def gives_up_drafts_of_holders(patch: Patch) -> None:
 
 def makes_drafts_of_late_slices(patch: Patch) -> None:
     """A late slice of a payload that was adopted and is gone makes a draft of it again."""
-    patch(PayloadDesk, "_end", lambda _desk, _file: None)
+    patch(UsedNames, "add", lambda _names, _name: None)

@@ -1,0 +1,49 @@
+"""Names of payloads that are over, by which a late slice is known."""
+
+from __future__ import annotations
+
+from array import array
+from bisect import bisect_left
+from collections import OrderedDict
+from typing import Final
+
+NUMBERS_MAX: Final = 4096
+"""Names of one series, whose numbers mostly rise; of more the lower half is forgotten."""
+SERIES_MAX: Final = 512
+"""Series that are known; of more the one of which no name was used for longest is forgotten."""
+SERIES_BITS: Final = 60
+"""A client counts what it stages from 1 << `SERIES_BITS` on, all else from 1: two series."""
+
+
+class UsedNames:
+    """Names ``SESSION-NUMBER``, the number in hexadecimal: 8 bytes each.  Not thread-safe."""
+
+    __slots__ = ("_numbers",)
+
+    def __init__(self) -> None:
+        self._numbers: OrderedDict[tuple[str, int], array[int]] = OrderedDict()
+
+    def add(self, name: str) -> None:
+        """Remember a name."""
+        series, number = _parts(name)
+        numbers = self._numbers.setdefault(series, array("Q"))
+        self._numbers.move_to_end(series)
+        at = bisect_left(numbers, number)
+        if at == len(numbers) or numbers[at] != number:
+            numbers.insert(at, number)
+        if len(numbers) > NUMBERS_MAX:
+            del numbers[: NUMBERS_MAX // 2]
+        if len(self._numbers) > SERIES_MAX:
+            self._numbers.popitem(last=False)
+
+    def __contains__(self, name: str) -> bool:
+        series, number = _parts(name)
+        numbers = self._numbers.get(series, ())
+        at = bisect_left(numbers, number)
+        return at < len(numbers) and numbers[at] == number
+
+
+def _parts(name: str) -> tuple[tuple[str, int], int]:
+    session, _, digits = name.rpartition("-")
+    number = int(digits, 16)
+    return (session, number >> SERIES_BITS), number
