@@ -13,6 +13,7 @@ from enact_dist.cell import Cell
 from enact_dist.core.client import Client
 from enact_dist.core.messages import PlacementMap, ShardEntry, Welcome
 from enact_dist.errors import ConfigError, LinkError, MisuseError
+from enact_dist.link.endpoints import split_endpoint
 from enact_dist.terms import checked_name
 
 if TYPE_CHECKING:
@@ -49,11 +50,15 @@ def connect(
     Raises:
         ShardUnreachableError: No shard answered in time; the message names shards and endpoints.
         ConfigError: The `cell.toml` cannot be used, or `target` is neither file nor endpoint.
+        MisuseError: A time is negative or not a number.
     """
     from enact_dist.config_environment import carrier_of
     from enact_dist.link.joining import join
     from enact_dist.link.zenoh_config import OPEN_S
 
+    for word, waits_s in (("timeout_s", timeout_s), ("patience_s", patience_s)):
+        if not waits_s >= 0.0:
+            raise MisuseError(f"{word} is {waits_s!r}; it must be 0 or more seconds")
     name, ttl_s = "", TTL_S
     carrier = carrier_of(os.environ)
     endpoints: tuple[str, ...] = (str(target),)
@@ -150,13 +155,12 @@ def _is_endpoint(target: str | Path) -> bool:
     """
     if isinstance(target, Path):
         return False
-    protocol, slash, address = target.partition("/")
-    if not slash or protocol not in _PROTOCOLS:
+    protocol, host, port = split_endpoint(target)
+    if "/" not in target or protocol not in _PROTOCOLS:
         return False
-    host, colon, port = address.partition("?")[0].partition("#")[0].rpartition(":")
     if protocol == "unixsock-stream":
         return True
-    if not host or not colon or not port.isdecimal() or not 0 < int(port) < 1 << 16:
+    if not host or not port.isdecimal() or not 0 < int(port) < 1 << 16:
         raise ConfigError(f"endpoint {target!r} lacks a host or a port; {_ENDPOINT}")
     return True
 

@@ -44,9 +44,6 @@ PIPE_BYTES: Final = 64 << 10
 NEVER_AGAIN: Final = 2
 """Exit status of wrong usage or configuration: the same command would fail the same way."""
 
-READY_MARK: Final = "ready:"
-"""First word of the line by which a child says that it serves."""
-
 Say = Callable[[str, str], None]
 """Takes the name of a child, or the empty string, and one line of its output."""
 
@@ -156,8 +153,10 @@ class _Child:
             self._events.put(_Ended(self, process.wait()))
 
     def _pass_on(self, lines: list[str], *, alive: bool) -> None:
+        from enact_dist.link.log import says_ready  # each command imports this module
+
         for line in lines:
-            if alive and line.startswith(READY_MARK):
+            if alive and says_ready(line):
                 self._events.put(_Ready(self))
             self._say(self.task.name, line)
 

@@ -28,7 +28,7 @@ from enact_dist.cli.verbs import (
     verbs_of,
 )
 from enact_dist.errors import ConfigError, ProtocolError
-from enact_dist.link.log import JsonLines
+from enact_dist.link.log import READY, JsonLines, say
 from enact_dist.link.service_manager import ServiceManager
 from enact_dist.link.signals import StopSignals
 
@@ -111,18 +111,20 @@ def run_actor(arguments: argparse.Namespace) -> int:
     see_working_folder()
     manager = ServiceManager()
     json_lines = JsonLines(process=f"actor {arguments.name or arguments.target}")
-    _log_to_stderr(json_lines if arguments.log == "json" else logging.Formatter(_TEXT))
+    formatter = json_lines if arguments.log == "json" else logging.Formatter(_TEXT)
+    _log_to_stderr(formatter)
     with StopSignals() as signals:
         actor, name, worlds = _made(arguments)
         stop = StopWithPulse(manager.alive)
         with open_cell(arguments, observer=False, actor=name) as cell:
             json_lines.cell, json_lines.process = cell.name, f"actor {name}"
-            print(f"ready: actor {name} in cell {cell.name}", flush=True)
+            say(formatter, "actor.ready", f"{READY} actor {name} in cell {cell.name}")
             manager.ready()
             signals.call(lambda _: manager.stopping())
             signals.call(lambda _: stop.set())
             statistics = run(actor, cell, worlds, stop=stop, name=name)
-    print(_farewell(name, statistics), flush=True)
+    counted = {key: getattr(statistics, key) for key in ("state", "updates", "failures", "refused")}
+    say(formatter, "actor.end", _farewell(name, statistics), **counted)
     return DONE
 
 

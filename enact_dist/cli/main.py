@@ -15,6 +15,7 @@ exit  meaning
 from __future__ import annotations
 
 import argparse
+import logging
 import os
 import sys
 from importlib import import_module
@@ -131,7 +132,7 @@ def _run(arguments: argparse.Namespace) -> int:
         status: int = arguments.run(arguments)
         sys.stdout.flush()
     except EnactError as error:
-        return _report(error, debug=arguments.debug)
+        return _report(error, arguments)
     except KeyboardInterrupt:
         return INTERRUPTED
     except BrokenPipeError:
@@ -139,18 +140,28 @@ def _run(arguments: argparse.Namespace) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return DONE
     except (OSError, ImportError, MemoryError) as error:
-        return _report(error, debug=arguments.debug)
+        return _report(error, arguments)
     return status
 
 
-def _report(error: Exception, *, debug: bool) -> int:
-    if debug:
+def _report(error: Exception, arguments: argparse.Namespace) -> int:
+    if arguments.debug:
         raise error
-    text = str(error) or type(error).__name__
-    print(f"enact: {' '.join(text.split())}", file=sys.stderr)
+    text = " ".join((str(error) or type(error).__name__).split())
+    as_json = getattr(arguments, "log", "text") == "json"
+    print(_refusal(arguments, text) if as_json else f"enact: {text}", file=sys.stderr)
     if isinstance(error, ConfigError):
         return USAGE
     return UNREACHABLE if isinstance(error, ShardUnreachableError) else FAILED
+
+
+def _refusal(arguments: argparse.Namespace, text: str) -> str:
+    """Return the line of a log of objects by which a process says why it does not run."""
+    from enact_dist.link.log import JsonLines
+
+    name = getattr(arguments, "name", "") or getattr(arguments, "target", "")
+    lines = JsonLines(process=f"{arguments.noun} {name}".rstrip())
+    return lines.line(f"{arguments.noun}.refused", text, level=logging.CRITICAL)
 
 
 if __name__ == "__main__":

@@ -107,7 +107,7 @@ def add_log(parser: Verb) -> None:
         "--log",
         choices=("text", "json"),
         default="text",
-        help="what the log on stderr looks like; json: an object per line (enact_dist.link.log)",
+        help="what the log looks like; json: an object per line (enact_dist.link.log)",
     )
 
 

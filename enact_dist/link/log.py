@@ -13,6 +13,10 @@ cell     name of the cell; empty where it is not known yet
 process  "shard NAME" or "actor NAME"
 error    a traceback; only where there is one
 =======  ==========================================================================================
+
+`shard.ready` has further fields, `endpoints`, `epoch` and `folder` (null: data in memory only), and
+so has `actor.end`: `state`, `updates`, `failures` and `refused`.  These two and `actor.ready` go to
+standard output, all else to standard error.
 """
 
 from __future__ import annotations
@@ -21,6 +25,7 @@ import json
 import logging
 import os
 import queue
+import sys
 import threading
 from contextlib import suppress
 from copy import copy
@@ -29,7 +34,11 @@ from typing import Final
 
 FORMATS: Final = ("text", "json")
 TEXT: Final = "%(asctime)s %(levelname)s %(name)s %(message)s"
+READY: Final = "ready:"
+"""First word of the line by which a shard or an actor says that it serves."""
 STDERR: Final = 2
+_FIELDS: Final = "enact_fields"
+"""Attribute of a record with further fields of its object; what else a program adds is its own."""
 LAST_S: Final = 0.3
 """How long an ending process waits until its last lines are written."""
 LINES_MAX: Final = 10_000
@@ -56,14 +65,51 @@ class JsonLines(logging.Formatter):
             "time": round(record.created, 6),
             "level": record.levelname,
             "logger": record.name,
-            "event": getattr(record, "event", ""),
+            "event": str(getattr(record, "event", "")),
             "text": record.getMessage(),
             "cell": self.cell,
             "process": self.process,
         }
         if record.exc_info:
             line["error"] = self.formatException(record.exc_info)
-        return json.dumps(line, ensure_ascii=False)
+        return json.dumps({**getattr(record, _FIELDS, {}), **line}, ensure_ascii=False)
+
+    def line(self, event: str, text: str, *, level: int = logging.INFO, **fields: object) -> str:
+        """Return the line of an event that no logger tells of."""
+        named = {"name": f"enact.{event.partition('.')[0]}", "msg": text, "event": event}
+        levels = {"levelno": level, "levelname": logging.getLevelName(level)}
+        return self.format(logging.makeLogRecord({**named, **levels, _FIELDS: fields}))
+
+
+def say(formatter: logging.Formatter, event: str, text: str, **fields: object) -> None:
+    """Print what others wait for to standard output: the text, or an object with it and `fields`.
+
+    In one write: others may share the pipe.
+    """
+    if isinstance(formatter, JsonLines):
+        text = formatter.line(event, text, level=logging.INFO, **fields)
+    sys.stdout.write(f"{text}\n")
+    sys.stdout.flush()
+
+
+def says_ready(line: str) -> bool:
+    """Whether a shard or an actor says by this line, text or object, that it serves."""
+    return in_words(line).startswith(READY)
+
+
+def in_words(line: str) -> str:
+    """Return the text of an object by which a shard or an actor says that it serves.
+
+    Any other line comes back as it is.
+    """
+    if not line.startswith("{") or '.ready"' not in line:
+        return line
+    try:
+        found = json.loads(line)
+    except (ValueError, RecursionError):
+        return line
+    ready = found.get("event") in ("shard.ready", "actor.ready")
+    return str(found.get("text", "")) if ready else line
 
 
 class Log:

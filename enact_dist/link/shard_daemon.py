@@ -20,8 +20,9 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.messages import ListLocks, Locks
 from enact_dist.errors import ConfigError, EnactError, LinkError
+from enact_dist.link.endpoints import split_endpoint
 from enact_dist.link.host import open_host
-from enact_dist.link.log import TEXT, JsonLines, Log
+from enact_dist.link.log import READY, TEXT, JsonLines, Log, say
 from enact_dist.link.service_manager import ServiceManager
 from enact_dist.link.shard_calls import ShardCalls
 from enact_dist.link.shared_folder import SharedFolder
@@ -251,8 +252,7 @@ def refuse_second_daemon(settings: DaemonSettings) -> None:
 
 def _somebody_listens(endpoint: str) -> bool:
     """Say whether it is worth asking there; a refused connection saves the time of asking."""
-    protocol, _, address = endpoint.partition("/")
-    host, _, port = address.partition("?")[0].partition("#")[0].rpartition(":")
+    protocol, host, port = split_endpoint(endpoint)
     if protocol != "tcp" or not port.isdecimal():
         return True
     try:
@@ -266,7 +266,8 @@ def run_shard(settings: DaemonSettings) -> int:
     """Run a shard until SIGTERM or SIGINT; return the exit status.  Main thread only."""
     name = settings.shard.name
     manager = ServiceManager()
-    with Log(_formatter(settings)), StopSignals() as signals:
+    formatter = _formatter(settings)
+    with Log(formatter), StopSignals() as signals:
         try:
             shard = start_shard(settings)
         except EnactError as error:
@@ -279,7 +280,7 @@ def run_shard(settings: DaemonSettings) -> int:
             signals.call(lambda word: _stop(shard, word, manager))
             signals.call_again(lambda _: shard.hurry())
             shard.host.each_tick(lambda: manager.alive(shard.host.state))
-            _say_ready(shard)
+            _say_ready(shard, formatter)
             manager.ready(shard.host.state)
             _stay_responsive()
             shard.wait()
@@ -300,14 +301,15 @@ def _stop(shard: RunningShard, name: str, manager: ServiceManager) -> None:
     shard.end()
 
 
-def _say_ready(shard: RunningShard) -> None:
-    settings = shard.settings
-    data = f"data in {settings.folder}" if settings.folder else "data in memory only"
-    print(
-        f"ready: shard {settings.shard.name} of cell {settings.cell} at"
-        f" {', '.join(settings.listen)}, epoch {shard.host.epoch}, {data}",
-        flush=True,
+def _say_ready(shard: RunningShard, formatter: logging.Formatter) -> None:
+    settings, epoch = shard.settings, shard.host.epoch
+    folder = str(settings.folder) if settings.folder else None
+    data = f"data in {folder}" if folder else "data in memory only"
+    text = (
+        f"{READY} shard {settings.shard.name} of cell {settings.cell} at"
+        f" {', '.join(settings.listen)}, epoch {epoch}, {data}"
     )
+    say(formatter, "shard.ready", text, endpoints=settings.listen, epoch=epoch, folder=folder)
 
 
 def _stay_responsive() -> None:

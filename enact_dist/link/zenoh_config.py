@@ -8,10 +8,13 @@ relay between peers).  Reasons for the settings, measured with 1.10 on a loopbac
 - Link lease = TTL / 2: the token of a stopped process has to vanish before its lease ends.
 - `wait_before_close`: whoever does not read for the time of a link lease is given up, not after
   5 s; a client waits longer, since only its own thread does, and a busy shard must not lose it.
+  On whoever acknowledges nothing the kernel gives up by then (`zenoh_sockets`): a shard after
+  three quarters of a link lease or 3 s, so that with a TTL above 8 s a cut of some seconds ends
+  the link of whoever was sent something meanwhile, though not its lease.
 - `max_wait_before_drop_fragments` 2 s: slices of a large datum over a slow network are not
   dropped after 50 ms; only senders of their own ever wait for it.
 - Reconnection every 50 ms: a restarted shard is back in use after 0.1 s, not 1 s.
-- `zenoh_links` lets lost connections close at once, and be back soon after a cut.
+- `zenoh_links`: lost connections hold up nobody, and a cut one is back soon.
 
 Sessions must be closed before the interpreter ends (it hangs otherwise), and must never be closed
 or freed in a forked child (that hangs too): `close_session` and `keep_after_fork` see to both.
@@ -44,7 +47,11 @@ CONNECT_WAIT_MS: Final = 50
 OPEN_S: Final = 5.0
 """How long whoever accepts a connection has to answer in Zenoh's language."""
 CLIENT_BLOCK_S: Final = 3.0
-"""How long a client waits for a shard that does not read before it gives up the connection."""
+"""How long a client waits for a shard that does not read before it gives up the connection; no
+shard waits longer for a client either."""
+PATIENCE: Final = 0.75
+"""For how much of a link's lease a shard's bytes may stay unacknowledged: less than all of it, so
+that the kernel has given up before anybody closes the link."""
 TRANSPORTS_MAX: Final = 20_000
 """Connections of one shard: one for the calls and one for the large data of each session."""
 
@@ -129,7 +136,8 @@ def open_session(
     except zenoh.ZError as error:
         raise _open_error(error, listen) from None
     _open_sessions.append((os.getpid(), session))
-    _watches[session] = watch = LinkWatch(session, connect)
+    patience_s = min(PATIENCE * lease_s, CLIENT_BLOCK_S) if listen else CLIENT_BLOCK_S
+    _watches[session] = watch = LinkWatch(session, connect, patience_s)
     keep_after_fork(watch)
     return session
 

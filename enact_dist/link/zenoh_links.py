@@ -1,4 +1,6 @@
-"""Looks after the connections of a Zenoh session: none lingers, and a cut one is back soon.
+"""Looks after the connections of a Zenoh session: none holds up others, a cut one is back soon.
+
+`settle` says what a connection is given as soon as it is there, and why.
 
 A connection that nobody answers is repeated by the kernel once a second at best, so after a cut
 Zenoh is connected again up to 1.1 s late (0.6 s with this).  From the loss of a connection on,
@@ -9,6 +11,7 @@ answered at once, the network is there again and the waiting one is given up; Ze
 
 from __future__ import annotations
 
+import contextlib
 import socket
 import threading
 import time
@@ -16,7 +19,8 @@ from typing import TYPE_CHECKING, Final
 
 import zenoh
 
-from enact_dist.link.zenoh_sockets import end_lingering, give_up, unanswered
+from enact_dist.link.endpoints import split_endpoint
+from enact_dist.link.zenoh_sockets import give_up, settle, unanswered
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -36,10 +40,12 @@ class LinkWatch:
     Args:
         session: Not closed with this.
         connect: The endpoints that it connects to.
+        patience_s: How long bytes that it sent may stay unacknowledged.
     """
 
-    def __init__(self, session: zenoh.Session, connect: Sequence[str]) -> None:
+    def __init__(self, session: zenoh.Session, connect: Sequence[str], patience_s: float) -> None:
         self._connect = tuple(connect)
+        self._patience_s = patience_s
         self._closing = threading.Event()
         self._listener = session.info.declare_link_events_listener(
             zenoh.handlers.FifoChannel(EVENTS_MAX), history=True
@@ -52,8 +58,7 @@ class LinkWatch:
     def _run(self, events: zenoh.Handler[zenoh.LinkEvent]) -> None:
         try:
             while True:
-                lost = _counted(events, events.recv())
-                end_lingering()
+                lost = _counted(events, events.recv(), self._patience_s)
                 if lost and self._connect:
                     self._knock(events, lost)
         except zenoh.ZError:  # the session is closed
@@ -66,8 +71,7 @@ class LinkWatch:
         while not self._closing.wait(pause_s):
             event = events.try_recv()
             if event is not None:
-                lost = _counted(events, event, lost)
-                end_lingering()
+                lost = _counted(events, event, self._patience_s, lost)
             if not lost:
                 return
             began_s = time.thread_time()
@@ -85,29 +89,41 @@ class LinkWatch:
 
 
 def _counted(
-    events: zenoh.Handler[zenoh.LinkEvent], event: zenoh.LinkEvent | None, lost: int = 0
+    events: zenoh.Handler[zenoh.LinkEvent],
+    event: zenoh.LinkEvent | None,
+    patience_s: float,
+    lost: int = 0,
 ) -> int:
-    """Take all events that are here; return how many connections are lost now.
+    """Take all events that are here and settle who came; return how many connections are lost now.
 
-    A thousand clients that connect at once are looked at together: each look lists all descriptors.
+    A thousand clients that connect at once are settled together: each look lists all descriptors.
     """
+    came = set()
     while event is not None:
-        lost = max(0, lost - 1) if event.kind == zenoh.SampleKind.PUT else lost + 1
+        if event.kind == zenoh.SampleKind.PUT:
+            lost = max(0, lost - 1)
+            came.add((_port_of(event.link.src), _port_of(event.link.dst)))
+        else:
+            lost += 1
         event = events.try_recv()
+    if came:
+        settle(came, patience_s)
     return lost
 
 
 def _hosts_of(endpoints: Iterable[str]) -> Iterable[tuple[str, int]]:
     """Yield the IPv4 addresses and ports of endpoints."""
     for endpoint in endpoints:
-        protocol, _, rest = endpoint.partition("/")
-        host, _, port = rest.partition("?")[0].partition("#")[0].rpartition(":")
-        if protocol != "tcp":
-            continue
-        try:
-            yield socket.gethostbyname(host), int(port)
-        except (OSError, ValueError):
-            continue  # IPv6, or a name that is not known yet: the kernel's pace will do
+        protocol, host, _ = split_endpoint(endpoint)
+        if protocol == "tcp":
+            with contextlib.suppress(OSError, UnicodeError):  # IPv6, or not known yet
+                yield socket.gethostbyname(host), _port_of(endpoint)
+
+
+def _port_of(endpoint: str) -> int:
+    """Return the port of an endpoint, 0 where it has none."""
+    port = split_endpoint(endpoint)[2]
+    return int(port) if port.isdecimal() else 0
 
 
 def _answers(address: str, port: int) -> bool:

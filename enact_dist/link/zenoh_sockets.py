@@ -1,4 +1,4 @@
-"""What Zenoh's TCP sockets need and its settings do not offer: see `end_lingering` and `give_up`.
+"""What Zenoh's TCP sockets need and its settings do not offer: see `settle` and `give_up`.
 
 Sockets are looked up among the open descriptors of this process; where the system does not list
 them (no Linux) nothing is done.
@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Collection, Iterator
 
 _DESCRIPTORS: Final = Path("/proc/self/fd")
 _TABLE: Final = Path("/proc/self/net/tcp")
@@ -28,24 +28,38 @@ _INTERNET: Final = (socket.AF_INET, socket.AF_INET6)
 _log = logging.getLogger("enact.link")
 
 
-def end_lingering() -> int:
-    """Let lost connections close at once; return how many would have waited.
+def settle(ports: Collection[tuple[int, int]], patience_s: float) -> int:
+    """Let connections end when nobody acknowledges what they sent, and close at once.
 
-    Zenoh 1.10 gives each of its TCP sockets a linger time of 10 s (zenoh issue 2350).  The kernel
-    then holds the thread that closes a socket until the other side has acknowledged everything, and
-    these are the few threads that receive for all connections.  So when one host was cut off, its
-    links were given up after their lease, and the shard heard nobody for another 10 s: 12 s from a
-    cut to the next grant with a TTL of 2 s, against 2.0 s now.  Without a linger time the kernel
-    goes on sending what is left, behind the process's back.
+    Zenoh 1.10 waits for the kernel in two places, each time with threads that serve everybody:
 
-    Only sockets with exactly Zenoh's linger time are touched.
+    - A link in mid-transfer is closed only once the kernel has taken what its sender has in hand,
+      and whoever else has a message for it waits meanwhile (zenoh issues 1053 and 1876): among
+      them the one thread that accepts connections, and the one that sends for all.  When a client
+      was cut off while it fetched, its shard answered nobody for 6 s more with a TTL of 12 s.
+      What the kernel has given up by itself is closed at once, and nobody waits for it.
+    - Closing lingers for 10 s (zenoh issue 2350), until all is acknowledged: 12 s from a cut to
+      the next grant with a TTL of 2 s, against 2.0 s now.  Without a linger time the kernel goes
+      on sending what is left, behind the process's back.
+
+    Args:
+        ports: Own and other port of each; only connections with exactly Zenoh's linger time count.
+        patience_s: How long sent bytes, or a closed window, may stay as they are.
+
+    Returns:
+        How many were settled; each is once.
     """
     found = 0
     for connection in connections():
         with connection, contextlib.suppress(OSError):
-            if connection.getsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _LINGER.size) == _ZENOHS:
-                connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _NONE)
-                found += 1
+            if connection.getsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _LINGER.size) != _ZENOHS:
+                continue
+            if (connection.getsockname()[1], connection.getpeername()[1]) not in ports:
+                continue
+            patience_ms = max(1, round(1e3 * patience_s))
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, patience_ms)
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _NONE)
+            found += 1
     return found
 
 

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.config_environment import without_overrides
 from enact_dist.errors import LinkError
+from enact_dist.link.log import in_words
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -81,7 +82,7 @@ class LineProcess:
     def _read(self) -> None:
         assert self._popen.stdout is not None
         for line in self._popen.stdout:
-            self._lines.put(line.rstrip("\n"))
+            self._lines.put(in_words(line.rstrip("\n")))
         self._lines.put(None)
 
     @property

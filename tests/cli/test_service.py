@@ -159,6 +159,42 @@ def test_log_of_an_actor_is_json_with_its_traceback(tmp_path, cell_file, spawn):
     assert line["error"].splitlines()[-1] == "ValueError: told in one line"
 
 
+def test_all_that_a_shard_and_an_actor_say_is_json(tmp_path, write_cell, spawn, until):
+    """From the start to the drain, on both outputs; what tells of them says it in fields, too."""
+    (tmp_path / "my_actors.py").write_text(ACTOR, encoding="utf-8")
+    file = write_cell(PINNED)
+    shard = spawn("shard", "run", "left", "--cell", file, "--log", "json")
+    said = until(shard, "ready: shard left of cell clitest")
+    actor = spawn("actor", "run", "my_actors:Beat", "--cell", file, "--log", "json")
+    told = until(actor, "told in one line")
+    for process, lines in ((actor, told), (shard, said)):
+        process.send_signal(signal.SIGTERM)
+        lines += list(process.stdout)
+
+    of_shard, of_actor = ([json.loads(line) for line in lines] for lines in (said, told))
+    (served,) = [line for line in of_shard if line["event"] == "shard.ready"]
+    (ended,) = [line for line in of_actor if line["event"] == "actor.end"]
+    assert "shard.stop" in {line["event"] for line in of_shard}
+    assert served["text"].endswith(f"epoch {served['epoch']}, data in {served['folder']}")
+    assert len(served["endpoints"]) == 1
+    assert of_actor[0]["event"] == "actor.ready"
+    assert {line["process"] for line in of_actor} == {"actor Beat"}
+    assert (ended["state"], ended["updates"]) == ("stopped", 0)
+    assert ended["failures"] > 0
+
+
+def test_actor_that_cannot_start_says_so_in_json(tmp_path, write_cell, spawn):
+    """What a service manager starts again and again writes one object each time."""
+    (tmp_path / "my_actors.py").write_text(ACTOR, encoding="utf-8")
+    words = ("my_actors:Beat", "--cell", write_cell(), "--timeout", "0.1", "--name", "heart")
+    actor = spawn("actor", "run", *words, "--log", "json")
+
+    (line,) = [json.loads(line) for line in actor.stdout]
+    assert actor.wait(60) == 3
+    assert (line["event"], line["level"]) == ("actor.refused", "CRITICAL")
+    assert line["process"] == "actor heart"
+
+
 def test_up_makes_json_of_every_line(write_cell, spawn, until):
     """Also of the lines that its children print for people; each says which process it is from."""
     up = spawn("up", write_cell(), "--no-actors", "--log", "json")
@@ -169,7 +205,7 @@ def test_up_makes_json_of_every_line(write_cell, spawn, until):
     found = [json.loads(line) for line in lines]
     assert {"up", "shard left", "shard right"} == {line["process"] for line in found}
     assert {line["cell"] for line in found} == {"clitest"}
-    assert "shard.stop" in {line["event"] for line in found}
+    assert {"shard.ready", "shard.stop"} <= {line["event"] for line in found}
 
 
 def test_metrics_are_served_where_the_file_or_the_command_says(write_cell, spawn, until, enact):

@@ -1,5 +1,6 @@
 """The supervisor: order of start and end, restarts, and children that never outlive it."""
 
+import json
 import os
 import subprocess
 import sys
@@ -8,6 +9,7 @@ import threading
 import pytest
 
 from enact_dist import supervise
+from enact_dist.link.log import says_ready
 from enact_dist.supervise import Supervisor, Task
 
 
@@ -50,6 +52,35 @@ def test_actors_start_after_the_shards_are_ready_and_leave_before_them():
     assert story.lines == [
         "shard: ready: serving", "actor: ready: serving", "actor: leaving", "shard: leaving"
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("line", "ready"),
+    [
+        ("ready: shard left of cell line at tcp/127.0.0.1:7481", True),
+        ('{"event": "shard.ready", "text": "ready: shard left"}', True),
+        ('{"text": "ready: actor fusion", "event": "actor.ready"}', True),
+        ('{"event": "", "text": "ready: says no .ready"}', False),
+        ('{"event": "shard.ready", "text": "ready: shar', False),
+        ("is it ready: no", False),
+    ],
+)
+def test_word_of_a_child_that_serves_is_known_in_either_log(line, ready):
+    """Text or object; what only quotes it, and half an object, are none."""
+    assert says_ready(line) is ready
+
+
+def test_actors_start_after_a_shard_whose_log_is_json(monkeypatch):
+    """Its first line says nothing, its second that it is ready: nobody waits any longer."""
+    monkeypatch.setattr(supervise, "READY_S", 3600.0)
+    lines = [{"event": "", "text": "ready: not"}, {"event": "shard.ready", "text": "ready: yes"}]
+    printed = "".join(f"print({json.dumps(line)!r}, flush=True);" for line in lines)
+    silent = SERVE.replace("print('ready: serving')", f"{printed}1")
+    story = Story("actor: ready")
+
+    story.run(task("actor", "actor", SERVE), task("shard", "shard", silent))
+
+    assert story.lines[2] == "actor: ready: serving"
 
 
 def test_child_that_failed_is_started_again_with_growing_pauses():

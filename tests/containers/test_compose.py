@@ -47,7 +47,8 @@ READ = """read = Read(*slot)
     with Lock(read) as lock:
         largest = int(lock[read].max())
         mapped = "/run/enact/" in Path("/proc/self/maps").read_text()
-        print(largest, "mapped" if mapped else "sent")"""
+    ways = {shard.carrier.split()[0] for shard in cell.shards()}
+    print(largest, "mapped" if mapped else "sent", "over", *ways)"""
 
 
 @pytest.fixture(scope="module")
@@ -118,10 +119,10 @@ def healthy(stack, service):
 
 
 def test_large_data_are_shared_between_containers(stack):
-    """What one container commits another one maps, as both have the folder in shared memory."""
+    """What one container commits another one maps; calls take the socket in the same folder."""
     stack.python("feedback", BY_REFERENCE.format(body=WRITE.format(value=1)))
 
-    assert stack.python("fusion", BY_REFERENCE.format(body=READ)) == "1 mapped"
+    assert stack.python("fusion", BY_REFERENCE.format(body=READ)) == "1 mapped over socket"
 
 
 def test_with_shared_memory_full_data_travel(stack):
@@ -133,7 +134,7 @@ def test_with_shared_memory_full_data_travel(stack):
     left = stack.json("shard", "ls")[0]
 
     stack.docker("exec", "shard-left", "rm", "/run/enact/full")
-    assert said == "2 sent"
+    assert said == "2 sent over socket"
     assert left["name"] == "left"
     assert left["counters"]["payload_fallbacks"] >= 1
 
@@ -230,6 +231,6 @@ def test_on_two_machines_the_verdicts_are_the_same(engine, images, alone, tmp_pa
 
         assert perception.ended("demo") == 0, perception.docker("logs", "demo")
         shards.python("feedback", BY_REFERENCE.format(body=WRITE.format(value=3)))
-        assert shards.python("feedback", BY_REFERENCE.format(body=READ)) == "3 mapped"
-        assert perception.python("fusion", BY_REFERENCE.format(body=READ)) == "3 sent"
+        assert shards.python("feedback", BY_REFERENCE.format(body=READ)) == "3 mapped over socket"
+        assert perception.python("fusion", BY_REFERENCE.format(body=READ)) == "3 sent over zenoh"
         assert judged(perception.out) == alone()

@@ -26,6 +26,7 @@ from enact_dist.core.messages import (
     WriteItem,
 )
 from enact_dist.core.shard_state import ShardSettings
+from enact_dist.link.log import in_words
 from enact_dist.link.socket_frames import Kind, Stream, send_frame
 from enact_dist.terms import Access
 
@@ -263,7 +264,7 @@ def process(program):
     def start(endpoint, folder="", *, first="", log="text", durability="volatile", ready=True):
         started = program(first + DAEMON, endpoint, folder, log, durability)
         if ready:
-            line = started.stdout.readline()
+            line = in_words(started.stdout.readline())
             assert line.startswith("ready: shard s0 of cell cell at "), line + started.stderr.read()
         return started
 

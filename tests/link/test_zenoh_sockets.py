@@ -1,18 +1,23 @@
-"""Zenoh's TCP sockets close at once, and do not wait for the kernel's next try after a cut."""
+"""Zenoh's TCP sockets hold up nobody, and do not wait for the kernel's next try after a cut."""
 
+import contextlib
 import os
 import select
+import signal
 import socket
 import struct
+import threading
 import time
 from types import SimpleNamespace
 
 import pytest
 import zenoh
 
+from enact_dist.link import zenoh_config
+from enact_dist.link.zenoh_carrier import wait_connected
 from enact_dist.link.zenoh_config import close_session, open_session
 from enact_dist.link.zenoh_links import _counted
-from enact_dist.link.zenoh_sockets import connections, end_lingering, give_up, unanswered
+from enact_dist.link.zenoh_sockets import connections, give_up, settle, unanswered
 
 LINGER = struct.Struct("ii")
 ZENOHS = (1, 10)
@@ -22,19 +27,32 @@ def linger_of(connection):
     return LINGER.unpack(connection.getsockopt(socket.SOL_SOCKET, socket.SO_LINGER, LINGER.size))
 
 
-@pytest.mark.parametrize(("before", "lingers"), [(ZENOHS, 0), ((1, 5), 1), ((0, 0), 0)])
-def test_only_sockets_with_zenohs_linger_time_are_changed(before, lingers):
-    """What a program has set on its own sockets stays."""
+def patience_ms_of(connection):
+    return connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT)
+
+
+@pytest.mark.parametrize(
+    ("before", "known", "after"),
+    [
+        (ZENOHS, True, (0, 1_500)),
+        (ZENOHS, False, (1, 0)),
+        ((1, 5), True, (1, 0)),
+        ((0, 0), True, (0, 0)),
+    ],
+)
+def test_only_zenohs_sockets_of_the_session_are_settled(before, known, after):
+    """What a program has set on its own sockets stays, and another session has its own lease."""
     with (
         socket.create_server(("127.0.0.1", 0)) as listener,
         socket.create_connection(listener.getsockname()) as connection,
     ):
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, LINGER.pack(*before))
+        ports = connection.getsockname()[1], connection.getpeername()[1]
 
-        found = end_lingering()
+        found = settle({ports} if known else {ports[::-1]}, 1.5)
 
-        assert linger_of(connection)[0] == lingers
-        assert found == (before == ZENOHS)
+        assert (linger_of(connection)[0], patience_ms_of(connection)) == after
+        assert found == (after[1] > 0)
 
 
 @pytest.mark.parametrize("default_s", [None, 60.0])
@@ -65,27 +83,73 @@ def test_sockets_of_the_program_go_on_as_it_has_set_them(monkeypatch, default_s)
         assert os.get_blocking(blocking.fileno())
 
 
-def lingering():
-    """Return how many TCP sockets of this process wait before they close."""
-    count = 0
+def settled(port):
+    """Return for how long either end of each connection to a port waits that is settled (ms)."""
+    found = []
     for connection in connections():
-        with connection:
-            count += bool(linger_of(connection)[0])
-    return count
+        with connection, contextlib.suppress(OSError):  # one that listens has no other end
+            ports = connection.getsockname()[1], connection.getpeername()[1]
+            if port in ports and not linger_of(connection)[0]:
+                found.append(patience_ms_of(connection))
+    return sorted(found)
 
 
-def test_connections_of_sessions_do_not_linger_on_either_side(endpoint):
+def test_connections_of_sessions_are_settled_on_either_side(endpoint):
     """Both ends are in this process; a connection that comes later is seen, too."""
+    port = int(endpoint.rpartition(":")[2])
     shard = open_session(listen=[endpoint], lease_s=1.0)
-    clients = [open_session(connect=[endpoint], lease_s=1.0) for _ in range(2)]
+    clients = [open_session(connect=[endpoint], lease_s=lease_s) for lease_s in (2.0, 60.0)]
+    expected = [750, 750, 3_000, 3_000]  # a client is as patient as a busy shard may need
     try:
         deadline_s = time.monotonic() + 30.0
-        while len(list(shard.info.links())) < 2 or lingering():
-            assert time.monotonic() < deadline_s, f"{lingering()} sockets linger"
+        while settled(port) != expected:
+            assert time.monotonic() < deadline_s, f"{settled(port)} in place of {expected}"
             time.sleep(0.005)  # nothing tells when a thread has seen a connection
     finally:
         for session in (*clients, shard):
             close_session(session)
+
+
+READER = """
+import contextlib
+import sys
+import zenoh
+from enact_dist.link.zenoh_config import open_session
+session = open_session(connect=[sys.argv[1]], lease_s=60.0)
+while True:  # until the queryable is known here, and then until the answer comes
+    with contextlib.suppress(zenoh.ZError):
+        session.get("large", timeout=60.0, congestion_control=zenoh.CongestionControl.BLOCK).recv()
+"""
+
+
+def test_reader_that_stops_in_mid_transfer_is_given_up_long_before_its_lease_ends(
+    program, endpoint, monkeypatch
+):
+    """Whoever sends to it would wait as long as a lease, and after that Zenoh's own threads."""
+    monkeypatch.setattr(zenoh_config, "CLIENT_BLOCK_S", 0.5)
+    shard = open_session(listen=[endpoint], lease_s=60.0)
+    others = []
+    try:
+        queryable = shard.declare_queryable("large", zenoh.handlers.FifoChannel(64))
+        reader = program(READER, endpoint)
+        query = queryable.handler.recv()
+        reader.send_signal(signal.SIGSTOP)
+        sending = threading.Thread(target=send, args=(query, bytes(64 << 20)), daemon=True)
+        sending.start()
+
+        sending.join(30.0)
+
+        assert not sending.is_alive()
+        others.append(open_session(connect=[endpoint], lease_s=60.0))
+        assert wait_connected(others[0], 15.0)
+    finally:
+        for session in (*others, shard):
+            close_session(session)
+
+
+def send(query, data):
+    with contextlib.suppress(zenoh.ZError), query:  # the connection goes meanwhile
+        query.reply("large", data)
 
 
 LEFT_OPEN = """
@@ -110,10 +174,11 @@ def test_sessions_that_were_left_open_are_closed_before_their_threads_are_waited
 def test_events_that_are_here_are_counted_at_once(kinds, lost):
     """Of a hundred connections that come together none is looked at alone."""
     kind_of = {"+": zenoh.SampleKind.PUT, "-": zenoh.SampleKind.DELETE}
-    events = iter([SimpleNamespace(kind=kind_of[kind]) for kind in kinds])
+    link = SimpleNamespace(src="tcp/[::1]:2", dst="tcp/[::1]:1")
+    events = iter([SimpleNamespace(kind=kind_of[kind], link=link) for kind in kinds])
     waiting = SimpleNamespace(try_recv=lambda: next(events, None))
 
-    assert _counted(waiting, waiting.try_recv()) == lost
+    assert _counted(waiting, waiting.try_recv(), 1.0) == lost
 
 
 def test_connection_that_nobody_answers_is_given_up_and_no_other():
