@@ -34,6 +34,7 @@ from enact_dist.core.records import Recovered
 from enact_dist.errors import StoreError
 from enact_dist.link.blobs import Blob, BlobFolder
 from enact_dist.link.folder_lock import FolderLock, check_format, sync_folder
+from enact_dist.link.held_bodies import let_go_of_killed
 from enact_dist.link.store_batch import Batch
 from enact_dist.link.store_database import Database, DatabaseRow
 from enact_dist.link.store_errors import store_error
@@ -123,8 +124,9 @@ def _read_locked(folder: Path) -> tuple[Database, Contents]:
     found = look_at(folder)
     check_format(folder, is_new=found.is_new)
     check_log(folder, power_cut=found.power_cut)
-    if found.is_new and found.mark is None:
-        # Before the first byte of the log: only a mark tells a power cut from damage.
+    if found.is_new:
+        # Before the first byte of the log: only a mark tells a power cut from damage.  One that is
+        # there may be of a start that was killed before it was forced to the disk.
         MarkFile.open(folder, 0).close()
         sync_folder(folder)
     database, contents = open_database(folder, found)
@@ -141,6 +143,7 @@ def _read_locked(folder: Path) -> tuple[Database, Contents]:
 
 def _open_locked(folder: Path, lock: FolderLock, unix_s: int) -> tuple[Store, Recovered]:
     database, contents = _read_locked(folder)
+    let_go_of_killed(folder)
     try:
         epoch = contents.recovered.epoch = max(contents.recovered.epoch + 1, unix_s)
         blobs = BlobFolder(folder / BLOB_FOLDER, epoch=epoch)

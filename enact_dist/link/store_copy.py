@@ -3,10 +3,10 @@
 How a copy of files that change becomes one state: the database is copied first and its log after
 it.  While the log's header stays what it was, all that was carried into the database meanwhile is
 in the log as well, and replaces what was copied torn.  Else both are copied again.  Large bodies
-are files that never change; links of ours hold all that are there just before and just after the
-log is read, for the shard unlinks what it replaces.  The mark is copied before all, so the copy is
-refused if it lacks anything that was acknowledged then.  A copy has its name only when every byte
-of it was checked and is on the disk.
+are files that never change; links hold all that are there just before and just after the log is
+read (`held_bodies`).  The mark is copied before all, so the copy is refused if it lacks anything
+that was acknowledged then.  A copy has its name only when every byte of it was checked and is on
+the disk.
 
 A shard that is restored begins with an epoch above that of its backup, of what was there before,
 and the wall clock: whoever knew a later state is told that the shard has started anew, and no lock
@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING, Final
 from enact_dist.errors import StoreError
 from enact_dist.link.blobs import BlobFolder
 from enact_dist.link.folder_lock import FORMAT_FILE, FolderLock, replace_file, sync_folder
+from enact_dist.link.held_bodies import HeldBodies, held_bodies
 from enact_dist.link.store import open_store, read_store
 from enact_dist.link.store_errors import store_error
 from enact_dist.link.store_folder import (
@@ -49,7 +50,6 @@ if TYPE_CHECKING:
 BACKUP_FILE: Final = "backup.json"
 TRIES_MAX: Final = 50
 """So often the files are copied anew because the shard has begun its log anew meanwhile."""
-_HELD_FOLDER: Final = "backup.held"
 ASIDE: Final = ".replaced-"
 """In the names of folders that were put aside, before the second in which they were."""
 
@@ -84,46 +84,43 @@ def back_up(folder: Path, into: Path, *, cell: str, shard: str, unix_s: int) -> 
     """Copy the folder of a shard, whether it runs or not, to a new folder.
 
     Raises:
-        StoreError: There is no data, it is damaged or in the midst of a rebalance, the copy cannot
-            be written, or `into` is there.
+        StoreError: There is no data, it is damaged or in the midst of a rebalance, another backup
+            of it is under way, the copy cannot be written, or `into` is there.
     """
     if not holds_store(folder):
         raise StoreError(f"no shard has its data in {folder}", path=str(folder))
     if into.exists():
         raise StoreError(f"{into} is there already; name a new folder", path=str(into))
     refuse_moving(folder)
-    partial, held = into.with_name(into.name + ".partial"), folder / _HELD_FOLDER
+    partial = into.with_name(into.name + ".partial")
     try:
-        for path in (partial, held):
-            shutil.rmtree(path, ignore_errors=True)
-            path.mkdir(parents=True)
-        try:
-            stored = _copied(folder, held, partial)
-        finally:
-            shutil.rmtree(held, ignore_errors=True)
-        backup = _told(stored, cell=cell, shard=shard, unix_s=unix_s)
-        replace_file(partial / BACKUP_FILE, json.dumps(asdict(backup)).encode())
-        _sync(partial)
-        partial.rename(into)
-        sync_folder(into.parent)
+        with held_bodies(folder) as bodies:
+            shutil.rmtree(partial, ignore_errors=True)
+            partial.mkdir(parents=True)
+            stored = _copied(folder, bodies, partial)
+            backup = _told(stored, cell=cell, shard=shard, unix_s=unix_s)
+            replace_file(partial / BACKUP_FILE, json.dumps(asdict(backup)).encode())
+            _sync(partial)
+            partial.rename(into)
+            sync_folder(into.parent)
     except OSError as failure:
         raise store_error(into, failure) from failure
     return backup
 
 
-def _copied(folder: Path, held: Path, partial: Path) -> Recovered:
+def _copied(folder: Path, bodies: HeldBodies, partial: Path) -> Recovered:
     """Copy a state of a folder; return it, with all of its bytes checked."""
     for _ in range(TRIES_MAX):
-        if not _copy_database(folder, held, partial):
+        if not _copy_database(folder, bodies, partial):
             continue
         database, contents = open_database(partial, look_at(partial))
         with closing(database):
             names = {blob.name for blob in contents.states.blobs.values()}
-            if not names <= _names(held):
+            if not all(bodies.has(name) for name in names):
                 continue
             (partial / BLOB_FOLDER).mkdir(exist_ok=True)
             for name in names:
-                shutil.copyfile(held / name, partial / BLOB_FOLDER / name)
+                shutil.copyfile(bodies.path(name), partial / BLOB_FOLDER / name)
             blobs = BlobFolder(partial / BLOB_FOLDER, epoch=0)
             read_blobs(contents, blobs, power_cut=False)
             put_together(contents, partial / DATABASE_FILE)
@@ -136,7 +133,7 @@ def _copied(folder: Path, held: Path, partial: Path) -> Recovered:
     )
 
 
-def _copy_database(folder: Path, held: Path, partial: Path) -> bool:
+def _copy_database(folder: Path, bodies: HeldBodies, partial: Path) -> bool:
     """Copy rows and log; False if the log was begun anew meanwhile, so that they do not fit."""
     for name in (FORMAT_FILE, MARK_FILE):
         shutil.copyfile(folder / name, partial / name)
@@ -144,10 +141,10 @@ def _copy_database(folder: Path, held: Path, partial: Path) -> bool:
     header = _header(log)
     shutil.copyfile(folder / DATABASE_FILE, partial / DATABASE_FILE)
     copy.unlink(missing_ok=True)
-    _hold(folder / BLOB_FOLDER, held)
+    bodies.hold(folder / BLOB_FOLDER)
     with suppress(FileNotFoundError):
         shutil.copyfile(log, copy)
-    _hold(folder / BLOB_FOLDER, held)
+    bodies.hold(folder / BLOB_FOLDER)
     if _header(log) != header:
         return False
     if header:
@@ -162,17 +159,6 @@ def _header(log: Path) -> bytes:
             return file.read(HEADER_BYTES)
     except FileNotFoundError:
         return b""
-
-
-def _hold(blobs: Path, held: Path) -> None:
-    """Link all files of large bodies that are not linked yet, so that they stay."""
-    for name in _names(blobs) - _names(held):
-        with suppress(FileNotFoundError):
-            os.link(blobs / name, held / name)
-
-
-def _names(folder: Path) -> set[str]:
-    return {path.name for path in folder.iterdir()}
 
 
 def _check_bodies(stored: Recovered) -> None:

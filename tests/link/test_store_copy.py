@@ -4,13 +4,16 @@ import os
 import shutil
 import signal
 import time
+from types import SimpleNamespace
 
 import pytest
 from store_writer import persist, slot_record
 
 from enact_dist.errors import StoreError
+from enact_dist.link import held_bodies as held_bodies_module
 from enact_dist.link import store_copy
 from enact_dist.link.folder_lock import FolderLock
+from enact_dist.link.held_bodies import HELD_FOLDER, held_bodies
 from enact_dist.link.store import open_store, read_store
 from enact_dist.link.store_copy import BACKUP_FILE, back_up, restore
 from enact_dist.terms import Durability
@@ -186,4 +189,39 @@ def test_a_damaged_shard_is_not_backed_up(folder, tmp_path):
     with pytest.raises(StoreError, match="its checksum is wrong"):
         back_up(folder, tmp_path / "copy", unix_s=1, **NAMES)
     assert not (tmp_path / "copy" / BACKUP_FILE).exists()
-    assert not (folder / "backup.held").exists()
+    assert not (folder / HELD_FOLDER).exists()
+
+
+def test_one_backup_at_a_time(folder, tmp_path):
+    """The second is told so, and takes nothing from under the first; nor does a start."""
+    with held_bodies(folder) as bodies:
+        bodies.hold(folder / "blobs")
+        with pytest.raises(StoreError, match=r"a backup of .* is under way.*wait for its end"):
+            back_up(folder, tmp_path / "copy", unix_s=1, **NAMES)
+        fill(folder, 2)
+        assert len(list((folder / HELD_FOLDER).iterdir())) == 1
+    assert not (folder / HELD_FOLDER).exists()
+    back_up(folder, tmp_path / "copy", unix_s=1, **NAMES)
+
+
+def test_a_start_lets_go_of_what_a_killed_backup_held(folder):
+    """Bodies that the shard has replaced since would stay on the disk."""
+    links = folder / HELD_FOLDER
+    links.mkdir()
+    body = next((folder / "blobs").iterdir())
+    os.link(body, links / body.name)
+    fill(folder, 2)
+    assert not links.exists()
+    assert versions(folder) == {"a": 2, "b": 2}
+
+
+def test_links_that_cannot_be_removed_keep_no_shard_from_its_start(folder, monkeypatch, caplog):
+    """As those of a backup that another user has made; they cost room, and the log says where."""
+    (folder / HELD_FOLDER).mkdir()
+
+    def refuse(path):
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(held_bodies_module, "shutil", SimpleNamespace(rmtree=refuse))
+    fill(folder, 2)
+    assert "stays: [Errno 13] Permission denied" in caplog.text

@@ -1,8 +1,10 @@
 """A damaged folder is refused by file and remedy; what only a power cut explains is not damage."""
 
+import os
 import random
 import shutil
 import sqlite3
+from pathlib import Path
 
 import pytest
 from store_writer import contents, outcome_record, persist, reopened, slot_record
@@ -12,6 +14,8 @@ from enact_dist.core.records import SlotRecord
 from enact_dist.errors import StoreError
 from enact_dist.link import store_mark
 from enact_dist.link.store import open_store
+from enact_dist.link.store_folder import DATABASE_FILE
+from enact_dist.link.store_mark import MARK_FILE
 from enact_dist.terms import Durability, NullReason
 
 FRAME_BYTES = 24 + 4096
@@ -379,3 +383,26 @@ def test_mark_that_cannot_be_read_excuses_nothing(crashed):
     (copy / "mark").unlink()
     flip(copy / "store.db-wal", frame_offset(2))
     assert "is damaged at byte" in str(refusal(copy))
+
+
+def test_mark_of_a_first_start_that_was_killed_is_forced_by_the_next(tmp_path, monkeypatch):
+    """Before the database is there: else a power cut could leave that one without the mark."""
+    folder, force = tmp_path / "s", os.fsync
+    forced = []
+
+    def fsync(descriptor):
+        path = Path(f"/proc/self/fd/{descriptor}").readlink()
+        if path == folder / MARK_FILE:
+            forced.append((folder / DATABASE_FILE).exists())
+            if len(forced) == 1:
+                raise KeyboardInterrupt  # killed
+        force(descriptor)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    with pytest.raises(KeyboardInterrupt):
+        open_store(folder, unix_s=1)
+    assert (folder / MARK_FILE).stat().st_size
+    store, _ = open_store(folder, unix_s=1)
+    store.close()
+
+    assert forced[:2] == [False, False]
