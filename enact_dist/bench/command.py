@@ -222,7 +222,9 @@ def _cells(row: Row) -> tuple[str, ...]:
         p99 = shown_us(row.p99_us) if row.p99_us is not None else ""
     met = "" if row.goal is None else {True: "yes", False: "NO", None: "?"}[row.met]
     ratio = "" if row.ratio is None else f"{row.ratio:.2f}"
-    return row.name, row.variant, median, p99, f"{row.n:,}", ratio, row.goal or "", met, row.note
+    speed = "" if row.mb_s is None else f"{row.mb_s:,.0f} MB/s"
+    note = "; ".join(filter(None, (speed, row.beside, row.note)))
+    return row.name, row.variant, median, p99, f"{row.n:,}", ratio, row.goal or "", met, note
 
 
 def _print(found: Mapping[str, object], rows: Sequence[Row]) -> None:
@@ -233,4 +235,6 @@ def _print(found: Mapping[str, object], rows: Sequence[Row]) -> None:
     print_table(COLUMNS, [_cells(row) for row in rows], empty="nothing was measured")
     judged = [row for row in rows if row.goal is not None]
     missed = [row for row in judged if row.met is False]
-    print(f"{len(judged)} goals, {len(missed)} not met")
+    print(
+        f"{len(judged)} goals, {len(missed)} not met; the design's budgets name none for the rest"
+    )

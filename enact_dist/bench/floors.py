@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.bench.raw_socket import RawSocket
-from enact_dist.bench.rows import Case
+from enact_dist.bench.rows import FLOOR, Case
 from enact_dist.bench.timing import PAUSE_S, timed
 from enact_dist.errors import MisuseError
 from enact_dist.verify.daemons import LineProcess, free_port
@@ -37,34 +37,39 @@ if TYPE_CHECKING:
 
 PAUSED: Final = ", paused"
 """Ends the name of a variant with pauses between the acts."""
-QUERY: Final = ("floor", "zenoh query")
-QUERY_PAUSED: Final = ("floor", "zenoh query" + PAUSED)
-PUBLISH: Final = ("floor", "zenoh pub/sub")
-ECHO: Final = ("floor", "socket echo")
-ECHO_PAUSED: Final = ("floor", "socket echo" + PAUSED)
-FDATASYNC: Final = ("floor", "fdatasync")
+QUERY: Final = (FLOOR, "zenoh query")
+QUERY_PAUSED: Final = (FLOOR, "zenoh query" + PAUSED)
+PUBLISH: Final = (FLOOR, "zenoh pub/sub")
+ECHO: Final = (FLOOR, "socket echo")
+ECHO_PAUSED: Final = (FLOOR, "socket echo" + PAUSED)
+FDATASYNC: Final = (FLOOR, "fdatasync")
 SIZES: Final = {"1 kB": 1_024, "0.9 MB": 921_600, "10 MB": 10_000_000, "100 MB": 100_000_000}
 """Bytes of the payloads that are measured."""
 
 
 def reply(size: str) -> Key:
     """Return the floor of a fetch over the network."""
-    return ("floor", f"zenoh reply {size}")
+    return (FLOOR, f"zenoh reply {size}")
 
 
 def written(size: str) -> Key:
     """Return the floor of a publication in shared memory."""
-    return ("floor", f"write {size}")
+    return (FLOOR, f"write {size}")
 
 
 def mapped(size: str) -> Key:
     """Return the floor of a fetch in shared memory."""
-    return ("floor", f"mmap {size}")
+    return (FLOOR, f"mmap {size}")
 
 
 def copied(size: str) -> Key:
     """Return the floor of a copy."""
-    return ("floor", f"memcpy {size}")
+    return (FLOOR, f"memcpy {size}")
+
+
+def size_of(variant: str) -> str:
+    """Return the size that a floor is named after, as in `SIZES`; what follows its kind else."""
+    return variant.removeprefix("zenoh ").partition(" ")[2]
 
 
 class Floors:
@@ -101,7 +106,10 @@ class Floors:
         bare = variant.removesuffix(PAUSED)
         pause_s = PAUSE_S if bare != variant else 0.0
         act = self._act(bare)
-        return Case("floor", variant, lambda seconds_s: timed(act, seconds_s, pause_s=pause_s))
+        moved = 0 if bare.startswith("mmap") else SIZES.get(size_of(bare), 0)
+        return Case(
+            FLOOR, variant, lambda seconds_s: timed(act, seconds_s, pause_s=pause_s), bytes=moved
+        )
 
     def _act(self, variant: str) -> Callable[[], object]:
         if variant == "zenoh query":
@@ -112,14 +120,17 @@ class Floors:
             return self._socket.echo
         if variant == "fdatasync":
             return self._fdatasync
-        kind, _, size = variant.partition(" ")
-        if kind == "zenoh":
-            raw, size = self._zenoh, size.removeprefix("reply ")
-            return functools.partial(raw.query, SIZES[size])
-        by_kind = {"memcpy": self._memcpy, "write": self._write, "mmap": self._mmap}
-        if kind not in by_kind or size not in SIZES:
+        size = size_of(variant)
+        acts: dict[str, Callable[[int], Callable[[], object]]] = {
+            "zenoh reply": lambda count: functools.partial(self._zenoh.query, count),
+            "memcpy": self._memcpy,
+            "write": self._write,
+            "mmap": self._mmap,
+        }
+        kind = variant.removesuffix(" " + size)
+        if kind not in acts or size not in SIZES:
             raise MisuseError(f"there is no floor {variant!r}")
-        return by_kind[kind](SIZES[size])
+        return acts[kind](SIZES[size])
 
     # ---------------------------------------------------------------- transports
 

@@ -2,6 +2,11 @@
 
 A fetch is divided by mapping a file of that size from shared memory (over the network: by a raw
 Zenoh answer of that size), a publication by writing such a file.
+
+Whoever has just written 100 MB has driven everything else out of the processor's caches, and what
+comes next is slow, whatever its size.  So where 100 MB are compared with 1 kB right after they were
+written, the 1 kB come after 100 MB that somebody wrote elsewhere; how they compare with 1 kB alone
+stands beside it.
 """
 
 from __future__ import annotations
@@ -9,13 +14,14 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from enact_dist.bench.floors import SIZES, mapped, reply, written
 from enact_dist.bench.place import EMBEDDED
-from enact_dist.bench.rows import Case, Goal, Key, at_most, times
+from enact_dist.bench.rows import Case, Key, at_most, times
 from enact_dist.bench.timing import timed
 from enact_dist.bench.updates import floor_of
 from enact_dist.lock import Lock
@@ -32,6 +38,9 @@ if TYPE_CHECKING:
 
 SMALL: Final = "1 kB"
 LARGEST: Final = "100 MB"
+ELSEWHERE: Final = f"after {LARGEST} elsewhere"
+ANEW: Final = "{}, written anew"
+FILLED: Final = "{}, filled in place, commit alone"
 WAIT_S: Final = 60.0
 WAKEUPS: Final = {"64 B": (64, 500.0, 0.003), "0.9 MB": (921_600, 800.0, 0.02)}
 """Bytes, goal in microseconds, and seconds between two changes."""
@@ -56,8 +65,12 @@ def fetch(world: WorldContext, of: Entity) -> float:
     """Read an array under a lock; return its first element plus its last."""
     read = Read(world, of, ARRAY)
     with Lock(read, wait_s=WAIT_S) as lock:
-        array = lock[read]
-        return float(array[0]) + float(array[-1])
+        return touched(lock[read])
+
+
+def touched(array: NDArray[Any]) -> float:
+    """Return an array's first element plus its last."""
+    return float(array[0]) + float(array[-1])
 
 
 def floats(size: int) -> NDArray[np.float32]:
@@ -76,33 +89,46 @@ def run_fetch(run: Run) -> None:
     if place.embedded:
         return
     with place.worker("storer", carrier=place.carrier) as storer:
-        fresh = _Storer(storer)
+        fresh = Storer(storer)
         world = place.world(place.carrier)
         for size in SIZES:
-            fresh.store(size)
+            fresh.store_sized(size)
             fetch(world, entity(size))
         cases = []
         for size in SIZES:
             cases += _fetches(world, size, fresh)
-        run.measure(cases)
+        run.measure([*cases, _small_fetch(world, fresh)])
         with place.far_world() as far:
             run.measure([_far_fetch(far, size, fresh) for size in SIZES])
 
 
-class _Storer:
+class Storer:
     """A worker that writes arrays when told to."""
 
     def __init__(self, worker: LineProcess) -> None:
         self._worker = worker
+        self._ordered = False
 
-    def store(self, size: str) -> None:
-        """Have an array of that size written anew; return once it is."""
-        self._worker.tell(f"{entity(size).name} {SIZES[size]}")
-        self._worker.expect("stored:", timeout_s=WAIT_S)
+    def order(self, of: Entity, count: int) -> None:
+        """Have an array of `count` bytes written anew, after what was ordered before."""
+        self.wait()
+        self._worker.tell(f"{of.name} {count}")
+        self._ordered = True
 
+    def wait(self) -> None:
+        """Wait until what was ordered is written."""
+        if self._ordered:
+            self._worker.expect("stored:", timeout_s=WAIT_S)
+            self._ordered = False
 
-def _same_as_small(variant: str) -> Goal:
-    return times(1.3, ("fetch", variant.format(SMALL)), "≤ 1.3 x 1 kB")
+    def store(self, of: Entity, count: int) -> None:
+        """Have an array of `count` bytes written anew; return once it is."""
+        self.order(of, count)
+        self.wait()
+
+    def store_sized(self, size: str) -> None:
+        """Have the array of that size written anew; return once it is."""
+        self.store(entity(size), SIZES[size])
 
 
 def _embedded_fetches(world: WorldContext) -> list[Case]:
@@ -121,33 +147,45 @@ def _fetching(
     return lambda seconds_s: timed(lambda: fetch(world, entity(size)), seconds_s, before=before)
 
 
-def _fetches(world: WorldContext, size: str, fresh: _Storer) -> list[Case]:
-    seen, anew = "{}, seen before", "{}, written anew"
-    largest = size == LARGEST
-    return [
-        Case(
-            "fetch",
-            seen.format(size),
-            _fetching(world, size),
-            mapped(size),
-            _same_as_small(seen) if largest else None,
-        ),
-        Case(
-            "fetch",
-            anew.format(size),
-            _fetching(world, size, lambda: fresh.store(size)),
-            mapped(size),
-            _same_as_small(anew) if largest else None,
-        ),
-    ]
+def _fetches(world: WorldContext, size: str, fresh: Storer) -> list[Case]:
+    seen = Case("fetch", f"{size}, seen before", _fetching(world, size), mapped(size))
+    anew = Case(
+        "fetch",
+        ANEW.format(size),
+        _fetching(world, size, lambda: fresh.store_sized(size)),
+        mapped(size),
+    )
+    if size == LARGEST:
+        goal = times(1.3, ("fetch", f"{SMALL}, seen before"), f"≤ 1.3 x {SMALL}")
+        seen = replace(seen, goal=goal)
+        anew = _beside_small(anew, ANEW)
+    return [seen, anew]
 
 
-def _far_fetch(world: WorldContext, size: str, fresh: _Storer) -> Case:
+def _small_fetch(world: WorldContext, fresh: Storer) -> Case:
+    """Return the case of 1 kB written anew, then 100 MB elsewhere, before the 1 kB are read."""
+
+    def before() -> None:
+        fresh.store_sized(SMALL)
+        fresh.store_sized(LARGEST)
+
+    what = f"{ANEW.format(SMALL)}, {ELSEWHERE}"
+    return Case("fetch", what, _fetching(world, SMALL, before), mapped(SMALL))
+
+
+def _beside_small(case: Case, variant: str) -> Case:
+    """Let a case of 100 MB be judged by that of 1 kB after 100 MB elsewhere."""
+    small = variant.format(SMALL)
+    goal = times(1.3, (case.name, f"{small}, {ELSEWHERE}"), f"≤ 1.3 x {SMALL} {ELSEWHERE}")
+    return replace(case, goal=goal, beside=((case.name, small), SMALL))
+
+
+def _far_fetch(world: WorldContext, size: str, fresh: Storer) -> Case:
     floor: Key = reply(size)
     return Case(
         "fetch",
         f"{size}, written anew, no common memory",
-        _fetching(world, size, lambda: fresh.store(size)),
+        _fetching(world, size, lambda: fresh.store_sized(size)),
         floor,
         times(1.0 / 0.8, floor, "≥ 0.8 of raw Zenoh"),
     )
@@ -165,22 +203,33 @@ def run_publish(run: Run) -> None:
     for size, count in SIZES.items():
         goal = times(1.2, written(size), "≤ 1.2 x write()") if size == LARGEST else None
         cases.append(Case("publish", size, _storing(world, size, count), written(size), goal))
-    cases += [_filled_case(world, size, count) for size, count in SIZES.items()]
-    run.measure(cases)
+    run.measure([*cases, *_filled_cases(world, zeroed=not place.embedded)])
 
 
-def _filled_case(world: WorldContext, size: str, count: int) -> Case:
-    """Return the case of an array that was filled in place: what its commit alone takes."""
-    variant = "{}, filled in place, commit alone"
-    goal = None
-    if size == LARGEST:
-        goal = times(1.3, ("publish", variant.format(SMALL)), "independent of size (≤ 1.3 x 1 kB)")
-    return Case(
-        "publish", variant.format(size), _committing(world, size, count), written(size), goal
-    )
+def _filled_cases(world: WorldContext, *, zeroed: bool) -> list[Case]:
+    """Return the cases of arrays that were filled in place: what their commit alone takes.
+
+    Args:
+        world: Where.
+        zeroed: Whether a shard hands out memory that it has just set to zero.
+    """
+    cases = [
+        Case("publish", FILLED.format(size), _committing(world, size, count), written(size))
+        for size, count in SIZES.items()
+    ]
+    if not zeroed:
+        goal = times(1.3, ("publish", FILLED.format(SMALL)), f"≤ 1.3 x {SMALL}")
+        return [*cases[:-1], replace(cases[-1], goal=goal)]
+    cases[-1] = _beside_small(cases[-1], FILLED)
+    spare = np.zeros(SIZES[LARGEST], np.uint8)
+    control = _committing(world, SMALL, SIZES[SMALL], before=lambda: spare.fill(1))
+    what = f"{FILLED.format(SMALL)}, {ELSEWHERE}"
+    return [*cases, Case("publish", what, control, written(SMALL))]
 
 
-def _committing(world: WorldContext, size: str, count: int) -> Callable[[float], Sequence[float]]:
+def _committing(
+    world: WorldContext, size: str, count: int, before: Callable[[], None] = lambda: None
+) -> Callable[[float], Sequence[float]]:
     write = Write(world, entity(f"new/{size}"), ARRAY)
     filled = floats(SIZES[SMALL])
 
@@ -193,6 +242,7 @@ def _committing(world: WorldContext, size: str, count: int) -> Callable[[float],
                 array = lock.new(write, (count // 4,), np.float32)
                 array[: filled.size] = filled
                 array[-1] = 1.0
+                before()
 
             return timed(stack.close, seconds_s, before=fill)
 

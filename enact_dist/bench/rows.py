@@ -9,6 +9,8 @@ from typing import Final, TypeAlias
 
 Key: TypeAlias = tuple[str, str]
 """Name of the bench and the variant in it."""
+FLOOR: Final = "floor"
+"""The bench of what the machine and the bare transports do by themselves."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,11 +53,13 @@ class Goal:
         limit_us: The longest median, from the other figures of the same run; None where those
             were not measured.
         p99_us: The longest 99th percentile; None where none is set.
+        needs: The figures that `limit_us` is told from.
     """
 
     text: str
     limit_us: Callable[[Figures], float | None]
     p99_us: float | None = None
+    needs: tuple[Key, ...] = ()
 
     def met(self, sample: Sample, figures: Figures) -> bool | None:
         """Say whether `sample` keeps to it; None where that cannot be told from this run."""
@@ -81,7 +85,7 @@ def times(factor: float, of: Key, text: str, *, plus: tuple[float, Key] | None =
         more_us = plus[0] * figures[plus[1]].median_us if plus is not None else 0.0
         return factor * figures[of].median_us + more_us
 
-    return Goal(text, limit_us)
+    return Goal(text, limit_us, needs=(of,) if plus is None else (of, plus[1]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,6 +98,8 @@ class Case:
         measure: Acts for so many seconds, and returns the time of each act in microseconds.
         floor: The figure that this one is divided by.
         goal: What it should keep to, if anything.
+        bytes: How many each act moves, where the speed is of interest; else 0.
+        beside: Another row that this one is to be seen beside, and what it is called there.
     """
 
     name: str
@@ -101,11 +107,18 @@ class Case:
     measure: Callable[[float], Sequence[float]]
     floor: Key | None = None
     goal: Goal | None = None
+    bytes: int = 0
+    beside: tuple[Key, str] | None = None
 
     @property
     def key(self) -> Key:
         """Under which its figure is kept."""
         return (self.name, self.variant)
+
+    @property
+    def needs(self) -> set[Key]:
+        """The figures of the same run without which it is not judged."""
+        return {*(self.goal.needs if self.goal else ()), *((self.floor,) if self.floor else ())}
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,6 +137,8 @@ class Row:
         value: The figure that is no time.
         unit: Of `value`.
         note: What a reader should know beside it.
+        mb_s: Megabytes (10^6 bytes) per second of the median, where the speed is of interest.
+        beside: So many times another row that its goal does not name, in words.
     """
 
     name: str
@@ -137,14 +152,17 @@ class Row:
     value: float | None = None
     unit: str | None = None
     note: str = ""
+    mb_s: float | None = None
+    beside: str = ""
 
     def as_json(self) -> dict[str, object]:
-        """Return the row as it stands in JSON: `value`, `unit`, `note` only where there is one."""
+        """Return the row as it stands in JSON; what only some rows have, only where it is."""
         found = {name: getattr(self, name) for name in TIME_FIELDS}
         if self.value is not None:
             found |= {"value": self.value, "unit": self.unit}
-        if self.note:
-            found["note"] = self.note
+        if self.mb_s is not None:
+            found["mb_s"] = self.mb_s
+        found |= {name: text for name in TEXT_FIELDS if (text := getattr(self, name))}
         return found
 
 
@@ -164,6 +182,7 @@ def value_row(
 
 
 TIME_FIELDS: Final = ("name", "variant", "median_us", "p99_us", "n", "ratio", "goal", "met")
+TEXT_FIELDS: Final = ("beside", "note")
 
 
 def row_of(case: Case, figures: Figures) -> Row:
@@ -179,7 +198,16 @@ def row_of(case: Case, figures: Figures) -> Row:
         round(sample.median_us / floor.median_us, 3) if floor is not None else None,
         case.goal.text if case.goal is not None else None,
         case.goal.met(sample, figures) if case.goal is not None else None,
+        mb_s=round(case.bytes / sample.median_us, 1) if case.bytes else None,
+        beside=_beside(case, sample, figures),
     )
+
+
+def _beside(case: Case, sample: Sample, figures: Figures) -> str:
+    if case.beside is None or case.beside[0] not in figures:
+        return ""
+    key, name = case.beside
+    return f"{sample.median_us / figures[key].median_us:.2f} x {name}"
 
 
 def shown_us(value_us: float) -> str:

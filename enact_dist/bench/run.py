@@ -17,19 +17,19 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.bench.floors import Floors
-from enact_dist.bench.rows import Case, Key, Row, Sample, row_of, sample_of
+from enact_dist.bench.rows import FLOOR, Case, Key, Row, Sample, row_of, sample_of
 
 if TYPE_CHECKING:
     from enact_dist.bench.place import Place
 
 ROUNDS: Final = 3
-HERE: Final = frozenset(("floor", "core"))
+HERE: Final = frozenset((FLOOR, "core"))
 """What is measured of this machine, wherever the cell is."""
 
 
 def _place_of(key: Key) -> int:
     """Return the place of a row in its part of the table: floors in their own order."""
-    return Floors.every().index(key) if key[0] == "floor" else 0
+    return Floors.every().index(key) if key[0] == FLOOR else 0
 
 
 class Run:
@@ -54,8 +54,8 @@ class Run:
         self._others: list[Row] = []
 
     def measure(self, cases: Sequence[Case], *, rounds: int = ROUNDS) -> None:
-        """Measure all cases in turn, with the floors that they are compared with."""
-        floors = {case.floor for case in cases if case.floor is not None}
+        """Measure all cases in turn, with the floors that they and their goals are told by."""
+        floors = {key for case in cases for key in case.needs if key[0] == FLOOR}
         every = [self.floors.case(floor[1]) for floor in sorted(floors)] + list(cases)
         for number in range(rounds):
             for case in every:
@@ -94,6 +94,6 @@ class Run:
                 row if row.name in HERE else replace(row, ratio=None, met=None) for row in found
             ]
         names = list(dict.fromkeys(row.name for row in (*found, *self._others)))
-        names.sort(key=lambda name: name != "floor")
+        names.sort(key=lambda name: name != FLOOR)
         ordered = sorted(found, key=lambda row: _place_of((row.name, row.variant)))
         return [row for name in names for row in (*ordered, *self._others) if row.name == name]

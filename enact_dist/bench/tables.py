@@ -1,7 +1,8 @@
 """The Markdown of several runs side by side: `enact bench --table a.json b.json c.json`.
 
-Every row that has a goal, in the order of the first run; floors that others are divided by stand
-in a table of their own.  Whatever is missing in a run is an empty cell, never a guess.
+Every row that has a goal, in the order of the first run; those without one and the floors that
+others are divided by stand in tables of their own.  Whatever is missing in a run is an empty cell,
+never a guess.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
-from enact_dist.bench.rows import shown_us
+from enact_dist.bench.rows import FLOOR, shown_us
 from enact_dist.errors import MisuseError
 
 if TYPE_CHECKING:
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
 Found: TypeAlias = dict[tuple[str, str], dict[str, Any]]
 """The rows of one run by bench and variant."""
 
-FLOOR: Final = "floor"
 FIELDS: Final = ("name", "variant", "median_us", "p99_us", "n", "ratio", "goal", "met")
 
 
@@ -55,11 +55,13 @@ def table(paths: Sequence[Path]) -> str:
     keys = list(dict.fromkeys(key for found in rows for key in found))
     judged = [key for key in keys if any(found.get(key, {}).get("goal") for found in rows)]
     floors = [key for key in keys if key[0] == FLOOR]
+    others = [key for key in keys if key not in judged and key not in floors]
     numbers = [f"run {number + 1}" for number in range(len(runs))]
     lines = [_machine(runs), ""]
     lines += _lines(("what", "goal", *numbers, "met"), (_judged(key, rows) for key in judged))
     lines += ["", *_reasons(judged, rows)]
-    lines += _lines(("floor of the same run", *numbers), (_plain(key, rows) for key in floors))
+    for head, plain in (("without a goal", others), ("floor of the same run", floors)):
+        lines += [*_lines((head, *numbers), (_plain(key, rows) for key in plain)), ""]
     return "\n".join(lines).rstrip() + "\n"
 
 
@@ -77,7 +79,7 @@ def _machine(runs: Sequence[tuple[Mapping[str, Any], Found]]) -> str:
 
 def _judged(key: tuple[str, str], runs: Sequence[Found]) -> tuple[str, ...]:
     goal = next(found[key]["goal"] for found in runs if key in found and found[key]["goal"])
-    return f"{key[0]}: {key[1]}", goal, *(_cell(found.get(key)) for found in runs), _met(key, runs)
+    return _named(key), goal, *(_cell(found.get(key)) for found in runs), _met(key, runs)
 
 
 def _met(key: tuple[str, str], runs: Sequence[Found]) -> str:
@@ -90,19 +92,29 @@ def _met(key: tuple[str, str], runs: Sequence[Found]) -> str:
     return f"{sum(known)} of {len(known)}" if any(known) else "**no**"
 
 
+def _named(key: tuple[str, str]) -> str:
+    return key[1] if key[0] == FLOOR else f"{key[0]}: {key[1]}"
+
+
 def _plain(key: tuple[str, str], runs: Sequence[Found]) -> tuple[str, ...]:
-    return key[1], *(_cell(found.get(key)) for found in runs)
+    return _named(key), *(_cell(found.get(key)) for found in runs)
 
 
 def _cell(row: Mapping[str, Any] | None) -> str:
     if row is None:
         return ""
     if row.get("value") is not None:
-        return f"{row['value']:g} {row.get('unit') or ''}".strip()
+        return f"{row['value']:g} {row.get('unit') or ''}".strip() + f" (n {row['n']:,})"
     if row["median_us"] is None:
         return ""
-    ratio = f", {row['ratio']:.2f} x" if row["ratio"] is not None else ""
-    return f"{shown_us(row['median_us'])} (p99 {shown_us(row['p99_us'])}{ratio})"
+    said = [f"p99 {shown_us(row['p99_us'])}", f"n {row['n']:,}"]
+    if row["ratio"] is not None:
+        said.append(f"{row['ratio']:.2f} x")
+    if row.get("beside"):
+        said.append(row["beside"])
+    if row.get("mb_s") is not None:
+        said.append(f"{row['mb_s']:,.0f} MB/s")
+    return f"{shown_us(row['median_us'])} ({', '.join(said)})"
 
 
 def _reasons(keys: Iterable[tuple[str, str]], runs: Sequence[Found]) -> list[str]:

@@ -51,7 +51,8 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
         nargs="*",
         type=bench_name,
         metavar="NAME",
-        help=f"which: {', '.join(NAMES)} (default: all)",
+        help=f"which: {', '.join(NAMES)} (default: all); a row without a goal is one for which"
+        " the design sets none, as all of `waiters` and most of `multi` and `durable`",
     )
     where = bench.add_mutually_exclusive_group()
     where.add_argument("--embedded", action="store_true", help="in this process only, no daemon")

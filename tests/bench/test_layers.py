@@ -1,17 +1,26 @@
 """The bench `layers` sees every layer of an update, once, and leaves no watch behind."""
 
+import time
+from functools import partial
+
 import pytest
 
 from enact_dist import local
+from enact_dist.bench.floors import QUERY
 from enact_dist.bench.layers import (
     CALLS,
     CLIENT,
     DECISIONS,
+    DECODED,
+    FETCHED,
     HOST,
     LOCK,
+    TOUCHED,
+    Profile,
     Watch,
     layer_times_us,
 )
+from enact_dist.bench.payloads import entity, fetch, floats, store
 from enact_dist.bench.updates import slots, update
 from enact_dist.core.messages import Acquire, Commit, Committed, Granted
 from enact_dist.core.shard import Shard
@@ -29,12 +38,51 @@ def test_every_layer_has_its_own_time(world):
     """Lock, client, host and decisions each take a part of every update, and no more than all."""
     (write,) = slots(world, 1)
 
-    own_us, messages = layer_times_us(lambda: update((write,)), world, seconds_s=0.05)
+    profile = Profile("update", world, lambda: update((write,)), QUERY)
+    own_us, messages = layer_times_us(profile, seconds_s=0.05)
 
-    assert list(own_us) == [LOCK, CLIENT, HOST, DECISIONS]
+    assert set(own_us) == {LOCK, CLIENT, HOST, DECISIONS}
     assert len({len(times_us) for times_us in own_us.values()}) == 1
     assert all(min(times_us) > 0.0 for times_us in own_us.values())
     assert [type(message) for message in messages] == [Acquire, Granted, Commit, Committed]
+
+
+def test_fetch_shows_its_datum_beside_the_layers(world):
+    """How the datum came, its decoding and its first touch are parts of their own."""
+    of = entity("1 kB")
+    store(world, of, floats(1_024))
+    begun = []
+
+    profile = Profile(
+        "fetch", world, partial(fetch, world, of), QUERY, lambda: begun.append(1), of_datum=True
+    )
+    own_us, _ = layer_times_us(profile, seconds_s=0.01)
+
+    assert set(own_us) == {LOCK, CLIENT, HOST, DECISIONS, FETCHED, DECODED, TOUCHED}
+    assert len(begun) == len(own_us[DECODED]) + 1  # an act that is not counted comes first
+
+
+def test_own_time_is_without_that_of_inner_layers():
+    """An outer call of 3 ms with an inner one of 20 ms has 3 ms of its own, not 23."""
+    watch = Watch()
+
+    class Layered:
+        @staticmethod
+        def inner():
+            time.sleep(0.02)
+
+    def outer():
+        time.sleep(0.003)
+        Layered.inner()
+
+    with watch.over(Layered, "inner", DECISIONS):
+        started_ns = time.perf_counter_ns()
+        watch.counted(CLIENT, outer)
+        whole_ns = time.perf_counter_ns() - started_ns
+
+    assert watch.spent_ns[DECISIONS] >= 20_000_000
+    assert watch.spent_ns[CLIENT] >= 3_000_000
+    assert sum(watch.spent_ns.values()) <= whole_ns
 
 
 def test_watch_counts_inner_calls_once_and_is_taken_off(world):

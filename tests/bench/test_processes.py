@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from enact_dist.bench import history, pipeline
+from enact_dist.bench.command import BENCHES
 from enact_dist.bench.decisions import Decider, granted_of, hand_over_us
 from enact_dist.bench.floors import ECHO, FDATASYNC, PUBLISH, QUERY, Floors
 from enact_dist.bench.pipeline_worker import (
@@ -54,6 +55,8 @@ def test_every_kind_of_floor_gives_times(new_run):
         key for key in Floors.every() if key in {QUERY, PUBLISH, ECHO, FDATASYNC, *small}
     ]
     assert all(row.median_us > 0 for row in rows)
+    fast = {row.variant for row in rows if row.mb_s}
+    assert fast == {"memcpy 1 kB", "write 1 kB", "zenoh reply 1 kB"}
 
 
 def test_raw_query_brings_as_many_bytes_as_asked(new_run):
@@ -143,6 +146,30 @@ def test_set_of_one_frame_is_told_by_heads_and_pixels():
 
     assert tick_of_set(by_head, areas) is None
     assert tick_of_set([*whole[:7], forged], areas) is None
+
+
+@pytest.mark.parametrize("bench", ["core", "update", "multi", "durable", "fetch", "publish"])
+def test_bench_within_the_process_judges_its_goals_alone(new_run, bench):
+    """Whatever a goal is told by is measured by the bench itself."""
+    assert_judged(new_run(EMBEDDED), bench)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "bench",
+    ["update", "layers", "multi", "durable", "waiters", "fetch", "publish", "wakeup", "stopped"],
+)
+def test_bench_judges_its_goals_alone(new_run, bench):
+    """The same over each carrier: no row is left undecided for want of another bench."""
+    assert_judged(new_run("zenoh", "socket"), bench)
+
+
+def assert_judged(run, bench):
+    BENCHES[bench](run)
+
+    rows = run.rows()
+    assert any(row.name == bench for row in rows)
+    assert [(row.name, row.variant) for row in rows if row.goal and row.met is None] == []
 
 
 @pytest.mark.slow

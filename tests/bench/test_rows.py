@@ -1,8 +1,10 @@
 """Samples, goals and rows: how figures are summed up and judged."""
 
+from dataclasses import replace
+
 import pytest
 
-from enact_dist.bench.floors import QUERY
+from enact_dist.bench.floors import ECHO, FDATASYNC, QUERY
 from enact_dist.bench.rows import Case, Goal, Sample, at_most, row_of, sample_of, times
 from enact_dist.bench.run import Run
 from enact_dist.bench.timing import COUNT_MIN, timed
@@ -48,6 +50,42 @@ def test_goal_may_allow_for_the_disk(mine_us, met):
     goal = times(2.6, FLOOR, "…", plus=(1.5, OTHER))
 
     assert row_of(case(goal), figures(floor=100.0, disk=200.0, mine=mine_us)).met is met
+
+
+def test_floors_of_a_goal_are_measured_with_its_row():
+    """Not only what the row is divided by: a bench that runs alone judges its rows."""
+    variants = []
+
+    class Machine:
+        def case(self, variant):
+            variants.append(variant)
+            return Case("floor", variant, lambda _seconds_s: [100.0])
+
+    run = Run(Place(near=True), Machine(), seconds_s=1.0, told=lambda _text: None)
+    goal = times(2.6, QUERY, "…", plus=(1.5, FDATASYNC))
+
+    run.measure([Case(*MINE, lambda _seconds_s: [410.0], ECHO, goal)])
+
+    assert {name for _, name in (QUERY, FDATASYNC, ECHO)} == set(variants)
+    assert [row.met for row in run.rows() if row.goal] == [True]
+
+
+def test_speed_is_told_of_what_moves_bytes():
+    """10 MB in 5 ms are 2,000 MB/s; a row that moves none has none."""
+    case = Case(*MINE, lambda _seconds_s: (), bytes=10_000_000)
+
+    assert row_of(case, figures(mine=5_000.0)).as_json()["mb_s"] == 2_000.0
+    assert "mb_s" not in row_of(replace(case, bytes=0), figures(mine=1.0)).as_json()
+
+
+def test_row_is_seen_beside_another_that_does_not_judge_it():
+    """The goal goes by the like-for-like row; the plain ratio is told all the same."""
+    beside = replace(case(times(1.3, FLOOR, "≤ 1.3 x like")), beside=(OTHER, "plain"))
+
+    row = row_of(beside, figures(floor=100.0, disk=50.0, mine=120.0))
+
+    assert (row.met, row.as_json()["beside"]) == (True, "2.40 x plain")
+    assert "beside" not in row_of(beside, figures(floor=100.0, mine=120.0)).as_json()
 
 
 def test_goal_without_its_floor_is_not_judged():

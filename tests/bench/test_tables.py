@@ -13,7 +13,7 @@ MACHINE = {"processor": "some", "cores": 2, "system": "Linux", "python": "3.11",
 
 def row(name="update", variant="one", median_us=100.0, **more):
     return {
-        "name": name, "variant": variant, "median_us": median_us, "p99_us": 200.0, "n": 9,
+        "name": name, "variant": variant, "median_us": median_us, "p99_us": 200.0, "n": 3000,
         "ratio": 1.5, "goal": "≤ 120 µs", "met": True, **more,
     }  # fmt: skip
 
@@ -33,13 +33,13 @@ def written(tmp_path):
 
 
 def test_row_with_a_goal_stands_beside_itself_in_each_run(written):
-    """Median, 99th percentile and ratio of each run, and whether the goal was kept in all."""
+    """Median, 99th percentile, n and ratio of each run, and whether the goal was kept in all."""
     text = table(written([row()], [row(median_us=110.0)], [row(median_us=130.0, met=False)]))
 
     assert text.splitlines()[0].startswith("some, 2 cores, Linux, Python 3.11, Zenoh 1; 2026-01-02")
     assert (
-        "| update: one | ≤ 120 µs | 100 µs (p99 200 µs, 1.50 x) | 110 µs (p99 200 µs, 1.50 x)"
-        " | 130 µs (p99 200 µs, 1.50 x) | 2 of 3 |"
+        "| update: one | ≤ 120 µs | 100 µs (p99 200 µs, n 3,000, 1.50 x) | 110 µs (p99 200 µs, n 3,000, 1.50 x)"
+        " | 130 µs (p99 200 µs, n 3,000, 1.50 x) | 2 of 3 |"
     ) in text
 
 
@@ -65,7 +65,8 @@ def test_row_that_a_run_lacks_is_an_empty_cell(written):
     text = table(written([row(), row("memory", "slot")], [row()]))
 
     assert (
-        "| memory: slot | ≤ 120 µs | 100 µs (p99 200 µs, 1.50 x) |  | yes (1 of 2 runs) |" in text
+        "| memory: slot | ≤ 120 µs | 100 µs (p99 200 µs, n 3,000, 1.50 x) |  | yes (1 of 2 runs) |"
+        in text
     )
 
 
@@ -76,19 +77,34 @@ def test_missed_row_tells_its_reasons_below(written):
 
     text = table(written([missed, row(note="fine")]))
 
-    assert "| pipeline: missed ticks | 0 | 3 ticks | **no** |" in text
+    assert "| pipeline: missed ticks | 0 | 3 ticks (n 3,000) | **no** |" in text
     assert "- pipeline: missed ticks: 3: late | mostly" in text
     assert "fine" not in text
 
 
 def test_floors_have_a_table_of_their_own(written):
-    """What figures are divided by is shown, without a goal."""
-    floor = row("floor", "zenoh query", goal=None, met=None, ratio=None)
+    """What figures are divided by is shown, without a goal; with its speed where it has one."""
+    bare = {"goal": None, "met": None, "ratio": None}
+    floors = [row("floor", "zenoh query", **bare), row("floor", "write 10 MB", mb_s=1862.4, **bare)]
 
-    text = table(written([floor, row()]))
+    text = table(written([*floors, row(beside="1.93 x 1 kB")]))
 
-    assert "| zenoh query | 100 µs (p99 200 µs) |" in text
+    assert "| zenoh query | 100 µs (p99 200 µs, n 3,000) |" in text
+    assert "| write 10 MB | 100 µs (p99 200 µs, n 3,000, 1,862 MB/s) |" in text
+    assert "| 100 µs (p99 200 µs, n 3,000, 1.50 x, 1.93 x 1 kB) |" in text
     assert "floor: zenoh query" not in text
+
+
+def test_row_without_a_goal_stands_in_a_second_table(written):
+    """What has nothing to keep to is shown, too, once, and is not judged."""
+    free = row("waiters", "8 threads", goal=None, met=None)
+
+    text = table(written([row(), free], [row()]))
+
+    judged, others = text.split("| without a goal | run 1 | run 2 |")
+    assert "waiters" not in judged
+    assert "| waiters: 8 threads | 100 µs (p99 200 µs, n 3,000, 1.50 x) |  |" in others
+    assert "update: one" not in others
 
 
 @pytest.mark.parametrize("content", ["", "[]", '{"rows": []}', '{"machine": {}, "rows": [{}]}'])
