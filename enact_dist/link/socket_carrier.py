@@ -203,15 +203,23 @@ class SocketCarrier:
             old.close()
         if line is not None:
             # A connection is there before anybody asks, and with it the kernel's word on our end.
-            for _ in range(FORCED_TRIES if self._forced else 1):
-                line.try_again()
-                connection = line.take()
-                if connection is not None:
-                    line.give_back(connection)
-                    break
+            connection = self.tried(line, line.take)
+            if connection is not None:
+                line.give_back(connection)
         self._refuse_if_forced(shard, line)
         for feed in list(self._feeds.values()):
             feed.settle()
+
+    def tried(
+        self, line: SocketLine, open_one: Callable[[], Connection | None]
+    ) -> Connection | None:
+        """Return what `open_one` opens on a line; where the socket is forced, it is asked again."""
+        for _ in range(FORCED_TRIES if self._forced else 1):
+            line.try_again()
+            connection = open_one()
+            if connection is not None:
+                return connection
+        return None
 
     def _refuse_if_forced(self, shard: str, line: SocketLine | None) -> None:
         problem = line.problem if line is not None else "it offers none"
@@ -363,16 +371,9 @@ class _Feed:
             self._over_zenoh = need_zenoh
 
     def _open_pump(self, shard: str, line: SocketLine) -> None:
-        connection = line.connect()
+        connection = self._carrier.tried(line, lambda: self._watching(line))
         if connection is None:
             return
-        try:
-            connection.exchange(Kind.WATCH, self._watch)
-        except (LinkError, ProtocolError, EOFError, OSError) as error:
-            _log.info("no notices over the socket to shard %s: %s", shard, error)
-            line.drop(connection)
-            return
-        wait_at_most(connection.socket, socket.SO_RCVTIMEO, 0.0)
         if self._queue.read_from(
             connection, lambda error: self._ended(shard, line, connection, error)
         ):
@@ -383,6 +384,20 @@ class _Feed:
         )
         self._pumps[shard] = line, connection, thread
         thread.start()
+
+    def _watching(self, line: SocketLine) -> Connection | None:
+        """Return a new connection that gets notices, None where there is none to be had."""
+        connection = line.connect()
+        if connection is None:
+            return None
+        try:
+            connection.exchange(Kind.WATCH, self._watch)
+        except (LinkError, ProtocolError, EOFError, OSError) as error:
+            _log.info("no notices over the socket to shard %s: %s", line.shard, error)
+            line.drop(connection)
+            return None
+        wait_at_most(connection.socket, socket.SO_RCVTIMEO, 0.0)
+        return connection
 
     def _pump(self, shard: str, line: SocketLine, connection: Connection) -> None:
         """Move notices from a connection into the queue until it ends."""

@@ -80,22 +80,22 @@ class SocketWatcher:
         """Send a frame, or as much as goes without waiting, or keep it, or drop it."""
         if self._bell < 0:
             return
-        rest = memoryview(frame)
-        if not self._waiting:
-            try:
-                sent = self._connected.send(frame, socket.MSG_DONTWAIT)
-            except BlockingIOError:
-                sent = 0
-            except OSError:  # its thread notices, too
-                return
-            if sent == len(frame):
-                return
-            rest = rest[sent:]
-            os.eventfd_write(self._bell, 1)
-        elif len(self._waiting) >= NOTICES_MAX:
-            self._service.host.count("notices_dropped")
+        if self._waiting:
+            if len(self._waiting) < NOTICES_MAX:
+                self._waiting.append(memoryview(frame))
+            else:
+                self._service.host.count("notices_dropped")
             return
-        self._waiting.append(rest)
+        try:
+            sent = self._connected.send(frame, socket.MSG_DONTWAIT)
+        except BlockingIOError:
+            sent = 0
+        except OSError:  # its thread notices, too
+            return
+        if sent < len(frame):
+            # Before the bell, at which its thread looks what there is to send, and then waits.
+            self._waiting.append(memoryview(frame)[sent:])
+            os.eventfd_write(self._bell, 1)
 
     def run(self) -> None:
         """Send what was kept, until the connection ends."""

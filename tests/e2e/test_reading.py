@@ -1,14 +1,12 @@
 """Readers that must not stop writers, and data that must not be stale."""
 
 import json
-import time
 
 import numpy as np
 import pytest
 
 from enact_dist import Aspect, Durability, Entity, Lock, Read, View, Write, connect
 from enact_dist.errors import NullDatumError
-from enact_dist.link.socket_connection import SEND_S
 
 COUNT = Aspect("count", int)
 FRAME = Aspect("frame", np.ndarray, Durability.VOLATILE)
@@ -68,7 +66,7 @@ def test_no_stale_value_is_served_after_shard_restarted(make_cell):
 def test_watcher_that_was_stopped_resynchronises_and_says_what_it_missed(make_cell, carrier):
     """A reader stopped for 3 s gets the newest state and the number of skipped versions.
 
-    Over a socket none are skipped: the shard keeps them for it, as long as it reads again soon.
+    Over a socket none are skipped: the shard keeps them for it.
     """
     import signal
 
@@ -78,7 +76,6 @@ def test_watcher_that_was_stopped_resynchronises_and_says_what_it_missed(make_ce
     ticking.expect("started")
     watcher.expect("version 100", 30)
     watcher.signal(signal.SIGSTOP)
-    stopped_s = time.monotonic()
     with connect(cell.file) as joined:
         view = View(joined.world("online"), Entity("ticker"), COUNT)
         start = joined.world("online").view(view)[view]
@@ -87,14 +84,13 @@ def test_watcher_that_was_stopped_resynchronises_and_says_what_it_missed(make_ce
             pass
         watch.close()
     watcher.signal(signal.SIGCONT)
-    soon = time.monotonic() - stopped_s < SEND_S
     ticking.tell("stop")
     last = len(json.loads(ticking.expect("times")))
     said = json.loads(watcher.expect("summary", 30))
 
     assert said["last"] == last
     assert said["first"] - 1 + said["seen"] + said["gap"] == last
-    assert said["gap"] > 0 if carrier == "zenoh" else said["gap"] == 0 or not soon
+    assert said["gap"] > 0 if carrier == "zenoh" else said["gap"] == 0
     assert said["in_order"]
 
 

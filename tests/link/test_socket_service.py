@@ -2,9 +2,11 @@
 
 import os
 import queue
+import select
 import socket
 import threading
 import time
+from types import SimpleNamespace
 
 import pytest
 from socket_parts import ask, counters, over_socket, speak
@@ -300,6 +302,54 @@ def test_watcher_that_does_not_read_delays_no_commit(raw, make_peer, monkeypatch
         assert isinstance(_write(peer, writer, stream, number), Committed)
 
     assert counters(raw.shard)["notices_dropped"] > 0
+
+
+def test_watcher_that_reads_again_gets_all_that_was_kept_for_it(raw, monkeypatch, until):
+    """Its thread may run at once when the bell rings: it then knows that there is more to send."""
+    bell = watching_after_each_bell(monkeypatch)
+    near = raw("watcher")
+    (connection,) = raw.shard._sockets._connections["watcher"]
+    connection.connected.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1)
+    send_frame(near, b"", kind=Kind.WATCH)
+    stream = Stream(near)
+    assert stream.receive()[0] == Kind.OPENED
+    (watcher,) = raw.shard._sockets._watchers
+    until(lambda: not watcher._waiting)
+    sent = [Notice("s0", raw.shard.host.epoch, number, ()) for number in range(1, 1001)]
+
+    for notice in sent:
+        raw.shard._sockets._publish(notice)
+
+    near.settimeout(ANSWER_S)
+    assert [decode_frame(*stream.receive()[1:]) for _ in sent] == sent
+    assert bell.rang
+
+
+def watching_after_each_bell(monkeypatch):
+    """Let a watcher's thread look what there is to send before its bell's ringing returns."""
+    looked, bell = threading.Event(), SimpleNamespace(rang=0)
+
+    class Poll:
+        def __init__(self):
+            self._poll = select.poll()
+            self.register, self.poll = self._poll.register, self._poll.poll
+
+        def modify(self, descriptor, events):
+            self._poll.modify(descriptor, events)
+            looked.set()
+
+    def ring(descriptor, number):
+        looked.clear()
+        os.eventfd_write(descriptor, number)
+        assert looked.wait(ANSWER_S)
+        bell.rang += 1
+
+    seen = SimpleNamespace(**{**vars(select), "poll": Poll})
+    monkeypatch.setattr(socket_watcher, "select", seen)
+    monkeypatch.setattr(
+        socket_watcher, "os", SimpleNamespace(**{**vars(os), "eventfd_write": ring})
+    )
+    return bell
 
 
 def test_watcher_is_welcomed_before_its_first_notice(raw, monkeypatch):
