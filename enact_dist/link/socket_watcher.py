@@ -54,9 +54,10 @@ class SocketWatcher:
 
     def put(self, notice: Notice, frame: bytes) -> None:
         """Send the frame of a notice, if it is watched; for one thread at a time."""
+        kept = True
         with self._mutex:
             if self._interest is None or self._interest.covers(notice):
-                self._send(self._taken_skipped() + frame)
+                kept = self._send(self._taken_skipped() + frame)
             elif self._skipped is None:
                 number = notice.number
                 self._skipped = Skipped(notice.shard, notice.epoch, number - 1, number)
@@ -64,38 +65,45 @@ class SocketWatcher:
             else:
                 shard, epoch, after, _ = self._skipped
                 self._skipped = Skipped(shard, epoch, after, notice.number)
+        self._count(kept=kept)
 
     def tell_skipped(self) -> None:
         """Send the numbers of what was skipped a while ago."""
         if self._skipped is None or time.monotonic() - self._skipped_s < SKIP_S:
             return
         with self._mutex:
-            self._send(self._taken_skipped())
+            kept = self._send(self._taken_skipped())
+        self._count(kept=kept)
+
+    def _count(self, *, kept: bool) -> None:
+        """Count what was dropped; without the mutex, which others take inside the host's."""
+        if not kept:
+            self._service.host.count("notices_dropped")
 
     def _taken_skipped(self) -> bytes:
         skipped, self._skipped = self._skipped, None
         return skipped_frame(*skipped[1:]) if skipped is not None else b""
 
-    def _send(self, frame: bytes) -> None:
-        """Send a frame, or as much as goes without waiting, or keep it, or drop it."""
+    def _send(self, frame: bytes) -> bool:
+        """Send a frame, or as much as goes without waiting, or keep it; False: it is dropped."""
         if self._bell < 0:
-            return
+            return True
         if self._waiting:
-            if len(self._waiting) < NOTICES_MAX:
-                self._waiting.append(memoryview(frame))
-            else:
-                self._service.host.count("notices_dropped")
-            return
+            if len(self._waiting) >= NOTICES_MAX:
+                return False
+            self._waiting.append(memoryview(frame))
+            return True
         try:
             sent = self._connected.send(frame, socket.MSG_DONTWAIT)
         except BlockingIOError:
             sent = 0
         except OSError:  # its thread notices, too
-            return
+            return True
         if sent < len(frame):
             # Before the bell, at which its thread looks what there is to send, and then waits.
             self._waiting.append(memoryview(frame)[sent:])
             os.eventfd_write(self._bell, 1)
+        return True
 
     def run(self) -> None:
         """Send what was kept, until the connection ends."""

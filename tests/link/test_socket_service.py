@@ -26,6 +26,7 @@ from enact_dist.core.messages import (
     Survey,
 )
 from enact_dist.link import socket_connection, socket_service, socket_watcher
+from enact_dist.link.notices import Interest
 from enact_dist.link.socket_frames import Kind, Stream, read_skipped, send_frame
 from enact_dist.terms import Access
 from enact_dist.wire.frames import decode_frame, encode_frame
@@ -323,6 +324,38 @@ def test_watcher_that_reads_again_gets_all_that_was_kept_for_it(raw, monkeypatch
     near.settimeout(ANSWER_S)
     assert [decode_frame(*stream.receive()[1:]) for _ in sent] == sent
     assert bell.rang
+
+
+def test_watcher_whose_numbers_are_dropped_does_not_hold_up_a_commit(monkeypatch):
+    """The timer counts them, for which it needs the host, while the host publishes to the watcher."""
+    monkeypatch.setattr(socket_watcher, "NOTICES_MAX", 1)
+    monkeypatch.setattr(socket_watcher, "SKIP_S", 0.0)
+    mutex, counting = threading.RLock(), threading.Event()
+
+    def count(_):
+        counting.set()
+        with mutex:
+            pass
+
+    def publish():
+        with mutex:
+            timer.start()
+            assert counting.wait(ANSWER_S)
+            watcher.put(Notice("s0", 1, 2, ()), b"")
+
+    service = SimpleNamespace(host=SimpleNamespace(count=count))
+    near, far = socket.socketpair()
+    with near, far:
+        cup = Interest(Survey(("online",), ("cup",), ("count",)))
+        watcher = socket_watcher.SocketWatcher(service, near, cup)
+        watcher.put(Notice("s0", 1, 1, ()), b"")
+        timer = threading.Thread(target=watcher.tell_skipped, daemon=True)
+        commit = threading.Thread(target=publish, daemon=True)
+        commit.start()
+        commit.join(10)
+
+    assert counting.is_set()
+    assert not commit.is_alive()
 
 
 def watching_after_each_bell(monkeypatch):
