@@ -130,7 +130,7 @@ class PayloadDesk:
         self._mutex = threading.RLock()  # reentrant: a destructor may run anywhere
         self._opening = tuple(threading.Lock() for _ in range(16))
         self._drafts: dict[str, _Draft] = {}
-        self._files: dict[str, int] = {}
+        self._files = 0
         self._adopted: dict[str, weakref.ref[Pages | Plain]] = {}
         self._over = UsedNames()
         self._bytes = self._gone = 0
@@ -159,6 +159,8 @@ class PayloadDesk:
             # Slices of one draft may come by several threads.
             with self._opening[hash(file) % len(self._opening)]:
                 draft = self._drafts.get(file) or self._opened(message.session, file, total)
+        if draft is None:
+            return Staged(file, total, False)
         if isinstance(draft, Refused):
             return draft
         if draft.size != total:
@@ -189,7 +191,8 @@ class PayloadDesk:
             draft.add(offset, end)
             return Staged(file, draft.have, draft.shared)
 
-    def _opened(self, session: str, file: str, total: int) -> _Draft | Refused:
+    def _opened(self, session: str, file: str, total: int) -> _Draft | Refused | None:
+        """Return a new draft; None where its name was used up meanwhile."""
         shared = self._folder is not None and self._has_room(total)
         if self._folder is not None and not shared and self._firm:
             return self._refused(session, total, self._bytes, self._bytes_max)
@@ -201,12 +204,14 @@ class PayloadDesk:
             if drafted + total > self._draft_bytes_max:
                 return self._refused(session, total, drafted, self._draft_bytes_max)
         try:
-            found = memory or plain_memory(total, ended=partial(self._ended, file, None))
+            found = memory or plain_memory(total, ended=partial(self._ended, file, None, 0))
         except OSError as error:
             self._count("payloads_refused")
             return Refused(NO_ROOM, f"{total} bytes for a payload cannot be had: {error.strerror}")
         draft = _Draft(session, total, found, memory is not None, self._clock.monotonic_ns())
         with self._mutex:
+            if file in self._over:
+                return None
             self._drafts[file] = draft
         return draft
 
@@ -238,6 +243,7 @@ class PayloadDesk:
             if self._bytes + total > self._bytes_max:
                 return False
             self._bytes += total
+            self._files += 1
             return True
 
     def _drafted(self) -> int:
@@ -258,16 +264,14 @@ class PayloadDesk:
         """Return the memory of a new file whose bytes are counted; None where it cannot be."""
         assert folder is not None
         try:
-            memory = self._file_memory(folder, file, total)
+            return self._file_memory(folder, file, total)
         except OSError as error:
             with self._mutex:
                 self._bytes -= total
+                self._files -= 1
             self._count("payload_fallbacks")
             _log.info("payload %s is no file: %s", file, error)
             return None
-        with self._mutex:
-            self._files[file] = total
-        return memory
 
     def _file_memory(self, folder: SharedFolder, file: str, total: int) -> Pages:
         flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
@@ -276,7 +280,9 @@ class PayloadDesk:
             os.fchmod(made, folder.access.draft_mode)
             # Never a hole: a page that cannot be had later kills whoever touches it.
             os.posix_fallocate(made, 0, total)
-            return map_file(made, total, writable=True, ended=partial(self._ended, file, folder))
+            return map_file(
+                made, total, writable=True, ended=partial(self._ended, file, folder, total)
+            )
         except BaseException:
             os.unlink(file, dir_fd=folder.descriptor)
             raise
@@ -341,15 +347,16 @@ class PayloadDesk:
         self._count("payloads_adopted")
         return draft.memory
 
-    def _ended(self, file: str, folder: SharedFolder | None) -> None:
-        """Nobody looks at a payload any more: remove it, then stop counting it."""
+    def _ended(self, file: str, folder: SharedFolder | None, counted: int) -> None:
+        """Nobody looks at a payload any more: remove it, then stop counting its bytes."""
         if folder is not None and folder.descriptor >= 0:
             try:
                 os.unlink(file, dir_fd=folder.descriptor)
             except OSError as error:  # the folder went first
                 _log.info("payload %s: %s", file, error)
         with self._mutex:
-            self._bytes -= self._files.pop(file, 0)
+            self._bytes -= counted
+            self._files -= folder is not None
             self._gone += 1
             self._adopted.pop(file, None)
 
@@ -386,7 +393,7 @@ class PayloadDesk:
         with self._mutex:
             return {
                 **self.counters,
-                "payload_files": len(self._files),
+                "payload_files": self._files,
                 "payload_bytes": self._bytes,
                 "payload_bytes_max": self._bytes_max if self._folder is not None else 0,
                 "payload_drafts": len(self._drafts),

@@ -3,6 +3,7 @@
 import errno
 import os
 import stat
+from types import SimpleNamespace
 
 import pytest
 
@@ -175,6 +176,48 @@ def test_drafts_end_after_a_time_without_a_slice(folder):
     desk.sweep(live, works)
     assert names(folder) == ["busy-1"]
     assert desk.figures()["drafts_swept"] == 2
+
+
+def test_draft_that_was_given_up_and_comes_again_is_not_counted_for_ever(folder, monkeypatch):
+    """Its file is gone and its bytes are still counted when its client sends the next slice."""
+    desk, ended = PayloadDesk(folder, 10 * SIZE), []
+
+    def unlink(file, *, dir_fd):
+        os.unlink(file, dir_fd=dir_fd)
+        ended.append(file)
+        if len(ended) == 1:
+            stage(desk)
+
+    monkeypatch.setattr(payload_desk, "os", SimpleNamespace(**{**vars(os), "unlink": unlink}))
+    stage(desk)
+    for _ in range(2):
+        desk.sweep(lambda _: False, lambda _: False)
+        assert leftovers().wait(5.0)
+
+    figures = desk.figures()
+    assert ended
+    assert names(folder) == []
+    assert (figures["payload_bytes"], figures["payload_files"]) == (0, 0)
+
+
+def test_slice_of_a_payload_that_is_dropped_meanwhile_makes_no_draft(desk):
+    """Its client gives it up between the look at its name and the opening."""
+    given_up = []
+
+    class Drafts(dict):
+        def get(self, file):
+            if not given_up:
+                given_up.append(file)
+                stage(desk, total=0)
+            return super().get(file)
+
+    desk._drafts = Drafts()
+
+    assert stage(desk) == Staged(FILE, SIZE, False)
+
+    assert desk.drafts() == {}
+    assert leftovers().wait(5.0)
+    assert desk.figures()["payload_bytes"] == 0
 
 
 # ---------------------------------------------------------------- adoption
