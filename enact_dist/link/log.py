@@ -116,7 +116,8 @@ class Log:
     """Sends the log of a daemon to stderr from a thread of its own while its block runs.
 
     A reader of the log that stops reading must not stop the shard, nor keep it from ending: lines
-    beyond `LINES_MAX` are lost and counted, and the last ones are waited for `LAST_S` only.
+    beyond `LINES_MAX` are lost and counted, and the last ones are waited for `LAST_S` only.  A line
+    that cannot be made is counted, too, and told in its place.
     """
 
     def __init__(self, formatter: logging.Formatter) -> None:
@@ -136,12 +137,21 @@ class Log:
         # To the descriptor itself: the locks of Python's streams and handlers, held while a full
         # pipe blocks a line, would keep the interpreter from ending.
         while (record := self._lines.get()) is not None:
-            left = f"{self._format(record)}\n".encode("utf-8", "backslashreplace")
+            left = f"{self._formatted(record)}\n".encode("utf-8", "backslashreplace")
             try:
                 while left:
                     left = left[os.write(STDERR, left) :]
             except OSError:  # its reader is gone for good, or its disk is full
                 self._handler.lost += 1
+
+    def _formatted(self, record: logging.LogRecord) -> str:
+        try:
+            return self._format(record)
+        except Exception as error:  # noqa: BLE001 - whatever it holds, the next line is written
+            self._handler.lost += 1
+            bare = {"name": record.name, "msg": _unmade(record, error)}
+            levels = {"levelno": record.levelno, "levelname": record.levelname}
+            return self._format(logging.makeLogRecord({**bare, **levels}))
 
     def __exit__(self, *_: object) -> None:
         if self._handler.lost:
@@ -161,7 +171,12 @@ class _BoundedHandler(QueueHandler):
     def prepare(self, record: logging.LogRecord) -> logging.LogRecord:
         """Make the text here, where what it tells of cannot change meanwhile; keep the rest."""
         record = copy(record)
-        record.msg, record.args = record.getMessage(), None
+        try:
+            record.msg = record.getMessage()
+        except Exception as error:  # noqa: BLE001 - logging would print it, which may wait
+            self.lost += 1
+            record.msg = _unmade(record, error)
+        record.args = None
         return record
 
     def enqueue(self, record: logging.LogRecord) -> None:
@@ -169,3 +184,8 @@ class _BoundedHandler(QueueHandler):
             self.queue.put_nowait(record)
         except queue.Full:
             self.lost += 1
+
+
+def _unmade(record: logging.LogRecord, error: Exception) -> str:
+    where = f"{record.module}:{record.lineno}"
+    return f"a line of {where} is lost, it cannot be made: {type(error).__name__}"
