@@ -127,12 +127,22 @@ class _Child:
                 self._process.send_signal(number)
 
     def _read(self, process: subprocess.Popen[bytes]) -> None:
+        """Follow a child to its end, which is told whatever becomes of its output."""
+        told = threading.Event()
+        try:
+            self._follow(process, told)
+        except Exception as error:  # noqa: BLE001 - nobody else would notice its end
+            self._say(self.task.name, f"its output is not read any more: {error}")
+        if not told.is_set():
+            self._events.put(_Ended(self, process.wait()))
+
+    def _follow(self, process: subprocess.Popen[bytes], told: threading.Event) -> None:
         """Pass on what the child writes, and tell of its end before that of its output.
 
         Whatever the child has started may hold the output for as long as it likes.
         """
         assert process.stdout is not None
-        lines, told = _Lines(), False
+        lines = _Lines()
         with process.stdout as output, select.epoll() as poll:
             poll.register(output, select.EPOLLIN)
             with _end_of(process, poll) as end:
@@ -143,14 +153,12 @@ class _Child:
                         last = lines.take(_what_is_left(output.fileno())) + lines.rest()
                         self._pass_on(last, alive=True)
                         self._events.put(_Ended(self, process.wait()))
-                        told = True
+                        told.set()
                     elif not (some := os.read(output.fileno(), PIPE_BYTES)):
                         break
                     else:
-                        self._pass_on(lines.take(some), alive=not told)
-        self._pass_on(lines.rest(), alive=not told)
-        if not told:
-            self._events.put(_Ended(self, process.wait()))
+                        self._pass_on(lines.take(some), alive=not told.is_set())
+        self._pass_on(lines.rest(), alive=not told.is_set())
 
     def _pass_on(self, lines: list[str], *, alive: bool) -> None:
         from enact_dist.link.log import says_ready  # each command imports this module
@@ -220,6 +228,7 @@ class Supervisor:
         self._children = [_Child(task, self._say, self._events) for task in tasks]
         self._actors_started = False
         self._failed = ""
+        self._lost = 0
 
     def run(self, stop: threading.Event, *, count: Callable[[], int] = lambda: 1) -> int:
         """Run everything until `stop` is set; return 0, or 1 if a shard can never run.
@@ -253,10 +262,15 @@ class Supervisor:
     def _say(self, name: str, line: str) -> None:
         with self._mutex:
             try:
+                if self._lost:
+                    self._sink("", f"{self._lost} lines of this log were lost")
+                    self._lost = 0
                 self._sink(name, line)
             except BrokenPipeError:
                 # Nobody reads the log any more; that is no reason to stop a robot.
                 self._sink = _say_nothing
+            except (OSError, ValueError):  # a full disk, a character that it does not have
+                self._lost += 1
 
     def _of(self, kind: str) -> list[_Child]:
         return [child for child in self._children if child.task.kind == kind]

@@ -1,10 +1,12 @@
 """The supervisor: order of start and end, restarts, and children that never outlive it."""
 
+import errno
 import json
 import os
 import subprocess
 import sys
 import threading
+from types import SimpleNamespace
 
 import pytest
 
@@ -146,6 +148,44 @@ def test_children_go_on_when_nobody_reads_the_log():
 
     assert Supervisor([task("shard", "shard", SERVE)], say).run(stop) == 0
     assert said == ["ready: serving"]
+
+
+def test_line_that_cannot_be_printed_is_counted_and_stops_nobody():
+    """Of a full disk, or in a character set that lacks a letter: the next line is printed."""
+    stop, said = threading.Event(), []
+
+    def say(name, line):
+        if not stop.is_set():
+            stop.set()
+            raise OSError(errno.ENOSPC, "no space left")
+        said.append((name, line))
+
+    assert run_in_time(Supervisor([task("shard", "shard", SERVE)], say), stop) == 0
+    assert said == [("", "1 lines of this log were lost"), ("shard", "leaving")]
+
+
+def test_end_of_a_child_is_noticed_though_its_output_cannot_be_read(monkeypatch):
+    """A supervisor that is short of descriptors still ends."""
+
+    def refused():
+        raise OSError(errno.EMFILE, "too many open files")
+
+    monkeypatch.setattr(supervise, "select", SimpleNamespace(epoll=refused))
+    story = Story("done; it is not started again")
+
+    ended = run_in_time(Supervisor([task("one", "actor", "")], story), story.stop)
+
+    assert ended == 0
+    assert "one: its output is not read any more: [Errno 24] too many open files" in story.lines
+
+
+def run_in_time(supervisor, stop):
+    """Run a supervisor; return what it returned, None where it does not end."""
+    ended = []
+    thread = threading.Thread(target=lambda: ended.append(supervisor.run(stop)), daemon=True)
+    thread.start()
+    thread.join(30)
+    return ended[0] if ended else None
 
 
 HOLDS = (
