@@ -427,6 +427,13 @@ class ShardHost:
             return self._shard.next_deadline_ns()
 
     def _keep_time(self) -> None:
+        try:
+            self._tick_on()
+        except Exception as failure:  # noqa: BLE001 - without it no lease ends
+            _log.exception("the timer of shard %s failed", self.name)
+            self._fail(failure)
+
+    def _tick_on(self) -> None:
         while not self._ended:
             wait_s = (self.tick() - self._clock.monotonic_ns()) / 1e9
             for act in self._each_tick:

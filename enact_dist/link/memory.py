@@ -8,6 +8,7 @@ for large ones.  Python's own `mmap` would keep a descriptor for each map (befor
 from __future__ import annotations
 
 import ctypes
+import logging
 import mmap
 import os
 import queue
@@ -26,6 +27,7 @@ STEP_BYTES: Final = 4 << 20
 """So much is given back at a time: until it is, no other thread of the process gets memory."""
 GATHER_S: Final = 0.02
 """How long leftovers are gathered: a thread that wakes for each would be in everybody's way."""
+_log = logging.getLogger("enact.link")
 _FAILED: Final = ctypes.c_void_p(-1).value
 _MAP_FIXED: Final = 0x10
 
@@ -202,7 +204,10 @@ class Leftovers:
             if self._hurry.wait(GATHER_S):
                 self._hurry.clear()
             while True:
-                task(*arguments)
+                try:
+                    task(*arguments)
+                except Exception:  # noqa: BLE001 - memory of all others would never be given back
+                    _log.exception("what was left to be done has failed")
                 del task, arguments
                 try:
                     task, arguments = self._tasks.get_nowait()

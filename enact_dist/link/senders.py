@@ -204,7 +204,10 @@ class _Sender:
                     parcel = self._parcels.popleft()
                     self._bytes -= parcel.size
             if parcel is not None:
-                parcel.send()
+                try:
+                    parcel.send()
+                except Exception:  # noqa: BLE001 - all that waits for this client would wait for ever
+                    _log.exception("an answer of %d bytes is lost", parcel.size)
                 self._in_hand = 0
             elif self._may_end(self):
                 return

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final, cast, get_args
 import zenoh
 
 from enact_dist.core.messages import Answer, Request
-from enact_dist.errors import EnactError, ProtocolError
+from enact_dist.errors import ProtocolError
 from enact_dist.link.zenoh_config import close_session, keep_after_fork, open_session
 from enact_dist.wire.frames import decode_frame, encode_frame
 from enact_dist.wire.keys import request_key, verb_of
@@ -152,7 +152,7 @@ class _Line:
             while (calls := self._next_calls()) is not None:
                 try:
                     answers = self._answers(calls)
-                except EnactError as error:
+                except Exception as error:  # noqa: BLE001 - a lock may wait for the next call
                     answers = []
                     _log.error("calls to shard %s: %s", self._shard, error)
                 self._note_silence(answered=bool(answers))

@@ -404,7 +404,7 @@ class _Feed:
         try:
             while True:
                 self._queue.take(connection.take_notices())
-        except (ProtocolError, EOFError, OSError) as error:
+        except Exception as error:  # noqa: BLE001 - whatever it is, another way is opened
             self._ended(shard, line, connection, error)
 
     def _ended(

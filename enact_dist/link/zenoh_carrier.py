@@ -443,7 +443,7 @@ def _pump(notices: zenoh.Handler[zenoh.Sample], feed: NoticeQueue) -> None:
             return
         try:
             message = decode_frame(_bytes(sample.attachment), _bytes(sample.payload))
-        except ProtocolError as error:
+        except Exception as error:  # noqa: BLE001 - the next one can be read
             _log.warning("a notice cannot be read: %s", error)
             continue
         if isinstance(message, Notice):

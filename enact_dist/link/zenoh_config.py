@@ -137,7 +137,11 @@ def open_session(
         raise _open_error(error, listen) from None
     _open_sessions.append((os.getpid(), session))
     patience_s = min(PATIENCE * lease_s, CLIENT_BLOCK_S) if listen else CLIENT_BLOCK_S
-    _watches[session] = watch = LinkWatch(session, connect, patience_s)
+    try:
+        _watches[session] = watch = LinkWatch(session, connect, patience_s)
+    except BaseException:  # the system has no more threads
+        close_session(session)
+        raise
     keep_after_fork(watch)
     return session
 

@@ -12,6 +12,7 @@ answered at once, the network is there again and the waiting one is given up; Ze
 from __future__ import annotations
 
 import contextlib
+import logging
 import socket
 import threading
 import time
@@ -32,6 +33,8 @@ LOOK_S: Final = 0.1
 COST: Final = 50
 """A look lists all descriptors of the process; the pause after it is this many times as long."""
 JOIN_S: Final = 1.0
+
+_log = logging.getLogger("enact.link")
 
 
 class LinkWatch:
@@ -56,13 +59,15 @@ class LinkWatch:
         self._thread.start()
 
     def _run(self, events: zenoh.Handler[zenoh.LinkEvent]) -> None:
-        try:
-            while True:
+        while True:
+            try:
                 lost = _counted(events, events.recv(), self._patience_s)
                 if lost and self._connect:
                     self._knock(events, lost)
-        except zenoh.ZError:  # the session is closed
-            return
+            except zenoh.ZError:  # the session is closed
+                return
+            except Exception as error:  # noqa: BLE001 - no descriptor is free, most likely
+                _log.warning("connections are not looked after at the moment: %s", error)
 
     def _knock(self, events: zenoh.Handler[zenoh.LinkEvent], lost: int) -> None:
         """Look at what waits for an answer until every lost connection is back."""

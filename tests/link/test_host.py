@@ -310,3 +310,18 @@ def test_host_serves_many_threads_without_losing_an_update(start, make_peer):
     peer = make_peer(call_of(host))
     peer.hello()
     assert bytes(peer.acquire("cup").states[0].datum.body) == b"200"
+
+
+def test_timer_that_fails_is_a_failure_of_the_shard(start):
+    """Without it no lease would end: nobody is answered any more, and the daemon is told."""
+    failures, told = [], threading.Event()
+    host = start(on_failure=lambda failure: (failures.append(failure), told.set()))
+
+    def drain():
+        raise ValueError("an inbox that cannot be read")
+
+    host.add_inbox(drain)
+
+    assert told.wait(30)
+    assert [str(failure) for failure in failures] == ["an inbox that cannot be read"]
+    assert host.ended

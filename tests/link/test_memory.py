@@ -11,6 +11,7 @@ import pytest
 from enact_dist.link.memory import (
     AT_ONCE_BYTES,
     STEP_BYTES,
+    Leftovers,
     body_of,
     leftovers,
     map_file,
@@ -104,3 +105,13 @@ def test_plain_memory_ends_as_a_map_does():
     assert ended == []
     del view
     assert ended == [1]
+
+
+def test_what_was_left_is_done_after_something_that_failed():
+    """Memory is given back by the same thread, for all."""
+    left = Leftovers()
+
+    left.later(int, "none")
+
+    assert left.wait(30.0)
+    assert left.wait(30.0)

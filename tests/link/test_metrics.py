@@ -173,3 +173,18 @@ def test_address_in_use_is_named():
         port = other.getsockname()[1]
         with pytest.raises(LinkError, match=rf"127.0.0.1:{port}: Address already in use; name"):
             MetricsServer(("127.0.0.1", port), str)
+
+
+def test_readers_for_whom_there_was_no_thread_take_no_place(served, monkeypatch):
+    """When the system has threads again, the metrics are there again."""
+
+    def refused(*_):
+        raise RuntimeError("can't start new thread")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(metrics_server.ThreadingMixIn, "process_request", refused)
+        for _ in range(metrics_server.READERS_MAX):
+            with pytest.raises(OSError, match=r"closed|reset"):
+                served()
+
+    assert "enact_ready" in served()

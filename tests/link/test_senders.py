@@ -187,3 +187,21 @@ def test_senders_drop_a_large_answer_where_no_thread_can_be_started(senders, cou
     assert later.done.wait(5)
     assert not later.dropped
     assert senders._senders == 1
+
+
+def test_sender_goes_on_after_an_answer_that_cannot_be_sent(senders):
+    """Whatever is wrong with it: the client's later answers leave all the same."""
+
+    class Broken(FakeParcel):
+        def send(self):
+            super().send()
+            raise ValueError("cannot be encoded")
+
+    gate = threading.Event()
+    senders.send("a", Broken(OUTSTANDING_BYTES_MAX, gate))
+    later = FakeParcel(100)
+    senders.send("a", later)
+    gate.set()
+
+    assert later.done.wait(30)
+    assert not later.dropped

@@ -9,7 +9,7 @@ import pytest
 from enact_dist.core.datum import LockId, Position, Token
 from enact_dist.core.messages import Finish, Finished, Resolve, Resolved, ShardEntry
 from enact_dist.errors import LinkError
-from enact_dist.link import shard_calls
+from enact_dist.link import shard_calls, zenoh_config
 from enact_dist.link.shard_calls import ShardCalls
 
 LOCK = LockId("0" * 32, 0, 1)
@@ -192,3 +192,25 @@ def test_closing_does_not_wait_for_each_shard_that_is_away(calling, free, monkey
     calls.close()
     calls.submit("s1", RESOLVE)
     until(lambda: not line_threads())
+
+
+def test_calls_go_on_after_what_nobody_expected(daemon, calling, endpoint, until, monkeypatch):
+    """Here the session has no thread of its own when it is opened; the core asks again."""
+    daemon(endpoint, "s1")
+    sessions = list(zenoh_config._open_sessions)
+    with monkeypatch.context() as patch:
+        patch.setattr(zenoh_config, "LinkWatch", refused)
+        calls = calling(s1=endpoint)
+        calls.submit("s1", RESOLVE)
+        until(lambda: refused.calls)
+        until(lambda: zenoh_config._open_sessions == sessions)
+
+    until(lambda: calls.answers or calls.submit("s1", RESOLVE))
+
+
+def refused(*_):
+    refused.calls += 1
+    raise RuntimeError("can't start new thread")
+
+
+refused.calls = 0

@@ -1,7 +1,9 @@
 """Zenoh's TCP sockets hold up nobody, and do not wait for the kernel's next try after a cut."""
 
 import contextlib
+import errno
 import os
+import queue
 import select
 import signal
 import socket
@@ -13,7 +15,7 @@ from types import SimpleNamespace
 import pytest
 import zenoh
 
-from enact_dist.link import zenoh_config
+from enact_dist.link import zenoh_config, zenoh_links
 from enact_dist.link.zenoh_carrier import wait_connected
 from enact_dist.link.zenoh_config import close_session, open_session
 from enact_dist.link.zenoh_links import _counted
@@ -202,3 +204,32 @@ def test_connection_that_nobody_answers_is_given_up_and_no_other():
         finally:
             for one in asking:
                 one.close()
+
+
+def test_connections_are_looked_after_again_after_an_error(monkeypatch):
+    """A process that is short of descriptors for a moment cannot list its connections."""
+    events, settled = queue.SimpleQueue(), queue.SimpleQueue()
+
+    def settle_or_fail(ports, _):
+        settled.put(ports)
+        raise OSError(errno.EMFILE, "too many open files")
+
+    def recv():
+        event = events.get()
+        if event is None:
+            raise zenoh.ZError("closed")
+        return event
+
+    monkeypatch.setattr(zenoh_links, "settle", settle_or_fail)
+    handler = SimpleNamespace(recv=recv, try_recv=lambda: None)
+    listener = SimpleNamespace(handler=handler)
+    info = SimpleNamespace(declare_link_events_listener=lambda *_, **__: listener)
+    watch = zenoh_links.LinkWatch(SimpleNamespace(info=info), (), 1.0)
+    for port in (1, 2):
+        link = SimpleNamespace(src=f"tcp/h:{port}", dst="tcp/h:7")
+        events.put(SimpleNamespace(kind=zenoh.SampleKind.PUT, link=link))
+    found = [settled.get(timeout=30) for _ in range(2)]
+    events.put(None)
+    watch.join()
+
+    assert found == [{(1, 7)}, {(2, 7)}]
