@@ -97,8 +97,8 @@ class Session:
 
     def aspect_used(self, name: str) -> Aspect[Any] | None:
         """Return the aspect of that name that this process used last here, if it used one."""
-        used = (aspect for aspect, _ in reversed(self._entries.values()) if aspect.name == name)
-        return next(used, None)
+        entries = list(self._entries.values())  # other threads add to them
+        return next((aspect for aspect, _ in reversed(entries) if aspect.name == name), None)
 
     def shard_of(self, slot: Slot) -> str:
         """Return the name of the shard that owns the slot."""
@@ -126,12 +126,12 @@ class Session:
         Raises:
             ShardUnreachableError: It does not in time.
         """
-        stamp_ns = self.client.core.unsettled_ns(shard)
+        stamp_ns = self.client.unsettled_ns(shard)
         deadline_s = time.monotonic() + SETTLE_S
         while stamp_ns:
             answer = self.client.call(shard, AwaitStamp(stamp_ns, SETTLE_SLICE_NS))
             if isinstance(answer, Reached) and answer.reached:
-                self.client.core.reached(shard, stamp_ns)
+                self.client.reached(shard, stamp_ns)
                 return
             if time.monotonic() >= deadline_s:
                 raise ShardUnreachableError(

@@ -252,8 +252,11 @@ class Client:
             lock.ask_again()
 
     def shards_in_use(self) -> list[str]:
-        """Return the shards that know this session, to keep it alive there."""
-        return [shard for shard, peer in self._peers.items() if peer.epoch]
+        """Return the shards that know this session, to keep it alive there.
+
+        Also while another thread learns of one.
+        """
+        return [shard for shard, peer in tuple(self._peers.items()) if peer.epoch]
 
     def live_locks(self) -> list[MultiLock]:
         """Return the locks that are not at rest."""

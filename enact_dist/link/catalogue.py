@@ -21,34 +21,37 @@ CATALOGUES: Final = (Welcome, Registered)
 
 
 class KnownCatalogue:
-    """The newest catalogue of each shard that was greeted."""
+    """The newest catalogue of each shard that was greeted.
+
+    One thread at a time changes it, any may look: whatever it is shown was made whole before.
+    """
 
     def __init__(self) -> None:
         self._aspects: dict[str, dict[str, AspectEntry]] = {}
         self._worlds: dict[str, dict[str, WorldEntry]] = {}
-        self._settled: set[AspectEntry] = set()
-        self._settled_for: PlacementMap | None = None
+        self._settled: tuple[PlacementMap | None, set[AspectEntry]] = (None, set())
 
     def learn(self, shard: str, answer: Welcome | Registered) -> None:
         """Take the catalogue that an answer carries."""
-        self._settled = set()
-        self._worlds[shard] = {name: WorldEntry(name) for name in answer.worlds}
-        self._worlds[shard].update((entry.name, entry) for entry in answer.forks)
+        worlds = {name: WorldEntry(name) for name in answer.worlds}
+        self._worlds[shard] = worlds | {entry.name: entry for entry in answer.forks}
         self._aspects[shard] = {entry.name: entry for entry in answer.aspects}
+        self._settled = (None, set())  # last: nobody settles by what was known before
 
     def forget(self, shard: str) -> None:
         """Forget the aspects of a shard, which does not know what it was said to know."""
-        self._settled = set()
         self._aspects.pop(shard, None)
+        self._settled = (None, set())
 
     def settled(self, aspects: Iterable[AspectEntry], placement: PlacementMap) -> bool:
         """Whether no shard of a placement must be asked before these aspects can be used.
 
         Found out once for each, until some catalogue changes: every lock asks.
         """
-        if placement is not self._settled_for:
-            self._settled, self._settled_for = set(), placement
-        settled = self._settled
+        settled_for, settled = self._settled
+        if placement is not settled_for:
+            settled = set()
+            self._settled = (placement, settled)
         for entry in aspects:
             if entry not in settled:
                 if any(self.lacks(shard.name, (), (entry,)) for shard in placement.shards):

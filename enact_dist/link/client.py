@@ -143,7 +143,8 @@ class CellClient(SessionClient):
         named = {i.aspect for _, its in (*lock.plan.locks, *lock.plan.views) for i in its}
         for shard in shards:
             self._catalogue.forget(shard)
-        aspects = [entry for name, entry in self._registered.items() if name in named]
+        registered = list(self._registered.items())  # other threads add to them
+        aspects = [entry for name, entry in registered if name in named]
         self.register(aspects=aspects, needed=lambda: shards)
         return bool(aspects)
 

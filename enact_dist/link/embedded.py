@@ -67,7 +67,7 @@ class EmbeddedCarrier:
         self._session = session
         self._pid = os.getpid()
         self._closed = False
-        self._feeds: list[NoticeQueue] = []
+        self._feeds: set[NoticeQueue] = set()
         host.event(SessionSeen(session, present=True))
 
     def request(self, shard: str, message: Request, *, timeout_s: float) -> Answer | None:
@@ -136,8 +136,14 @@ class EmbeddedCarrier:
         """Open a feed of the shard's notices."""
         self._check_usable()
         feed = NoticeQueue(interest)
-        feed.on_close = self._host.watch(feed.put)
-        self._feeds.append(feed)
+        unwatch = self._host.watch(feed.put)
+
+        def end() -> None:
+            unwatch()
+            self._feeds.discard(feed)
+
+        feed.on_close = end
+        self._feeds.add(feed)
         return feed
 
     def add_endpoints(self, entries: Sequence[ShardEntry]) -> None:
@@ -164,6 +170,6 @@ class EmbeddedCarrier:
         if self._closed or self._pid != os.getpid():
             return
         self._closed = True
-        for feed in self._feeds:
+        for feed in list(self._feeds):
             feed.close()
         self._host.event(SessionSeen(self._session, present=False))

@@ -34,7 +34,7 @@ from enact_dist.core.messages import (
     Welcome,
 )
 from enact_dist.core.placement import shard_of
-from enact_dist.errors import EnactError, MisuseError
+from enact_dist.errors import ConfigError, EnactError, MisuseError
 from enact_dist.link.catalogue import CATALOGUES, KnownCatalogue
 from enact_dist.link.clock import boottime_ns
 from enact_dist.link.lanes import Lanes
@@ -113,6 +113,7 @@ class SessionClient:
         self.payloads = SharedPayloads(client.session, self._staged, self.count)
         self._registered: dict[str, AspectEntry] = {}
         self._linked = client.placement
+        self._linking = threading.Lock()
         self._renewer: threading.Thread | None = None
         if keep_alive:
             self._renewer = threading.Thread(
@@ -298,11 +299,32 @@ class SessionClient:
             self.notice_numbers[shard] = (answer.epoch, answer.notice_number)
 
     def _follow_placement(self) -> None:
-        """Connect to the shards of a placement that was just learned; outside the mutex."""
+        """Connect to the shards of a placement that was just learned; outside the mutex.
+
+        Where that fails, or another thread is at it, whoever gets the next answer looks again.
+        """
         placement = self.core.placement
-        if placement is not self._linked and placement != self._linked:
+        if placement is self._linked or not self._linking.acquire(blocking=False):
+            return
+        try:
+            if placement != self._linked:
+                self.carrier.add_endpoints(placement.shards)
             self._linked = placement
-            self.carrier.add_endpoints(placement.shards)
+        except ConfigError:  # an endpoint that never can be reached is told once
+            self._linked = placement
+            raise
+        finally:
+            self._linking.release()
+
+    def unsettled_ns(self, shard: str) -> int:
+        """Return the stamp of a commit of ours that a shard may not show yet (0: none)."""
+        with self._mutex:
+            return self.core.unsettled_ns(shard)
+
+    def reached(self, shard: str, stamp_ns: int) -> None:
+        """Note that a shard shows everything up to a stamp."""
+        with self._mutex:
+            self.core.reached(shard, stamp_ns)
 
     # ---------------------------------------------------------------- catalogue
 

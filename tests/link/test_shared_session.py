@@ -1,0 +1,245 @@
+"""What the threads of one session share, looked at by one while another is changing it."""
+
+import threading
+from types import SimpleNamespace
+
+import pytest
+
+from enact_dist import Aspect, local
+from enact_dist.core.client import Client, Peer
+from enact_dist.core.datum import Slot
+from enact_dist.core.messages import (
+    AspectEntry,
+    AwaitStamp,
+    PlacementMap,
+    Reached,
+    Registered,
+    ShardEntry,
+    WorldEntry,
+)
+from enact_dist.core.unsettled import Unsettled
+from enact_dist.errors import ConfigError, LinkError
+from enact_dist.link.catalogue import KnownCatalogue
+from enact_dist.link.session_client import SessionClient
+
+COUNT = AspectEntry("count", "f", "volatile")
+ONE_SHARD = PlacementMap(1, (ShardEntry("s0", ()),), ())
+
+
+class Interrupted:
+    """Entries that let somebody look when they are gone through."""
+
+    def __init__(self, entries, look):
+        self.entries, self.look = entries, look
+
+    def __iter__(self):
+        self.look()
+        return iter(self.entries)
+
+
+def in_another_thread(act):
+    thread = threading.Thread(target=act, daemon=True)
+    thread.start()
+    thread.join(30)
+    assert not thread.is_alive()
+
+
+# ---------------------------------------------------------------- the catalogue
+
+
+def test_catalogue_settles_nothing_by_what_is_known_no_more():
+    """A lock asks whether its aspects are known while a restarted shard says that they are not."""
+    catalogue = KnownCatalogue()
+    catalogue.learn("s0", Registered(("online",), (COUNT,)))
+    seen = []
+
+    def look():
+        seen.append(catalogue.settled((COUNT,), ONE_SHARD))
+
+    catalogue.learn("s0", Registered(("online",), Interrupted((), look)))
+
+    assert seen == [True]
+    assert not catalogue.settled((COUNT,), ONE_SHARD)
+
+
+def test_catalogue_shows_a_fork_at_any_moment():
+    """Its shard names it again: it is not gone meanwhile."""
+    catalogue, seen = KnownCatalogue(), []
+    fork = WorldEntry("what_if", "online")
+    catalogue.learn("s0", Registered(("online",), (), (fork,)))
+
+    def look():
+        seen.append(catalogue.worlds())
+
+    catalogue.learn("s0", Registered(("online",), (), Interrupted((fork,), look)))
+
+    assert [sorted(worlds) for worlds in seen] == [["online", "what_if"]]
+
+
+# ---------------------------------------------------------------- further shards
+
+
+class Carrier:
+    """Connects to shards, or fails as it is told."""
+
+    def __init__(self, *failures):
+        self.failures = list(failures)
+        self.tried = 0
+
+    def add_endpoints(self, entries):
+        self.tried += 1
+        if self.failures:
+            raise self.failures.pop(0)
+
+
+def client_of(carrier):
+    return SessionClient(carrier, Client("a" * 32, ttl_ns=10**9), keep_alive=False)
+
+
+def hear(client):
+    client._take("s0", AwaitStamp(0, 0), Reached(reached=True, stamp_ns=0))
+
+
+def test_shards_that_could_not_be_connected_are_tried_again():
+    """No session could be opened at that moment; whoever asks next has one."""
+    carrier = Carrier(LinkError("no session can be opened"))
+    client = client_of(carrier)
+    client.core.learn_placement(ONE_SHARD)
+
+    with pytest.raises(LinkError):
+        hear(client)
+    hear(client)
+    hear(client)
+
+    assert carrier.tried == 2
+
+
+def test_endpoint_that_cannot_be_read_is_told_once():
+    """What a cell's file says wrongly does not stop who needs other shards."""
+    carrier = Carrier(ConfigError("no endpoint"), ConfigError("no endpoint"))
+    client = client_of(carrier)
+    client.core.learn_placement(ONE_SHARD)
+
+    with pytest.raises(ConfigError):
+        hear(client)
+    hear(client)
+
+    assert carrier.tried == 1
+
+
+def test_shards_are_connected_once_by_two_threads_that_learn_of_them():
+    """The other one has its answer while this one compares what it has learned."""
+    carrier, compared = Carrier(), []
+    client = client_of(carrier)
+
+    class Learned(PlacementMap):
+        __slots__ = ()
+        __hash__ = PlacementMap.__hash__
+
+        def __ne__(self, other):
+            compared.append(other)
+            if len(compared) == 1:
+                in_another_thread(lambda: hear(client))
+            return tuple(self) != tuple(other)
+
+    client.core.learn_placement(Learned(*ONE_SHARD))
+    hear(client)
+
+    assert compared
+    assert carrier.tried == 1
+
+
+# ---------------------------------------------------------------- looked at while it grows
+
+
+def test_shards_in_use_can_be_listed_while_another_thread_learns_of_one():
+    """As a cell that is being closed does."""
+    client = Client("a" * 32, ttl_ns=10**9)
+
+    class Met(Peer):
+        @property
+        def epoch(self):
+            client._peer("s1")
+            return 1
+
+        @epoch.setter
+        def epoch(self, _):
+            pass
+
+    client._peers["s0"] = Met()
+
+    assert client.shards_in_use() == ["s0"]
+
+
+@pytest.fixture
+def session():
+    with local(worlds=["online"]) as cell:
+        yield cell.world("online").session
+
+
+def test_aspect_that_was_used_is_found_while_another_thread_uses_one(session):
+    """As a listing does that shows data of a type."""
+
+    class Named(str):
+        __slots__ = ()
+        __hash__ = str.__hash__
+
+        def __eq__(self, other):
+            session.register_aspects([Aspect(f"other{len(session._entries)}", int)])
+            return False
+
+    session.register_aspects([Aspect("count", int), Aspect("pose", int)])
+
+    assert session.aspect_used(Named("none")) is None
+
+
+def test_aspects_are_registered_again_while_another_thread_registers_one(session, monkeypatch):
+    """After a shard has forgotten them."""
+    client, wanted = session.client, []
+    item = SimpleNamespace(aspect="count")
+    plan = SimpleNamespace(locks=[("shard", (item,))], views=[])
+    code = SimpleNamespace(code="unknown_aspect")
+    refused = SimpleNamespace(plan=plan, phase=None, refusal=code)
+
+    class Name(str):
+        __slots__ = ()
+        __hash__ = str.__hash__
+
+        def __eq__(self, other):
+            client._registered["new"] = COUNT
+            return str.__eq__(self, other)
+
+    client._registered = {Name("count"): COUNT}
+    monkeypatch.setattr(client, "register", lambda **named: wanted.append(named["aspects"]))
+    monkeypatch.setattr("enact_dist.link.client.Refused", SimpleNamespace)
+
+    assert client._begins_anew(refused, 0)
+    assert wanted == [[COUNT]]
+
+
+def test_own_commits_are_noted_while_nobody_settles_others(session, monkeypatch):
+    """A note made in the midst of it would be lost, and its commit not shown to its own process."""
+    client, owned = session.client, []
+    reached = Unsettled.reached
+
+    def noted(unsettled, shard, stamp_ns):
+        owned.append(client._mutex._is_owned())
+        reached(unsettled, shard, stamp_ns)
+
+    monkeypatch.setattr(Unsettled, "reached", noted)
+    (shard,) = client.shards()
+    client.core.unsettled.committed(shard, [Slot("online", "cup", "count")], 1)
+
+    session.settle(shard)
+
+    assert owned == [True]
+    assert not client.core.unsettled
+
+
+def test_feed_that_was_closed_is_forgotten(session):
+    """A process that watches again and again does not grow."""
+    feeds = [session.client.subscribe() for _ in range(3)]
+    for feed in feeds:
+        feed.close()
+
+    assert not session.client.carrier._feeds
