@@ -153,6 +153,7 @@ class NoticeQueue:
         self._dropped = 0
         self._ear: _Ear | None = None
         self._polling = False
+        self._pid = os.getpid()
 
     @property
     def dropped(self) -> int:
@@ -219,8 +220,10 @@ class NoticeQueue:
     def get(self, timeout_s: float | None) -> Notice | Skipped | None:
         """Return the next notice or what was skipped before it.
 
-        None after `timeout_s` without one, or once closed.
+        None after `timeout_s` without one, once closed, and in a forked child.
         """
+        if self._is_inherited():
+            return None
         deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
         while True:
             with self._mutex:
@@ -239,8 +242,14 @@ class NoticeQueue:
 
     def get_here(self) -> Notice | Skipped | None:
         """Return the next of those that are here already, None if there is none."""
+        if self._is_inherited():
+            return None
         with self._mutex:
             return self._notices.popleft() if self._notices and not self._closed else None
+
+    def _is_inherited(self) -> bool:
+        """Whether this is a forked child: its parent's thread may have held the mutex for good."""
+        return self._pid != os.getpid()
 
     def _has_news(self) -> bool:
         return bool(self._notices) or self._closed or self._ear is not None
@@ -270,6 +279,8 @@ class NoticeQueue:
 
     def close(self) -> None:
         """End the feed and wake whoever waits in `get`; twice is harmless."""
+        if self._is_inherited():
+            return
         with self._mutex:
             if self._closed:
                 return

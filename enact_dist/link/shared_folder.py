@@ -174,8 +174,9 @@ class SharedFolder:
         """Remove the folder with all that is in it; twice is harmless."""
         if self.descriptor >= 0:
             shutil.rmtree(self.path, ignore_errors=True)
-            os.close(self.descriptor)
-            self.descriptor = -1
+            # Nobody may name a file by its number any more when another thread gets that.
+            descriptor, self.descriptor = self.descriptor, -1
+            os.close(descriptor)
 
 
 def _make(root: int, name: str, access: Access) -> tuple[Access, int]:

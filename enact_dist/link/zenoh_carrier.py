@@ -315,9 +315,14 @@ class ZenohCarrier:
         token = session.liveliness().declare_token(token_key(self._cell, self._session))
         link = _Link(session, endpoints, token, BulkWay(endpoints, self._lease_s, self._open_s))
         with self._mutex:
-            self._links.append(link)
-            for feed, pumps in self._feeds.items():
-                pumps.append(self._pump_into(feed, link))
+            late = self._closed  # by another thread, while this one was opened
+            if not late:
+                self._links.append(link)
+                for feed, pumps in self._feeds.items():
+                    pumps.append(self._pump_into(feed, link))
+        if late:
+            close_session(session)
+            self._check_usable()
         return link
 
     def way_to(self, shard: str) -> str:
@@ -379,7 +384,8 @@ class ZenohCarrier:
         """End all connections and pending calls (they return None); twice is harmless."""
         if self._closed or self._pid != os.getpid():
             return
-        self._closed = True
+        with self._mutex:
+            self._closed = True
         pumps = [pump for pumps in self._feeds.values() for pump in pumps]
         for feed in list(self._feeds):
             feed.close()

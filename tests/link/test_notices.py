@@ -1,5 +1,7 @@
 """The queue of notices: newest win, losses are counted, a waiter always wakes."""
 
+import os
+import signal
 import socket
 import threading
 import time
@@ -211,3 +213,19 @@ def test_source_that_ends_is_told_of_once_and_may_be_followed_by_another(piped):
 
         assert queue.get(1.0).number == 6
         assert len(ends) == 1
+
+
+def test_feed_in_a_forked_child_waits_for_no_thread_of_its_parent():
+    """One that held its mutex at the fork is not there: nothing is got, and it can be closed."""
+    queue = NoticeQueue()
+    queue.put(Notice("s0", 1, 1, ()))
+    with queue._mutex:
+        child = os.fork()
+        if child == 0:
+            signal.alarm(10)
+            got = queue.get(None), queue.get_here()
+            queue.close()
+            os._exit(0 if got == (None, None) else 1)
+
+    assert os.waitpid(child, 0) == (child, 0)
+    assert queue.get(0.0).number == 1

@@ -21,7 +21,7 @@ from enact_dist.core.messages import (
     Welcome,
 )
 from enact_dist.errors import MisuseError, ProtocolError, ShardUnreachableError
-from enact_dist.link import zenoh_bulk, zenoh_carrier
+from enact_dist.link import zenoh_bulk, zenoh_carrier, zenoh_config
 from enact_dist.link.zenoh_config import close_session, open_session
 from enact_dist.link.zenoh_discovery import FoundShard, discover, find_shards
 from enact_dist.wire.frames import encode_frame
@@ -172,6 +172,27 @@ def test_carrier_reaches_further_shards_when_it_learns_of_them(daemon, carry, en
     answers = carrier.request_all([("s0", ListLocks()), ("s1", ListLocks())], timeout_s=30)
     assert [type(answer) for answer in answers] == [Locks, Locks]
     assert carrier.endpoint_of("s1") == second
+
+
+def test_carrier_that_is_closed_while_it_connects_leaves_nothing_open(
+    daemon, carry, endpoint, free, monkeypatch
+):
+    """The token of a session that was left open would show its client as present."""
+    daemon(endpoint)
+    before = list(zenoh_config._open_sessions)
+    carrier = carry(endpoint)
+
+    def opened_late(**settings):
+        session = open_session(**settings)
+        carrier.close()
+        return session
+
+    monkeypatch.setattr(zenoh_carrier, "open_session", opened_late)
+    monkeypatch.setattr(zenoh_carrier, "REACH_S", 0.01)
+    with pytest.raises(MisuseError):
+        carrier.add_endpoints([ShardEntry("s1", (free(),))])
+
+    assert zenoh_config._open_sessions == before
 
 
 @both
