@@ -89,29 +89,27 @@ class CellClient(SessionClient):
         """
         self.check_usable()
         items = tuple(items)
+        begun = [] if begun is None else begun
         started_ns = self._now_ns()
         give_up_ns = started_ns + int(min(wait_s, CALLS_S_MAX) * 1e9)
 
-        def begin(*, lock_views: bool = False) -> MultiLock:
+        def begin(*, lock_views: bool = False) -> None:
             with self._mutex:
                 plan = self.core.plan(items, lock_views=lock_views, past_ns=past_ns)
                 now_ns = self._now_ns()
                 wait_ns, hold_ns = max(0, give_up_ns - now_ns), int(hold_s * 1e9)
                 lock = self.core.begin(lane, plan, now_ns=now_ns, wait_ns=wait_ns, hold_ns=hold_ns)
+                if begun:
+                    begun[-1].lane_free = True  # the lane goes on with the next one
+                begun.append(lock)
             if interrupt is not None:
                 lock.slice_ns = INTERRUPTIBLE_SLICE_NS
-            if begun is not None:
-                begun.append(lock)
-            return lock
 
         lane = self._lanes.take()
         try:
-            lock = begin()
-        except BaseException:
-            self._lanes.give_back(lane)
-            raise
-        try:
+            begin()
             for attempt in itertools.count():
+                lock = begun[-1]
                 self._drive(lock, interrupt=interrupt)
                 if lock.phase is Phase.HELD:
                     return lock
@@ -121,11 +119,14 @@ class CellClient(SessionClient):
                 lock_views = lock.no_cut and not self.core.observer and not past_ns
                 if lock_views:
                     self.count("views_locked")
-                lock = begin(lock_views=lock_views)
+                begin(lock_views=lock_views)
             waited_s = (self._now_ns() - started_ns) / 1e9
             raise not_granted(lock, waited_s, self.carrier.endpoint_of)
         except BaseException:
-            self.release(lock)
+            if begun:
+                self.release(begun[-1])
+            else:
+                self._lanes.give_back(lane)
             raise
 
     def _begins_anew(self, lock: MultiLock, attempt: int) -> bool:

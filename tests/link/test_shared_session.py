@@ -11,16 +11,19 @@ from enact_dist.core.datum import Slot
 from enact_dist.core.messages import (
     AspectEntry,
     AwaitStamp,
+    Item,
     PlacementMap,
     Reached,
     Registered,
     ShardEntry,
     WorldEntry,
 )
+from enact_dist.core.phase import Phase
 from enact_dist.core.unsettled import Unsettled
 from enact_dist.errors import ConfigError, LinkError
 from enact_dist.link.catalogue import KnownCatalogue
 from enact_dist.link.session_client import SessionClient
+from enact_dist.terms import Access
 
 COUNT = AspectEntry("count", "f", "volatile")
 ONE_SHARD = PlacementMap(1, (ShardEntry("s0", ()),), ())
@@ -42,6 +45,12 @@ def in_another_thread(act):
     thread.start()
     thread.join(30)
     assert not thread.is_alive()
+
+
+@pytest.fixture
+def session():
+    with local(worlds=["online"]) as cell:
+        yield cell.world("online").session
 
 
 # ---------------------------------------------------------------- the catalogue
@@ -149,6 +158,37 @@ def test_shards_are_connected_once_by_two_threads_that_learn_of_them():
     assert carrier.tried == 1
 
 
+# ---------------------------------------------------------------- lanes
+
+
+@pytest.mark.parametrize("attempt", [1, 2])
+def test_lane_of_a_lock_that_is_interrupted_as_it_begins_is_given_back_once(
+    session, monkeypatch, attempt
+):
+    """Two threads would have it otherwise; a lock that is asked for anew keeps its lane."""
+    client = session.client
+
+    class Begun(list):
+        def append(self, lock):
+            super().append(lock)
+            if len(self) == attempt:
+                raise KeyboardInterrupt
+
+    def lose(lock, **_):
+        lock.phase = Phase.LOST
+
+    begun = Begun()
+    monkeypatch.setattr(client, "_drive", lose)
+    item = Item(int(Access.WRITE), "online", "cup", "count")
+    with pytest.raises(KeyboardInterrupt):
+        client.acquire([item], wait_s=1.0, hold_s=1.0, begun=begun)
+    client.release(begun[-1])  # as whoever asked does
+
+    lanes = client._lanes
+    assert len(begun) == attempt
+    assert sorted(lanes._free) == list(range(lanes._made))
+
+
 # ---------------------------------------------------------------- looked at while it grows
 
 
@@ -169,12 +209,6 @@ def test_shards_in_use_can_be_listed_while_another_thread_learns_of_one():
     client._peers["s0"] = Met()
 
     assert client.shards_in_use() == ["s0"]
-
-
-@pytest.fixture
-def session():
-    with local(worlds=["online"]) as cell:
-        yield cell.world("online").session
 
 
 def test_aspect_that_was_used_is_found_while_another_thread_uses_one(session):
