@@ -14,6 +14,7 @@ a socket, in whichever thread it arrives, and a thread of ours reads it there an
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 import socket
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 STOPPING: Final = (signal.SIGTERM, signal.SIGINT)
 _END: Final = 0
 
+_log = logging.getLogger("enact.link")
 _running: list[StopSignals] = []
 
 
@@ -103,7 +105,10 @@ class StopSignals:
                 first, self._name = not self._name, signal.Signals(number).name
                 acts = list(self._acts if first else self._acts_again)
             for act in acts:
-                act(self._name)
+                try:
+                    act(self._name)
+                except Exception:  # noqa: BLE001 - the process has to end all the same
+                    _log.exception("what %s was to bring about has failed", self._name)
             self.event.set()
 
 

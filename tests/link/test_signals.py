@@ -36,6 +36,17 @@ def test_signal_that_came_first_acts_when_act_is_known():
     assert acted == ["SIGTERM"]
 
 
+def test_signal_is_an_event_whatever_becomes_of_its_act():
+    """What one part of a process does about it fails; the other parts, and later signals, go on."""
+    acted = []
+    with StopSignals() as signals:
+        signals.call(int)
+        signals.call(acted.append)
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert signals.event.wait(30)
+    assert acted == ["SIGTERM"]
+
+
 def test_signal_inside_a_wait_never_deadlocks():
     """A storm of signals between the steps of `Event.wait` leaves the main thread going.
 
