@@ -52,6 +52,8 @@ shared_bytes_max       none           cap of each shard's large data in the memo
   host                 this machine   host name of the machine that runs it
   metrics              none           ``host:port``, or a port of the loopback, at which
                                       Prometheus may ask for `/metrics` (deploy/metrics.md)
+  drain_s              0.8            how long holders of locks may still finish after SIGTERM,
+                                      seconds (0 to 3600); whoever stops it has to wait longer
 [[pins]]               none           entities kept on one shard; the first match wins
   entities             required       name pattern, ``tray/**``
   shard                required       name of a shard
@@ -105,6 +107,7 @@ from enact_dist.config_types import (
 )
 from enact_dist.config_values import (
     CARRIERS,
+    DRAIN_S_MAX,
     TTL_S_MAX,
     TTL_S_MIN,
     checked_endpoint,
@@ -259,7 +262,7 @@ def _shards(root: Table, file: Path, data_folder: Path | None) -> tuple[ShardCon
 
 
 def _shard(name: str, table: Table, file: Path, data_folder: Path | None) -> ShardConfig:
-    table.refuse_unknown("listen", "advertise", "folder", "host", "metrics")
+    table.refuse_unknown("listen", "advertise", "folder", "host", "metrics", "drain_s")
     _check_title(name, "shard", table)
     listen = _endpoints(table, "listen")
     if not listen:
@@ -274,7 +277,9 @@ def _shard(name: str, table: Table, file: Path, data_folder: Path | None) -> Sha
                 " that names the host",
             )
     folder = _folder(table, "folder", file) or (data_folder and data_folder / name)
-    return ShardConfig(name, listen, advertise, folder, _host(table), _metrics(table))
+    drain_s = table.take_float("drain_s", 0.0, low=0.0, high=DRAIN_S_MAX)
+    told_s = drain_s if "drain_s" in table.values else None
+    return ShardConfig(name, listen, advertise, folder, _host(table), _metrics(table), told_s)
 
 
 def _metrics(table: Table) -> tuple[str, int] | None:

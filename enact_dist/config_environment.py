@@ -11,6 +11,7 @@ ENACT_SHARD_<NAME>_LISTEN     shards.NAME.listen, comma separated
 ENACT_SHARD_<NAME>_ADVERTISE  shards.NAME.advertise, comma separated
 ENACT_SHARD_<NAME>_FOLDER     shards.NAME.folder
 ENACT_SHARD_<NAME>_METRICS    shards.NAME.metrics
+ENACT_SHARD_<NAME>_DRAIN_S    shards.NAME.drain_s
 ============================  =====================================================
 
 `<NAME>` is the shard's name in capitals, with ``_`` for ``.`` and ``-``.  Relative folders are
@@ -33,6 +34,7 @@ from enact_dist.config_table import suggestion
 from enact_dist.config_types import CARRIER_DEFAULT
 from enact_dist.config_values import (
     CARRIERS,
+    DRAIN_S_MAX,
     TTL_S_MAX,
     TTL_S_MIN,
     checked_endpoint,
@@ -54,7 +56,7 @@ _CELL_NAMES: Final = (
     "ENACT_SHARED_FOLDER",
 )
 _SHARD_PREFIX: Final = "ENACT_SHARD_"
-_SHARD_KEYS: Final = ("LISTEN", "ADVERTISE", "FOLDER", "METRICS")
+_SHARD_KEYS: Final = ("LISTEN", "ADVERTISE", "FOLDER", "METRICS", "DRAIN_S")
 _CLOSE: Final = 0.85
 """Similarity from which a name counts as misspelt; ENACT_SESSION_TTL has 0.94."""
 
@@ -68,7 +70,9 @@ def with_environment(config: CellConfig, environment: Mapping[str, str]) -> Cell
     ours = {name: text for name, text in environment.items() if name.startswith("ENACT_")}
     _refuse_unknown(config, ours)
     if "ENACT_SESSION_TTL_S" in ours:
-        config = dataclasses.replace(config, ttl_s=_ttl_s(ours["ENACT_SESSION_TTL_S"]))
+        config = dataclasses.replace(
+            config, ttl_s=_seconds("ENACT_SESSION_TTL_S", ours, TTL_S_MIN, TTL_S_MAX)
+        )
     if "ENACT_CARRIER" in ours:
         config = dataclasses.replace(config, carrier=_carrier(ours["ENACT_CARRIER"]))
     if "ENACT_SHARED_BYTES_MAX" in ours:
@@ -110,17 +114,14 @@ def _refuse_unknown(config: CellConfig, ours: Mapping[str, str]) -> None:
             raise ConfigError(f"the environment sets {name}; did you mean {close[0]}?")
 
 
-def _ttl_s(text: str) -> float:
+def _seconds(name: str, ours: Mapping[str, str], low: float, high: float) -> float:
     try:
-        ttl_s = float(text)
+        seconds = float(ours[name])
     except ValueError:
-        ttl_s = -1.0
-    if not TTL_S_MIN <= ttl_s <= TTL_S_MAX:
-        raise ConfigError(
-            f"ENACT_SESSION_TTL_S={text!r} is no number of seconds from {TTL_S_MIN:g} to"
-            f" {TTL_S_MAX:g}"
-        )
-    return ttl_s
+        seconds = -1.0
+    if not low <= seconds <= high:
+        raise ConfigError(f"{name}={ours[name]!r} is no number of seconds from {low:g} to {high:g}")
+    return seconds
 
 
 def _bytes_max(text: str) -> int:
@@ -180,6 +181,10 @@ def _with_overrides(shard: ShardConfig, ours: Mapping[str, str]) -> ShardConfig:
             shard = dataclasses.replace(shard, metrics=metrics_address(metrics))
         except ValueError as error:
             raise ConfigError(f"{variable_of(shard.name, 'METRICS')}: {error}") from error
+    drain = variable_of(shard.name, "DRAIN_S")
+    if ours.get(drain):
+        drain_s = _seconds(drain, ours, 0.0, DRAIN_S_MAX)
+        shard = dataclasses.replace(shard, drain_s=drain_s)
     return shard
 
 

@@ -40,6 +40,8 @@ class ShardConfig:
         folder: Its data folder, absolute, or ``None`` to keep everything in memory.
         host: Host name of the machine it runs on; empty: wherever `enact up` is called.
         metrics: Host and port at which Prometheus may ask, or ``None``.
+        drain_s: How long holders may still finish after a signal, seconds; ``None`` leaves it to
+            the daemon.
     """
 
     name: str
@@ -48,6 +50,7 @@ class ShardConfig:
     folder: Path | None
     host: str = ""
     metrics: tuple[str, int] | None = None
+    drain_s: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

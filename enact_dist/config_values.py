@@ -16,6 +16,8 @@ TTL_S_MIN: Final = 0.2
 """Shorter leases end in ordinary scheduling pauses of a loaded machine."""
 TTL_S_MAX: Final = 60.0
 """A dead holder blocks its data for one TTL, a restarted shard waits one for absent sessions."""
+DRAIN_S_MAX: Final = 3600.0
+"""As long as `enact lock hold` holds a lock unless told."""
 
 _ENDPOINT: Final = re.compile(r"tcp/(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+):(\d{1,5})\Z")
 _ADDRESS: Final = re.compile(r"((\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+)?:)?\d{1,5}\Z")

@@ -37,8 +37,8 @@ GOOD_S: Final = 10.0
 """A child that ran this long counts as well again."""
 READY_S: Final = 20.0
 """How long actors wait for the shards at the start; then they try by themselves."""
-DRAIN_S: Final = {"actor": 10.0, "shard": 5.0}
-"""How long a child may take to end after SIGTERM; then it is killed."""
+END_S: Final = {"actor": 10.0, "shard": 5.0}
+"""How long a child may take to end after SIGTERM, beside its own drain; then it is killed."""
 SUPERVISOR_VARIABLE: Final = "ENACT_SUPERVISOR_PID"
 PIPE_BYTES: Final = 64 << 10
 NEVER_AGAIN: Final = 2
@@ -56,11 +56,18 @@ class Task:
         name: How the log names it.
         kind: "shard" or "actor"; decides the order of start and end.
         command: What to run.
+        drain_s: How long it was told to wait for others before it ends.
     """
 
     name: str
     kind: str
     command: tuple[str, ...]
+    drain_s: float = 0.0
+
+    @property
+    def end_s(self) -> float:
+        """How long it may take to end after SIGTERM."""
+        return END_S[self.kind] + self.drain_s
 
 
 @dataclass(frozen=True, slots=True)
@@ -319,18 +326,19 @@ class Supervisor:
                 child.start()
 
     def _drain(self, kind: str, count: Callable[[], int]) -> None:
-        running = [child for child in self._of(kind) if child.running]
-        for child in running:
+        asked = [child for child in self._of(kind) if child.running]
+        asked_s = time.monotonic()
+        for child in asked:
             child.send(signal.SIGTERM)
-        deadline_s = time.monotonic() + DRAIN_S[kind]
-        while any(child.running for child in running):
-            if time.monotonic() > deadline_s or count() > 1:
-                for child in running:
-                    if child.running:
-                        self._say(child.task.name, "did not end in time and is killed")
-                        child.send(signal.SIGKILL)
-                deadline_s = float("inf")
-                count = _once
+        killed: list[_Child] = []
+        while any(child.running for child in asked):
+            past_s = time.monotonic() - asked_s
+            for child in asked:
+                late = past_s > child.task.end_s or count() > 1
+                if late and child.running and child not in killed:
+                    self._say(child.task.name, "did not end in time and is killed")
+                    child.send(signal.SIGKILL)
+                    killed.append(child)
             self._take_end(0.1)
 
     def _take_end(self, timeout_s: float) -> None:
@@ -344,10 +352,6 @@ class Supervisor:
 
 def _say_nothing(_name: str, _line: str) -> None:
     pass
-
-
-def _once() -> int:
-    return 1
 
 
 def end_with_supervisor() -> None:

@@ -68,7 +68,8 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
         type=duration,
         default=None,
         metavar="S",
-        help="seconds that holders of locks may still finish after SIGTERM (default: 0.8)",
+        help="seconds that holders of locks may still finish after SIGTERM (default: `drain_s` of"
+        " cell.toml, or 0.8)",
     )
     ls = add_verb(
         verbs,
@@ -125,6 +126,7 @@ def run_shard(arguments: argparse.Namespace) -> int:
     load_config(target).shard(arguments.name)
     config = load_config(target, environment=environment)
     shard = config.shard(arguments.name)
+    drain_s = shard.drain_s if arguments.drain_s is None else arguments.drain_s
     return shard_daemon.run_shard(
         shard_daemon.DaemonSettings(
             cell=config.name,
@@ -136,7 +138,7 @@ def run_shard(arguments: argparse.Namespace) -> int:
             carrier=config.carrier,
             shared_bytes_max=config.shared_bytes_max,
             metrics=shard.metrics,
-            drain_s=shard_daemon.DRAIN_S if arguments.drain_s is None else arguments.drain_s,
+            drain_s=shard_daemon.DRAIN_S if drain_s is None else drain_s,
         )
     )
 

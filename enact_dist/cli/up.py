@@ -51,7 +51,7 @@ def run_up(arguments: argparse.Namespace) -> int:
     if actors:
         _refuse_misfits(config)
     tasks = [
-        *(_task(config, "shard", shard.name, arguments.log) for shard in shards),
+        *(_task(config, "shard", shard.name, arguments.log, shard.drain_s) for shard in shards),
         *(_task(config, "actor", actor.name, arguments.log) for actor in actors),
     ]
     say: Say = _Log([task.name for task in tasks])
@@ -84,11 +84,12 @@ def _refuse_misfits(config: CellConfig) -> None:
         )
 
 
-def _task(config: CellConfig, kind: str, name: str, log: str) -> Task:
+def _task(config: CellConfig, kind: str, name: str, log: str, drain_s: float | None = None) -> Task:
     from enact_dist.supervise import Task
 
     command = (sys.executable, "-m", "enact_dist.cli.main", kind, "run", name)
-    return Task(name, kind, (*command, "--cell", str(config.path), "--log", log))
+    words = ("--cell", str(config.path), "--log", log)
+    return Task(name, kind, (*command, *words), drain_s or 0.0)
 
 
 class _Log:

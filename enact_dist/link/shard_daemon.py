@@ -181,10 +181,12 @@ class RunningShard:
         if held:
             _log.warning(
                 "%d locks are lost, still held when the drain of %g s was over: %s; give them"
-                " longer with --drain",
+                " longer: --drain, or ENACT_SHARD_<NAME>_DRAIN_S, or drain_s in [shards.%s] of"
+                " cell.toml; the first of them that is there counts",
                 len(held),
                 drain_s,
                 "; ".join(held),
+                self.settings.shard.name,
                 extra={"event": "shard.drain_over"},
             )
 

@@ -27,6 +27,7 @@ listen = ["tcp/0.0.0.0:7448", "tcp/127.0.0.1:7449"]
 advertise = "tcp/tray-pc:7448"
 folder = "/srv/right"
 host = "tray-pc"
+drain_s = 10
 
 [[pins]]
 entities = "tray/**"
@@ -114,6 +115,7 @@ def test_config_holds_every_key_when_the_file_gives_all():
     assert right.listen == ("tcp/0.0.0.0:7448", "tcp/127.0.0.1:7449")
     assert right.advertise == ("tcp/tray-pc:7448",)
     assert (right.folder, right.host) == (Path("/srv/right"), "tray-pc")
+    assert (left.drain_s, right.drain_s) == (None, 10.0)
     assert config.pins == (Pin("tray/**", "right"), Pin("system", "left"))
     assert [entry.durability for entry in config.aspects] == [
         Durability.VOLATILE, None
@@ -206,6 +208,7 @@ WRONG = {
     "port": ('name = "c"\n[shards.left]\nlisten = "tcp/h:70000"\n', 3, "'tcp/h:70000' is no endpoint"),
     "endpoint type": ('name = "c"\n[shards.left]\nlisten = [\n  "tcp/h:1",\n  7,\n]\n', 5, "an array of strings, not an integer (7)"),
     "wildcard": ('name = "c"\n[shards.left]\nlisten = "tcp/0.0.0.0:7447"\n', 3, "nobody can connect to tcp/0.0.0.0:7447"),
+    "drain": ('name = "c"\n' + SHARD + "drain_s = -1\n", 4, "'drain_s' in [shards.left] must lie between 0 and 3600, not -1"),
     "same endpoint": ('name = "c"\n' + SHARD + '[shards.right]\nlisten = "tcp/127.0.0.1:7447"\n', 5, "shards left and right share endpoint tcp/127.0.0.1:7447"),
     "same folder": ('name = "c"\n' + SHARD + 'folder = "f"\n[shards.right]\nlisten = "tcp/h:1"\nfolder = "f"\n', 7, "shards left and right share folder /cells/demo/f"),
     "ttl type": ('name = "c"\nsession_ttl_s = true\n' + SHARD, 2, "'session_ttl_s' in the file is a number, not a boolean (True)"),
@@ -293,6 +296,8 @@ def test_environment_overrides_the_file():
         ENACT_SHARD_LEFT_LISTEN="tcp/10.0.0.1:1, tcp/10.0.0.2:2",
         ENACT_SHARD_RIGHT_ADVERTISE="tcp/other:9",
         ENACT_SHARD_RIGHT_FOLDER="/var/right",
+        ENACT_SHARD_LEFT_DRAIN_S="0",
+        ENACT_SHARD_RIGHT_DRAIN_S="30",
         ENACT_CARRIER="zenoh",
         ENACT_CELL="elsewhere",
         PATH="/bin",
@@ -303,6 +308,7 @@ def test_environment_overrides_the_file():
     assert left.listen == left.advertise == ("tcp/10.0.0.1:1", "tcp/10.0.0.2:2")
     assert (left.folder, right.folder) == (Path("/var/enact/left"), Path("/var/right"))
     assert right.advertise == ("tcp/other:9",)
+    assert (left.drain_s, right.drain_s) == (0.0, 30.0)
 
 
 def test_data_folder_override_leaves_a_folder_of_its_own():
@@ -315,6 +321,7 @@ WRONG_ENVIRONMENT = [
     ("ENACT_SESSION_TTL_S", "nan", "ENACT_SESSION_TTL_S='nan' is no number of seconds"),
     ("ENACT_CARRIER", "mqtt", r"ENACT_CARRIER='mqtt' is unknown \(known: auto, zenoh, socket\)"),
     ("ENACT_SESSION_TTL", "2", "did you mean ENACT_SESSION_TTL_S"),
+    ("ENACT_SHARD_LEFT_DRAIN_S", "ever", "ENACT_SHARD_LEFT_DRAIN_S='ever' is no number of seconds"),
     ("ENACT_SHARD_LEFT_LISTN", "x", "did you mean 'ENACT_SHARD_LEFT_LISTEN'"),
     ("ENACT_SHARD_MIDDLE_LISTEN", "x", "no key of a shard of /cells/demo/cell.toml"),
     (

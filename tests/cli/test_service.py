@@ -8,7 +8,7 @@ import threading
 
 import pytest
 
-from enact_dist import Aspect, Entity, Lock, Write, connect
+from enact_dist import Aspect, Entity, Lock, Write, connect, supervise
 from enact_dist.errors import EnactError, LockTimeoutError
 
 COUNT = Aspect("count", int)
@@ -144,6 +144,61 @@ def test_second_signal_ends_the_drain_and_the_holder_is_named(write_cell, spawn,
     assert (line["level"], line["cell"], line["process"]) == ("WARNING", "clitest", "shard left")
     assert "slow@" in line["text"]
     assert "online:piece/count" in line["text"]
+
+
+def test_up_drains_a_shard_as_its_table_says(write_cell, spawn, until):
+    """The log names the holder and each place where a longer drain can be said."""
+    file = write_cell(PINNED)
+    file.write_text(file.read_text().replace("[shards.right]", "drain_s = 0\n[shards.right]"))
+    up = spawn("up", file, "--no-actors")
+    for _ in range(2):
+        until(up, "ready: shard")
+    with connect(file, actor="slow") as cell, pytest.raises(EnactError):
+        piece = Write(cell.world("online"), Entity("piece"), COUNT)
+        with Lock(piece, wait_s=5.0) as lock:
+            up.send_signal(signal.SIGTERM)
+            said = "".join(until(up, "down"))
+            lock[piece] = 7
+
+    assert "still held when the drain of 0 s was over: slow@" in said
+    assert "--drain, or ENACT_SHARD_<NAME>_DRAIN_S, or drain_s in [shards.left]" in said
+
+
+def test_drain_of_the_command_wins_over_that_of_the_file(write_cell, spawn, until):
+    """A unit or a compose file can say its own, as it says how long it waits."""
+    file = write_cell(PINNED)
+    file.write_text(file.read_text().replace("[shards.right]", "drain_s = 0\n[shards.right]"))
+    shard = spawn("shard", "run", "left", "--cell", file, "--drain", "60", "--log", "json")
+    until(shard, "ready: shard")
+    with connect(file, actor="holder") as cell:
+        piece = Write(cell.world("online"), Entity("piece"), COUNT)
+        with Lock(piece) as lock:
+            shard.send_signal(signal.SIGTERM)
+            until(shard, '"shard.stop"')
+            lock[piece] = 7
+        assert lock.position is not None
+    assert "shard.drain_over" not in shard.stdout.read()
+
+
+def test_up_waits_longer_for_a_shard_than_that_drains(write_cell, enact, monkeypatch):
+    """Else it would kill a shard whose holders still have their time."""
+    found = {}
+
+    class Supervisor:
+        def __init__(self, tasks, _say):
+            found.update({task.name: task.end_s for task in tasks})
+
+        def run(self, _stop, **_):
+            return 0
+
+    monkeypatch.setattr(supervise, "Supervisor", Supervisor)
+    monkeypatch.setenv("ENACT_SHARD_RIGHT_DRAIN_S", "30")
+    file = write_cell()
+    file.write_text(file.read_text().replace("[shards.right]", "drain_s = 60\n[shards.right]"))
+
+    assert enact("up", file, "--no-actors").status == 0
+    assert found["left"] > 60.0
+    assert found["right"] > 30.0
 
 
 def test_log_of_an_actor_is_json_with_its_traceback(tmp_path, cell_file, spawn):

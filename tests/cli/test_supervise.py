@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 from types import SimpleNamespace
+from dataclasses import replace
 
 import pytest
 
@@ -134,6 +135,28 @@ def test_second_signal_kills_what_does_not_leave():
     story.run(task("deaf", "shard", deaf), count=lambda: 2)
 
     assert "deaf: did not end in time and is killed" in story.lines
+
+
+def test_child_that_drains_long_is_waited_for_and_no_other(monkeypatch, tmp_path):
+    """Each is given the drain that it was told of; one that is not ended by then is killed."""
+    monkeypatch.setitem(supervise.END_S, "shard", 0.5)
+    gate = tmp_path / "gate"
+    os.mkfifo(gate)
+    deaf = "import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('ready:'); signal.pause()"
+    slow = SERVE.replace("lambda *_: ", f"lambda *_: open({str(gate)!r}).read() or ")
+    story = Story("ready:", times=2)
+
+    def tell(name, line):
+        story(name, line)
+        if "deaf: did not end in time" in story.lines[-1]:
+            gate.write_text("")  # read by now, or as soon as it is
+
+    tasks = [task("deaf", "shard", deaf), replace(task("slow", "shard", slow), drain_s=600.0)]
+    Supervisor(tasks, tell).run(story.stop)
+
+    assert "deaf: did not end in time and is killed" in story.lines
+    assert "slow: leaving" in story.lines
+    assert "slow: did not end in time and is killed" not in story.lines
 
 
 def test_children_go_on_when_nobody_reads_the_log():

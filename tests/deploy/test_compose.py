@@ -1,0 +1,21 @@
+"""The compose file, as far as it can be read without an engine."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from enact_dist.cli.main import build_parser
+
+TEXT = (Path(__file__).parents[2] / "deploy" / "compose.yaml").read_text("utf-8")
+
+
+@pytest.mark.parametrize("name", ["left", "right"])
+def test_a_shard_of_the_compose_file_drains_before_it_is_killed(name):
+    """The engine waits longer than the drain that the command asks for, which is a good while."""
+    (command,) = re.findall(rf"command: \[(shard, run, {name}.*)\]", TEXT)
+    (grace_s,) = re.findall(r"stop_grace_period: (\d+)s", TEXT)
+    arguments = build_parser().parse_args([word.strip(' "') for word in command.split(",")])
+
+    assert (arguments.drain_s or 0.0) >= 5.0
+    assert float(grace_s) > arguments.drain_s + 5.0
