@@ -24,7 +24,7 @@ from enact_dist.cli.verbs import (
     verbs_of,
     whole,
 )
-from enact_dist.errors import ConfigError, LeaseLostError, MisuseError
+from enact_dist.errors import ConfigError, LeaseLostError, MisuseError, ShardUnreachableError
 from enact_dist.link.signals import StopSignals
 from enact_dist.terms import Access, Entities, Entity, checked_name
 
@@ -68,7 +68,8 @@ def _add_hold(verbs: argparse._SubParsersAction[Verb]) -> None:
     hold = add_verb(
         verbs,
         "hold",
-        "run a command while holding a lock; status is the command's, 1 if the lock is lost",
+        "run a command while holding a lock; status is the command's, 1 if the lock is lost, 3 if"
+        " its shard does not answer; either ends the command",
         run=hold_lock,
         example="enact lock hold online:robot/pose:write -- ./calibrate.sh\n"
         "enact lock hold --world online robot/pose:write 'tray/*/surface:read' -- sleep 5",
@@ -238,6 +239,7 @@ def _hold(cell: Cell, arguments: argparse.Namespace, stop: StopSignals) -> int:
     entries = client.aspect_entries()
     client.register(aspects=[entries[item.aspect] for item in items])  # a pattern is on every shard
     lock = client.acquire(items, wait_s=arguments.wait, hold_s=arguments.hold)
+    name, by_itself = arguments.command[0], False
     try:
         with HeldCommand(arguments.command) as running:
             while not running.wait(POLL_S):
@@ -247,11 +249,18 @@ def _hold(cell: Cell, arguments: argparse.Namespace, stop: StopSignals) -> int:
                     running.pause()
                     client.check(lock)
                     running.resume()
+            by_itself = True
         client.check(lock)
     except LeaseLostError as error:
-        raise LeaseLostError(
-            f"{error}; {arguments.command[0]} was ended, as it no longer holds the lock",
-            cause=error.cause,
+        fate = "had ended by itself" if by_itself else "was ended, as it no longer holds the lock"
+        raise LeaseLostError(f"{error}; {name} {fate}", cause=error.cause) from error
+    except ShardUnreachableError as error:
+        doubt = "whether it held the lock to its end" if by_itself else "whether it holds the lock"
+        fate = "had ended by itself, but" if by_itself else "was ended, as"
+        raise ShardUnreachableError(
+            f"{error}; {name} {fate} nobody can say {doubt}",
+            shard=error.shard,
+            endpoint=error.endpoint,
         ) from error
     finally:
         client.release(lock)

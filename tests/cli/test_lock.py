@@ -5,8 +5,10 @@ import time
 import pytest
 
 from enact_dist import Aspect, Entity, Lock, Write, connect
+from enact_dist.cli.main import main
 
 COUNT = Aspect("count", int)
+PINNED = '[[pins]]\nentities = "**"\nshard = "left"\n'
 
 
 @pytest.fixture(scope="module")
@@ -96,6 +98,33 @@ def test_hold_kills_its_command_and_fails_when_the_lock_is_broken(at, spawn, unt
     assert hold.wait(60) == 1
     assert "was lost" in rest
     assert "survived" not in rest
+
+
+def test_hold_says_that_it_ended_its_command_when_the_shard_went(write_cell, spawn, until, enact):
+    """Status 3, the shard, and what became of the command: it may hold nothing any more."""
+    file = write_cell(PINNED)
+    shard, other = (spawn("shard", "run", name, "--cell", file) for name in ("left", "right"))
+    for started in (shard, other):
+        until(started, "ready: shard")
+    assert enact("world", "put", "--new", "online", "piece/count", "1", "--cell", file).status == 0
+    hold = spawn("lock", "hold", "--cell", file, "--timeout", "1", "online:piece/count:write",
+                 "--", "sh", "-c", "echo running; sleep 60; echo survived")  # fmt: skip
+    until(hold, "running")
+    shard.kill()
+    rest = hold.stdout.read()
+
+    assert hold.wait(60) == 3
+    assert "shard left" in rest
+    assert "sh was ended, as nobody can say whether it holds the lock" in rest
+    assert "survived" not in rest
+
+
+def test_help_of_hold_names_each_status_of_its_own(capsys):
+    """A script has to tell them from those of its command."""
+    with pytest.raises(SystemExit):
+        main(["lock", "hold", "--help"])
+    said = " ".join(capsys.readouterr().out.split())
+    assert "1 if the lock is lost, 3 if its shard does not answer" in said
 
 
 def test_command_dies_with_whoever_held_its_lock(spawn, until, at, cell_file):
