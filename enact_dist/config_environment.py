@@ -15,11 +15,11 @@ ENACT_SHARD_<NAME>_DRAIN_S    shards.NAME.drain_s
 ============================  =====================================================
 
 `<NAME>` is the shard's name in capitals, with ``_`` for ``.`` and ``-``.  Relative folders are
-relative to the working folder.  A variable that starts with ``ENACT_SHARD_`` and names no shard or
-no such key, or that is close to one of the others, is a `ConfigError`: a misspelt override must
-not end as a silent default.  `ENACT_CELL` (which cell the command line talks to) and
-`ENACT_SHARED_FOLDER` (where processes of one host meet, see `link.shared_folder`) are no keys of
-the file.
+relative to the working folder.  An empty variable counts as none.  One that starts with
+``ENACT_SHARD_`` and names no shard or no such key, or that is close to one of the others, is a
+`ConfigError`: a misspelt override must not end as a silent default.  `ENACT_CELL` (which cell the
+command line talks to) and `ENACT_SHARED_FOLDER` (where processes of one host meet, see
+`link.shared_folder`) are no keys of the file.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from enact_dist.config_values import (
 from enact_dist.errors import ConfigError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from enact_dist.config_types import CellConfig, ShardConfig
 
@@ -67,8 +67,8 @@ def with_environment(config: CellConfig, environment: Mapping[str, str]) -> Cell
     Raises:
         ConfigError: An override has a wrong value, or names nothing of this cell.
     """
-    ours = {name: text for name, text in environment.items() if name.startswith("ENACT_")}
-    _refuse_unknown(config, ours)
+    _refuse_unknown(config, [name for name in environment if name.startswith("ENACT_")])
+    ours = {name: text for name, text in environment.items() if text}
     if "ENACT_SESSION_TTL_S" in ours:
         config = dataclasses.replace(
             config, ttl_s=_seconds("ENACT_SESSION_TTL_S", ours, TTL_S_MIN, TTL_S_MAX)
@@ -99,7 +99,7 @@ def variable_of(shard: str, key: str) -> str:
     return f"{_SHARD_PREFIX}{re.sub('[.-]', '_', shard).upper()}_{key}"
 
 
-def _refuse_unknown(config: CellConfig, ours: Mapping[str, str]) -> None:
+def _refuse_unknown(config: CellConfig, ours: Sequence[str]) -> None:
     of_shards = [variable_of(shard.name, key) for shard in config.shards for key in _SHARD_KEYS]
     for name in ours:
         if name.startswith(_SHARD_PREFIX) and name not in of_shards:
@@ -142,7 +142,7 @@ def carrier_of(environment: Mapping[str, str]) -> str:
     Raises:
         ConfigError: There is none of that name.
     """
-    return _carrier(environment.get("ENACT_CARRIER", CARRIER_DEFAULT))
+    return _carrier(environment.get("ENACT_CARRIER") or CARRIER_DEFAULT)
 
 
 def _moved(config: CellConfig, data_folder: Path) -> CellConfig:
@@ -170,7 +170,8 @@ def _with_overrides(shard: ShardConfig, ours: Mapping[str, str]) -> ShardConfig:
     if any(is_wildcard(endpoint) for endpoint in shard.advertise):
         raise ConfigError(
             f"shard {shard.name} would advertise {', '.join(shard.advertise)}, to which nobody can"
-            f" connect; set {variable_of(shard.name, 'ADVERTISE')} too"
+            f" connect; set {variable_of(shard.name, 'ADVERTISE')} too (or say --advertise of"
+            " `enact shard run`)"
         )
     folder = ours.get(variable_of(shard.name, "FOLDER"))
     if folder:

@@ -16,8 +16,10 @@ from enact_dist.cli.verbs import (
     add_noun,
     add_reader,
     add_verb,
+    address,
     cell_target,
     duration,
+    endpoints,
     is_endpoint,
     open_cell,
     verbs_of,
@@ -40,37 +42,7 @@ CHECK_S: Final = 2.0
 def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
     """Add the noun and its verbs."""
     verbs = verbs_of(add_noun(nouns, "shard", "run and list shard daemons"))
-    run = add_verb(
-        verbs,
-        "run",
-        "run one shard daemon of the cell until SIGTERM",
-        run=run_shard,
-        example="enact shard run left --cell cell.toml",
-    )
-    run.add_argument("name", metavar="NAME", help="name of the shard in cell.toml")
-    add_cell(run)
-    run.add_argument(
-        "--listen", action="append", metavar="ENDPOINT", help="replaces `listen` of cell.toml"
-    )
-    run.add_argument(
-        "--advertise", action="append", metavar="ENDPOINT", help="replaces `advertise`"
-    )
-    run.add_argument("--folder", metavar="DIR", help="replaces `folder` of cell.toml")
-    run.add_argument(
-        "--metrics",
-        metavar="HOST:PORT",
-        help="serve /metrics for Prometheus there; a port alone is one of the loopback",
-    )
-    add_log(run)
-    run.add_argument(
-        "--drain",
-        dest="drain_s",
-        type=duration,
-        default=None,
-        metavar="S",
-        help="seconds that holders of locks may still finish after SIGTERM (default: `drain_s` of"
-        " cell.toml, or 0.8)",
-    )
+    _add_run(verbs)
     ls = add_verb(
         verbs,
         "ls",
@@ -102,6 +74,49 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
     check.set_defaults(timeout_s=CHECK_S)
     shard_rebalance.add_to(verbs)
     shard_backup.add_to(verbs)
+
+
+def _add_run(verbs: argparse._SubParsersAction[Verb]) -> None:
+    run = add_verb(
+        verbs,
+        "run",
+        "run one shard daemon of the cell until SIGTERM",
+        run=run_shard,
+        example="enact shard run left --cell cell.toml",
+    )
+    run.add_argument("name", metavar="NAME", help="name of the shard in cell.toml")
+    add_cell(run)
+    run.add_argument(
+        "--listen",
+        action="append",
+        type=endpoints,
+        metavar="ENDPOINT",
+        help="replaces `listen` of cell.toml",
+    )
+    run.add_argument(
+        "--advertise",
+        action="append",
+        type=endpoints,
+        metavar="ENDPOINT",
+        help="replaces `advertise`",
+    )
+    run.add_argument("--folder", metavar="DIR", help="replaces `folder` of cell.toml")
+    run.add_argument(
+        "--metrics",
+        type=address,
+        metavar="HOST:PORT",
+        help="serve /metrics for Prometheus there; a port alone is one of the loopback",
+    )
+    add_log(run)
+    run.add_argument(
+        "--drain",
+        dest="drain_s",
+        type=duration,
+        default=None,
+        metavar="S",
+        help="seconds that holders of locks may still finish after SIGTERM (default: `drain_s` of"
+        " cell.toml, or 0.8)",
+    )
 
 
 def run_shard(arguments: argparse.Namespace) -> int:

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from enact_dist.config_values import checked_endpoint, metrics_address
 from enact_dist.errors import ConfigError
 from enact_dist.terms import Entities, checked_name
 
@@ -132,6 +133,28 @@ def whole(text: str) -> int:
     if not text.isdecimal() or not int(text):
         raise argparse.ArgumentTypeError(f"{text!r} is no whole number above zero")
     return int(text)
+
+
+def endpoints(text: str) -> str:
+    """Check endpoints, comma separated, or none; an `argparse` type."""
+    for endpoint in text.split(","):
+        if endpoint.strip():
+            _checked(checked_endpoint, endpoint.strip())
+    return text
+
+
+def address(text: str) -> str:
+    """Check where metrics are to be served, or nothing; an `argparse` type."""
+    if text:
+        _checked(metrics_address, text)
+    return text
+
+
+def _checked(check: Callable[[str], object], text: str) -> None:
+    try:
+        check(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def entities(text: str) -> str:

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from enact_dist.config import parse_config
+from enact_dist.config_environment import carrier_of
 from enact_dist.core.messages import AspectEntry, Pin, ShardEntry
 from enact_dist.errors import ConfigError
 from enact_dist.terms import Durability, Retention
@@ -316,6 +317,18 @@ def test_data_folder_override_leaves_a_folder_of_its_own():
     assert parsed(FULL, ENACT_DATA_FOLDER="/var").shard("right").folder == Path("/srv/right")
 
 
+def test_empty_variables_count_as_none():
+    """A compose file hands on what nobody has set as an empty text."""
+    of_cell = ("SESSION_TTL_S", "DATA_FOLDER", "CARRIER", "SHARED_BYTES_MAX")
+    of_shard = [
+        f"SHARD_LEFT_{key}" for key in ("LISTEN", "ADVERTISE", "FOLDER", "METRICS", "DRAIN_S")
+    ]
+    nothing = {f"ENACT_{name}": "" for name in (*of_cell, *of_shard)}
+
+    assert parsed(FULL, **nothing) == parsed(FULL)
+    assert carrier_of(nothing) == carrier_of({})
+
+
 WRONG_ENVIRONMENT = [
     ("ENACT_SESSION_TTL_S", "fast", "ENACT_SESSION_TTL_S='fast' is no number of seconds"),
     ("ENACT_SESSION_TTL_S", "nan", "ENACT_SESSION_TTL_S='nan' is no number of seconds"),
@@ -323,6 +336,7 @@ WRONG_ENVIRONMENT = [
     ("ENACT_SESSION_TTL", "2", "did you mean ENACT_SESSION_TTL_S"),
     ("ENACT_SHARD_LEFT_DRAIN_S", "ever", "ENACT_SHARD_LEFT_DRAIN_S='ever' is no number of seconds"),
     ("ENACT_SHARD_LEFT_LISTN", "x", "did you mean 'ENACT_SHARD_LEFT_LISTEN'"),
+    ("ENACT_SHARD_LEFT_LISTN", "", "did you mean 'ENACT_SHARD_LEFT_LISTEN'"),
     ("ENACT_SHARD_MIDDLE_LISTEN", "x", "no key of a shard of /cells/demo/cell.toml"),
     (
         "ENACT_SHARD_LEFT_LISTEN",

@@ -9,6 +9,7 @@ import threading
 import pytest
 
 from enact_dist import Aspect, Entity, Lock, Write, connect, supervise
+from enact_dist.cli.main import main
 from enact_dist.errors import EnactError, LockTimeoutError
 
 COUNT = Aspect("count", int)
@@ -279,13 +280,27 @@ def test_metrics_are_served_where_the_file_or_the_command_says(write_cell, spawn
     assert 'enact_ready{cell="clitest",shard="left"} 1' in text.splitlines()
 
 
-def test_metrics_at_no_address_are_a_usage_error(enact, write_cell):
-    """On the command line, in the file and in the environment."""
+def test_metrics_at_no_address_are_a_usage_error(enact, write_cell, monkeypatch):
+    """On the command line, in the file and in the environment, each named as what it is."""
     file = write_cell()
-    on_line = enact("shard", "run", "left", "--cell", file, "--metrics", "nowhere")
+    monkeypatch.setenv("ENACT_SHARD_LEFT_METRICS", "anywhere")
+    in_environment = enact("shard", "run", "left", "--cell", file)
+    monkeypatch.delenv("ENACT_SHARD_LEFT_METRICS")
     file.write_text(file.read_text().replace("[shards.right]", 'metrics = ":0"\n[shards.right]'))
     in_file = enact("shard", "run", "left", "--cell", file)
 
-    assert (on_line.status, in_file.status) == (2, 2)
-    assert "ENACT_SHARD_LEFT_METRICS: 'nowhere' is no address for metrics" in on_line.err
+    assert (in_environment.status, in_file.status) == (2, 2)
+    assert "ENACT_SHARD_LEFT_METRICS: 'anywhere' is no address" in in_environment.err
     assert "line 9: ':0' is no address for metrics" in in_file.err
+
+
+@pytest.mark.parametrize("option", ["--listen", "--advertise", "--metrics"])
+def test_option_that_is_wrong_is_named_and_no_variable(option, write_cell, capsys):
+    """Nobody has set ENACT_SHARD_LEFT_…, so nobody is sent to look for it."""
+    with pytest.raises(SystemExit) as ended:
+        main(["shard", "run", "left", "--cell", str(write_cell()), option, "nonsense"])
+    said = capsys.readouterr().err
+
+    assert ended.value.code == 2
+    assert f"argument {option}: 'nonsense' is no " in said
+    assert "ENACT_" not in said
