@@ -6,8 +6,8 @@ import os
 import subprocess
 import sys
 import threading
-from types import SimpleNamespace
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 
