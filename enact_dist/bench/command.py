@@ -26,6 +26,7 @@ from enact_dist.bench.rows import Row, shown_us
 from enact_dist.bench.run import Run
 from enact_dist.bench.tables import table
 from enact_dist.bench.updates import run_durable, run_multi, run_update, run_waiters
+from enact_dist.bench.visit import PEAK_BYTES, without_room
 from enact_dist.cli.output import print_json, print_table
 from enact_dist.cli.verbs import DONE, FAILED
 from enact_dist.errors import EnactError, MisuseError
@@ -131,8 +132,11 @@ def run(arguments: argparse.Namespace) -> int:
                 shards=arguments.shards or 1,
                 carriers=carriers_of(arguments),
                 shared=memory / "shared",
+                said=_say,
             )
         )
+        if arguments.connect is not None:
+            names = with_room(place, names, named=bool(arguments.names))
         floors = stack.enter_context(Floors(folder, memory))
         told = stack.enter_context(_progress())
         measured = Run(place, floors, seconds_s=arguments.seconds_s or SECONDS_S, told=told)
@@ -143,6 +147,26 @@ def run(arguments: argparse.Namespace) -> int:
     else:
         _print(found, rows)
     return FAILED if failed else DONE
+
+
+def with_room(place: Place, names: list[str], *, named: bool) -> list[str]:
+    """Return the benches for whose data a cell that runs has room, and say which are left out.
+
+    Raises:
+        MisuseError: There is none for one that was asked for by name.
+    """
+    if not PEAK_BYTES.keys() & names:
+        return names
+    refused = without_room(place.cell(place.carrier).shards(), names)
+    if named and refused:
+        raise MisuseError("; ".join(refused.values()))
+    for why in refused.values():
+        _say(f"left out: {why}")
+    return [name for name in names if name not in refused]
+
+
+def _say(text: str) -> None:
+    print(f"enact: {text}", file=sys.stderr)
 
 
 @contextlib.contextmanager
@@ -166,7 +190,7 @@ def _ran(name: str, measured: Run) -> bool:
     except EnactError as error:
         if not measured.place.own:
             raise
-        print(f"enact: bench {name}: {error}", file=sys.stderr)
+        _say(f"bench {name}: {error}")
         measured.add_row(
             Row(name, "failed", None, None, 0, goal="runs", met=False, note=str(error))
         )

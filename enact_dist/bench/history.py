@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from enact_dist.bench.place import EMBEDDED, Place, environment
+from enact_dist.bench.place import EMBEDDED, WORLD, Place, environment
 from enact_dist.bench.rows import Case, Goal, Key, times, value_row
 from enact_dist.bench.timing import timed
 from enact_dist.bench.updates import WAIT_S, floor_of, update
@@ -152,8 +152,9 @@ def _looks(world: WorldContext, floor: Key) -> list[Case]:
 def _forks(run: Run, carrier: str, floor: Key) -> Iterator[Case]:
     """Yield cases that fork contexts of small and of large data, a time per slot."""
     for label, size in FORKED_BYTES.items():
-        name = f"history_{size}"
+        name = f"{WORLD}_history_{size}"
         source = run.place.world(carrier, name)
+        run.place.uses(carrier, _fork_of(name))
         aspect = Aspect("history_forked", np.ndarray, Durability.VOLATILE)
         for number in range(FORKED):
             write = Write(source, Entity(f"forked/{number}"), aspect)
@@ -168,8 +169,12 @@ def _fork(label: str) -> str:
     return f"fork of {FORKED} slots of {label}, per slot"
 
 
+def _fork_of(name: str) -> str:
+    return f"{name}_fork"
+
+
 def _forking(source: WorldContext) -> Measure:
-    name = f"{source.name}_fork"
+    name = _fork_of(source.name)
 
     def dropped() -> None:
         with contextlib.suppress(UnknownWorldError):

@@ -8,13 +8,14 @@ import os
 import signal
 from typing import TYPE_CHECKING, Any, Final
 
+from enact_dist.bench.visit import Visit
 from enact_dist.config_values import CARRIERS
 from enact_dist.connecting import connect, local
 from enact_dist.link.shared_folder import SHARED_FOLDER_VARIABLE
 from enact_dist.verify.daemons import LineProcess, free_port
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
 
     from enact_dist.cell import Cell
@@ -66,6 +67,7 @@ class Place:
         shards: How many daemons that one has.
         carriers: How benches that compare them reach the cell, `EMBEDDED` among others.
         shared: What the shared folder of an own cell is to be; None for that of this user.
+        said: Called with what a person should know of what stays in a cell that runs.
     """
 
     def __init__(
@@ -76,6 +78,7 @@ class Place:
         shards: int,
         carriers: tuple[str, ...],
         shared: Path | None = None,
+        said: Callable[[str], None] = lambda _text: None,
     ) -> None:
         self.folder = folder
         self.carriers = carriers
@@ -86,6 +89,7 @@ class Place:
         self._stack = contextlib.ExitStack()
         self._logs = 0
         self._daemons: list[LineProcess] = []
+        self._visit = Visit(target, connected=self._anew, said=said) if target else None
         if self.own and shared is not None:
             # Nobody else's files there: what it grows by is ours.
             shared.mkdir(mode=0o700)
@@ -95,7 +99,11 @@ class Place:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._stack.close()
+        try:
+            self._stack.close()
+        finally:
+            if self._visit is not None:
+                self._visit.leave()
 
     @property
     def embedded(self) -> bool:
@@ -148,11 +156,21 @@ class Place:
 
     # ---------------------------------------------------------------- cells
 
-    def world(self, carrier: str, name: str = WORLD) -> WorldContext:
-        """Return a world context as this process reaches it over a carrier; made if need be."""
+    def cell(self, carrier: str) -> Cell:
+        """Return the cell as this process reaches it over a carrier."""
         if carrier not in self._cells:
             self._cells[carrier] = self._stack.enter_context(self._opened(carrier))
-        return self._cells[carrier].create_world(name)
+        return self._cells[carrier]
+
+    def world(self, carrier: str, name: str = WORLD) -> WorldContext:
+        """Return a world context as this process reaches it over a carrier; made if need be."""
+        self.uses(carrier, name)
+        return self.cell(carrier).create_world(name)
+
+    def uses(self, carrier: str, name: str) -> None:
+        """Note a world context that is made next: of a cell that runs it goes at the end."""
+        if self._visit is not None:
+            self._visit.uses(self.cell(carrier), name)
 
     def way(self, carrier: str) -> str:
         """Return how calls over a carrier travel: "socket", "zenoh" or `EMBEDDED`.
@@ -161,9 +179,8 @@ class Place:
         """
         if carrier == EMBEDDED:
             return carrier
-        self.world(carrier)
-        self._cells[carrier].worlds()  # greets every shard, so that each says how it is reached
-        ways = {shard.carrier for shard in self._cells[carrier].shards()}
+        self.cell(carrier).worlds()  # greets every shard, so that each says how it is reached
+        ways = {shard.carrier for shard in self.cell(carrier).shards()}
         return "socket" if ways == {"socket"} else "zenoh"
 
     def _opened(self, carrier: str) -> Cell:
@@ -173,10 +190,20 @@ class Place:
         with environment(**{CARRIER_VARIABLE: carrier}):
             return connect(target, actor="bench", timeout_s=JOIN_S)
 
+    def _anew(self) -> Cell:
+        with environment(**{CARRIER_VARIABLE: self.carrier}):
+            return connect(self.target, actor="bench", timeout_s=JOIN_S)
+
+    def _joined(self, carrier: str) -> str:
+        """Return what workers connect to, once this process has joined it: they would die of it."""
+        if not self.own:
+            self.world(carrier)
+        return self.target
+
     @contextlib.contextmanager
     def far_world(self) -> Iterator[WorldContext]:
         """Give the world context as a client of another host has it: no memory in common."""
-        target = self.target
+        target = self._joined(self.carrier)
         with self._elsewhere():
             cell = connect(target, actor="bench-far", timeout_s=JOIN_S)
         with cell:
@@ -201,7 +228,7 @@ class Place:
         module: str = WORKER,
     ) -> Iterator[list[LineProcess]]:
         """Run a process for each role with its options; all have said ``ready:``."""
-        target = self.target
+        target = self._joined(carrier)
         with environment(**{CARRIER_VARIABLE: carrier}):
             processes = [
                 self._process(module, (target, role, json.dumps(options)))
@@ -224,7 +251,7 @@ class Place:
     @contextlib.contextmanager
     def far_worker(self, role: str, **options: Any) -> Iterator[LineProcess]:
         """Run a worker as on another host: it has no memory in common with any shard."""
-        target = self.target
+        target = self._joined(self.carrier)
         with self._elsewhere():
             process = self._process(WORKER, (target, role, json.dumps(options)))
         try:

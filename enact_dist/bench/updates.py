@@ -259,10 +259,12 @@ def _side_by_side(acts: list[Callable[[], None]]) -> Callable[[float], list[floa
         threads = [threading.Thread(target=repeat, args=(n,)) for n in range(len(acts))]
         for thread in threads:
             thread.start()
-        found_us = _per_act_us(counts, seconds_s, failed)
-        end.set()
-        for thread in threads:
-            thread.join()
+        try:
+            found_us = _per_act_us(counts, seconds_s, failed)
+        finally:
+            end.set()
+            for thread in threads:
+                thread.join()
         if failed:
             raise failed[0]
         return found_us

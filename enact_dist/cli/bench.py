@@ -62,7 +62,9 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
     where.add_argument(
         "--connect",
         metavar="ENDPOINT_OR_FILE",
-        help="a cell that runs; its world context `bench` is made and written to",
+        help="a cell that runs; its world context `bench` (and some that begin so) is made, written"
+        " to, and dropped at the end, unless it was there before; benches for whose data there is"
+        " no room under shared_bytes_max are refused, those not named left out",
     )
     bench.add_argument(
         "--carrier",

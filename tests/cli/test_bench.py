@@ -1,16 +1,22 @@
 """`enact bench`: what it prints, what JSON has, how it ends.  No time is judged here."""
 
+import contextlib
 import json
 import os
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 import pytest
 
-from enact_dist.bench import command
+from enact_dist import Lock, connect
+from enact_dist.bench import command, updates
+from enact_dist.bench.place import Place
+from enact_dist.bench.visit import PEAK_BYTES, Visit, without_room
+from enact_dist.cell_info import ShardInfo
 from enact_dist.cli import bench
-from enact_dist.errors import LinkError
+from enact_dist.errors import EnactError, LinkError, ShardUnreachableError
 
 FIELDS = ["name", "variant", "median_us", "p99_us", "n", "ratio", "goal", "met"]
 SHORT = ("--seconds", "0.03")
@@ -87,8 +93,118 @@ def test_running_cell_is_measured(enact, cell_file):
     rows = rows_of(enact("bench", *words, *SHORT))
 
     assert rows["update", "zenoh, volatile"]["goal"] == "≤ 2.3 x query"
-    result = enact("world", "ls", "--cell", str(cell_file), "--json")
-    assert "bench" in json.dumps(result.json)
+    assert worlds_of(enact, cell_file) == ["online", "training"]
+
+
+def worlds_of(enact, cell_file):
+    found = enact("world", "ls", "--cell", str(cell_file), "--json").json
+    return sorted(row["world"] for row in found)
+
+
+def write_some(run):
+    """Write a number; a bench that takes no time."""
+    updates.update(updates.slots(run.place.world("auto"), 1))
+
+
+def interrupted(run):
+    """Be interrupted while a lock is held, which stays."""
+    world = run.place.world("auto")
+    (write,) = updates.slots(world, 1)
+    stack.enter_context(Lock(write))
+    raise KeyboardInterrupt
+
+
+stack = contextlib.ExitStack()
+"""Holds a lock that nobody gives back."""
+
+
+def failing(run):
+    """Write a number, then fail."""
+    write_some(run)
+    raise LinkError("the worker has gone")
+
+
+@pytest.mark.parametrize(("act", "status"), [(write_some, 0), (failing, 1), (interrupted, 130)])
+def test_context_of_a_bench_goes_with_its_end(enact, cell_file, monkeypatch, act, status):
+    """However it ended, a lock that was left included; nothing is said of it."""
+    monkeypatch.setitem(command.BENCHES, "multi", act)
+
+    result = enact("bench", "multi", "--connect", str(cell_file))
+
+    with contextlib.suppress(EnactError):
+        stack.close()
+    assert result.status == status
+    assert "world context" not in result.err
+    assert worlds_of(enact, cell_file) == ["online", "training"]
+
+
+def test_context_that_was_there_before_stays(enact, cell_file, monkeypatch):
+    """Somebody's figures may be in it; how to drop it is said."""
+    monkeypatch.setitem(command.BENCHES, "multi", write_some)
+    with connect(cell_file) as cell:
+        cell.create_world("bench")
+        try:
+            result = enact("bench", "multi", "--connect", str(cell_file))
+            assert result.status == 0
+            assert "bench" in worlds_of(enact, cell_file)
+        finally:
+            cell.drop_world("bench")
+
+    assert "'bench' was there before this run and stays" in result.err
+    assert f"`enact world drop bench --cell {cell_file}` drops it" in result.err
+
+
+def test_context_that_cannot_be_dropped_is_told():
+    """The cell may have gone meanwhile."""
+
+    def gone():
+        raise ShardUnreachableError("no shard answers", shard="s", endpoint="e")
+
+    cell = SimpleNamespace(worlds=tuple)
+    said = []
+    visit = Visit("my cell.toml", connected=gone, said=said.append)
+    visit.leave()
+    assert said == []
+    visit.uses(cell, "bench")
+    visit.leave()
+
+    (text,) = said
+    assert "'bench' may still be there: no shard answers" in text
+    assert "--cell 'my cell.toml'` drops it" in text
+
+
+def test_bench_that_would_push_history_out_is_not_run(enact, cell_file, monkeypatch):
+    """Refused where it is named, left out where it is not, before anything is written."""
+    ran = []
+    monkeypatch.setitem(PEAK_BYTES, "fetch", 1 << 60)
+    monkeypatch.setattr(
+        command, "BENCHES", {"core": lambda _: ran.append("core"), "fetch": ran.append}
+    )
+    words = ("bench", "--connect", str(cell_file))
+
+    refused = enact(*words, "fetch", "core")
+    assert (refused.status, ran) == (1, [])
+    assert "its oldest history would go; raise shared_bytes_max" in refused.err
+
+    left_out = enact(*words)
+    assert (left_out.status, ran) == (0, ["core"])
+    assert "left out: fetch writes up to" in left_out.err
+    assert worlds_of(enact, cell_file) == ["online", "training"]
+
+
+def test_room_is_that_of_the_fullest_shard_and_used_up_by_the_benches_before():
+    """Who has no cap has no history in shared memory that could go."""
+
+    def shard(name, used, cap):
+        return ShardInfo(name, "", True, counters={"payload_bytes": used, "payload_bytes_max": cap})
+
+    roomy, full, bare = shard("a", 0, 10**9), shard("b", 600 * 10**6, 10**9), shard("c", 0, 0)
+
+    assert without_room([roomy, bare], ["update", "fetch", "wakeup"]) == {}
+    found = without_room([roomy, full, bare], ["update", "stopped", "fetch", "publish", "wakeup"])
+    assert list(found) == ["fetch", "publish"]
+    assert "shard b has 400 MB left of its cap of 1000 MB" in found["fetch"]
+    assert "benches before it take up to 70 MB" in found["fetch"]
 
 
 @pytest.mark.slow
@@ -134,14 +250,29 @@ def test_bench_that_cannot_run_as_asked_is_refused(enact, words, status, text):
     assert text in result.err
 
 
-def test_unreachable_cell_is_its_own_status(enact, monkeypatch):
-    """A cell that does not answer is 3, as everywhere."""
+@pytest.mark.parametrize("name", ["multi", "fetch", "pipeline"])
+def test_unreachable_cell_is_its_own_status(enact, monkeypatch, name):
+    """A cell that does not answer is 3, as everywhere, and no worker is started to find it out."""
+    started = []
     monkeypatch.setattr("enact_dist.bench.place.JOIN_S", 0.3)
+    monkeypatch.setattr("enact_dist.bench.place.LineProcess", lambda *words: started.append(words))
 
-    result = enact("bench", "multi", "--connect", "tcp/127.0.0.1:1")
+    result = enact("bench", name, "--connect", "tcp/127.0.0.1:1")
 
-    assert result.status == 3
+    assert (result.status, started) == (3, [])
     assert "tcp/127.0.0.1:1" in result.err
+    assert result.err.count("\n") == 1
+
+
+def test_workers_join_no_cell_that_this_process_does_not_reach(tmp_path, monkeypatch):
+    """Whichever bench starts them, and wherever they seem to be."""
+    monkeypatch.setattr("enact_dist.bench.place.JOIN_S", 0.3)
+    monkeypatch.setattr("enact_dist.bench.place.LineProcess", None)
+    place = Place(tmp_path, target="tcp/127.0.0.1:1", shards=1, carriers=("auto",))
+
+    for started in (place.worker("storer", carrier="auto"), place.far_worker("fetcher")):
+        with pytest.raises(ShardUnreachableError), started:
+            pass
 
 
 def test_help_names_every_bench():
