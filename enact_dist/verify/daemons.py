@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 LINE_S: Final = 30.0
 """How long a line may stay out before the process counts as hung."""
+LOG_BYTES: Final = 2000
+"""So much of a log's end is looked at."""
 COMMAND: Final = "enact_dist.cli.main"
 
 
@@ -35,6 +37,15 @@ def free_port() -> int:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]
         return port
+
+
+def last_said(log: str) -> str:
+    """Return the last line of a log; if it has a traceback, the line that says what was wrong."""
+    lines = [line for line in log.splitlines() if line.strip()]
+    if "Traceback (most recent call last):" not in lines:
+        return lines[-1] if lines else ""
+    last = max((n for n, line in enumerate(lines) if line[0].isspace()), default=-1)
+    return (lines[last + 1 :] or lines[-1:])[0].removeprefix("enact_dist.errors.")
 
 
 class LineProcess:
@@ -108,8 +119,10 @@ class LineProcess:
                 return line[len(start) :].strip()
 
     def _error(self, found: str) -> LinkError:
-        last = self._log.read_text(errors="replace")[-2000:].strip()
-        return LinkError(f"{self.name} {found}; its log ends with: {last or 'nothing'}")
+        log = self._log.read_text(errors="replace")[-LOG_BYTES:].strip()
+        error = LinkError(f"{self.name} {found}; its log ends with: {last_said(log) or 'nothing'}")
+        error.add_note(log)  # for whoever wants the traceback, and for nobody else
+        return error
 
     def tell(self, line: str) -> None:
         """Send one line."""

@@ -2,7 +2,8 @@
 
 import pytest
 
-from enact_dist.verify.daemons import CellProcesses, LineProcess
+from enact_dist.errors import LinkError
+from enact_dist.verify.daemons import CellProcesses, LineProcess, last_said
 
 
 @pytest.mark.parametrize("way", ["zenoh", "auto"])
@@ -28,3 +29,24 @@ def test_shard_whose_log_is_json_is_waited_for_as_any_other(tmp_path):
             assert daemon.expect("ready:").startswith("shard s0 of cell verify at tcp/127.0.0.1:")
         finally:
             daemon.end()
+
+
+def test_process_that_fails_is_told_by_what_was_wrong(tmp_path):
+    """One line of its traceback; the rest is with the error, for whoever shows tracebacks."""
+    process = LineProcess("timeit", ("raise ValueError('no figure')",), tmp_path / "log")
+    try:
+        with pytest.raises(LinkError) as found:
+            process.expect("ready:")
+    finally:
+        process.end()
+
+    assert str(found.value).endswith("its log ends with: ValueError: no figure")
+    assert "Traceback" in found.value.__notes__[0]
+
+
+def test_last_thing_said_is_a_line():
+    """With a traceback or without, whatever came before it."""
+    traceback = "begun\nTraceback (most recent call last):\n  File x\n    y()\n"
+    assert last_said(traceback + "enact_dist.errors.LinkError: gone") == "LinkError: gone"
+    assert last_said("one\ntwo\n\n") == "two"
+    assert last_said("") == ""
