@@ -27,6 +27,7 @@ from enact_dist.bench.run import Run
 from enact_dist.bench.tables import table
 from enact_dist.bench.updates import run_durable, run_multi, run_update, run_waiters
 from enact_dist.bench.visit import PEAK_BYTES, without_room
+from enact_dist.cli.bench import BENCHES as TOLD
 from enact_dist.cli.output import print_json, print_table
 from enact_dist.cli.verbs import DONE, FAILED
 from enact_dist.errors import EnactError, MisuseError
@@ -68,11 +69,9 @@ BENCHES: Final[dict[str, Callable[[Run], None]]] = {
     "memory": run_memory,
     "recovery": run_recovery,
 }
-BETWEEN_PROCESSES: Final = frozenset(
-    ("waiters", "wakeup", "pipeline", "stopped", "memory", "recovery")
-)
+BETWEEN_PROCESSES: Final = frozenset(name for name, told in TOLD.items() if not told.alone)
 """Benches that mean nothing within one process."""
-OWN_DAEMONS: Final = frozenset(("memory", "recovery"))
+OWN_DAEMONS: Final = frozenset(name for name, told in TOLD.items() if not told.guest)
 """Benches that look into daemons or kill them."""
 
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import textwrap
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from enact_dist.cli.verbs import add_verb, seconds, whole
 from enact_dist.config_values import CARRIERS
@@ -12,24 +13,61 @@ from enact_dist.config_values import CARRIERS
 if TYPE_CHECKING:
     from enact_dist.cli.verbs import Verb
 
-NAMES: Final = (
-    "floor",
-    "core",
-    "update",
-    "layers",
-    "multi",
-    "durable",
-    "waiters",
-    "fetch",
-    "publish",
-    "wakeup",
-    "history",
-    "pipeline",
-    "stopped",
-    "memory",
-    "recovery",
-)
+
+class Told(NamedTuple):
+    """What `--help` says of a bench.
+
+    Attributes:
+        what: What it measures.
+        alone: Whether it can be `--embedded`: within one process.
+        guest: Whether it can `--connect` to a cell that runs.
+        minutes: Whether it takes more than a minute with the measuring time that is usual.
+    """
+
+    what: str
+    alone: bool = True
+    guest: bool = True
+    minutes: bool = False
+
+
+BENCHES: Final = {
+    "floor": Told(
+        "the machine and the bare transports: Zenoh, Unix socket, memory, disk", minutes=True
+    ),
+    "core": Told("a shard's decisions alone: a lock and its commit, hand-over among 1,000"),
+    "update": Told("lock, read, write, release, by durability, over each carrier", minutes=True),
+    "layers": Told(
+        "where the time of an update, a fetch and a wake-up goes, layer by layer", minutes=True
+    ),
+    "multi": Told("up to 32 slots in a lock, 8 threads side by side, slots on several shards"),
+    "durable": Told("commits that survive a power cut: one, from several threads, of 10 MB"),
+    "waiters": Told("hand-over of a slot for which 2 to 32 threads wait", alone=False),
+    "fetch": Told("reading arrays of 1 kB to 100 MB, seen before, new, from afar", minutes=True),
+    "publish": Told("writing arrays of 1 kB to 100 MB, and committing what was filled in place"),
+    "wakeup": Told("from a commit in one process to its array in another", alone=False),
+    "history": Told(
+        "what kept versions cost an update; looks at the past, forks, 8 cameras whose history"
+        " fills memory (not with --connect)",
+        minutes=True,
+    ),
+    "pipeline": Told(
+        "17 processes: 8 cameras at 10 Hz, 8 workers, a reader of whole sets",
+        alone=False,
+        minutes=True,
+    ),
+    "stopped": Told("updates beside a reader of 50 MB that stands still", alone=False),
+    "memory": Told("a daemon's memory per slot and per commit", alone=False, guest=False),
+    "recovery": Told(
+        "how soon locks are back after a holder or a shard was killed",
+        alone=False,
+        guest=False,
+        minutes=True,
+    ),
+}
 """The benches, in the order in which they run and stand in the table."""
+_HEADING: Final = (
+    "\n\nbenches (less than a minute each with --seconds 3; [minutes]: one to three):\n"
+)
 
 
 def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
@@ -46,13 +84,15 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
         "enact bench fetch --connect tcp/tray-pc:7447\n"
         "enact bench --table run1.json run2.json run3.json",
     )
+    assert bench.description is not None
+    bench.description += _HEADING + "\n".join(map(_line, BENCHES))
     bench.add_argument(
         "names",
         nargs="*",
         type=bench_name,
         metavar="NAME",
-        help=f"which: {', '.join(NAMES)} (default: all); a row without a goal is one for which"
-        " the design sets none, as all of `waiters` and most of `multi` and `durable`",
+        help="which of those above (default: all); a row without a goal is one for which the"
+        " design sets none, as all of `waiters` and most of `multi` and `durable`",
     )
     where = bench.add_mutually_exclusive_group()
     where.add_argument("--embedded", action="store_true", help="in this process only, no daemon")
@@ -90,10 +130,23 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
     )
 
 
+def _line(name: str) -> str:
+    """Return what is said of a bench, indented as the help of arguments is."""
+    told = BENCHES[name]
+    but = {
+        "not --embedded": not told.alone,
+        "not --connect": not told.guest,
+        "minutes": told.minutes,
+    }
+    marks = ", ".join(mark for mark, holds in but.items() if holds)
+    text = f"{told.what} [{marks}]" if marks else told.what
+    return textwrap.fill(text, 98, initial_indent=f"  {name:10}", subsequent_indent=" " * 12)
+
+
 def bench_name(text: str) -> str:
     """Read the name of a bench; an `argparse` type."""
-    if text not in NAMES:
-        raise argparse.ArgumentTypeError(f"there is no bench {text!r}; known: {', '.join(NAMES)}")
+    if text not in BENCHES:
+        raise argparse.ArgumentTypeError(f"there is no bench {text!r}; known: {', '.join(BENCHES)}")
     return text
 
 

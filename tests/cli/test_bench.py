@@ -275,9 +275,25 @@ def test_workers_join_no_cell_that_this_process_does_not_reach(tmp_path, monkeyp
             pass
 
 
-def test_help_names_every_bench():
-    """The verb's names and what it can run are one list."""
-    assert tuple(command.BENCHES) == bench.NAMES
+@pytest.mark.parametrize("words", [("--help",), ("fetch", "--help")])
+def test_help_says_of_every_bench_what_it_measures(enact, capsys, words):
+    """In the order in which they run, and where they cannot."""
+    assert tuple(command.BENCHES) == tuple(bench.BENCHES)
+    with pytest.raises(SystemExit) as left:
+        enact("bench", *words)
+
+    assert left.value.code == 0
+    shown = (
+        capsys.readouterr().out.partition("one to three):\n")[2].partition("\n\n")[0].splitlines()
+    )
+    said = [line.split() for line in shown if line[2] != " "]
+    assert [words[0] for words in said] == list(command.BENCHES)
+    assert all(len(words) > 4 for words in said)
+    text = " ".join(" ".join(shown).split())
+    assert text.count("not --embedded") == len(command.BETWEEN_PROCESSES) == 6
+    assert text.count("not --connect,") == len(command.OWN_DAEMONS) - 1
+    assert "stands still [not --embedded]" in text
+    assert max(map(len, shown)) < 100
 
 
 def test_goal_that_is_missed_is_told_and_is_no_failure(enact, monkeypatch):
