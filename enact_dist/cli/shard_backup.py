@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -81,6 +82,12 @@ def run_restore(arguments: argparse.Namespace) -> int:
         unix_s=int(time.time()),
         replace=arguments.replace,
     )
+    if not backup.digests:
+        print(
+            f"enact: warning: {arguments.path} was made before backups had digests: what a shard's"
+            " start checks was checked, and not every byte of it compared; make a new backup",
+            file=sys.stderr,
+        )
     if arguments.json:
         print_json({"backup": backup, "folder": folder, "before": aside})
         return DONE

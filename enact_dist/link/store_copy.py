@@ -6,7 +6,7 @@ in the log as well, and replaces what was copied torn.  Else both are copied aga
 are files that never change; links hold all that are there just before and just after the log is
 read (`held_bodies`).  The mark is copied before all, so the copy is refused if it lacks anything
 that was acknowledged then.  A copy has its name only when every byte of it was checked and is on
-the disk.
+the disk, with a digest (`backup_digests`) that is made of the copy: the shard waits for none.
 
 A shard that is restored begins with an epoch above that of its backup, of what was there before,
 and the wall clock: whoever knew a later state is told that the shard has started anew, and no lock
@@ -15,8 +15,8 @@ or commit of before counts.
 
 from __future__ import annotations
 
+import dataclasses
 import errno
-import json
 import os
 import shutil
 import time
@@ -25,6 +25,14 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.errors import StoreError
+from enact_dist.link.backup_digests import (
+    BACKUP_FILE,
+    Digest,
+    check_files,
+    digests_of,
+    read_sealed,
+    sealed,
+)
 from enact_dist.link.blobs import BlobFolder
 from enact_dist.link.folder_lock import FORMAT_FILE, FolderLock, replace_file, sync_folder
 from enact_dist.link.held_bodies import HeldBodies, held_bodies
@@ -47,7 +55,7 @@ if TYPE_CHECKING:
 
     from enact_dist.core.records import Recovered
 
-BACKUP_FILE: Final = "backup.json"
+DIGESTS: Final = "digests"
 TRIES_MAX: Final = 50
 """So often the files are copied anew because the shard has begun its log anew meanwhile."""
 ASIDE: Final = ".replaced-"
@@ -66,6 +74,7 @@ class Backup:
         entities: How many entities it has.
         states: How many states of their slots, replaced ones included.
         size: Bytes of their data.
+        digests: Whether it has digests of its files, or was made before backups had them.
     """
 
     cell: str
@@ -75,6 +84,7 @@ class Backup:
     entities: int
     states: int
     size: int
+    digests: bool = True
 
 
 # ---------------------------------------------------------------- back up
@@ -99,7 +109,9 @@ def back_up(folder: Path, into: Path, *, cell: str, shard: str, unix_s: int) -> 
             partial.mkdir(parents=True)
             stored = _copied(folder, bodies, partial)
             backup = _told(stored, cell=cell, shard=shard, unix_s=unix_s)
-            replace_file(partial / BACKUP_FILE, json.dumps(asdict(backup)).encode())
+            told = {name: value for name, value in asdict(backup).items() if name != DIGESTS}
+            replace_file(partial / BACKUP_FILE, sealed(told, digests_of(partial)))
+            read_backup(partial)
             _sync(partial)
             partial.rename(into)
             sync_folder(into.parent)
@@ -193,17 +205,21 @@ def _sync(folder: Path) -> None:
 # ---------------------------------------------------------------- restore
 
 
-def read_backup(path: Path) -> Backup:
-    """Return what a backup says of itself.
+def read_backup(path: Path) -> tuple[Backup, dict[str, Digest] | None]:
+    """Return what a backup says of itself and of its files; None: it has no digests of them.
 
     Raises:
-        StoreError: It is none.
+        StoreError: It is none, or that is not what it was.
     """
+    told, files = read_sealed(path)
     try:
-        return Backup(**json.loads((path / BACKUP_FILE).read_text(encoding="utf-8")))
-    except (OSError, ValueError, TypeError) as failure:
+        if told.keys() != {field.name for field in dataclasses.fields(Backup)} - {DIGESTS}:
+            raise ValueError(f"it has {', '.join(told)}")
+        return Backup(**told, digests=files is not None), files
+    except (TypeError, ValueError) as failure:
         raise StoreError(
-            f"{path} is no backup of a shard: its {BACKUP_FILE} cannot be read ({failure})",
+            f"{path} is no backup of a shard, or its {BACKUP_FILE} is damaged ({failure}); copy the"
+            " backup again from where it is whole, or take another one",
             path=str(path),
         ) from failure
 
@@ -211,7 +227,10 @@ def read_backup(path: Path) -> Backup:
 def restore(
     source: Path, folder: Path, *, cell: str, shard: str, unix_s: int, replace: bool = False
 ) -> tuple[Backup, Path | None]:
-    """Make the folder of a stopped shard what a backup has.
+    """Make the folder of a stopped shard what a backup has, every byte of it compared before.
+
+    A backup that was made before there were digests has to do with the checks of a shard's start:
+    whoever has no other one would rather have it than nothing.
 
     Args:
         source: The backup.
@@ -228,7 +247,7 @@ def restore(
         StoreError: The backup is of another shard, damaged or from the future; the folder is in
             use, or is there and not to be replaced; or it cannot be written.
     """
-    backup = read_backup(source)
+    backup, files = read_backup(source)
     if (backup.cell, backup.shard) != (cell, shard):
         raise StoreError(
             f"{source} is a backup of shard {backup.shard} of cell {backup.cell}, not of {shard} of"
@@ -242,9 +261,11 @@ def restore(
         )
     partial = folder.with_name(folder.name + ".restoring")
     try:
+        if files is not None:
+            check_files(source, files)
         shutil.rmtree(partial, ignore_errors=True)
         if not folder.exists() or not any(folder.iterdir()):
-            _build(source, partial, backup, unix_s=unix_s, epoch=_epoch_before(folder))
+            _build(source, partial, backup, files, unix_s=unix_s, epoch=_epoch_before(folder))
             try:
                 partial.rename(folder)  # an empty folder gives way, one begun meanwhile does not
             except OSError as failure:
@@ -257,7 +278,7 @@ def restore(
             raise _has_data(folder)
         epoch = _epoch_before(folder)
         with closing(FolderLock(folder)):
-            _build(source, partial, backup, unix_s=unix_s, epoch=epoch)
+            _build(source, partial, backup, files, unix_s=unix_s, epoch=epoch)
             while (aside := folder.with_name(f"{folder.name}{ASIDE}{unix_s}")).exists():
                 unix_s += 1
             folder.rename(aside)
@@ -276,13 +297,27 @@ def _has_data(folder: Path) -> StoreError:
     )
 
 
-def _build(source: Path, partial: Path, backup: Backup, *, unix_s: int, epoch: int) -> None:
+def _build(
+    source: Path,
+    partial: Path,
+    backup: Backup,
+    files: dict[str, Digest] | None,
+    *,
+    unix_s: int,
+    epoch: int,
+) -> None:
     """Make a folder of a backup, checked whole, whose next epoch is above `epoch`."""
-    shutil.copytree(source, partial, ignore=shutil.ignore_patterns(BACKUP_FILE))
+    if files is None:
+        shutil.copytree(source, partial, ignore=shutil.ignore_patterns(BACKUP_FILE))
+    else:
+        (partial / BLOB_FOLDER).mkdir(parents=True)
+        for name in files:
+            shutil.copyfile(source / name, partial / name)
+        check_files(partial, files)
     with read_store(partial) as stored:
         _check_bodies(stored)
         found = _told(stored, cell=backup.cell, shard=backup.shard, unix_s=backup.unix_s)
-    if found != backup:
+    if found != dataclasses.replace(backup, digests=True):
         raise StoreError(
             f"{source} is not what it was when it was made: {found.states} states with"
             f" {found.size} bytes are there of {backup.states} with {backup.size}; copy it again",

@@ -1,8 +1,11 @@
 """`enact shard`: run, drain, list."""
 
+import json
 import signal
 
 import pytest
+
+from enact_dist.link.store import open_store
 
 
 def test_ls_lists_every_shard(enact, cell_file):
@@ -60,3 +63,25 @@ def test_shard_drains_and_leaves_with_status_0_on_a_signal(write_cell, spawn, un
 
     assert shard.wait(60) == 0
     assert "elsewhere" in ready
+
+
+def test_backup_without_digests_is_restored_with_a_warning(enact, write_cell, tmp_path):
+    """Whoever has no other one needs it; on standard error, so that JSON stays JSON."""
+    open_store(tmp_path / "shard", unix_s=1)[0].close()
+    words = ("left", "--cell", str(write_cell()), "--json")
+    made = enact("shard", "backup", *words, "--to", "copy", "--folder", "shard")
+    assert (made.status, made.json["digests"]) == (0, True)
+    whole = enact("shard", "restore", *words, "--from", "copy", "--folder", "first")
+    assert (whole.status, whole.err) == (0, "")
+
+    told = json.loads((tmp_path / "copy" / "backup.json").read_text())
+    del told["files"], told["sha256"]
+    (tmp_path / "copy" / "backup.json").write_text(json.dumps(told))
+    old = enact("shard", "restore", *words, "--from", "copy", "--folder", "second")
+
+    assert (old.status, old.json["backup"]["digests"]) == (0, False)
+    assert "copy was made before backups had digests" in old.err
+    (tmp_path / "copy" / "backup.json").write_text(json.dumps({**told, "digest": 1}))
+    damaged = enact("shard", "restore", *words, "--from", "copy", "--folder", "third")
+    assert damaged.status == 1
+    assert "backup.json is damaged" in damaged.err

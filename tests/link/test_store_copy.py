@@ -1,9 +1,12 @@
 """Back-ups of folders that are written meanwhile, and what a restored one is."""
 
+import hashlib
+import json
 import os
 import shutil
 import signal
 import time
+from random import Random
 from types import SimpleNamespace
 
 import pytest
@@ -12,10 +15,11 @@ from store_writer import persist, slot_record
 from enact_dist.errors import StoreError
 from enact_dist.link import held_bodies as held_bodies_module
 from enact_dist.link import store_copy
+from enact_dist.link.backup_digests import BACKUP_FILE, read_sealed, sealed
 from enact_dist.link.folder_lock import FolderLock
 from enact_dist.link.held_bodies import HELD_FOLDER, held_bodies
 from enact_dist.link.store import open_store, read_store
-from enact_dist.link.store_copy import BACKUP_FILE, back_up, restore
+from enact_dist.link.store_copy import back_up, restore
 from enact_dist.terms import Durability
 
 NAMES = {"cell": "line", "shard": "left"}
@@ -169,11 +173,11 @@ def test_what_must_not_be_restored_is_refused(folder, tmp_path):
 
     blob = next((copy / "blobs").iterdir())
     blob.write_bytes(bytes(LARGE))
-    with pytest.raises(StoreError, match="its checksum is wrong"):
+    with pytest.raises(StoreError, match=f"{blob.name} has {LARGE} bytes with SHA-256"):
         restore(copy, new, unix_s=100, **NAMES)
     blob.unlink()
     (copy / "mark").write_bytes(b"")
-    with pytest.raises(StoreError, match=r"is missing|is not what it was"):
+    with pytest.raises(StoreError, match=r"mark has 0 bytes .* \(and 1 more files\)"):
         restore(copy, new, unix_s=100, **NAMES)
     assert not new.exists()
 
@@ -225,3 +229,113 @@ def test_links_that_cannot_be_removed_keep_no_shard_from_its_start(folder, monke
     monkeypatch.setattr(held_bodies_module, "shutil", SimpleNamespace(rmtree=refuse))
     fill(folder, 2)
     assert "stays: [Errno 13] Permission denied" in caplog.text
+
+
+def damages(random, size):
+    """Yield a name and an edit of the bytes of a file, several of each kind."""
+    for _ in range(12):
+        at, bit = random.randrange(size), 1 << random.randrange(8)
+        yield (
+            f"bit {bit} of byte {at}",
+            lambda b, at=at, bit=bit: b[:at] + bytes((b[at] ^ bit,)) + b[at + 1 :],
+        )
+    cut = random.randrange(size)
+    yield f"cut to {cut}", lambda b: b[:cut]
+    yield "empty", lambda _: b""
+    yield "one byte more", lambda b: b + bytes((random.randrange(256),))
+    yield "one byte less", lambda b: b[:-1]
+    yield "missing", lambda _: None
+
+
+@pytest.mark.parametrize("kind", ["backup.json", "mark", "format", "store.db", "blobs"])
+def test_one_byte_of_a_backup_that_differs_is_refused(folder, tmp_path, kind):
+    """Whatever the byte means, before anything is written; the error names the file."""
+    copy, new = tmp_path / "copy", tmp_path / "new"
+    back_up(folder, copy, unix_s=100, **NAMES)
+    path = copy / kind if kind != "blobs" else next((copy / kind).iterdir())
+    whole, random = path.read_bytes(), Random(7)
+
+    for what, edit in damages(random, len(whole)):
+        damaged = edit(whole)
+        path.unlink()
+        if damaged is not None:
+            path.write_bytes(damaged)
+        with pytest.raises(StoreError) as found:
+            restore(copy, new, unix_s=200, **NAMES)
+            pytest.fail(f"{kind}, {what}")
+        assert path.name in str(found.value), what
+        if kind != "backup.json":
+            assert digest_of_bytes(whole) in str(found.value)
+            assert damaged is None or digest_of_bytes(damaged) in str(found.value)
+        assert not new.exists()
+        assert not new.with_name("new.restoring").exists()
+        path.write_bytes(whole)
+    restore(copy, new, unix_s=200, **NAMES)
+    assert versions(new) == {"a": 1, "b": 1}
+
+
+def digest_of_bytes(content):
+    return f"{len(content)} bytes with SHA-256 {hashlib.sha256(content).hexdigest()}"
+
+
+def test_what_lies_beside_the_files_of_a_backup_is_not_restored(folder, tmp_path):
+    """Nor does it stand in the way; a log of another database would be read as this one's."""
+    copy, new = tmp_path / "copy", tmp_path / "new"
+    store, _ = open_store(folder, unix_s=1)
+    try:
+        store.write([persist(slot_record("a", 2))])
+        back_up(folder, copy, unix_s=100, **NAMES)
+        files = {path.relative_to(copy).as_posix() for path in copy.rglob("*") if path.is_file()}
+        assert files == {*read_sealed(copy)[1], BACKUP_FILE}
+        shutil.copyfile(folder / "store.db-wal", copy / "store.db-wal")
+    finally:
+        store.close()
+    (copy / "notes.txt").write_text("of the old host")
+
+    restore(copy, new, unix_s=200, **NAMES)
+
+    assert versions(new) == {"a": 2, "b": 1}
+    assert not (new / "notes.txt").exists()
+
+
+def test_a_copy_that_is_not_what_was_copied_is_refused(folder, tmp_path, monkeypatch):
+    """A disk may fail under the restored folder, too."""
+    copy, new = tmp_path / "copy", tmp_path / "new"
+    back_up(folder, copy, unix_s=100, **NAMES)
+    real = shutil.copyfile
+
+    def copyfile(source, target):
+        real(source, target)
+        if target.name == "mark":
+            target.write_bytes(target.read_bytes()[:-1])
+
+    monkeypatch.setattr(store_copy.shutil, "copyfile", copyfile)
+    with pytest.raises(StoreError, match=r"new.restoring/mark has 43 bytes"):
+        restore(copy, new, unix_s=200, **NAMES)
+    assert not new.exists()
+
+
+def test_a_backup_of_before_there_were_digests_is_restored(folder, tmp_path):
+    """It says so of itself; a newer one cannot pass for it, whatever it has lost."""
+    copy, new = tmp_path / "copy", tmp_path / "new"
+    back_up(folder, copy, unix_s=100, **NAMES)
+    told = json.loads((copy / BACKUP_FILE).read_text())
+    for lost in ("sha256", "files"):
+        del told[lost]
+        (copy / BACKUP_FILE).write_text(json.dumps(told))
+        if lost == "sha256":
+            with pytest.raises(StoreError, match=r"backup.json is damaged .*files"):
+                restore(copy, new, unix_s=200, **NAMES)
+    assert restore(copy, new, unix_s=200, **NAMES)[0].digests is False
+    assert versions(new) == {"a": 1, "b": 1}
+
+
+def test_a_backup_names_no_file_outside_of_it(folder, tmp_path):
+    """Its text may come from anywhere."""
+    back_up(folder, tmp_path / "copy", unix_s=100, **NAMES)
+    told, files = read_sealed(tmp_path / "copy")
+    for name in ("../mark", "blobs/..", "blobs/../../mark", "/etc/passwd", "other"):
+        text = sealed(told, {**files, name: files["mark"]})
+        (tmp_path / "copy" / BACKUP_FILE).write_bytes(text)
+        with pytest.raises(StoreError, match="is no file of a backup"):
+            restore(tmp_path / "copy", tmp_path / "new", unix_s=200, **NAMES)
