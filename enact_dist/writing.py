@@ -2,19 +2,21 @@
 
 Large data are written there at once (see `link.payload_client`), small ones, and those of shards
 that share no memory with this process, travel with the commit.  `blank` hands out memory to be
-filled in place; once the block ends nobody can change it any more.
+filled in place; once the block ends nobody can change it any more, not by a view that he has kept
+or by `setflags` either: large memory is cut off (see `Draft.close`), small is copied.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, cast
 
 from enact_dist.core.datum import Datum, Slot
 from enact_dist.core.messages import WriteItem
 from enact_dist.errors import DatumTypeError, MisuseError
 from enact_dist.wire.limits import BODY_BYTES_MAX, ITEMS_MAX, PAYLOAD_BYTES_MIN
-from enact_dist.wire.payload import decode_to_fill, encode_parts
+from enact_dist.wire.payload import decode_to_fill, encode_parts, joined
 from enact_dist.wire.shapes import ArrayOf, RecordOf, shape_of
 
 if TYPE_CHECKING:
@@ -114,23 +116,36 @@ class Writing:
             NoRoomError: The shard's cap is reached.
         """
         encoded = encode_parts(like, datum_type, stamp_ns=stamp_ns)
-        draft = self._payloads.draft(shard, encoded.size)
-        memory = self._payloads.memory(draft) if draft is not None else None
-        if memory is None:
-            draft, memory = None, _plain(encoded)
+        draft, memory, shown = self._memory(shard, encoded)
         encoded.put_texts(memory)
         value, arrays = decode_to_fill(encoded.encoding, memory, datum_type)
         if not arrays:
             if draft is not None:
-                draft.close()
-                self._payloads.drop(shard, draft.file)
+                self._drop(draft)
             raise DatumTypeError(
                 f"new() hands out arrays to be filled, and {type(like).__name__} has none; put()"
                 " takes any datum"
             )
-        datum = encoded.over(memory.toreadonly(), draft.file if draft is not None else "")
+        datum = encoded.over(shown, draft.file if draft is not None else "")
         self._note(slot, self._keep(slot, _Written(datum, draft, arrays)))
         return value
+
+    def _memory(self, shard: str, encoded: Encoded) -> tuple[Draft | None, memoryview, memoryview]:
+        """Return memory to be filled, where it lies, and the same bytes read-only."""
+        draft = self._payloads.draft(shard, encoded.size)
+        memory = self._payloads.memory(draft) if draft is not None else None
+        if memory is not None:
+            return draft, memory, memory.toreadonly()
+        nameless = self._payloads.nameless(shard, encoded.size)
+        if nameless is not None:
+            return nameless
+        memory = _plain(encoded)
+        return None, memory, memory.toreadonly()
+
+    def _drop(self, draft: Draft) -> None:
+        draft.close()
+        if draft.file:
+            self._payloads.drop(draft.shard, draft.file)
 
     def _forget(self, slot: Slot) -> None:
         """Drop what was written to a slot: something else takes its place."""
@@ -138,7 +153,7 @@ class Writing:
         if old is not None:
             _fix(old)
             if old.draft is not None:
-                self._payloads.drop(old.draft.shard, old.draft.file)
+                self._drop(old.draft)
 
     def _keep(self, slot: Slot, written: _Written) -> Datum:
         self._forget(slot)
@@ -148,9 +163,12 @@ class Writing:
 
     def fix(self) -> None:
         """Let nobody change any of it: it is about to be committed."""
-        for written in self._by_slot.values():
+        for slot, written in self._by_slot.items():
             for array in written.arrays:
                 array.flags.writeable = False
+            datum = written.datum
+            if self._payloads.inside and written.draft is None and self.data[slot] is datum:
+                self.data[slot] = replace(datum, body=joined([datum.body], datum.size))
 
     def end(self, *, committed: bool) -> None:
         """Let go of it after the lock has ended."""

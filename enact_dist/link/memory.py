@@ -99,6 +99,23 @@ def map_file(
     return _mapped(Pages, address, size, ended)
 
 
+def anonymous_file(size: int) -> int:
+    """Return the descriptor of a file that has no name, all of whose pages are there.
+
+    It goes with its descriptor and its maps.
+
+    Raises:
+        OSError: As the system reports it.
+    """
+    descriptor = os.memfd_create("enact", os.MFD_CLOEXEC)
+    try:
+        os.posix_fallocate(descriptor, 0, size)
+    except BaseException:
+        os.close(descriptor)
+        raise
+    return descriptor
+
+
 def _mapped(kind: type[Kind], address: int, size: int, ended: Callable[[], None] | None) -> Kind:
     mapped = kind.from_address(address)
     mapped.address, mapped.size, mapped.ended = address, size, ended

@@ -3,6 +3,9 @@
 Both need that client and shard share memory, which the nonce of the shard's WELCOME proves for one
 start of it (see `shared_folder`).  Where they do not, or whatever fails here, the same bytes travel
 with the messages: every failure is counted, none is the caller's.
+
+A shard in this very process takes the bytes as they are.  What is filled in place for it lies in a
+file without a name, so that its writer can be cut off just the same.
 """
 
 from __future__ import annotations
@@ -18,7 +21,14 @@ from typing import TYPE_CHECKING, Any, Final
 from enact_dist.core.datum import Datum
 from enact_dist.core.messages import Refused, Stage, Staged
 from enact_dist.errors import EnactError
-from enact_dist.link.memory import Pages, body_of, leftovers, map_file, withdraw
+from enact_dist.link.memory import (
+    Pages,
+    anonymous_file,
+    body_of,
+    leftovers,
+    map_file,
+    withdraw,
+)
 from enact_dist.link.payload_desk import NO_ROOM
 from enact_dist.link.refusals import error_of
 from enact_dist.link.shared_folder import OpenedFolder, open_shared
@@ -43,7 +53,7 @@ class Draft:
 
     Attributes:
         shard: Where it lies.
-        file: Its name there.
+        file: Its name there; "" where it has none, and is committed by its bytes.
         size: Its length in bytes.
     """
 
@@ -72,6 +82,14 @@ class Draft:
                 written -= len(left.pop(0))
             if written:
                 left[0] = left[0][written:]
+        return self.shown()
+
+    def shown(self) -> memoryview:
+        """Return the bytes, read-only, in a map that no `close` cuts off.
+
+        Raises:
+            OSError: As the system reports it.
+        """
         return body_of(map_file(self._descriptor, self.size, writable=False)).toreadonly()
 
     def memory(self) -> memoryview:
@@ -130,9 +148,16 @@ class SharedPayloads:
         session: The session of this process; its payloads bear its name.
         call: Makes one call to a shard; None stands for no answer.
         count: Adds to a counter of the session.
+        inside: Whether the only shard is in this process, and takes data as they lie here.
+
+    Attributes:
+        inside: As above.
     """
 
-    def __init__(self, session: str, call: Call, count: Callable[[str], None]) -> None:
+    def __init__(
+        self, session: str, call: Call, count: Callable[[str], None], *, inside: bool = False
+    ) -> None:
+        self.inside: Final = inside
         self._session = session
         self._call = call
         self._count = count
@@ -188,6 +213,27 @@ class SharedPayloads:
             self._count("payload_fallbacks")
             _log.info("payload %s of shard %s: %s", file, shard, error)
             self.drop(shard, file)
+            return None
+
+    def nameless(self, shard: str, size: int) -> tuple[Draft, memoryview, memoryview] | None:
+        """Make memory that is filled in place and handed to a shard in this process as it lies.
+
+        Returns:
+            The draft, its bytes to be filled, and the same bytes as the shard gets them; None
+            where they are few, are copied on their way, or no such memory can be had.
+        """
+        if not self.inside or size <= PAYLOAD_BYTES_MIN:
+            return None
+        try:
+            draft = Draft(shard, "", size, anonymous_file(size))
+            try:
+                return draft, draft.memory(), draft.shown()
+            except BaseException:
+                draft.close()
+                raise
+        except OSError as error:
+            self._count("payload_fallbacks")
+            _log.info("%d bytes to be filled have no file: %s", size, error)
             return None
 
     def filled(self, draft: Draft, parts: Sequence[Any]) -> memoryview | None:

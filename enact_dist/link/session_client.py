@@ -41,6 +41,7 @@ from enact_dist.link.lanes import Lanes
 from enact_dist.link.payload_client import SharedPayloads
 from enact_dist.link.refusals import error_of, unreachable
 from enact_dist.link.used_names import SERIES_BITS
+from enact_dist.wire.limits import BODY_BYTES_MAX
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -110,7 +111,12 @@ class SessionClient:
         self._returns = 0
         self._lanes = Lanes()
         self._catalogue = KnownCatalogue()
-        self.payloads = SharedPayloads(client.session, self._staged, self.count)
+        self.payloads = SharedPayloads(
+            client.session,
+            self._staged,
+            self.count,
+            inside=carrier.fetch_bytes > BODY_BYTES_MAX,
+        )
         self._registered: dict[str, AspectEntry] = {}
         self._linked = client.placement
         self._linking = threading.Lock()

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from enact_dist import Aspect, Durability, Entity, Lock, Read, View, Write
 from enact_dist.errors import DatumTypeError, LockReleasedError, MisuseError, ReadonlyError
+from enact_dist.link.memory import leftovers
 
 piece = Entity("work_piece")
 CARRIERS = pytest.mark.carrier("local", "socket", "zenoh")
@@ -154,22 +155,110 @@ def test_array_is_read_only_after_the_block(online, rows):
     assert (cloud == 1.0).all()
 
 
-@pytest.mark.carrier("socket", "zenoh")
-def test_view_made_before_the_commit_reaches_nobody_after_it(online):
-    """A stray write through it stays in its process; the array itself stays as it was read."""
-    from enact_dist.link.memory import leftovers
+def change(array, kept, value):
+    """Write to a committed array through a view of before, and by making it writable again."""
+    kept[:] = value
+    try:
+        array.setflags(write=True)
+    except ValueError:  # numpy refuses it where the memory is read-only by itself
+        return
+    array[0] = value
 
+
+@CARRIERS
+@pytest.mark.parametrize("size", [1000, 1 << 16, (1 << 16) + 1, 1_000_000, 9_000_000])
+def test_view_made_before_the_commit_reaches_nobody_after_it(online, size):
+    """A stray write stays with its array: neither who has read it sees it, nor who reads it then.
+
+    The array itself keeps what was committed until then.
+    """
     write, view = Write(online, piece, CLOUD), View(online, piece, CLOUD)
     with Lock(write) as lock:
-        cloud = lock.new(write, (1_000_000,), np.uint8)
+        cloud = lock.new(write, (size,), np.uint8)
+        cloud[:] = 1
+        kept, seen = cloud[10:20], lock[write]
+    with Lock(view) as lock:
+        before = lock[view]
+    assert leftovers().wait(30.0)
+    assert (cloud == 1).all()
+
+    change(cloud, kept, 99)
+
+    assert (kept == 99).all()
+    with Lock(view) as lock:
+        after = lock[view]
+    assert [int(each.max()) for each in (before, after)] == [1, 1]
+    assert not seen.flags.writeable
+    with pytest.raises(ValueError, match="WRITEABLE"):
+        after.setflags(write=True)
+
+
+@pytest.mark.carrier("socket", "zenoh")
+@pytest.mark.parametrize("size", [1000, 1_000_000, 9_000_000])
+def test_stray_write_reaches_nobody_where_no_memory_is_shared(online, size):
+    """The shard has its own copy, and what this process remembers of it is none of its arrays."""
+    online.session.client.payloads.close()  # from here on all data travel
+    assert online.session.client.payloads.draft("local", 1_000_000) is None
+    write, view = Write(online, piece, CLOUD), View(online, piece, CLOUD)
+    with Lock(write) as lock:
+        cloud = lock.new(write, (size,), np.uint8)
         cloud[:] = 1
         kept = cloud[10:20]
-    assert leftovers().wait(30.0)
+    with Lock(view) as lock:
+        before = lock[view]
 
-    kept[:] = 99
+    change(cloud, kept, 99)
+
+    for _ in range(2):  # the second time it may come from the cache
+        with Lock(view) as lock:
+            assert (lock[view] == 1).all()
+    assert (before == 1).all()
+
+
+@pytest.mark.carrier("local")
+@pytest.mark.parametrize("size", [1_000_000, 9_000_000])
+def test_stray_write_reaches_nobody_where_no_file_can_be_had(online, size, monkeypatch):
+    """Without a descriptor left, say, the commit copies; a counter tells."""
+
+    def refuse(*_):
+        raise OSError(24, "Too many open files")
+
+    monkeypatch.setattr(os, "memfd_create", refuse)
+    write, view = Write(online, piece, CLOUD), View(online, piece, CLOUD)
+    with Lock(write) as lock:
+        cloud = lock.new(write, (size,), np.uint8)
+        cloud[:] = 1
+        kept = cloud[10:20]
+
+    change(cloud, kept, 99)
 
     with Lock(view) as lock:
         assert (lock[view] == 1).all()
+    assert online.session.client.counters["payload_fallbacks"] == 1
+
+
+@pytest.mark.carrier("local")
+def test_descriptors_of_new_arrays_go_with_the_block(online):
+    """Committed, dropped or replaced: none is left open once they are cut off."""
+    write = Write(online, piece, CLOUD)
+
+    def fail():
+        with Lock(write) as lock:
+            lock.new(write, (1_000_000,), np.uint8)[:] = 1
+            raise KeyError("on purpose")
+
+    before = len(list(Path("/proc/self/fd").iterdir()))
+    for _ in range(20):
+        with Lock(write) as lock:
+            lock.new(write, (1_000_000,), np.uint8)[:] = 1
+            lock[write] = np.ones(3)
+        with Lock(write) as lock:
+            lock.new(write, (1_000_000,), np.uint8)[:] = 1
+        with pytest.raises(KeyError):
+            fail()
+    assert leftovers().wait(30.0)
+
+    assert len(list(Path("/proc/self/fd").iterdir())) == before
 
 
 @CARRIERS
