@@ -346,7 +346,8 @@ class Lock:
     ) -> T:
         """Return a datum whose arrays are to be filled in place; committing it copies nothing.
 
-        It counts as written; after the block its arrays are read-only.
+        It counts as written; after the block its arrays are read-only.  One block hands out one for
+        each slot; `put` may still take its place.
 
         Args:
             request: A `Write` of this lock.
@@ -358,10 +359,12 @@ class Lock:
         Raises:
             ReadonlyError: The request does not allow writing.
             DatumTypeError: What was asked is not of the aspect's type, or has no array.
+            MisuseError: This block has one of this slot already.
             NoRoomError: As `put`.
         """
         self._check_writable(request)
         slot, asked = slot_of(request), request.aspect.datum_type
+        self._writing.refuse_second(slot, request)
         wanted = template(asked, like, shape, dtype)
         value: T = self._writing.blank(slot, self._shard(slot), wanted, asked, stamp_ns)
         return value

@@ -107,6 +107,16 @@ class Writing:
             return self._keep(slot, _Written(encoded.datum(), None))
         return self._keep(slot, _Written(encoded.over(body, draft.file), draft))
 
+    def refuse_second(self, slot: Slot, request: object) -> None:
+        """Raise `MisuseError` if a datum of this slot was handed out to be filled, and stands."""
+        held = self._by_slot.get(slot)
+        if held is not None and held.arrays:
+            raise MisuseError(
+                f"new({request!r}) has handed out a datum in this block already, and a second one"
+                " would take its place with nothing in it: fill the first, or give it up with"
+                " `del lock[request]` before you ask for another"
+            )
+
     def blank(self, slot: Slot, shard: str, like: object, datum_type: Any, stamp_ns: int) -> Any:
         """Set a slot to a value like `like`, whose arrays are to be filled, and return it.
 

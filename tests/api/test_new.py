@@ -119,6 +119,7 @@ def test_dataclass_of_arrays_is_filled_in_place(online):
     assert (found.points_m.dtype, found.colors.dtype) == (np.float32, np.float64)
     with Lock(write) as lock:
         assert lock.new(write, shapes, {"colors": np.uint8}).colors.dtype == np.uint8
+        del lock[write]
         lock.new(write, shapes, np.float32)
 
 
@@ -281,10 +282,11 @@ def test_block_that_raises_leaves_nothing(online):
 
 @CARRIERS
 def test_last_write_of_a_block_counts(online):
-    """A second new, a put or a deletion takes the place of the first; its file goes."""
+    """A put or a deletion takes the place of what was handed out; its file goes."""
     write, read = Write(online, piece, CLOUD), Read(online, piece, CLOUD)
     with Lock(write) as lock:
         lock.new(write, (200_000,), np.uint8)[:] = 1
+        del lock[write]
         lock.new(write, (300_000,), np.uint8)[:] = 2
         lock[write] = np.full(100_000, 3, np.uint8)
     with Lock(read) as lock:
@@ -297,6 +299,32 @@ def test_last_write_of_a_block_counts(online):
         assert lock.is_null(write)
     with Lock(read) as lock:
         assert lock.is_null(read)
+
+
+@CARRIERS
+@pytest.mark.parametrize("size", [1000, 1_000_000])
+def test_second_new_of_a_block_is_refused(online, size):
+    """It would commit what nobody has filled; the first one stands, and can be given up."""
+    write, read = Write(online, piece, CLOUD), Read(online, piece, CLOUD)
+    with Lock(write) as lock:
+        first = lock.new(write, (size,), np.uint8)
+        first[:] = 1
+        with pytest.raises(MisuseError, match=r"new\(Write\(.*work_piece.*`del lock\[request\]`"):
+            lock.new(write, (size + 1,), np.uint8)
+        first[:2] = 2
+    with Lock(read) as lock:
+        assert lock[read][:4].tolist() == [2, 2, 1, 1]
+
+    with Lock(write) as lock:
+        lock.new(write, (size,), np.uint8)[:] = 3
+        del lock[write]
+        lock.new(write, (5,), np.uint8)[:] = 4
+        lock[write] = np.full(5, 5, np.uint8)
+        lock.new(write, (6,), np.uint8)[:] = 6
+    with Lock(read) as lock:
+        assert lock[read].tolist() == [6] * 6
+    shared = size > 1000 and online.session.client.carrier.way_to("local") != "call"
+    assert come_down_to(1 if shared else 0)  # what was committed and replaced
 
 
 @CARRIERS
