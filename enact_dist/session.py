@@ -14,6 +14,7 @@ from enact_dist.link.session_client import CALL_S
 from enact_dist.reading import slot_of
 from enact_dist.retention import checked_retention
 from enact_dist.terms import Entity, LockRequest
+from enact_dist.together import Together
 from enact_dist.wire.fingerprint import fingerprint
 
 if TYPE_CHECKING:
@@ -168,6 +169,16 @@ class Session:
         )
 
 
+def _remedy(request: object) -> str:
+    """Return what to do with what is no lock request."""
+    if isinstance(request, Together):
+        return (
+            "to lock what belongs to a set, make it the trigger of an Actor; to see the newest"
+            " complete set without a lock, world.view(together)"
+        )
+    return "use Read, Write, View or …Each"
+
+
 def session_of(requests: tuple[LockRequest[Any], ...], *, view: bool = False) -> Session:
     """Return the one cell session that all requests belong to.
 
@@ -181,7 +192,7 @@ def session_of(requests: tuple[LockRequest[Any], ...], *, view: bool = False) ->
     session: Session | None = None
     for request in requests:
         if not isinstance(request, LockRequest):
-            raise MisuseError(f"{request!r} is no lock request; use Read, Write, View or …Each")
+            raise MisuseError(f"{request!r} is no lock request; {_remedy(request)}")
         found: Session | None = getattr(request.world, "session", None)
         if found is None:
             raise MisuseError(
