@@ -44,6 +44,7 @@ class ShardInfo:
     Attributes:
         open: Whether it grants locks; False while it waits for older leases to end after a start,
             and while it ends.
+        size_bytes: Of the newest data, each counted as in `SlotInfo`.
         clock_ahead_s: Its wall clock less ours, half a round trip taken off.
         round_trip_s: Of the call that asked.
         carrier: How this process's calls to it travel: "socket", or "zenoh" and why.
@@ -106,7 +107,8 @@ class SlotInfo:
     """One slot of a world context, without its datum.
 
     Attributes:
-        size_bytes: Length of the datum's buffers; 0 for null and for plain numbers.
+        size_bytes: Length of the datum's body: arrays, texts and bytes over 256 B, long lists; 0
+            for all else.
         null_reason: Why it is null, or the empty string.
         shard: Where it lies.
     """

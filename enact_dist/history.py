@@ -59,7 +59,8 @@ class Version(Generic[T]):
         position: Where its commit stands in time.
         until_ns: Stamp of the version that replaced it, 0 where it is the newest one.
         stamp_ns: When the datum was captured, 0 where the writer did not say.
-        size_bytes: Length of the datum's buffers; 0 for null and for plain numbers.
+        size_bytes: Length of the datum's body: arrays, texts and bytes over 256 B, long lists; 0
+            for all else.
         null_reason: Why it is null, or the empty string.
         kept: The labels under which it is kept.
         cause: Who committed it and what went in; None where that is not known.

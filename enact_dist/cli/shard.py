@@ -26,7 +26,7 @@ from enact_dist.cli.verbs import (
 )
 from enact_dist.core.epochs import state_of
 from enact_dist.errors import ConfigError
-from enact_dist.link.counters import told
+from enact_dist.link.counters import BODIES, told
 
 if TYPE_CHECKING:
     import argparse
@@ -46,7 +46,7 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
     ls = add_verb(
         verbs,
         "ls",
-        "list the shards of the cell and how they are",
+        f"list the shards of the cell and how they are; data: bytes of {BODIES}",
         run=list_shards,
         example="enact shard ls --cell tcp/127.0.0.1:7447",
     )

@@ -8,8 +8,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+from enact_dist.wire.limits import INLINE_BYTES_MAX
+
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
+
+BODIES: Final = f"arrays, texts and bytes over {INLINE_BYTES_MAX} B, long lists; all else counts 0"
+"""What of a datum counts where bytes of data are told: its body (see `enact_dist.wire`)."""
 
 
 class Counter(NamedTuple):
@@ -34,7 +39,7 @@ _SLOW_READER: Final = "find the client that is stopped or too slow: enact actor 
 OF_A_SHARD: Final[dict[str, Counter]] = {
     # Work
     "commits": Counter("commits that were applied here"),
-    "bytes_written": Counter("bytes of data in them"),
+    "bytes_written": Counter(f"bytes of data in them: {BODIES}"),
     "bytes_fetched": Counter("bytes that were fetched in slices"),
     "locks_granted": Counter("locks that were granted"),
     "locks_validated": Counter("locks without a write here that were confirmed at their end"),

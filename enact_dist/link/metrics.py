@@ -11,7 +11,7 @@ from itertools import accumulate
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from enact_dist.core.latencies import BOUNDS_S
-from enact_dist.link.counters import OF_A_SHARD
+from enact_dist.link.counters import BODIES, OF_A_SHARD
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -46,7 +46,7 @@ _NOW: Final = {
     "uptime_seconds": ("time since this start", ""),
     "sessions": ("clients that are connected, or have been a moment ago", ""),
     "slots": ("slots that lie here, null ones too", ""),
-    "slot_bytes": ("bytes of their newest data", "enact world tree shows which"),
+    "slot_bytes": (f"bytes of their newest data: {BODIES}", "enact world tree shows which"),
     "locks_held": ("locks that are held", ""),
     "locks_waiting": ("locks that wait", "enact lock ls shows for whom"),
     "requests_parked": ("requests that wait for their answers", ""),

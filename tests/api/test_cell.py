@@ -4,6 +4,7 @@ import threading
 import time
 
 import msgpack
+import numpy as np
 import pytest
 
 from enact_dist import Aspect, Entity, Lock, Position, Read, View, Write, connect, local
@@ -271,3 +272,30 @@ def test_connect_refuses_what_is_no_time(word, waits_s):
     """Before anything is asked: a wait that is no number would never end, or at once."""
     with pytest.raises(MisuseError, match=f"{word} is .*must be 0 or more seconds"):
         connect("tcp/127.0.0.1:9", **{word: waits_s})
+
+
+@pytest.mark.parametrize(
+    ("datum_type", "datum", "least"),
+    [
+        (int, 1 << 40, 0),
+        (float, 1.5, 0),
+        (str, "x" * 256, 0),
+        (bytes, b"x" * 256, 0),
+        (list[int], list(range(100)), 0),
+        (str, "x" * 257, 257),
+        (bytes, b"x" * 257, 257),
+        (list[int], list(range(10_000)), 10_000),
+        (np.ndarray, np.zeros(3), 24),
+    ],
+)
+def test_bytes_of_data_are_those_of_their_bodies(cell, datum_type, datum, least):
+    """As the metrics and `enact shard ls` say: arrays, what is longer than 256 B, long lists."""
+    before = cell.shards()[0]
+    online, aspect = cell.world("online"), Aspect("datum", datum_type)
+    online.init(piece, aspect, datum)
+    after = cell.shards()[0]
+
+    found = after.size_bytes - before.size_bytes
+    written = after.counters.get("bytes_written", 0) - before.counters.get("bytes_written", 0)
+    assert found == written == online.survey()[0].size_bytes
+    assert (found >= least) if least else (found == 0)
