@@ -27,7 +27,7 @@ from enact_dist.core.messages import (
     Reached,
     Sessions,
 )
-from enact_dist.errors import EnactError, MisuseError
+from enact_dist.errors import EnactError, LinkError, MisuseError
 from enact_dist.forking import drop_world
 from enact_dist.history import keep_versions, kept_versions, let_go
 from enact_dist.lineage import causes_of, effects_of
@@ -359,12 +359,21 @@ class Cell(Closing):
         return lock_info(shard, holder) if holder is not None else None
 
     def shards(self) -> tuple[ShardInfo, ...]:
-        """Return every shard of the cell, unreachable ones too."""
-        self._client.greet_new()  # how calls travel is known from a shard's welcome on
-        return tuple(self._shard_info(shard) for shard in self._client.shards())
+        """Return every shard of the cell, unreachable ones too, with why where that is known."""
+        self._client.check_usable()
+        return tuple(self._shard_or_problem(shard) for shard in self._client.shards())
+
+    def _shard_or_problem(self, shard: str) -> ShardInfo:
+        """Return what is known of a shard: what is wrong with one says nothing of the others."""
+        try:
+            return self._shard_info(shard)
+        except LinkError as error:
+            endpoint = self._client.carrier.endpoint_of(shard)
+            return ShardInfo(shard, endpoint, reachable=False, problem=str(error))
 
     def _shard_info(self, shard: str) -> ShardInfo:
         endpoint = self._client.carrier.endpoint_of(shard)
+        self._client.greet_new(shard)  # how calls travel is known from its welcome on
         started_s = time.monotonic()
         answer = self._client.call_once([(shard, ListSessions())])[0]
         round_trip_s = time.monotonic() - started_s

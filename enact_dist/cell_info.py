@@ -42,6 +42,7 @@ class ShardInfo:
     """One shard of the cell; `reachable` False leaves everything else at zero.
 
     Attributes:
+        reachable: Whether it answers, and this process may use the way to it.
         open: Whether it grants locks; False while it waits for older leases to end after a start,
             and while it ends.
         size_bytes: Of the newest data, each counted as in `SlotInfo`.
@@ -49,6 +50,7 @@ class ShardInfo:
         round_trip_s: Of the call that asked.
         carrier: How this process's calls to it travel: "socket", or "zenoh" and why.
         counters: Its statistics by name.
+        problem: Why it is not reachable, empty where it just does not answer.
     """
 
     name: str
@@ -65,6 +67,7 @@ class ShardInfo:
     round_trip_s: float = 0.0
     carrier: str = ""
     counters: dict[str, int] = field(default_factory=dict)
+    problem: str = ""
 
 
 @dataclass(frozen=True, slots=True)

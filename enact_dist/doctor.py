@@ -298,6 +298,9 @@ def _best_rounds(cell: Cell) -> list[ShardInfo]:
 
 def _shard(shard: ShardInfo) -> Iterator[Finding]:
     subject = f"shard {shard.name}"
+    if shard.problem:
+        yield Finding(Level.FAIL, subject, f"{shard.endpoint}: {shard.problem}")
+        return
     if not shard.reachable:
         yield _unreachable(subject, shard.endpoint)
         return

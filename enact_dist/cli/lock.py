@@ -162,7 +162,7 @@ def list_locks(arguments: argparse.Namespace) -> int:
 
 
 def in_reach(cell: Cell) -> tuple[tuple[str, ...], int]:
-    """Return the shards that answer, and the exit status; name the others.
+    """Return the shards that can be asked, and the exit status; name the others.
 
     A lock in doubt is looked for exactly when another shard is lost.
     """
@@ -172,7 +172,8 @@ def in_reach(cell: Cell) -> tuple[tuple[str, ...], int]:
             reachable.append(shard.name)
         else:
             status = UNREACHABLE
-            print(f"enact: shard {shard.name} at {shard.endpoint} does not answer", file=sys.stderr)
+            why = f": {shard.problem}" if shard.problem else " does not answer"
+            print(f"enact: shard {shard.name} at {shard.endpoint}{why}", file=sys.stderr)
     return tuple(reachable), status
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.cli import shard_backup, shard_rebalance
@@ -159,7 +160,7 @@ def run_shard(arguments: argparse.Namespace) -> int:
 
 
 def list_shards(arguments: argparse.Namespace) -> int:
-    """Print all shards, also those that do not answer."""
+    """Print all shards, also those that cannot be reached; why, if it is known, on a line each."""
     with open_cell(arguments) as cell:
         shards = cell.shards()
     if arguments.json:
@@ -177,6 +178,10 @@ def list_shards(arguments: argparse.Namespace) -> int:
             [_row(shard) for shard in shards],
             empty="no shards",
         )  # fmt: skip
+    if not arguments.json:
+        for shard in shards:
+            if shard.problem:
+                print(f"enact: shard {shard.name}: {shard.problem}", file=sys.stderr)
     return DONE if all(shard.reachable for shard in shards) else UNREACHABLE
 
 

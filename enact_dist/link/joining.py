@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import time
+from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.messages import Welcome
 from enact_dist.errors import LinkError
 from enact_dist.link.client import CellClient
 from enact_dist.link.socket_carrier import SocketCarrier
-from enact_dist.link.zenoh_carrier import ZenohCarrier
+from enact_dist.link.zenoh_carrier import POLL_S, ZenohCarrier
 from enact_dist.link.zenoh_config import OPEN_S
 from enact_dist.link.zenoh_discovery import discover
 
@@ -17,6 +18,9 @@ if TYPE_CHECKING:
 
     from enact_dist.core.client import Client
     from enact_dist.link.carrier import Carrier
+
+HELLO_S: Final = 1.0
+"""How long a further shard has to welcome us, where the socket of the first one cannot be used."""
 
 
 def join(
@@ -39,7 +43,7 @@ def join(
         carrier: How messages travel, one of `CARRIERS`.
 
     Raises:
-        LinkError: Another cell answers, or the socket is asked for and cannot be used.
+        LinkError: Another cell answers, or the socket is asked for and no shard has one to use.
         ShardUnreachableError: None answered; the message names the endpoints.
     """
     found, welcome = discover(endpoints, client.hello(""), timeout_s=timeout_s)
@@ -63,9 +67,39 @@ def join(
     try:
         if carrier != "zenoh":
             way = sockets = SocketCarrier(zenoh, client.session, forced=carrier == "socket")
-            sockets.learn(welcome)
+            welcome = _first_usable(sockets, client, welcome, timeout_s)
         way.add_endpoints(welcome.placement.shards)
     except BaseException:
         way.close()
         raise
     return found, CellClient(way, client), welcome
+
+
+def _first_usable(
+    sockets: SocketCarrier, client: Client, welcome: Welcome, timeout_s: float
+) -> Welcome:
+    """Return the welcome of a shard to which calls may travel: this one, unless that is refused.
+
+    Raises:
+        LinkError: The socket is asked for, and no shard with one answers within `timeout_s`.
+    """
+    try:
+        sockets.learn(welcome)
+    except LinkError:
+        entries = welcome.placement.shards
+        sockets.add_endpoints(entries)
+        others = [entry.name for entry in entries if entry.name != welcome.shard]
+        deadline_s = time.monotonic() + timeout_s
+        while others and (left_s := deadline_s - time.monotonic()) > 0:
+            for name in tuple(others):
+                try:
+                    wait_s = min(left_s, HELLO_S)
+                    answer = sockets.request(name, client.hello(name), timeout_s=wait_s)
+                except LinkError:
+                    others.remove(name)
+                    continue
+                if isinstance(answer, Welcome):
+                    return answer
+            time.sleep(POLL_S)  # its connection may be on its way
+        raise
+    return welcome

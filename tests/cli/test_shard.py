@@ -54,6 +54,55 @@ def test_ls_names_the_shard_that_is_down(enact, write_cell, spawn, until):
     assert "UNREACHABLE" in result.out
 
 
+@pytest.fixture
+def no_socket_of_right(write_cell, spawn, until, tmp_path, monkeypatch):
+    """The file of a cell whose shard `right` shares another folder, while the socket is forced."""
+    file = write_cell()
+    monkeypatch.setenv("ENACT_CARRIER", "socket")
+    for name in ("left", "right"):
+        folder = tmp_path / f"shared-{name}"
+        folder.mkdir(mode=0o700)
+        monkeypatch.setenv("ENACT_SHARED_FOLDER", str(folder))
+        until(spawn("shard", "run", name, "--cell", file), "ready: shard")
+    monkeypatch.setenv("ENACT_SHARED_FOLDER", str(tmp_path / "shared-left"))
+    return file
+
+
+@pytest.mark.slow
+@pytest.mark.carrier("auto")
+def test_forced_socket_that_one_shard_has_not_hides_no_other(enact, no_socket_of_right):
+    """Named by the file or by either endpoint: that shard stands there with the reason, status 3."""
+    file = no_socket_of_right
+    listed = enact("shard", "ls", "--cell", file, "--json")
+    shards = {shard["name"]: shard for shard in listed.json}
+
+    assert listed.status == 3
+    assert (shards["left"]["reachable"], shards["left"]["carrier"]) == (True, "socket")
+    assert shards["right"]["reachable"] is False
+    assert "that of shard right cannot be used" in shards["right"]["problem"]
+    for target in (file, shards["left"]["endpoint"], shards["right"]["endpoint"]):
+        result = enact("shard", "ls", "--cell", target)
+        left, right = result.out.splitlines()[1:]
+        assert result.status == 3
+        assert "open" in left
+        assert "UNREACHABLE" in right
+        assert result.err == f"enact: shard right: {shards['right']['problem']}\n"
+        assert enact("lock", "ls", "--cell", target).status == 3
+
+
+@pytest.mark.slow
+@pytest.mark.carrier("auto")
+def test_doctor_names_the_shard_whose_forced_socket_cannot_be_had(enact, no_socket_of_right):
+    """One finding says why; the other shard is looked at as usual."""
+    result = enact("doctor", "--cell", no_socket_of_right, "--json")
+    found = {finding["subject"]: finding for finding in result.json}
+
+    assert result.status == 1
+    assert "over socket" in found["shard left"]["text"]
+    assert found["shard right"]["level"] == "FAIL"
+    assert "that of shard right cannot be used" in found["shard right"]["text"]
+
+
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_shard_drains_and_leaves_with_status_0_on_a_signal(write_cell, spawn, until, number):
     """A signal is the ordinary end of a shard."""

@@ -97,6 +97,31 @@ def test_way_to_a_shard_is_that_of_the_next_lock_on_it(two, until):
         until(lambda: [shard.carrier for shard in cell.shards()] == ["socket", "socket"])
 
 
+@pytest.mark.carrier("auto")
+@pytest.mark.parametrize("without", ["a", "b"])
+def test_forced_socket_that_one_shard_has_not_ends_only_what_lies_there(two, monkeypatch, without):
+    """All are listed, that one with its reason, whoever answers first; locks go on elsewhere."""
+    other = {"a": "b", "b": "a"}[without]
+    for name in "ab":
+        two.start(name)
+    (two.running[without]._shared.path / "socket").unlink()
+    monkeypatch.setenv("ENACT_CARRIER", "socket")
+
+    with two.connect() as cell:
+        shards = {shard.name: shard for shard in cell.shards()}
+        again = {shard.name: shard for shard in cell.shards()}
+        lies = {"a": here, "b": there}
+        add_one(cell.world("online"), lies[other])
+        with pytest.raises(LinkError, match=f"that of shard {without} cannot be used"):
+            add_one(cell.world("online"), lies[without])
+
+        assert shards[other].reachable
+        assert shards[other].carrier == "socket"
+        assert (shards[other].problem, shards[without].reachable) == ("", False)
+        assert f"that of shard {without} cannot be used: it offers none" in shards[without].problem
+        assert again[without].problem == shards[without].problem
+
+
 def test_client_registers_its_aspects_again_when_a_shard_forgot_them(two):
     """A shard without a folder restarts empty; locks that name known aspects go on, unwaiting."""
     two.start("a")
