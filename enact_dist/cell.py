@@ -360,7 +360,6 @@ class Cell(Closing):
 
     def shards(self) -> tuple[ShardInfo, ...]:
         """Return every shard of the cell, unreachable ones too, with why where that is known."""
-        self._client.check_usable()
         return tuple(self._shard_or_problem(shard) for shard in self._client.shards())
 
     def _shard_or_problem(self, shard: str) -> ShardInfo:
@@ -372,10 +371,15 @@ class Cell(Closing):
             return ShardInfo(shard, endpoint, reachable=False, problem=str(error))
 
     def _shard_info(self, shard: str) -> ShardInfo:
-        endpoint = self._client.carrier.endpoint_of(shard)
-        self._client.greet_new(shard)  # how calls travel is known from its welcome on
+        client, question = self._client, (shard, ListSessions())
+        endpoint = client.carrier.endpoint_of(shard)
+        if client.core.needs_hello(shard):
+            # How calls travel is known from its welcome on.  Who is silent is waited for once.
+            hello = (shard, client.core.hello(shard))
+            if client.call_once([hello, question])[1] is None:
+                return ShardInfo(shard, endpoint, reachable=False)
         started_s = time.monotonic()
-        answer = self._client.call_once([(shard, ListSessions())])[0]
+        answer = client.call_once([question])[0]
         round_trip_s = time.monotonic() - started_s
         if not isinstance(answer, Sessions):
             return ShardInfo(shard, endpoint, reachable=False)
@@ -393,7 +397,7 @@ class Cell(Closing):
             locks=sum(session.locks for session in answer.sessions),
             clock_ahead_s=ahead_ns / 1e9,
             round_trip_s=round_trip_s,
-            carrier=self._client.carrier.way_to(shard),
+            carrier=client.carrier.way_to(shard),
             counters={counter.name: counter.value for counter in answer.counters},
         )
 

@@ -349,11 +349,6 @@ class SessionClient:
             if isinstance(answer, Refused):
                 raise error_of(answer)
 
-    def greet_new(self, shard: str) -> None:
-        """Say hello once to a shard that does not know this session yet, if it answers."""
-        if self.core.needs_hello(shard):
-            self.call_once([(shard, self.core.hello(shard))])
-
     def worlds(self) -> dict[str, WorldEntry]:
         """Return the world contexts that every greeted shard knows."""
         return self._catalogue.worlds()

@@ -7,7 +7,7 @@ import time
 import pytest
 
 from enact_dist import Aspect, Durability, Entity, Lock, Read, View, Write, connect
-from enact_dist.core.messages import Pin, PlacementMap, ShardEntry
+from enact_dist.core.messages import ListSessions, Pin, PlacementMap, ShardEntry
 from enact_dist.core.shard_state import ShardSettings
 from enact_dist.errors import LinkError, MisuseError, ProtocolError, ShardUnreachableError
 from enact_dist.link.shard_daemon import DaemonSettings, start_shard
@@ -82,6 +82,24 @@ def test_client_locks_on_a_living_shard_when_another_is_away(two):
         assert [shard.reachable for shard in cell.shards()] == [True, False]
         two.start("b")
         add_one(online, there)
+
+
+def test_silent_shard_is_waited_for_once_while_all_are_listed(two, monkeypatch):
+    """It is greeted and asked at once; one that is known already is only asked."""
+    two.start("a")
+    with two.connect() as cell:
+        asked = []
+        send = cell._client.carrier.request_all
+
+        def request_all(calls, **options):
+            if any(isinstance(message, ListSessions) for _, message in calls):
+                asked.append([(shard, type(message).__name__) for shard, message in calls])
+            return send(calls, **options)
+
+        monkeypatch.setattr(cell._client.carrier, "request_all", request_all)
+        assert [shard.reachable for shard in cell.shards()] == [True, False]
+
+    assert asked == [[("a", "ListSessions")], [("b", "Hello"), ("b", "ListSessions")]]
 
 
 @pytest.mark.carrier("auto")
