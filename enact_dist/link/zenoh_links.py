@@ -61,7 +61,9 @@ class LinkWatch:
     def _run(self, events: zenoh.Handler[zenoh.LinkEvent]) -> None:
         while True:
             try:
-                lost = _counted(events, events.recv(), self._patience_s)
+                here = _all_here(events, events.recv())
+                _settle_new(here, self._patience_s)
+                lost = _lost_after(here)
                 if lost and self._connect:
                     self._knock(events, lost)
             except zenoh.ZError:  # the session is closed
@@ -76,7 +78,9 @@ class LinkWatch:
         while not self._closing.wait(pause_s):
             event = events.try_recv()
             if event is not None:
-                lost = _counted(events, event, self._patience_s, lost)
+                here = _all_here(events, event)
+                _settle_new(here, self._patience_s)
+                lost = _lost_after(here, lost)
             if not lost:
                 return
             began_s = time.thread_time()
@@ -93,26 +97,40 @@ class LinkWatch:
         self._thread.join(JOIN_S)
 
 
-def _counted(
-    events: zenoh.Handler[zenoh.LinkEvent],
-    event: zenoh.LinkEvent | None,
-    patience_s: float,
-    lost: int = 0,
-) -> int:
-    """Take all events that are here and settle who came; return how many connections are lost now.
+def _all_here(
+    events: zenoh.Handler[zenoh.LinkEvent], first: zenoh.LinkEvent
+) -> list[zenoh.LinkEvent]:
+    """Return the first event and all that wait behind it."""
+    here = [first]
+    while (event := events.try_recv()) is not None:
+        here.append(event)
+    return here
 
-    A thousand clients that connect at once are settled together: each look lists all descriptors.
+
+def _has_come(event: zenoh.LinkEvent) -> bool:
+    """Say whether a connection has come; else one has gone."""
+    return event.kind == zenoh.SampleKind.PUT
+
+
+def _settle_new(events: Iterable[zenoh.LinkEvent], patience_s: float) -> None:
+    """Settle the connections that have come.
+
+    A thousand that come at once are settled together: each look lists all descriptors.
     """
-    came = set()
-    while event is not None:
-        if event.kind == zenoh.SampleKind.PUT:
-            lost = max(0, lost - 1)
-            came.add((_port_of(event.link.src), _port_of(event.link.dst)))
-        else:
-            lost += 1
-        event = events.try_recv()
+    came = {
+        (_port_of(event.link.src), _port_of(event.link.dst)) for event in events if _has_come(event)
+    }
     if came:
         settle(came, patience_s)
+
+
+def _lost_after(events: Iterable[zenoh.LinkEvent], lost: int = 0) -> int:
+    """Return how many connections are lost after these events, of `lost` before.
+
+    One that comes stands for one that was lost, where there is such a one.
+    """
+    for event in events:
+        lost = max(0, lost - 1) if _has_come(event) else lost + 1
     return lost
 
 

@@ -18,7 +18,7 @@ import zenoh
 from enact_dist.link import zenoh_config, zenoh_links
 from enact_dist.link.zenoh_carrier import wait_connected
 from enact_dist.link.zenoh_config import close_session, open_session
-from enact_dist.link.zenoh_links import _counted
+from enact_dist.link.zenoh_links import _all_here, _lost_after, _settle_new
 from enact_dist.link.zenoh_sockets import connections, give_up, settle, unanswered
 
 LINGER = struct.Struct("ii")
@@ -172,15 +172,39 @@ def test_sessions_that_were_left_open_are_closed_before_their_threads_are_waited
     assert process.wait(timeout=60.0) == 0
 
 
-@pytest.mark.parametrize(("kinds", "lost"), [("+-", 1), ("-+", 0), ("++-", 1), ("--", 2)])
-def test_events_that_are_here_are_counted_at_once(kinds, lost):
-    """Of a hundred connections that come together none is looked at alone."""
+def link_events(kinds):
+    """Return events of connections that came (+) and went (-), each with ports of its own."""
     kind_of = {"+": zenoh.SampleKind.PUT, "-": zenoh.SampleKind.DELETE}
-    link = SimpleNamespace(src="tcp/[::1]:2", dst="tcp/[::1]:1")
-    events = iter([SimpleNamespace(kind=kind_of[kind], link=link) for kind in kinds])
-    waiting = SimpleNamespace(try_recv=lambda: next(events, None))
+    return [
+        SimpleNamespace(
+            kind=kind_of[kind], link=SimpleNamespace(src=f"tcp/[::1]:{port}", dst="tcp/[::1]:1")
+        )
+        for port, kind in enumerate(kinds, 2)
+    ]
 
-    assert _counted(waiting, waiting.try_recv(), 1.0) == lost
+
+@pytest.mark.parametrize(
+    ("kinds", "before", "lost"),
+    [("+-", 0, 1), ("-+", 0, 0), ("++-", 0, 1), ("--", 0, 2), ("++-", 2, 1), ("+", 1, 0)],
+)
+def test_connection_that_comes_stands_for_a_lost_one(kinds, before, lost):
+    """One that comes while none is lost is a new one, and makes up for none that goes later."""
+    assert _lost_after(link_events(kinds), before) == lost
+
+
+def test_connections_that_come_together_are_settled_together(monkeypatch):
+    """Of a hundred none is looked for alone, and those that have gone are not looked for."""
+    settled = []
+    monkeypatch.setattr(zenoh_links, "settle", lambda ports, _: settled.append(ports))
+    first, *others = link_events("+-+")
+    waiting = iter(others)
+
+    here = _all_here(SimpleNamespace(try_recv=lambda: next(waiting, None)), first)
+    _settle_new(here, 1.0)
+    _settle_new(link_events("--"), 1.0)
+
+    assert here == [first, *others]
+    assert settled == [{(2, 1), (4, 1)}]
 
 
 def test_connection_that_nobody_answers_is_given_up_and_no_other():
