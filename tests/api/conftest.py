@@ -1,10 +1,14 @@
 """A cell inside the test's own process, or with one shard beside it, with two world contexts."""
 
 import socket
+import sys
+from pathlib import Path
 
 import pytest
 
 from enact_dist import connect, local
+
+sys.path.append(str(Path(__file__).parent))  # not first: other folders have a conftest, too
 
 WORLDS = ("online", "training")
 

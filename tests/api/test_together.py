@@ -3,27 +3,35 @@
 from __future__ import annotations
 
 import itertools
-import socket
 import sys
 import threading
 import time
 
 import numpy as np
 import pytest
+from together_parts import (
+    DEPTH,
+    KEPT,
+    LEFT,
+    PATIENCE_S,
+    RIGHT,
+    SYSTEM,
+    TOTAL,
+    cameras,
+    capture,
+    pair,
+    role,
+)
 
 from enact_dist import (
     Aspect,
     Durability,
     Entities,
-    Entity,
     Lock,
     Read,
     Together,
     View,
-    World,
     Write,
-    connect,
-    local,
     testing,
 )
 from enact_dist.actor import Actor
@@ -33,67 +41,18 @@ from enact_dist.actor_inbox import SetInbox, Watching
 from enact_dist.actor_process import ActorThread
 from enact_dist.config import load_config
 from enact_dist.core.datum import Position
-from enact_dist.core.messages import Pin, PlacementMap, ShardEntry
-from enact_dist.core.shard_state import ShardSettings
 from enact_dist.errors import MisuseError, NotRequestedError, NullDatumError
-from enact_dist.link.shard_daemon import DaemonSettings, start_shard
 from enact_dist.together import captured_versions
 from enact_dist.watch import Change
 
 pytestmark = pytest.mark.carrier("local", "drawn")
 
-PATIENCE_S = 30.0
-KEPT = 4
-LEFT, RIGHT, SYSTEM = Entity("camera/left"), Entity("camera/right"), Entity("system")
-DEPTH = Aspect("depth", int, Durability.VOLATILE, retention=KEPT)
-TOTAL = Aspect("total", int, Durability.VOLATILE)
-role = World("online")
-
 
 @pytest.fixture(params=["local", "two shards"])
 def cell(request, tmp_path, monkeypatch):
     """The left camera on one shard, the right one on another; or both in this process."""
-    if request.param == "local":
-        with local(worlds=["online"]) as opened:
-            yield opened
-        return
-    monkeypatch.setenv("ENACT_SHARED_FOLDER", str(tmp_path))
-    monkeypatch.setenv("ENACT_CARRIER", "socket")
-    with socket.socket() as one, socket.socket() as other:
-        for probe in (one, other):
-            probe.bind(("127.0.0.1", 0))
-        endpoints = [f"tcp/127.0.0.1:{probe.getsockname()[1]}" for probe in (one, other)]
-    names = ("s0", "s1")
-    placement = PlacementMap(
-        1,
-        tuple(ShardEntry(name, (at,)) for name, at in zip(names, endpoints, strict=True)),
-        (Pin(str(LEFT), "s0"), Pin(str(RIGHT), "s1")),
-    )
-    shards = [
-        start_shard(
-            DaemonSettings(
-                "cell", ShardSettings(name, placement, worlds=("online",)), (at,), carrier="socket"
-            )
-        )
-        for name, at in zip(names, endpoints, strict=True)
-    ]
-    try:
-        with connect(endpoints[0]) as opened:
-            yield opened
-    finally:
-        for shard in shards:
-            shard.stop(drain_s=0.0)
-
-
-def capture(cell, entity, stamp_ns, value=None, aspect=DEPTH):
-    """Commit a datum that was captured at a stamp; by default the stamp is its value, too."""
-    request = Write(cell.world("online"), entity, aspect)
-    with Lock(request) as lock:
-        lock.put(request, stamp_ns if value is None else value, stamp_ns=stamp_ns)
-
-
-def pair(world, **options):
-    return Together([View(world, entity, DEPTH) for entity in (LEFT, RIGHT)], **options)
+    with cameras(request.param, tmp_path, monkeypatch) as opened:
+        yield opened
 
 
 class Sum(Actor):
@@ -380,114 +339,6 @@ def test_set_of_large_data_is_fetched_at_once(cell, monkeypatch):
 
     assert fetched == [2]
     assert [int(one[-1]) for one in data] == [7, 7]
-
-
-# ---------------------------------------------------------------- the paper's first application
-
-TICKS = 12
-CAMERAS = [Entity(f"camera/{index}") for index in range(8)]
-FRAME = Aspect("frame", np.ndarray, Durability.VOLATILE)
-MASK = Aspect("mask", np.ndarray, Durability.VOLATILE, retention=TICKS)
-VOLUME = Aspect("volume", int, Durability.VOLATILE)
-DROPPED = (3, 5)
-"""Camera and tick of the frame that is never published."""
-START_NS = 1_700_000_000_000_000_000
-
-
-def stamp_of(tick):
-    return START_NS + tick * 100_000_000
-
-
-def silhouette(camera, tick):
-    """What camera `camera` sees at a tick: (48, 64) bool."""
-    mask = np.zeros((48, 64), bool)
-    mask[camera : camera + 10, 3 * tick : 3 * tick + 8] = True
-    return mask
-
-
-def silhouettes_of(camera):
-    """Return an actor that makes masks of one camera's frames."""
-
-    class Silhouettes(Actor):
-        frame = View(role, CAMERAS[camera], FRAME)
-        mask = Write(role, CAMERAS[camera], MASK)
-        triggers = (frame,)
-
-        def update(self, lock):
-            bright = lock[self.frame][..., 0] > 127
-            lock.put(self.mask, bright, stamp_ns=lock.stamp_ns(self.frame))
-
-    return Silhouettes()
-
-
-class VisualHull(Actor):
-    """Take eight masks of one moment."""
-
-    masks = Together([View(role, camera, MASK) for camera in CAMERAS], by="stamp")
-    volume = Write(role, SYSTEM, VOLUME)
-    triggers = (masks,)
-
-    def __init__(self):
-        self.sets = {}
-        self.all_seen = threading.Event()
-
-    def update(self, lock):
-        masks = lock[self.masks]
-        self.sets[lock.stamp_ns(self.masks)] = [mask.copy() for mask in masks]
-        lock[self.volume] = int(sum(mask.sum() for mask in masks))
-        if stamp_of(TICKS - 1) in self.sets:
-            self.all_seen.set()
-
-
-def publish(cell, camera, errors):
-    """Publish a camera's frames, each once the mask of the one before is there."""
-    online = cell.world("online")
-    request = Write(online, CAMERAS[camera], FRAME)
-    try:
-        with online.watch(CAMERAS[camera], MASK) as watch:
-            for tick in range(TICKS):
-                if (camera, tick) == DROPPED:
-                    continue
-                frame = np.zeros((48, 64, 3), np.uint8)
-                frame[silhouette(camera, tick)] = 255
-                with Lock(request) as lock:
-                    lock.put(request, frame, stamp_ns=stamp_of(tick))
-                change = watch.next(PATIENCE_S)
-                assert change is not None, f"no mask {tick} of camera {camera}"
-                assert change.captured_ns == stamp_of(tick)
-    except Exception as error:
-        errors.append(error)
-
-
-def test_eight_cameras_eight_workers_and_one_consumer_of_whole_sets(cell):
-    """Always eight masks of one stamp; the frame that a camera drops is counted and named."""
-    hull, errors = VisualHull(), []
-    workers = [ActorThread(silhouettes_of(camera), cell) for camera in range(8)]
-    cameras = [threading.Thread(target=publish, args=(cell, c, errors)) for c in range(8)]
-    with ActorThread(hull, cell) as thread:
-        for worker in workers:
-            worker.__enter__()
-        try:
-            for camera in cameras:
-                camera.start()
-            for camera in cameras:
-                camera.join()
-            assert not errors
-            assert hull.all_seen.wait(PATIENCE_S), (thread.statistics(), sorted(hull.sets))
-        finally:
-            for worker in workers:
-                worker.__exit__(None, None, None)
-
-    camera, dropped = DROPPED
-    assert list(hull.sets) == [stamp_of(tick) for tick in range(TICKS) if tick != dropped]
-    for tick in set(range(TICKS)) - {dropped}:
-        for index, mask in enumerate(hull.sets[stamp_of(tick)]):
-            assert (mask == silhouette(index, tick)).all(), (tick, index)
-    found = thread.statistics()
-    assert (found.updates, found.incomplete, found.late, found.unstamped) == (TICKS - 1, 1, 0, 0)
-    assert found.last_incomplete == (
-        f"set of stamp {stamp_of(dropped)}: without online:camera/{camera}/mask"
-    )
 
 
 @pytest.mark.parametrize(("retention", "found"), [(1, 2), (8, 0)])
