@@ -253,8 +253,11 @@ class Recorder:
         self._pending = sorted(newest.values()) + later
 
     def _listen_until_settled(self, watch: Watch) -> None:
+        """Listen for `SETTLE_S`, and once after it: until then this thread may have stood still."""
         ends_s = time.monotonic() + SETTLE_S
-        while time.monotonic() < ends_s:
+        over = False
+        while not over:
+            over = time.monotonic() >= ends_s
             self._listen(watch, POLL_S)
 
     def _listen(self, watch: Watch, wait_s: float) -> None:

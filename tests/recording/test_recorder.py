@@ -5,6 +5,7 @@ import os
 import threading
 import time
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -62,7 +63,7 @@ class Running:
 
     def __enter__(self):
         self.thread.start()
-        assert self.begun.wait(20)
+        assert self.begun.wait(60)
         return self.recorder.summary
 
     def __exit__(self, *_):
@@ -117,6 +118,32 @@ def test_every_commit_of_concurrent_writers_is_whole_and_in_order(cell, online, 
     stamps = [commit.log_ns for commit in commits]
     assert stamps == sorted(set(stamps))
     assert (summary.commits, summary.missing, summary.out_of_order) == (3 * rounds, 0, 0)
+
+
+def test_a_recorder_that_stood_still_takes_what_was_told_meanwhile(
+    cell, online, tmp_path, monkeypatch
+):
+    """At its begin what is there, and at its end what was committed before it was told to stop."""
+    standing_still = time.monotonic
+    path = tmp_path / "run.mcap"
+    online.init(piece, COUNT, 1)
+    listen_until_settled = Recorder._listen_until_settled
+
+    def stood_still(self, watch):
+        """Let all of the time pass between the first look at the clock and the second."""
+        clock = iter([0.0])
+        with monkeypatch.context() as patched:
+            patched.setattr(
+                recorder, "time", SimpleNamespace(monotonic=lambda: next(clock, standing_still()))
+            )
+            listen_until_settled(self, watch)
+
+    monkeypatch.setattr(Recorder, "_listen_until_settled", stood_still)
+    with Running(cell, path) as summary, monkeypatch.context() as resting:
+        resting.setattr(recorder.Recorder, "_listen", lambda *_: None)
+        put((Write(online, piece, COUNT), 2))
+    assert (summary.initial, summary.commits) == (1, 1)
+    assert [v.version for commit in commits_of(path) for v in commit.versions] == [1, 2]
 
 
 def test_a_version_names_its_stamp_shard_and_actor(cell, online, tmp_path):
@@ -248,13 +275,13 @@ def test_versions_without_a_notice_come_from_the_history(cell, online, tmp_path,
     def paused(self, watch, wait_s):
         if self.summary.commits:
             entered.set()
-            assert go_on.wait(20)
+            assert go_on.wait(60)
         listen(self, watch, wait_s)
 
     monkeypatch.setattr(Recorder, "_listen", paused)
     with Running(cell, path) as summary:
         put((Write(online, piece, keeping), 0))
-        assert entered.wait(20)
+        assert entered.wait(60)
         for number in range(1, 30):
             put((Write(online, piece, keeping), number))
         put((Write(online, bench, keeping), 0))
@@ -297,10 +324,14 @@ def test_disk_that_is_too_slow_costs_no_memory_and_is_named(cell, online, tmp_pa
 def test_too_many_that_wait_are_dropped_by_name(cell, online, tmp_path, monkeypatch):
     """The oldest go, and the reason says why."""
     monkeypatch.setattr(recorder, "WANTED_MAX", 5)
-    monkeypatch.setattr(recorder, "SETTLE_S", 1.0)
-    with Running(cell, tmp_path / "run.mcap") as summary:
+    with Running(cell, tmp_path / "run.mcap") as summary, monkeypatch.context() as resting:
+        resting.setattr(recorder, "SETTLE_S", 3600.0)
         for number in range(20):
             put((Write(online, piece, COUNT), number))
+        ends_s = time.monotonic() + 30.0
+        while summary.missing < 15:
+            assert time.monotonic() < ends_s
+            time.sleep(0.01)
     assert summary.gaps == {recorder.DISK_SLOW: 15}
     assert [v.version for c in commits_of(tmp_path / "run.mcap") for v in c.versions] == list(
         range(16, 21)
