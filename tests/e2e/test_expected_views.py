@@ -83,9 +83,9 @@ class Skew:
                 lock[write] = lock[view] + 1
                 if self.expects:
                     lock.expect(view)
-                self.viewed.wait(10.0)
+                self.viewed.wait(60.0)
                 if self.in_turn and mine == RIGHT:
-                    self.first_ended.wait(10.0)
+                    self.first_ended.wait(60.0)
         except ChangedError as changed:
             error = changed
         finally:

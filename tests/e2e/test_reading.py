@@ -15,7 +15,7 @@ counter = Entity("counter")
 
 @pytest.mark.slow
 def test_slow_viewer_leaves_writer_alone(make_cell):
-    """While a reader works on its View for 3 s, a writer of 100 Hz goes on; a lock would stop it."""
+    """While a reader works on its View, a writer of 100 Hz goes on; a lock would stop it."""
     cell = make_cell().start_all()
     ticking = cell.worker("ticker", 100)
     ticking.expect("started")
@@ -23,16 +23,15 @@ def test_slow_viewer_leaves_writer_alone(make_cell):
         world = joined.world("online")
         watch = world.watch(Entity("ticker"), COUNT)
         assert watch.next(30.0)
-        viewer = cell.worker("view_slowly", 3)
+        viewer = cell.worker("view_slowly")
         first = viewer.expect("viewing")
+        while watch.next(30.0).version < int(first) + 100:
+            pass
+        viewer.tell("look again")
         assert viewer.expect("still", 30) == first, "a view is of one moment"
-        view = View(world, Entity("ticker"), COUNT)
-        assert (
-            world.view(view)[view] >= int(first) + 15
-        )  # of 300 on a machine that does nothing else
         watch.close()
     ticking.tell("stop")
-    assert max(json.loads(ticking.expect("times"))) < 3000.0
+    assert int(ticking.expect("committed")) >= int(first) + 100
 
 
 @pytest.mark.slow
@@ -85,8 +84,9 @@ def test_watcher_that_was_stopped_resynchronises_and_says_what_it_missed(make_ce
         watch.close()
     watcher.signal(signal.SIGCONT)
     ticking.tell("stop")
-    last = len(json.loads(ticking.expect("times")))
-    said = json.loads(watcher.expect("summary", 30))
+    last = int(ticking.expect("committed"))
+    watcher.tell(str(last))
+    said = json.loads(watcher.expect("summary", 60))
 
     assert said["last"] == last
     assert said["first"] - 1 + said["seen"] + said["gap"] == last
