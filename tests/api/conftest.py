@@ -2,6 +2,7 @@
 
 import socket
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -108,6 +109,29 @@ def two_stored(tmp_path, monkeypatch):
         yield running
     finally:
         running.close()
+
+
+class Loose:
+    """Stands for `LOOSE_NS`: how long what was replaced stays for cuts, until the test ends it."""
+
+    def __init__(self):
+        self._ended_ns = 0
+
+    def __rsub__(self, _now_ns):
+        return self._ended_ns
+
+    def end(self):
+        """Let what was replaced until now have stayed for long enough."""
+        self._ended_ns = time.time_ns()
+
+
+@pytest.fixture
+def loose(monkeypatch):
+    """What is replaced in shards of this process stays for cuts until `loose.end()`."""
+    from enact_dist.core import history
+
+    monkeypatch.setattr(history, "LOOSE_NS", Loose())
+    return history.LOOSE_NS
 
 
 @pytest.fixture

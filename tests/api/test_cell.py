@@ -177,7 +177,7 @@ def test_wait_refuses_what_is_no_position_of_the_cell(cell, online):
 def test_locks_show_holder_and_waiter(cell, online):
     """Who holds, who waits for whom, how, and for how long it may last."""
     waiting = threading.Thread(target=lambda: Lock(Read(online, bench, COUNT)).__enter__())
-    with Lock(Write(online, bench, COUNT), hold_s=30.0):
+    with Lock(Write(online, bench, COUNT), hold_s=600.0):
         waiting.start()
         while len(cell.locks()) < 2:
             assert waiting.is_alive()
@@ -187,7 +187,7 @@ def test_locks_show_holder_and_waiter(cell, online):
     assert (waiter.granted, waiter.modes, waiter.waits_for) == (False, "read", (holder.number,))
     assert holder.slots == ("online:work_bench/count (write)",)
     assert holder.pid == waiter.pid > 0
-    assert 29.0 < holder.hold_left_s <= 30.0
+    assert 500.0 < holder.hold_left_s <= 600.0
 
 
 def test_break_lock_tells_whether_there_was_one(cell, online):
@@ -207,7 +207,7 @@ def test_shards_show_what_a_shard_is_doing(cell, online):
     assert (shard.slots, shard.sessions, shard.locks) == (2, 1, 1)
     assert shard.size_bytes >= 1000
     assert shard.counters["commits"] == 2
-    assert abs(shard.clock_ahead_s) < 1.0
+    assert abs(shard.clock_ahead_s) < 30.0
 
 
 @pytest.mark.carrier("local")

@@ -174,7 +174,7 @@ def test_fork_over_shards_is_one_cut_with_everything_that_was_reported(two_shard
         assert dict(fork.view(arms)[arms]) == {LEFT: number, RIGHT: number}
 
 
-def test_fork_of_what_one_shard_has_forgotten_is_taken_back(two_shards):
+def test_fork_of_what_one_shard_has_forgotten_is_taken_back(two_shards, loose):
     """The error names the oldest known moment, and the other shard has nothing of it left."""
     cell, online = two_shards.cell, two_shards.cell.world("online")
     fleeting = Aspect("fleeting", int, Durability.VOLATILE, retention=2)
@@ -182,7 +182,7 @@ def test_fork_of_what_one_shard_has_forgotten_is_taken_back(two_shards):
     then = put(online, RIGHT, 1, fleeting)
     for number in (2, 3):
         put(online, RIGHT, number, fleeting)
-    time.sleep(2.1)  # what is replaced stays for cuts for two seconds
+    loose.end()
     put(online, RIGHT, 4, fleeting)
 
     with pytest.raises(ForgottenError, match=r"right/arm/fleeting is older than .* known from"):

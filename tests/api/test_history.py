@@ -50,7 +50,7 @@ def test_history_is_limited_by_count_and_time(online):
         with pytest.raises(MisuseError, match=r"count is"):
             online.history(ARM, COUNT, count=wrong)
     with pytest.raises(MisuseError, match=r"in the future"):
-        online.history(ARM, COUNT, since=time.time() + 9.0)
+        online.history(ARM, COUNT, since=time.time() + 600.0)
 
 
 def test_deleted_state_is_a_version(online):
@@ -125,14 +125,14 @@ def test_datum_without_its_type_is_readable(online):
 # ---------------------------------------------------------------- kept
 
 
-def test_kept_version_outlives_its_retention(cell, online):
+def test_kept_version_outlives_its_retention(cell, online, loose):
     """It is listed, readable and named under its label; let go of, it is forgotten."""
     put(online, ARM, 1, FLEETING)
     (first,) = online.history(ARM, FLEETING)
     cell.keep("drop-17", [first])
     for number in range(2, 6):
         put(online, ARM, number, FLEETING)
-    time.sleep(2.1)  # what is replaced stays for cuts for two seconds
+    loose.end()
     put(online, ARM, 6, FLEETING)
 
     versions = online.history(ARM, FLEETING)
