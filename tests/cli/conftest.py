@@ -68,7 +68,7 @@ def read_until(process, mark):
 
 def end(process):
     process.send_signal(signal.SIGTERM)
-    process.wait(20)
+    process.wait(60)
     process.stdout.close()
 
 

@@ -178,7 +178,7 @@ def test_up_runs_the_cell_restarts_what_dies_and_drains_in_order(
     rest = up.stdout.read().splitlines()
 
     assert watch.status == 0
-    assert up.wait(20) == 0
+    assert up.wait(60) == 0
     assert lines[0].startswith("enact  | up: cell clitest on ")
     assert any(line.startswith("left   | ready: shard left") for line in lines)
     ends = [index for index, line in enumerate(rest) if "stopped: actor" in line]

@@ -73,7 +73,7 @@ def test_a_signal_ends_the_recording_whole(enact, spawn, cell_file, put, tmp_pat
     put(world, **dict.fromkeys("abcdefgh", 2))
     process.send_signal(number)
     text = process.stdout.read()
-    assert process.wait(20) == 0, text
+    assert process.wait(60) == 0, text
     summary = json.loads(text)
     done = enact("replay", out, "--into", cell_file, "--world", f"{world}=copy{number}", "--json")
     assert (done.json["whole"], done.json["versions"]) == (True, summary["versions"])

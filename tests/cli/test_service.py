@@ -82,14 +82,11 @@ def test_actor_whose_update_hangs_is_silent(tmp_path, cell_file, spawn, manager,
     """Then the service manager ends it and starts it anew."""
     (tmp_path / "my_actors.py").write_text(ACTOR, encoding="utf-8")
     until(spawn("actor", "run", "my_actors:Hang", "--cell", cell_file, env=watched), "hangs")
-    manager.settimeout(0.0)
-    with pytest.raises(BlockingIOError):
-        while True:
-            manager.recv(4096)
     manager.settimeout(1.0)
 
     with pytest.raises(TimeoutError):
-        manager.recv(4096)
+        for _ in range(30):  # what was sent before it hung
+            manager.recv(4096)
 
 
 PINNED = '[[pins]]\nentities = "**"\nshard = "left"\n'

@@ -233,12 +233,12 @@ def test_death_is_noticed_while_a_grandchild_holds_the_output(request):
         target=Supervisor([task("shard", "shard", HOLDS)], note).run, args=(story.stop,)
     )
     running.start()
-    heard = story.stop.wait(20)
+    heard = story.stop.wait(60)
     story.stop.set()
     for pid in held[:] if not heard else ():
         held.remove(pid)
         os.kill(pid, 9)  # or the supervisor would wait for it, too
-    running.join(20)
+    running.join(60)
 
     assert heard
     assert "shard: ended by SIGKILL; started again in 0.2 s" in story.lines

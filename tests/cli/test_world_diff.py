@@ -2,6 +2,7 @@
 
 import itertools
 import threading
+import time
 from dataclasses import dataclass
 
 import numpy as np
@@ -249,8 +250,9 @@ def test_comparing_holds_no_lock_where_there_is_no_cut(cell, cell_file, writer, 
     with connect(cell_file, actor="watcher") as other:
         one, two = other.world("training"), other.world("online")
         own = Aspect("name", str, compare=looked_at)
-        diffs = [one.diff(two, "sum/*", [COUNT, own]) for _ in range(20)]
-        locked = other.statistics().get("views_locked", 0)
-    assert locked > 0
-    assert [(len(diff), diff.equal) for diff in diffs] == [(0, 5)] * 20
+        diffs, ends_s = [], time.monotonic() + 60.0
+        while len(diffs) < 20 or not other.statistics().get("views_locked", 0):
+            assert time.monotonic() < ends_s, "the writer never came in between"
+            diffs.append(one.diff(two, "sum/*", [COUNT, own]))
+    assert {(len(diff), diff.equal) for diff in diffs} == {(0, 5)}
     assert held == []
