@@ -33,6 +33,9 @@ from enact_dist.terms import Access
 sys.path.insert(0, str(Path(__file__).parent))
 
 WORLD, ASPECT = "online", "count"
+TTL_S = 2.0
+LINK_S = 30.0
+"""A link outlives what stands still: who asks once without a second try is answered."""
 
 
 def settings_of(name="s0", *, endpoints=(), durability="volatile", others=()):
@@ -56,7 +59,7 @@ class Peer:
     seq: int = 0
     durability: str = "volatile"
 
-    def hello(self, *, ttl_s=2.0, actor="peer"):
+    def hello(self, *, ttl_s=TTL_S, actor="peer"):
         message = Hello(self.session, self.epoch, int(ttl_s * 1e9), actor, "host", 1, False)
         welcome = self.call(self.shard, message)
         self.epoch = welcome.epoch
@@ -126,13 +129,21 @@ def daemon(make_settings):
 
     def start(endpoint, name="s0", *, folder=None, cell="cell", **options):
         shard = make_settings(name, endpoints=(endpoint,), **options)
-        started = start_shard(DaemonSettings(cell, shard, (endpoint,), folder))
+        settings = DaemonSettings(cell, shard, (endpoint,), folder, link_lease_s=LINK_S)
+        started = start_shard(settings)
         running.append(started)
         return started
 
     yield start
     for shard in running:
         shard.stop(drain_s=0.0)
+
+
+@pytest.fixture(autouse=True)
+def _patient_sockets(monkeypatch):
+    """A process that stands still has its socket all the same: what is tested is not the pause."""
+    monkeypatch.setattr("enact_dist.link.socket_line.CONNECT_S", 30.0)
+    monkeypatch.setattr("enact_dist.link.socket_connection.OPEN_S", 60.0)
 
 
 @pytest.fixture(autouse=True)
@@ -157,14 +168,14 @@ def carry(request):
     opened = []
     over_socket = getattr(request, "param", "zenoh") == "socket"
 
-    def open_carrier(*endpoints, session="", ttl_s=2.0, **options):
+    def open_carrier(*endpoints, session="", ttl_s=2 * LINK_S, **options):
         session = session or secrets.token_hex(16)
         carrier = ZenohCarrier("cell", session, "tester", endpoints, ttl_s=ttl_s, **options)
         if over_socket:
             carrier = SocketCarrier(carrier, session, forced=True)
         opened.append(carrier)
         if over_socket:
-            hello = Hello(session, 0, int(ttl_s * 1e9), "tester", "host", os.getpid(), True)
+            hello = Hello(session, 0, int(TTL_S * 1e9), "tester", "host", os.getpid(), True)
             while carrier.request("s0", hello, timeout_s=1) is None:
                 assert carrier.calls["zenoh"] < 100
             assert carrier.way_to("s0") == "socket"

@@ -228,7 +228,7 @@ def test_keep_alives_go_on_after_an_answer_that_cannot_be_read(two, monkeypatch)
 
         monkeypatch.setattr(client.core, "ttl_ns", 100_000_000)
         monkeypatch.setattr(client.carrier, "request_all", bad_once)
-        assert went_on.wait(10.0)
+        assert went_on.wait(30.0)
         assert cell.statistics()["keep_alives_failed"] == 1
 
 

@@ -184,7 +184,7 @@ def test_host_acknowledges_a_durable_commit_only_after_the_store(start, make_pee
     store.may_write.set()
 
     assert not early
-    assert answered.wait(5)
+    assert answered.wait(30)
     assert isinstance(answers[0], Committed)
 
 
@@ -194,14 +194,15 @@ def test_host_acknowledges_nothing_when_the_store_fails(start, make_peer):
     store.may_write.set()
     failed = threading.Event()
     host = start(store, durability="durable", on_failure=lambda _: failed.set())
-    peer = make_peer(call_of(host, timeout_s=0.1), durability="durable")
+    peer = make_peer(call_of(host), durability="durable")
     peer.hello()
     granted = peer.acquire("cup")
+    peer.call = call_of(host, timeout_s=0.1)  # nothing will come
     store.failure = StoreError("no space left on /data", path="/data")
 
     answer = peer.commit(granted, "cup", b"x")
 
-    assert failed.wait(5)
+    assert failed.wait(30)
     assert answer is None
     assert host.failure is store.failure
     assert peer.call("s0", ListLocks()) is None

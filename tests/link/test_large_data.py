@@ -38,7 +38,10 @@ def far(request, make_settings, endpoint, monkeypatch, tmp_path):
     cells = []
     with TcpProxy(port, bytes_per_s=getattr(request, "param", None)) as proxy:
         shard = make_settings("s0", endpoints=(proxy.endpoint,))
-        started = start_shard(DaemonSettings("cell", shard, (endpoint,), shared_bytes_max=0))
+        settings = DaemonSettings(
+            "cell", shard, (endpoint,), shared_bytes_max=0, link_lease_s=TTL_S / 2
+        )
+        started = start_shard(settings)
 
         file = tmp_path / "cell.toml"
         file.write_text(  # a lease that a busy machine does not outlast while the network is cut
@@ -52,9 +55,7 @@ def far(request, make_settings, endpoint, monkeypatch, tmp_path):
 
         def restart():
             open_cell.shard.stop(drain_s=0.0)
-            open_cell.shard = start_shard(
-                DaemonSettings("cell", shard, (endpoint,), shared_bytes_max=0)
-            )
+            open_cell.shard = start_shard(settings)
 
         open_cell.proxy, open_cell.shard, open_cell.restart = proxy, started, restart
         yield open_cell

@@ -41,7 +41,7 @@ def peer(host, make_peer):
     def call(_, message):
         answers, come = [], threading.Event()
         host.submit(message, lambda answer: (answers.append(answer), come.set()))
-        return answers[0] if come.wait(10) else None
+        return answers[0] if come.wait(60) else None
 
     peer = make_peer(call)
     peer.hello()

@@ -57,7 +57,7 @@ def fill(folder, content, file=FILE):
 
 def names(folder):
     """Return the payloads in a folder once nothing is on its way out."""
-    assert leftovers().wait(5.0)
+    assert leftovers().wait(30)
     return sorted(file.name for file in folder.path.iterdir() if file.name != "nonce")
 
 
@@ -376,7 +376,7 @@ def test_room_that_comes_and_goes_by_itself_ends_no_search_for_more(folder, monk
         found = take(total)
         if len(looks) == 1:
             desk.drop(f"{SESSION}-2")
-            assert leftovers().wait(5.0)
+            assert leftovers().wait(30)
         return found
 
     monkeypatch.setattr(desk, "_reserved", reserved)
@@ -442,7 +442,7 @@ def test_draft_whose_file_somebody_has_removed_is_no_payload(folder):
 
     assert adopted(desk).body == b""
 
-    assert leftovers().wait(5.0)
+    assert leftovers().wait(30)
     assert desk.figures()["payloads_missing"] == 1
     assert desk.figures()["payload_bytes"] == 0
 

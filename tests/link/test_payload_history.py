@@ -27,7 +27,7 @@ def cell(make_settings, endpoint):
     found = connect(endpoint)
 
     def files():
-        assert leftovers().wait(5.0)
+        assert leftovers().wait(30)
         return shard.host._payloads.figures()["payload_files"]
 
     found.files, found.shard = files, shard

@@ -24,7 +24,7 @@ class FakeParcel:
         self.thread = threading.get_ident()
         self.begun.set()
         if self.gate is not None:
-            assert self.gate.wait(10)
+            assert self.gate.wait(60)
         self.done.set()
 
     def drop(self):
@@ -59,10 +59,10 @@ def test_senders_leave_a_large_answer_to_a_thread_of_the_client(senders):
     large = FakeParcel(OUTSTANDING_BYTES_MAX, gate)
 
     senders.send("a", large)
-    assert large.begun.wait(5)
+    assert large.begun.wait(30)
     gate.set()
 
-    assert large.done.wait(5)
+    assert large.done.wait(30)
     assert large.thread != threading.get_ident()
 
 
@@ -83,7 +83,7 @@ def test_senders_keep_the_order_of_one_client_while_its_sender_works(senders):
     gate = threading.Event()
     large, small = FakeParcel(OUTSTANDING_BYTES_MAX, gate), FakeParcel(10)
     senders.send("a", large)
-    assert large.begun.wait(5)
+    assert large.begun.wait(30)
     senders.new_burst()
     senders.heard("a")
 
@@ -92,7 +92,7 @@ def test_senders_keep_the_order_of_one_client_while_its_sender_works(senders):
     gate.set()
 
     assert not early
-    assert small.done.wait(5)
+    assert small.done.wait(30)
     assert small.thread == large.thread
 
 
@@ -104,12 +104,12 @@ def test_senders_count_small_answers_together_until_the_client_is_heard_again(se
     for parcel in burst:
         senders.heard("a")
         senders.send("a", parcel)
-    assert all(parcel.done.wait(5) for parcel in burst)
+    assert all(parcel.done.wait(30) for parcel in burst)
     senders.new_burst()
     senders.heard("a")
     later = FakeParcel(size)
     senders.send("a", later)
-    assert later.done.wait(5)
+    assert later.done.wait(30)
 
     here = threading.get_ident()
     assert [parcel.thread == here for parcel in burst] == [True, True, True, False]
@@ -120,7 +120,7 @@ def test_senders_drop_and_count_what_is_too_much_for_one_client(senders, counts)
     gate = threading.Event()
     first = FakeParcel(OUTSTANDING_BYTES_MAX, gate)
     senders.send("a", first)
-    assert first.begun.wait(5)
+    assert first.begun.wait(30)
 
     parcels = [FakeParcel(OUTSTANDING_BYTES_MAX) for _ in range(QUEUED_ANSWERS_MAX + 5)]
     for parcel in parcels:
@@ -130,7 +130,7 @@ def test_senders_drop_and_count_what_is_too_much_for_one_client(senders, counts)
 
     assert dropped == 5
     assert counts == {"answers_dropped": 5}
-    assert all(parcel.done.wait(5) for parcel in parcels)
+    assert all(parcel.done.wait(30) for parcel in parcels)
 
 
 def test_senders_let_an_idle_thread_go_and_start_another_when_needed(senders, monkeypatch):
@@ -139,14 +139,14 @@ def test_senders_let_an_idle_thread_go_and_start_another_when_needed(senders, mo
     before = set(threading.enumerate())
     first = FakeParcel(OUTSTANDING_BYTES_MAX)
     senders.send("a", first)
-    assert first.done.wait(5)
+    assert first.done.wait(30)
     for thread in set(threading.enumerate()) - before:
-        thread.join(5)
+        thread.join(30)
 
     second = FakeParcel(OUTSTANDING_BYTES_MAX)
     senders.send("a", second)
 
-    assert second.done.wait(5)
+    assert second.done.wait(30)
     assert second.thread != threading.get_ident()
 
 
@@ -155,7 +155,7 @@ def test_senders_drop_what_waits_when_they_are_closed(senders):
     gate = threading.Event()
     stuck, waiting = (FakeParcel(OUTSTANDING_BYTES_MAX, gate) for _ in range(2))
     senders.send("a", stuck)
-    assert stuck.begun.wait(5)
+    assert stuck.begun.wait(30)
     senders.send("a", waiting)
 
     senders.close()
@@ -184,7 +184,7 @@ def test_senders_drop_a_large_answer_where_no_thread_can_be_started(senders, cou
     assert large.dropped
     assert counts["answers_dropped"] == 1
     assert small.thread == threading.get_ident()
-    assert later.done.wait(5)
+    assert later.done.wait(30)
     assert not later.dropped
     assert senders._senders == 1
 

@@ -15,7 +15,7 @@ def manager(request, tmp_path):
     path = f"@enact-test-{os.getpid()}" if request.param == "abstract" else str(tmp_path / "notify")
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as heard:
         heard.bind(path.replace("@", "\0", 1))
-        heard.settimeout(5.0)
+        heard.settimeout(30.0)
         yield heard, path
 
 
@@ -27,7 +27,7 @@ def told(heard):
         try:
             lines += heard.recv(4096).decode().splitlines()
         except BlockingIOError:
-            heard.settimeout(5.0)
+            heard.settimeout(30.0)
             return lines
 
 
@@ -110,6 +110,6 @@ def test_a_hung_dispatcher_is_not_pinged_for(manager, daemon, endpoint):
         heard.settimeout(0.5)  # five ticks
         with pytest.raises(TimeoutError):
             heard.recv(4096)
-    heard.settimeout(5.0)
+    heard.settimeout(30.0)
 
     assert heard.recv(4096) == b"WATCHDOG=1"

@@ -112,7 +112,7 @@ def test_daemon_refuses_and_counts_what_it_cannot_read(daemon, carry, endpoint, 
     """A frame that is no request is answered with a refusal; the next request is served."""
     daemon(endpoint)
     carrier = carry(endpoint)
-    session = open_session(connect=[endpoint], lease_s=1.0)
+    session = open_session(connect=[endpoint], lease_s=30.0)
     try:
         carrier.request("s0", ListLocks(), timeout_s=30)
         replies = session.get("enact/cell/s0/acquire/x", attachment=header, timeout=30)

@@ -38,7 +38,7 @@ def raw(endpoint):
 
     def ask(*frames):
         if not opened:
-            opened.append(open_session(connect=(endpoint,), lease_s=1.0))
+            opened.append(open_session(connect=(endpoint,), lease_s=30.0))
         sent = [
             opened[0].get(
                 request_key("cell", "s0", "hello", "fuzz"),
@@ -116,7 +116,7 @@ def test_shard_refuses_rubbish_and_serves_its_neighbour(daemon, endpoint, raw):
             unread = type(answer) is m.Refused and answer.code == "protocol"
             assert unread or is_request, (seed, frame, answer)
     neighbour.ending.set()
-    neighbour.join(20)
+    neighbour.join(60)
 
     counters = shard.host._shard.counters
     assert neighbour.failure is None, (seed, neighbour.failure)

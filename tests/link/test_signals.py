@@ -19,8 +19,8 @@ def test_signal_sets_event_and_calls_act_once():
     with StopSignals() as signals:
         signals.call(lambda name: (acted.append(name), done.set()))
         os.kill(os.getpid(), signal.SIGTERM)
-        assert signals.event.wait(5)
-        assert done.wait(5)
+        assert signals.event.wait(30)
+        assert done.wait(30)
         os.kill(os.getpid(), signal.SIGINT)
     assert acted == ["SIGTERM"]
     assert signals.count == 2
@@ -31,7 +31,7 @@ def test_signal_that_came_first_acts_when_act_is_known():
     acted = []
     with StopSignals() as signals:
         os.kill(os.getpid(), signal.SIGTERM)
-        assert signals.event.wait(5)
+        assert signals.event.wait(30)
         signals.call(acted.append)
     assert acted == ["SIGTERM"]
 

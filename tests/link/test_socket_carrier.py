@@ -7,6 +7,7 @@ import threading
 import time
 
 import pytest
+from quiet_moments import met_once
 from socket_parts import COUNT, CUP, add_one, carrier_of, over_socket
 
 from enact_dist import Entity, Lock, Write, connect
@@ -164,14 +165,17 @@ def test_late_answer_never_meets_the_next_call(daemon, carry, endpoint):
     """A connection whose answer was not waited for is thrown away."""
     daemon(endpoint)
     carrier = carry(endpoint)
+    before, late = carrier.calls["zenoh"], []
 
-    for _ in range(5):
-        assert carrier.request("s0", AwaitStamp(2**62, 150_000_000), timeout_s=0.05) is None
+    for _ in range(100):  # whose thread stands still has its answer in time
+        late.append(carrier.request("s0", AwaitStamp(2**62, 150_000_000), timeout_s=0.05) is None)
         assert isinstance(carrier.request("s0", ListLocks(), timeout_s=30), Locks)
+        if sum(late) == 5:
+            break
     time.sleep(0.2)
 
     assert isinstance(carrier.request("s0", ListLocks(), timeout_s=30), Locks)
-    assert carrier.calls["zenoh"] <= 1  # the first hello
+    assert (sum(late), carrier.calls["zenoh"]) == (5, before)
 
 
 @over_socket
@@ -242,17 +246,18 @@ def test_watch_lists_nothing_again_while_only_other_slots_change(daemon, endpoin
         with world.watch("somebody/else") as watch:
             listed = []
             monkeypatch.setattr(watch, "_list_again", lambda *_args, **_more: listed.append(1))
-            end_s = time.monotonic() + 3.0
-            while time.monotonic() < end_s:
-                with Lock(request) as lock:
-                    lock[request] += 1
-                assert watch.next(timeout_s=0.01) is None
-            epoch, number = cell._client.notice_numbers["s0"]
 
-            assert listed == []
-            assert number > 10
-            assert watch._following["s0"].epoch == epoch
-            assert watch._following["s0"].number > 10
+            def attempt():
+                listed.clear()
+                first, end_s = watch._following["s0"].number, time.monotonic() + 2.0
+                while time.monotonic() < end_s or watch._following["s0"].number < first + 10:
+                    with Lock(request) as lock:
+                        lock[request] += 1
+                    assert watch.next(timeout_s=0.01) is None
+                assert listed == []  # unless all stood still for as long as a number may stay out
+                assert watch._following["s0"].epoch == cell._client.notice_numbers["s0"][0]
+
+            met_once(attempt)
 
 
 def test_carrier_says_what_went_over_what(daemon, endpoint, until):
@@ -343,10 +348,9 @@ def test_signals_do_not_lengthen_a_call(daemon, carry, endpoint):
     before = signal.signal(signal.SIGALRM, lambda *_: came.append(time.monotonic()))
     signal.setitimer(signal.ITIMER_REAL, 0.05, 0.05)
     try:
-        answer = carrier.request("s0", AwaitStamp(2**62, 1_000_000_000), timeout_s=0.2)
+        while len(came) < 2:  # of a thread that stood still there may be one in a call
+            answer = carrier.request("s0", AwaitStamp(2**62, 30_000_000_000), timeout_s=0.2)
+            assert answer is None  # it comes after half a minute
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         signal.signal(signal.SIGALRM, before)
-
-    assert answer is None  # it comes after a second
-    assert len(came) > 1

@@ -136,7 +136,7 @@ def test_place_of_a_client_that_left_before_its_greeting_was_answered_is_free(
     def admit_late(served, connection, session):
         admit(served, connection, session)
         left.append(session)
-        assert gone.wait(5)
+        assert gone.wait(30)
 
     monkeypatch.setattr(socket_service.SocketService, "admit", admit_late)
     for near in nears:
@@ -178,13 +178,13 @@ def test_request_that_was_read_is_handled_before_the_tick(raw, monkeypatch):
 
     def decode_slowly(*frame):
         decoding.set()
-        assert go_on.wait(5)  # as if the interpreter let others run first
+        assert go_on.wait(30)  # as if the interpreter let others run first
         return decode(*frame)
 
     monkeypatch.setattr(socket_connection, "decode_frame", decode_slowly)
     monkeypatch.setattr(socket_service, "DRAIN_ROUNDS", 5000)
     send_frame(raw(), encode_frame(ListLocks())[0])
-    assert decoding.wait(5)
+    assert decoding.wait(30)
     handed_in, found = host._handles, []
     drain = threading.Thread(target=lambda: (service.drain_inbox(), found.append(host._handles)))
     drain.start()

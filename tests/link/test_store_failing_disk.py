@@ -102,7 +102,7 @@ def test_full_disk_stops_the_daemon_and_loses_nothing_that_was_answered(disk, en
     data = folder / "data"
     with running(enter, endpoint, data) as daemon:
         written, failure = write_until_it_fails(endpoint)
-        assert daemon.wait(timeout=20) == 1
+        assert daemon.wait(timeout=60) == 1
         story = daemon.stderr.read()
     assert isinstance(failure, CommitUnknownError | LinkError), failure
     assert written > 3
@@ -124,12 +124,12 @@ def test_daemon_on_a_full_disk_does_not_start_and_says_why(disk, endpoint):
     data = folder / "data"
     with running(enter, endpoint, data) as daemon:
         daemon.terminate()
-        assert daemon.wait(timeout=20) == 0
+        assert daemon.wait(timeout=60) == 0
     with contextlib.suppress(OSError), (seen / "ballast").open("wb", buffering=0) as ballast:
         while True:
             ballast.write(bytes(4096))
     command = [*enter, sys.executable, "-c", DAEMON, endpoint, str(data)]
-    ended = subprocess.run(command, capture_output=True, text=True, timeout=30, check=False)
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert ended.returncode == 1
     assert f"no room for the data of {data}: 0 bytes are free there" in ended.stderr
 
@@ -146,7 +146,7 @@ def test_failed_sync_stops_the_daemon_and_loses_nothing_that_was_answered(tmp_pa
     strace = ["strace", "-f", "-o", str(tmp_path / "trace"), "-e", "trace=fdatasync", "-e", inject]
     with running(strace, endpoint, data) as daemon:
         written, failure = write_until_it_fails(endpoint)
-        assert daemon.wait(timeout=20) == 1
+        assert daemon.wait(timeout=60) == 1
         story = daemon.stderr.read()
     assert isinstance(failure, CommitUnknownError | LinkError), failure
     assert written > 3
