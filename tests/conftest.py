@@ -16,6 +16,7 @@ from enact_dist import lock
 
 sys.path.insert(0, str(Path(__file__).parent))
 import carriers
+import ports
 
 # How long an example takes says more about the machine than about what is tested.
 settings.register_profile("load", deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -65,6 +66,13 @@ def no_lock_left_behind():
     """Let a test that failed inside a lock fail alone, not with all that follow."""
     yield
     lock._thread.lock = None
+
+
+@pytest.fixture(autouse=True)
+def _ports_are_given_back():
+    """Keep the ports of a test's daemons for them until the test is over."""
+    yield
+    ports.give_back()
 
 
 @pytest.hookimpl(hookwrapper=True)

@@ -1,7 +1,6 @@
 """That tests run over the carrier which `carriers.py` says, in every process that they start."""
 
 import json
-import socket
 import subprocess
 import sys
 from collections import Counter
@@ -9,6 +8,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import carriers
+import ports
 import pytest
 
 from enact_dist import connect
@@ -45,9 +45,7 @@ def chosen(monkeypatch):
 @pytest.mark.carrier("socket", "zenoh")
 def test_every_process_of_a_test_takes_the_carrier_of_the_test(carrier, tmp_path):
     """Its own connections, those of programs that it starts and those of `enact`."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = ports.free_port()
     file = tmp_path / "cell.toml"
     file.write_text(f'name = "way"\n[shards.s0]\nlisten = "tcp/127.0.0.1:{port}"\n')
     enact = [sys.executable, "-m", "enact_dist.cli.main", "shard"]

@@ -1,11 +1,11 @@
 """A cell inside the test's own process, or with one shard beside it, with two world contexts."""
 
-import socket
 import sys
 import time
 from pathlib import Path
 
 import pytest
+from ports import free_endpoint
 
 from enact_dist import connect, local
 
@@ -26,9 +26,7 @@ def cell(carrier, tmp_path, monkeypatch):
     from enact_dist.link.shard_daemon import DaemonSettings, start_shard
 
     monkeypatch.setenv("ENACT_SHARED_FOLDER", str(tmp_path))
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    endpoint = free_endpoint()
     placement = PlacementMap(1, (ShardEntry("local", (endpoint,)),), ())
     settings = ShardSettings("local", placement, worlds=WORLDS)
     shard = start_shard(DaemonSettings("cell", settings, (endpoint,), carrier=carrier))
@@ -46,7 +44,7 @@ class TwoShards:
         from enact_dist.core.messages import Pin, PlacementMap, ShardEntry
 
         self._folder = folder
-        self._endpoints = {name: f"tcp/127.0.0.1:{port}" for name, port in _two_ports()}
+        self._endpoints = {name: free_endpoint() for name in ("left", "right")}
         self._placement = PlacementMap(
             1,
             tuple(ShardEntry(name, (end,)) for name, end in self._endpoints.items()),
@@ -77,16 +75,6 @@ class TwoShards:
         self.cell.close()
         for name in list(self._running):
             self.stop(name)
-
-
-def _two_ports():
-    probes = [socket.socket() for _ in range(2)]
-    for probe in probes:
-        probe.bind(("127.0.0.1", 0))
-    ports = [probe.getsockname()[1] for probe in probes]
-    for probe in probes:
-        probe.close()
-    return zip(("left", "right"), ports, strict=True)
 
 
 @pytest.fixture

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import socket
 import subprocess
 import sys
 from typing import TYPE_CHECKING
 
 import pytest
+from ports import free_port
 
 from enact_dist import Aspect, Durability, Entity, View, connect
 from enact_dist.actor_process import spawn_actor
@@ -47,9 +47,7 @@ listen = "tcp/127.0.0.1:{port}"
 @pytest.fixture
 def endpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     """A shard daemon, and a folder with `sample_scale.py` as the working folder."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = free_port()
     (tmp_path / "sample_scale.py").write_text(SCALE)
     (tmp_path / "cell.toml").write_text(CELL.format(port=port))
     monkeypatch.chdir(tmp_path)

@@ -1,9 +1,8 @@
 """Diffs of a shard that restarts: nothing is compared with what is gone, and nothing is missed."""
 
-import socket
-
 import numpy as np
 import pytest
+from ports import free_endpoint
 
 from enact_dist import Aspect, Durability, Entity, Lock, Tolerance, Write, connect
 from enact_dist.core.messages import PlacementMap, ShardEntry
@@ -30,9 +29,7 @@ def restart(tmp_path, monkeypatch):
     monkeypatch.setenv("ENACT_CARRIER", "socket")
     monkeypatch.setenv("ENACT_SHARED_FOLDER", str(tmp_path / "shared"))
     (tmp_path / "shared").mkdir()
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    endpoint = free_endpoint()
     placement = PlacementMap(1, (ShardEntry("local", (endpoint,)),), ())
     settings = ShardSettings("local", placement, worlds=("training", "online"), ttl_ns_max=10**9)
     daemon = DaemonSettings(

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import socket
+
+from ports import free_endpoint
 
 from enact_dist import (
     Aspect,
@@ -38,10 +39,7 @@ def cameras(kind, tmp_path, monkeypatch):
         return
     monkeypatch.setenv("ENACT_SHARED_FOLDER", str(tmp_path))
     monkeypatch.setenv("ENACT_CARRIER", "socket")
-    with socket.socket() as one, socket.socket() as other:
-        for probe in (one, other):
-            probe.bind(("127.0.0.1", 0))
-        endpoints = [f"tcp/127.0.0.1:{probe.getsockname()[1]}" for probe in (one, other)]
+    endpoints = [free_endpoint(), free_endpoint()]
     names = ("s0", "s1")
     placement = PlacementMap(
         1,

@@ -3,13 +3,13 @@
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from ports import free_port
 
 from enact_dist.cli.main import main
 
@@ -17,19 +17,8 @@ ENACT = (sys.executable, "-m", "enact_dist.cli.main")
 SURROUNDINGS = {"PYTHONUNBUFFERED": "1", "PYTHONPATH": str(Path(__file__).parents[2])}
 
 
-def free_ports(count):
-    sockets = [socket.socket() for _ in range(count)]
-    try:
-        for probe in sockets:
-            probe.bind(("127.0.0.1", 0))
-        return [probe.getsockname()[1] for probe in sockets]
-    finally:
-        for probe in sockets:
-            probe.close()
-
-
 def new_cell(folder, more=""):
-    left, right = free_ports(2)
+    left, right = free_port(), free_port()
     file = folder / "cell.toml"
     file.write_text(
         f"""\

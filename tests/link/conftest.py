@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
+from ports import free_endpoint
 
 from enact_dist.core.datum import Datum, LockId, Slot
 from enact_dist.core.messages import (
@@ -99,13 +100,6 @@ def make_settings():
 def make_peer():
     """Sessions that speak in messages over a `call(shard, message)`."""
     return Peer
-
-
-def free_endpoint():
-    """Return an endpoint of the loopback at which nobody listens now."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 @pytest.fixture

@@ -3,7 +3,6 @@
 import os
 import random
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -13,6 +12,7 @@ import pytest
 from mcap.exceptions import McapError
 from mcap.records import Channel, Message
 from mcap.stream_reader import StreamReader
+from ports import free_endpoint
 
 from enact_dist import Aspect, Entity, Lock, Write, connect
 from enact_dist.recording.reading import Recording
@@ -51,9 +51,7 @@ def started():
 @pytest.fixture
 def endpoint(tmp_path, started):
     """One shard that commits are made at all the time."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        address = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    address = free_endpoint()
     file = tmp_path / "cell.toml"
     file.write_text(f'name = "killed"\n[shards.only]\nlisten = "{address}"\n')
     started("-m", "enact_dist.cli.main", "shard", "run", "only", "--cell", file, ready="ready")
@@ -102,9 +100,7 @@ def test_killed_recorder_leaves_whole_commits_without_a_hole(endpoint, started, 
 @pytest.mark.slow
 def test_recording_goes_on_when_a_shard_comes_back(started, tmp_path):
     """Killed and started again, its durable data have no hole in the recording."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        address = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    address = free_endpoint()
     file = tmp_path / "cell.toml"
     file.write_text(
         'name = "back"\nworlds = ["online"]\ndata_folder = "data"\nsession_ttl_s = 1.0\n'
