@@ -108,8 +108,9 @@ def test_doctor_reports_each_shard_of_a_running_cell(enact, cell_file):
 
 
 @pytest.mark.carrier("auto")
-def test_way_to_a_shard_is_found_out_before_it_is_told(enact, cell_file):
+def test_way_to_a_shard_is_found_out_before_it_is_told(enact, cell_file, monkeypatch):
     """Both shards offer a socket; a cell that is joined has met one of them only."""
+    monkeypatch.setattr("enact_dist.link.socket_line.CONNECT_S", 30.0)
     findings = enact("doctor", "--cell", cell_file, "--json").json
     shards = enact("shard", "ls", "--cell", cell_file, "--json").json
 

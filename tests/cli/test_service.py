@@ -11,6 +11,7 @@ import pytest
 from enact_dist import Aspect, Entity, Lock, Write, connect, supervise
 from enact_dist.cli.main import main
 from enact_dist.errors import EnactError, LockTimeoutError
+from enact_dist.link import client as link_client
 
 COUNT = Aspect("count", int)
 ACTOR = """\
@@ -122,8 +123,11 @@ def refused(write):
         pass
 
 
-def test_second_signal_ends_the_drain_and_the_holder_is_named(write_cell, spawn, until):
+def test_second_signal_ends_the_drain_and_the_holder_is_named(
+    write_cell, spawn, until, monkeypatch
+):
     """Whoever cannot wait says it twice; the log says who paid, in a line for programs."""
+    monkeypatch.setattr(link_client, "FINISH_S", 1.0)
     file = write_cell(PINNED)
     shard = spawn("shard", "run", "left", "--cell", file, "--drain", "60", "--log", "json")
     until(shard, "ready: shard")
