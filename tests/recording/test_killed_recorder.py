@@ -73,7 +73,7 @@ def test_killed_recorder_leaves_whole_commits_without_a_hole(endpoint, started, 
         while not (path.exists() and path.stat().st_size > 5_000):
             assert recorder.poll() is None, recorder.stdout.read()
             time.sleep(0.01)
-        time.sleep(seeds.uniform(0.0, 2.5))
+        time.sleep(seeds.uniform(0.0, 1.3))  # at any moment of a chunk
         recorder.send_signal(signal.SIGKILL)
         killed_ns = time.time_ns()
         recorder.wait()
@@ -91,7 +91,7 @@ def test_killed_recorder_leaves_whole_commits_without_a_hole(endpoint, started, 
             continue  # killed in its first chunk
         versions = [commit.versions[0].version for commit in commits]
         assert versions == list(range(versions[0], versions[0] + len(versions)))
-        assert killed_ns - commits[-1].log_ns < 4e9
+        assert killed_ns - commits[-1].log_ns < 10e9  # 1.3 s of a process that has its turns
         assert _publicly_readable(path) == 2 * len(commits)
         held.append(len(numbered))
     assert max(held) > 50, "under load"
