@@ -109,13 +109,14 @@ def test_shard_refuses_rubbish_and_serves_its_neighbour(daemon, endpoint, raw, u
         kinds = [kind_of(*frame) for frame in frames]
         frames = [frame for frame, kind in zip(frames, kinds, strict=True) if kind not in BY_HAND]
         for frame, replies in zip(frames, raw(*frames), strict=True):
+            assert len(replies) == 1, (seed, frame, replies)
             answer = answer_of(replies)
             is_request = kind_of(*frame) in m.Request.__args__
             refused += not is_request
             others += is_request
             unread = type(answer) is m.Refused and answer.code == "protocol"
             assert unread or is_request, (seed, frame, answer)
-    until(lambda: neighbour.written > 20 or neighbour.failure)
+    until(lambda: neighbour.written > 20 or neighbour.failure, limit_s=60.0)
     neighbour.ending.set()
     neighbour.join(60)
 
