@@ -71,6 +71,13 @@ class Decisions:
             decision.due_ns = now_ns + decision.pause_ns
             decision.pause_ns = min(2 * decision.pause_ns, AGAIN_NS_MAX)
 
+    def tell_now(self, shard: str, now_ns: int) -> Iterator[Effect]:
+        """Tell a participant that has come back into reach, and begin with short pauses again."""
+        for decision in self.by_lock.values():
+            if shard in decision.left:
+                decision.due_ns, decision.pause_ns = now_ns, AGAIN_NS_MIN
+        yield from self.tell(now_ns)
+
     def finished(self, lock: LockId, shard: str) -> Iterator[Effect]:
         """A participant has applied the commit, and that survives."""
         decision = self.by_lock.get(lock)

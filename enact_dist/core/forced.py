@@ -116,6 +116,12 @@ class ForcedAborts:
                 yield Call(record.primary, resolve)
                 self._ask_ns[lock] = now_ns + ASK_NS
 
+    def ask_now(self, shard: str) -> None:
+        """Let the next `ask` ask this shard, whenever it was asked before."""
+        for lock in self._ask_ns:
+            if self._records[lock].primary == shard:
+                self._ask_ns[lock] = self._state.now_ns
+
     def next_deadline_ns(self) -> int | None:
         """Return when a lost shard is to be asked again."""
         return min(self._ask_ns.values(), default=None)

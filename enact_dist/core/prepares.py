@@ -8,8 +8,9 @@
 
 Rules a change must keep
   * What is prepared ignores its client and every lease; only its primary's word ends it (or an
-    operator's).  This shard asks for that word by itself, again and again: there is no
-    coordinator, and no scan at a restart that could miss a late prepare.
+    operator's).  This shard asks for that word by itself, again and again, and at once when the
+    primary comes back into reach: there is no coordinator, and no scan at a restart that could
+    miss a late prepare.
   * `Finished` is said only when the end of the prepared state survives: after that the primary
     may forget, and would answer *aborted*.
   * Nobody sees the writes before their record is durable (a restart must not take them back).
@@ -60,6 +61,7 @@ from enact_dist.terms import Durability
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
+    from enact_dist.core.records import ShardReturned
     from enact_dist.core.shard_state import ShardState
     from enact_dist.core.tenures import Tenure
 
@@ -293,6 +295,17 @@ class PrepareDesk:
             yield Call(record.primary, Resolve(lock, record.primary_token, name))
             self._ask_ns[lock] = now_ns + self._ask_again_ns(lock)
         yield from self._forced.ask()
+
+    def on_shard_returned(self, message: ShardReturned, _: int) -> Iterator[Effect]:
+        """Another shard is in reach again: ask for its word, and say ours, without a pause."""
+        state, shard = self._state, message.shard
+        for lock in self._ask_ns:
+            record = state.tenures.by_lock[lock].prepared
+            if record is not None and record.primary == shard:
+                self._ask_ns[lock] = state.now_ns
+        self._forced.ask_now(shard)
+        yield from self.ask()
+        yield from state.decisions.tell_now(shard, state.now_ns)
 
     def next_deadline_ns(self) -> int | None:
         """Return when a primary is to be asked again."""

@@ -301,6 +301,13 @@ class Called:
 
 
 @dataclass(frozen=True, slots=True)
+class ShardReturned:
+    """Another shard has come (back) into reach; a hint, which may come late, twice or never."""
+
+    shard: str
+
+
+@dataclass(frozen=True, slots=True)
 class SessionSeen:
     """A session's liveliness token appeared or vanished."""
 
@@ -335,4 +342,4 @@ class MakeRoom:
     bytes: int
 
 
-Event = Persisted | Called | SessionSeen | SessionDied | Tick | Drain | MakeRoom
+Event = Persisted | Called | ShardReturned | SessionSeen | SessionDied | Tick | Drain | MakeRoom

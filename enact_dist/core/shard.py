@@ -69,6 +69,7 @@ from enact_dist.core.records import (
     Reply,
     SessionDied,
     SessionSeen,
+    ShardReturned,
     Tick,
 )
 from enact_dist.core.session_desk import SessionDesk
@@ -120,6 +121,7 @@ class Shard:
             Finish: self._prepares.on_finish,
             Resolve: self._prepares.on_resolve,
             Called: self._prepares.on_called,
+            ShardReturned: self._prepares.on_shard_returned,
             ForceAbort: self._prepares.on_force_abort,
             AwaitStamp: self._on_await_stamp,
             Survey: self._on_survey,

@@ -1,12 +1,13 @@
 """Calls from shard to shard: what became of a prepared lock, and that one has committed.
 
 Each other shard has a Zenoh session and a thread of its own, both made at the first call, so that
-one that is down delays nobody.  A call is made once; whether it is made again the core decides.
-Whoever submits never waits.
+one that is down delays nobody.  A call is made once; whether it is made again the core decides,
+which is told when a shard comes back into reach.  Whoever submits never waits.
 """
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import threading
 import time
@@ -17,6 +18,7 @@ import zenoh
 from enact_dist.core.messages import Answer, Request
 from enact_dist.errors import ProtocolError
 from enact_dist.link.zenoh_config import close_session, keep_after_fork, open_session
+from enact_dist.link.zenoh_presence import ShardPresence
 from enact_dist.wire.frames import decode_frame, encode_frame
 from enact_dist.wire.keys import request_key, verb_of
 
@@ -47,6 +49,8 @@ class ShardCalls:
         shards: All shards of the cell with their endpoints.
         lease_s: A connection counts as lost after so long without a sign of life.
         answered: Called with shard, request and answer, from the thread of that shard.
+        returned: Called with the name of each shard that was called once and comes (back) into
+            reach, from any thread.
     """
 
     def __init__(
@@ -57,14 +61,20 @@ class ShardCalls:
         *,
         lease_s: float,
         answered: Callable[[str, Request, Answer], None],
+        returned: Callable[[str], None],
     ) -> None:
         self._cell, self._name, self._lease_s = cell, name, lease_s
         self._endpoints = {shard.name: shard.endpoints for shard in shards if shard.name != name}
-        self._answered = answered
+        self._answered, self._returned = answered, returned
         self._mutex = threading.Lock()
         self._lines: dict[str, _Line] = {}
         self._unknown: dict[str, None] = {}
         self._closed = False
+
+    @property
+    def others(self) -> tuple[str, ...]:
+        """The shards that can be called."""
+        return tuple(self._endpoints)
 
     def submit(self, shard: str, request: Request) -> None:
         """Queue a call; the same call that is queued already is not queued twice."""
@@ -87,6 +97,7 @@ class ShardCalls:
                 self._endpoints[shard],
                 self._lease_s,
                 lambda request, answer: self._answered(shard, request, answer),
+                lambda: self._returned(shard),
             )
         except RuntimeError as error:
             _log.warning("no call to shard %s now: %s", shard, error)
@@ -127,14 +138,16 @@ class _Line:
         endpoints: tuple[str, ...],
         lease_s: float,
         answered: Callable[[Request, Answer], None],
+        returned: Callable[[], None],
     ) -> None:
         self._shard = shard
         self._key_of, self._endpoints, self._lease_s = key_of, endpoints, lease_s
-        self._answered = answered
+        self._answered, self._returned = answered, returned
         self._queued: dict[Request, None] = {}
         self._wake = threading.Condition(threading.Lock())
         self._ending = False
         self._session: zenoh.Session | None = None
+        self._presence: ShardPresence | None = None
         self._silent_since_s: float | None = None
         self._silence_told = False
         keep_after_fork(self)
@@ -168,13 +181,20 @@ class _Line:
         Raises:
             EnactError: None can be made.
         """
-        if self._session is None:
-            self._session = open_session(connect=self._endpoints, lease_s=self._lease_s)
         session = self._session
+        if session is None:
+            session = self._session = open_session(connect=self._endpoints, lease_s=self._lease_s)
+            with contextlib.suppress(zenoh.ZError):  # closed meanwhile
+                key = self._key_of(calls[0])
+                self._presence = ShardPresence(session, key, self._tell_returned)
         sent = [(request, self._send(session, request)) for request in calls]
         end_s = time.monotonic() + CALL_S
         received = [(request, _receive(replies, end_s)) for request, replies in sent]
         return [(request, answer) for request, answer in received if answer is not None]
+
+    def _tell_returned(self) -> None:
+        if not self._ending:
+            self._returned()
 
     def _note_silence(self, *, answered: bool) -> None:
         """Tell the log once that the shard is away, and once that it is back."""
@@ -226,7 +246,10 @@ class _Line:
         self._close_session()
 
     def join(self, timeout_s: float) -> None:
+        deadline_s = time.monotonic() + timeout_s
         self._thread.join(max(0.0, timeout_s))
+        if self._presence is not None:
+            self._presence.join(max(0.0, deadline_s - time.monotonic()))
 
     def _close_session(self) -> None:
         session = self._session

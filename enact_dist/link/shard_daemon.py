@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.messages import ListLocks, Locks
+from enact_dist.core.records import ShardReturned
 from enact_dist.errors import ConfigError, EnactError, LinkError
 from enact_dist.link.endpoints import split_endpoint
 from enact_dist.link.host import open_host
@@ -123,9 +124,12 @@ class RunningShard:
                 shard.placement.shards,
                 lease_s=settings.link_lease_s,
                 answered=self.host.called,
+                returned=lambda name: self.host.event(ShardReturned(name)),
             )
             undo.callback(self._calls.close)
             self.host.call_with(self._calls.submit)
+            for other in self._calls.others:  # what the first tick asked of them nobody carried
+                self.host.event(ShardReturned(other))
             self._service = ZenohService(self.host, self._session, settings.cell)
             undo.pop_all()
 

@@ -1,4 +1,4 @@
-"""Tells a client when a shard comes (back) into reach, so that nobody has to ask again and again.
+"""Tells who calls a shard when it comes (back) into reach: nobody has to ask again and again.
 
 Zenoh notes on its own when a queryable for a key appears: 7 to 12 ms after the daemon's `ready`,
 measured on a loopback, against up to a quarter of a TTL until the next keep-alive.

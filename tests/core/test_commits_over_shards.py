@@ -33,6 +33,7 @@ from enact_dist.core.records import (
     PreparedEnded,
     PreparedRecord,
     SessionDied,
+    ShardReturned,
     Tick,
 )
 
@@ -212,6 +213,16 @@ class TestParticipant:
         bench.event(Tick())
 
         assert bench.calls == [("far", Resolve(ANN, FAR_TOKEN, "s0"))]
+
+    @pytest.mark.parametrize(("shard", "asked"), [("far", 1), ("elsewhere", 0)])
+    def test_primary_that_comes_back_is_asked_at_once(self, bench, shard, asked):
+        """It was asked while it was away; any other shard says nothing of this lock."""
+        prepared(bench)
+        bench.wait(TTL_NS)
+        before = len(bench.calls)
+        bench.event(ShardReturned(shard))
+
+        assert bench.calls[before:] == asked * [("far", Resolve(ANN, FAR_TOKEN, "s0"))]
 
     def test_release_of_a_prepared_lock_makes_it_ask_soon(self, bench):
         """A client that gives up has told the primary too, so the answer is there."""

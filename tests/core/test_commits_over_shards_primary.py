@@ -9,6 +9,7 @@ from prepare_parts import ANN, FAR_TOKEN, STAMP_NS, V, W, decided, prepared
 from shard_bench import MS, TTL_NS, S, ShardBench, datum, item, lock_id, slot
 
 from enact_dist.core.datum import Position, Token
+from enact_dist.core.decisions import AGAIN_NS_MIN
 from enact_dist.core.messages import (
     RESOLVED_ABORTED,
     RESOLVED_COMMITTED,
@@ -36,6 +37,7 @@ from enact_dist.core.records import (
     Called,
     DecisionDone,
     DecisionRecord,
+    ShardReturned,
     Tick,
 )
 
@@ -55,6 +57,19 @@ class TestPrimary:
         (record,) = [r for r in bench.log if isinstance(r, DecisionRecord)]
         assert record == DecisionRecord(ANN, answer.position, ("far",))
         assert answer.position.stamp_ns > STAMP_NS
+
+    def test_participant_that_comes_back_is_told_at_once(self, bench):
+        """The pauses have grown while it was away, and are short again after that."""
+        finish = ("far", Finish(ANN, decided(bench).position))
+        bench.wait(5 * S, keep=("ann",))
+        bench.calls.clear()
+
+        bench.event(ShardReturned("elsewhere"))
+        assert bench.calls == []
+        bench.event(ShardReturned("far"))
+        assert bench.calls == [finish]
+        bench.wait(AGAIN_NS_MIN, keep=("ann",))
+        assert bench.calls == [finish, finish]
 
     def test_participants_are_told_until_they_have_finished(self, bench):
         """Lost messages are made up for; then the decision is forgotten."""

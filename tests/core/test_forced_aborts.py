@@ -25,7 +25,7 @@ from enact_dist.core.messages import (
     Resolved,
     WriteItem,
 )
-from enact_dist.core.records import Called
+from enact_dist.core.records import Called, ShardReturned
 from enact_dist.terms import Access
 
 ANN, BOB = lock_id("ann"), lock_id("bob")
@@ -162,6 +162,19 @@ def test_lost_shard_that_had_not_committed_raises_no_alarm(bench):
     bench.calls.clear()
     bench.wait(5 * S)
     assert not bench.calls
+
+
+def test_lost_shard_that_comes_back_is_asked_at_once(bench):
+    """Whether the commit is torn should be known as soon as it can be."""
+    force(bench)
+    bench.wait(S)
+    bench.calls.clear()
+
+    bench.event(ShardReturned("elsewhere"))
+    assert bench.calls == []
+    bench.event(ShardReturned("far"))
+
+    assert bench.calls == [("far", FAR)]
 
 
 def test_second_abort_by_hand_finds_nothing_in_doubt(bench):

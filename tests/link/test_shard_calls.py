@@ -6,8 +6,18 @@ import time
 
 import pytest
 
-from enact_dist.core.datum import LockId, Position, Token
-from enact_dist.core.messages import Finish, Finished, Resolve, Resolved, ShardEntry
+from enact_dist.core import prepares
+from enact_dist.core.datum import Datum, LockId, Position, Slot, Token
+from enact_dist.core.messages import (
+    Finish,
+    Finished,
+    Prepare,
+    Prepared,
+    Resolve,
+    Resolved,
+    ShardEntry,
+    WriteItem,
+)
 from enact_dist.errors import LinkError
 from enact_dist.link import shard_calls, zenoh_config
 from enact_dist.link.shard_calls import ShardCalls
@@ -22,7 +32,7 @@ def calling():
     made = []
 
     def make(**endpoints):
-        answers = []
+        answers, returned = [], []
         shards = [ShardEntry(name, (endpoint,)) for name, endpoint in endpoints.items()]
         calls = ShardCalls(
             "cell",
@@ -30,8 +40,9 @@ def calling():
             [ShardEntry("s0", ()), *shards],
             lease_s=1.0,
             answered=lambda *answer: answers.append(answer),
+            returned=returned.append,
         )
-        calls.answers = answers
+        calls.answers, calls.returned = answers, returned
         made.append(calls)
         return calls
 
@@ -73,6 +84,48 @@ def test_shard_that_comes_late_is_reached_on_the_same_way(daemon, calling, endpo
     until(lambda: calls.answers or calls.submit("s1", RESOLVE))
 
     assert len(line_threads()) == 1
+
+
+def test_shard_that_comes_back_is_told(daemon, calling, endpoint, until):
+    """Of one that was called and did not answer, and again after each restart."""
+    calls = calling(s1=endpoint, s2=endpoint)
+    calls.submit("s1", RESOLVE)
+    until(lambda: calls._lines["s1"]._silent_since_s)  # it was called in vain
+    assert calls.returned == []
+
+    first = daemon(endpoint, "s1")
+    until(lambda: calls.returned)
+    assert calls.answers == []
+    first.stop(drain_s=0.0)
+    seen = len(calls.returned)
+    daemon(endpoint, "s1")
+    until(lambda: len(calls.returned) > seen)
+
+    assert set(calls.returned) == {"s1"}
+
+
+def test_primary_that_comes_back_is_asked_by_whoever_waits_for_it(
+    daemon, carry, make_peer, endpoint, free, tmp_path, until, monkeypatch
+):
+    """A lock in doubt ends with the cut, not with the pause after the last question."""
+    monkeypatch.setattr(prepares, "ASK_NS_MAX", 3600 * 10**9)
+    far = free()
+    stored = {"folder": tmp_path, "durability": "durable", "others": (ShardEntry("s0", (far,)),)}
+    first, carrier = daemon(endpoint, "s1", **stored), carry(endpoint, ttl_s=7200.0)
+    peer = make_peer(lambda shard, message: carrier.request(shard, message, timeout_s=5), "s1")
+    peer.hello(ttl_s=7200.0)
+    grant = peer.acquire("piece")
+    write = WriteItem(Slot("online", "piece", "count"), Datum(b"\x01", b"5", 1))
+    prepare = Prepare(grant.lock, grant.token, (write,), 0, (), "s0", Token(1, 1))
+    assert isinstance(carrier.request("s1", prepare, timeout_s=5), Prepared)
+    first.stop(drain_s=0.0)
+    second = daemon(endpoint, "s1", **stored)
+    until(lambda: (line := second._calls._lines.get("s0")) and line._silent_since_s)
+
+    daemon(far, "s0")
+
+    until(lambda: second.host.figures().get("resolved_aborted"))
+    assert second.host.figures()["locks_held"] == 0
 
 
 def test_call_that_is_queued_is_not_queued_twice(calling, endpoint, monkeypatch):
