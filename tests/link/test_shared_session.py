@@ -91,6 +91,8 @@ def test_catalogue_shows_a_fork_at_any_moment():
 class Carrier:
     """Connects to shards, or fails as it is told."""
 
+    fetch_bytes = 1 << 20
+
     def __init__(self, *failures):
         self.failures = list(failures)
         self.tried = 0
