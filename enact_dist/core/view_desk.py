@@ -121,8 +121,13 @@ class ViewDesk:
                 del self._parked[reply_to]
                 yield Reply(reply_to, self._dropped(message) or self._viewed(message))
 
-    def _dropped(self, message: TakeView) -> Refused | None:
-        """Refuse a view of a context that was dropped while it waited for another one."""
+    def _dropped(self, message: TakeView) -> Refused | EpochChanged | None:
+        """Refuse a view whose session, or one of whose contexts, ended while it waited.
+
+        What it showed would stay pinned for a session that nobody ends any more.
+        """
+        if self._state.sessions.known(message.lock.session) is None:
+            return EpochChanged(self._state.epoch)
         worlds = self._state.catalogue.worlds
         gone = next((item.context for item in message.items if item.context not in worlds), None)
         return None if gone is None else unknown_world(gone, worlds)

@@ -37,6 +37,7 @@ from enact_dist.core.records import (
     Called,
     DecisionDone,
     DecisionRecord,
+    SessionDied,
     ShardReturned,
     Tick,
 )
@@ -247,3 +248,16 @@ class TestViews:
         viewed = bench.answers[handle]
         assert isinstance(viewed, Viewed)
         assert viewed.until_ns < bench.wall_ns
+
+    def test_view_whose_session_ended_while_it_waited_pins_nothing(self, bench):
+        """Nobody fetches what it would show, and nobody would let go of that."""
+        bench.write("bob", 1, "x" * 100_000)
+        prepared(bench)
+        handle = bench.send(self.view(bench, at_ns=bench.wall_ns + 50 * MS))
+        bench.event(SessionDied("bob"))
+        assert handle not in bench.answers
+
+        bench.ask(Finish(ANN, Position(bench.wall_ns + 90 * MS, "far")))
+
+        assert bench.answers[handle] == EpochChanged(bench.shard.epoch)
+        assert not bench.shard.state.pins
