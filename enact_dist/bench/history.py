@@ -154,7 +154,8 @@ def _forks(run: Run, carrier: str, floor: Key) -> Iterator[Case]:
     for label, size in FORKED_BYTES.items():
         name = f"{WORLD}_history_{size}"
         source = run.place.world(carrier, name)
-        run.place.uses(carrier, _fork_of(name))
+        forked = run.place.unused(carrier, f"{name}_fork")  # it is dropped again and again
+        run.place.uses(carrier, forked)
         aspect = Aspect("history_forked", np.ndarray, Durability.VOLATILE)
         for number in range(FORKED):
             write = Write(source, Entity(f"forked/{number}"), aspect)
@@ -162,20 +163,14 @@ def _forks(run: Run, carrier: str, floor: Key) -> Iterator[Case]:
                 lock[write] = np.zeros(size, np.uint8)
         first = (NAME, _fork(next(iter(FORKED_BYTES))))
         goal = times(1.3, first, "independent of size (≤ 1.3 x 1 kB)") if size > 1_000 else None
-        yield Case(NAME, _fork(label), _forking(source), floor, goal)
+        yield Case(NAME, _fork(label), _forking(source, forked), floor, goal)
 
 
 def _fork(label: str) -> str:
     return f"fork of {FORKED} slots of {label}, per slot"
 
 
-def _fork_of(name: str) -> str:
-    return f"{name}_fork"
-
-
-def _forking(source: WorldContext) -> Measure:
-    name = _fork_of(source.name)
-
+def _forking(source: WorldContext, name: str) -> Measure:
     def dropped() -> None:
         with contextlib.suppress(UnknownWorldError):
             drop_world(source.session, name)

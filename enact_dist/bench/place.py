@@ -8,7 +8,7 @@ import os
 import signal
 from typing import TYPE_CHECKING, Any, Final
 
-from enact_dist.bench.visit import Visit
+from enact_dist.bench.visit import Visit, anywhere
 from enact_dist.config_values import CARRIERS
 from enact_dist.connecting import connect, local
 from enact_dist.link.shared_folder import SHARED_FOLDER_VARIABLE
@@ -171,6 +171,14 @@ class Place:
         """Note a world context that is made next: of a cell that runs it goes at the end."""
         if self._visit is not None:
             self._visit.uses(self.cell(carrier), name)
+
+    def unused(self, carrier: str, name: str) -> str:
+        """Return `name`, or with a number behind it if some shard has a world context of it."""
+        found, number = name, 1
+        while anywhere(self.cell(carrier), found):
+            number += 1
+            found = f"{name}_{number}"
+        return found
 
     def way(self, carrier: str) -> str:
         """Return how calls over a carrier travel: "socket", "zenoh" or `EMBEDDED`.

@@ -1,7 +1,8 @@
 """Benches in a cell that runs: what they make there goes at their end, and pushes nothing out.
 
 World contexts that a run has made are dropped at its end, over a connection of its own, so that no
-lock of the run stands in the way, however it ended.  Those that were there before stay.
+lock of the run stands in the way, however it ended.  Those that were there before stay, be it on
+one shard alone: one that keeps nothing on disk forgets them when it restarts, the others do not.
 
 At the cap of shared memory a shard lets its oldest history go for what is new.  That of the cell is
 worth more than a figure: a bench for whose data there is no room under the cap is left out.
@@ -58,7 +59,7 @@ class Visit:
     def uses(self, cell: Cell, name: str) -> None:
         """Note, before it is made, whether a world context is there already."""
         if name not in self._made:
-            self._made[name] = name not in cell.worlds()
+            self._made[name] = not anywhere(cell, name)
 
     def leave(self) -> None:
         """Drop what was made; say what stays, and how to drop it."""
@@ -67,11 +68,11 @@ class Visit:
         left = dict(self._made)
         try:
             with self._connected() as cell:
-                there = cell.worlds()
-                for name in list(left):
-                    if name in there and left[name]:
+                for name, made in self._made.items():
+                    there = anywhere(cell, name)
+                    if there and made:
                         _drop(cell, name)
-                    if name not in there or left[name]:
+                    if made or not there:
                         del left[name]
             why = "was there before this run and stays"
         except EnactError as error:
@@ -90,13 +91,22 @@ class Visit:
             )
 
 
+def anywhere(cell: Cell, name: str) -> bool:
+    """Whether any shard has a world context, or a part of one, of that name.
+
+    Raises:
+        ShardUnreachableError: A shard does not answer.
+    """
+    cell.worlds()  # greets every shard, but lists only what all of them have
+    return bool(cell._client.worlds_at(name))  # noqa: SLF001 - as each shard has just said
+
+
 def _drop(cell: Cell, name: str) -> None:
     """Drop a world context, after the locks of processes that have just ended."""
-    session = cell.world(name).session
     deadline_s = time.monotonic() + UNLOCKED_S
     while True:
         try:
-            drop_world(session, name)  # whatever lock this thread was interrupted in
+            drop_world(cell._session, name)  # noqa: SLF001 - whatever lock this thread was interrupted in
         except MisuseError:
             if time.monotonic() >= deadline_s:
                 raise

@@ -10,8 +10,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from enact_dist import Lock, connect
-from enact_dist.bench import command, updates
+from enact_dist import Aspect, Entity, Lock, View, connect
+from enact_dist.bench import command, history, updates
 from enact_dist.bench.place import Place
 from enact_dist.bench.visit import PEAK_BYTES, Visit, without_room
 from enact_dist.cell_info import ShardInfo
@@ -154,13 +154,100 @@ def test_context_that_was_there_before_stays(enact, cell_file, monkeypatch):
     assert f"`enact world drop bench --cell {cell_file}` drops it" in result.err
 
 
+@pytest.fixture
+def half_kept(write_cell, spawn, until):
+    """A running cell whose shard right keeps nothing on disk: its file, and what restarts right."""
+    file = write_cell()
+    text = file.read_text().replace('data_folder = "data"\n', "")
+    text = text.replace("[shards.left]\n", '[shards.left]\nfolder = "left"\n')
+    file.write_text(f'{text}\n[[pins]]\nentities = "kept"\nshard = "left"\n')
+    right = []
+
+    def run(name):
+        process = spawn("shard", "run", name, "--cell", file)
+        until(process, "ready: shard")
+        return process
+
+    def restart():
+        right[0].kill()
+        right[0].wait(60)
+        right[0] = run("right")
+
+    run("left")
+    right.append(run("right"))
+    return file, restart
+
+
+def test_context_of_which_one_shard_has_the_data_stays(enact, half_kept, monkeypatch):
+    """A shard that has forgotten it says nothing of the other's data."""
+    file, restart = half_kept
+    monkeypatch.setitem(command.BENCHES, "multi", write_some)
+    aspect = Aspect("weight_g", int)
+    with connect(file) as cell:
+        cell.create_world("bench").init(Entity("kept"), aspect, 7)
+    restart()
+
+    result = enact("bench", "multi", "--connect", str(file))
+
+    assert result.status == 0, result.err
+    assert "'bench' was there before this run and stays" in result.err
+    with connect(file) as cell:
+        kept = View(cell.world("bench"), Entity("kept"), aspect)
+        assert kept.world.view(kept)[kept] == 7
+
+
+def test_context_of_a_bench_goes_from_the_shard_that_still_has_it(enact, half_kept, monkeypatch):
+    """Though another one has restarted meanwhile and knows nothing of it."""
+    file, restart = half_kept
+
+    def restarted(run):
+        write_some(run)
+        restart()
+
+    monkeypatch.setitem(command.BENCHES, "multi", restarted)
+
+    result = enact("bench", "multi", "--connect", str(file))
+
+    assert (result.status, "world context" in result.err) == (0, False), result.err
+    with connect(file) as cell:
+        cell.worlds()
+        assert cell._client.worlds_at("bench") == {}
+
+
+def test_fork_of_a_bench_takes_the_place_of_no_context(enact, cell_file, monkeypatch):
+    """It is dropped before each next one; somebody's of its name is not."""
+    theirs, seen = "bench_history_10_fork", []
+    monkeypatch.setattr(history, "FORKED", 1)
+    monkeypatch.setattr(history, "FORKED_BYTES", {"10 B": 10})
+
+    def forks(run):
+        for case in history._forks(run, "auto", ("floor", "")):
+            seen.extend(case.measure(0.01))
+
+    monkeypatch.setitem(command.BENCHES, "multi", forks)
+    aspect = Aspect("weight_g", int)
+    with connect(cell_file) as cell:
+        world = cell.create_world(theirs)
+        world.init(Entity("kept"), aspect, 7)
+        kept = View(world, Entity("kept"), aspect)
+        try:
+            result = enact("bench", "multi", "--connect", str(cell_file))
+            assert world.view(kept)[kept] == 7
+            assert worlds_of(enact, cell_file) == [theirs, "online", "training"]
+        finally:
+            cell.drop_world(theirs)
+
+    assert (result.status, len(seen) > 0) == (0, True), result.err
+
+
 def test_context_that_cannot_be_dropped_is_told():
     """The cell may have gone meanwhile."""
 
     def gone():
         raise ShardUnreachableError("no shard answers", shard="s", endpoint="e")
 
-    cell = SimpleNamespace(worlds=tuple)
+    client = SimpleNamespace(worlds_at=lambda _name: {})
+    cell = SimpleNamespace(worlds=tuple, _client=client)
     said = []
     visit = Visit("my cell.toml", connected=gone, said=said.append)
     visit.leave()
