@@ -19,6 +19,7 @@ import dataclasses
 import errno
 import os
 import shutil
+import stat
 import time
 from contextlib import closing, suppress
 from dataclasses import asdict, dataclass
@@ -310,9 +311,12 @@ def _build(
     if files is None:
         shutil.copytree(source, partial, ignore=shutil.ignore_patterns(BACKUP_FILE))
     else:
-        (partial / BLOB_FOLDER).mkdir(parents=True)
+        partial.mkdir(mode=0o700, parents=True)  # nobody else looks in before the modes are right
+        (partial / BLOB_FOLDER).mkdir()
         for name in files:
             shutil.copyfile(source / name, partial / name)
+        for name in (*files, BLOB_FOLDER):
+            _keep_mode(source / name, partial / name)
         check_files(partial, files)
     with read_store(partial) as stored:
         _check_bodies(stored)
@@ -326,7 +330,14 @@ def _build(
     store, _ = open_store(partial, unix_s=unix_s)
     with closing(store):
         store.raise_epoch(epoch)
+    _keep_mode(source, partial)
     _sync(partial)
+
+
+def _keep_mode(source: Path, target: Path) -> None:
+    """Let who may read the original, and nobody else, read the copy; its owner writes it."""
+    owner = stat.S_IRWXU if target.is_dir() else stat.S_IRUSR | stat.S_IWUSR
+    target.chmod(stat.S_IMODE(source.stat().st_mode) | owner)
 
 
 def _epoch_before(folder: Path) -> int:

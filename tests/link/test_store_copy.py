@@ -315,6 +315,34 @@ def test_a_copy_that_is_not_what_was_copied_is_refused(folder, tmp_path, monkeyp
     assert not new.exists()
 
 
+def modes_of(folder):
+    paths = (folder, *folder.rglob("*"))
+    return {path.relative_to(folder).as_posix(): path.stat().st_mode & 0o777 for path in paths}
+
+
+def test_what_nobody_else_may_read_stays_so_when_it_is_restored(folder, tmp_path):
+    """Whatever the umask of whoever restores it; a backup that lies read-only is still written."""
+    copy, new, archived = tmp_path / "copy", tmp_path / "new", tmp_path / "archived"
+    before = os.umask(0o077)
+    try:
+        back_up(folder, copy, unix_s=100, **NAMES)
+        os.umask(0o022)
+        restore(copy, new, unix_s=200, **NAMES)
+        for path in copy.rglob("*"):
+            path.chmod(0o500 if path.is_dir() else 0o400)
+        restore(copy, archived, unix_s=200, **NAMES)
+    finally:
+        os.umask(before)
+
+    blob = next((copy / "blobs").iterdir()).name
+    files = {"mark", "format", "store.db", f"blobs/{blob}"}
+    expected = dict.fromkeys(files, 0o600) | dict.fromkeys((".", "blobs"), 0o700)
+    for restored in (new, archived):
+        found = modes_of(restored)
+        assert {name: found[name] for name in expected} == expected
+        assert versions(restored) == {"a": 1, "b": 1}
+
+
 def test_a_backup_of_before_there_were_digests_is_restored(folder, tmp_path):
     """It says so of itself; a newer one cannot pass for it, whatever it has lost."""
     copy, new = tmp_path / "copy", tmp_path / "new"
