@@ -75,16 +75,17 @@ class Writing:
             MisuseError: It is more than one lock may write.
             NoRoomError: The shard's cap is reached.
         """
-        self._note(slot, self._datum(slot, encoded, shard_of))
+        self._refuse_beyond(slot, encoded.size)
+        self._note(slot, self._written(slot, encoded, shard_of))
 
     def delete(self, slot: Slot) -> None:
         """Set a slot to null."""
-        self._forget(slot)
+        self._refuse_beyond(slot, 0)
         self._note(slot, None)
 
-    def _note(self, slot: Slot, datum: Datum | None) -> None:
-        old = self.data.get(slot)
-        size = self._bytes - (old.size if old else 0) + (datum.size if datum else 0)
+    def _refuse_beyond(self, slot: Slot, size: int) -> None:
+        """Raise before anything is made or given up for what one lock may not write any more."""
+        size = self._bytes_with(slot, size)
         if slot not in self.data and len(self.data) >= ITEMS_MAX:
             raise MisuseError(f"one lock writes at most {ITEMS_MAX} data; use several locks")
         if size > BODY_BYTES_MAX:
@@ -92,20 +93,31 @@ class Writing:
                 f"the writes of one lock have {size} bytes; at most {BODY_BYTES_MAX}: use several"
                 " locks"
             )
+
+    def _bytes_with(self, slot: Slot, size: int) -> int:
+        old = self.data.get(slot)
+        return self._bytes - (old.size if old else 0) + size
+
+    def _note(self, slot: Slot, written: _Written | None) -> None:
+        """Let something take the place of what was written to a slot."""
+        datum = written.datum if written is not None else None
+        size = self._bytes_with(slot, datum.size if datum is not None else 0)
+        self._forget(slot)
+        if written is not None and (written.draft is not None or written.arrays):
+            self._by_slot[slot] = written
         self.data[slot] = datum
         self._bytes = size
         self.edits += 1
 
-    def _datum(self, slot: Slot, encoded: Encoded, shard_of: Callable[[Slot], str]) -> Datum:
-        """Return the datum that stands for a value."""
+    def _written(self, slot: Slot, encoded: Encoded, shard_of: Callable[[Slot], str]) -> _Written:
+        """Return the datum that stands for a value, and where it lies."""
         if encoded.size <= PAYLOAD_BYTES_MIN:
-            self._forget(slot)
-            return encoded.datum()
+            return _Written(encoded.datum(), None)
         draft = self._payloads.draft(shard_of(slot), encoded.size)
         body = self._payloads.filled(draft, encoded.parts) if draft is not None else None
         if draft is None or body is None:
-            return self._keep(slot, _Written(encoded.datum(), None))
-        return self._keep(slot, _Written(encoded.over(body, draft.file), draft))
+            return _Written(encoded.datum(), None)
+        return _Written(encoded.over(body, draft.file), draft)
 
     def refuse_second(self, slot: Slot, request: object) -> None:
         """Raise `MisuseError` if a datum of this slot was handed out to be filled, and stands."""
@@ -126,6 +138,7 @@ class Writing:
             NoRoomError: The shard's cap is reached.
         """
         encoded = encode_parts(like, datum_type, stamp_ns=stamp_ns)
+        self._refuse_beyond(slot, encoded.size)
         draft, memory, shown = self._memory(shard, encoded)
         encoded.put_texts(memory)
         value, arrays = decode_to_fill(encoded.encoding, memory, datum_type)
@@ -137,7 +150,7 @@ class Writing:
                 " takes any datum"
             )
         datum = encoded.over(shown, draft.file if draft is not None else "")
-        self._note(slot, self._keep(slot, _Written(datum, draft, arrays)))
+        self._note(slot, _Written(datum, draft, arrays))
         return value
 
     def _memory(self, shard: str, encoded: Encoded) -> tuple[Draft | None, memoryview, memoryview]:
@@ -165,19 +178,13 @@ class Writing:
             if old.draft is not None:
                 self._drop(old.draft)
 
-    def _keep(self, slot: Slot, written: _Written) -> Datum:
-        self._forget(slot)
-        if written.draft is not None or written.arrays:
-            self._by_slot[slot] = written
-        return written.datum
-
     def fix(self) -> None:
         """Let nobody change any of it: it is about to be committed."""
         for slot, written in self._by_slot.items():
             for array in written.arrays:
                 array.flags.writeable = False
             datum = written.datum
-            if self._payloads.inside and written.draft is None and self.data[slot] is datum:
+            if self._payloads.inside and written.draft is None and self.data.get(slot) is datum:
                 self.data[slot] = replace(datum, body=joined([datum.body], datum.size))
 
     def end(self, *, committed: bool) -> None:
