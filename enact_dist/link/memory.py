@@ -13,6 +13,7 @@ import mmap
 import os
 import queue
 import threading
+import weakref
 from functools import cache
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
@@ -28,6 +29,8 @@ STEP_BYTES: Final = 4 << 20
 GATHER_S: Final = 0.02
 """How long leftovers are gathered: a thread that wakes for each would be in everybody's way."""
 _log = logging.getLogger("enact.link")
+_to_fill: Final[weakref.WeakValueDictionary[int, Pages]] = weakref.WeakValueDictionary()
+"""Maps that their files still get what is written to, by the descriptors of the files."""
 _FAILED: Final = ctypes.c_void_p(-1).value
 _MAP_FIXED: Final = 0x10
 
@@ -97,6 +100,39 @@ def map_file(
     protection = mmap.PROT_READ | (mmap.PROT_WRITE if writable else 0)
     address = _map(None, size, protection, mmap.MAP_SHARED, descriptor)
     return _mapped(Pages, address, size, ended)
+
+
+def map_to_fill(descriptor: int, size: int) -> Pages:
+    """Map a file for writing until `cut_off`; a forked child is cut off it at once.
+
+    Raises:
+        OSError: As the system reports it.
+    """
+    pages = _to_fill[descriptor] = map_file(descriptor, size, writable=True)
+    return pages
+
+
+def cut_off(pages: Pages, descriptor: int) -> None:
+    """Withdraw a map that was filled, and close its file.
+
+    Raises:
+        OSError: As the system reports it.
+    """
+    try:
+        withdraw(pages, descriptor)
+    finally:
+        _to_fill.pop(descriptor, None)
+        os.close(descriptor)
+
+
+def _cut_child_off() -> None:
+    """Let a forked child change what it has of its parent's maps for itself alone."""
+    for descriptor, pages in list(_to_fill.items()):
+        try:
+            withdraw(pages, descriptor)
+        except OSError as error:
+            _log.warning("what the parent fills could not be cut off: %s", error)
+    _to_fill.clear()
 
 
 def anonymous_file(size: int) -> int:
@@ -233,6 +269,7 @@ class Leftovers:
 
 
 _leftovers = Leftovers()
+os.register_at_fork(after_in_child=_cut_child_off)
 os.register_at_fork(after_in_child=_leftovers.forget)
 
 

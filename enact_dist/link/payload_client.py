@@ -25,9 +25,10 @@ from enact_dist.link.memory import (
     Pages,
     anonymous_file,
     body_of,
+    cut_off,
     leftovers,
     map_file,
-    withdraw,
+    map_to_fill,
 )
 from enact_dist.link.payload_desk import NO_ROOM
 from enact_dist.link.refusals import error_of
@@ -98,7 +99,7 @@ class Draft:
         Raises:
             OSError: As the system reports it.
         """
-        self._pages = map_file(self._descriptor, self.size, writable=True)
+        self._pages = map_to_fill(self._descriptor, self.size)
         return body_of(self._pages)
 
     def close(self) -> None:
@@ -120,11 +121,9 @@ class Draft:
 
 def _cut_off(pages: Pages, descriptor: int) -> None:
     try:
-        withdraw(pages, descriptor)
+        cut_off(pages, descriptor)
     except OSError as error:
         _log.warning("a committed array could not be cut off its file: %s", error)
-    finally:
-        os.close(descriptor)
 
 
 class _Shared:
