@@ -99,9 +99,9 @@ class CellClient(SessionClient):
                 now_ns = self._now_ns()
                 wait_ns, hold_ns = max(0, give_up_ns - now_ns), int(hold_s * 1e9)
                 lock = self.core.begin(lane, plan, now_ns=now_ns, wait_ns=wait_ns, hold_ns=hold_ns)
-                if begun:
-                    begun[-1].lane_free = True  # the lane goes on with the next one
                 begun.append(lock)
+                for before in begun[-2:-1]:
+                    before.lane_free = True  # the lane goes on with the next one
             if interrupt is not None:
                 lock.slice_ns = INTERRUPTIBLE_SLICE_NS
 
@@ -123,11 +123,22 @@ class CellClient(SessionClient):
             waited_s = (self._now_ns() - started_ns) / 1e9
             raise not_granted(lock, waited_s, self.carrier.endpoint_of)
         except BaseException:
+            self._release_of(lane)
             if begun:
                 self.release(begun[-1])
             else:
                 self._lanes.give_back(lane)
             raise
+
+    def _release_of(self, lane: int) -> None:
+        """Release what lives in a lane, a lock that an interrupt has kept from being noted too.
+
+        Keep-alives would name it for ever, and no lost release of the lane would be repaired.
+        """
+        with self._mutex:
+            for lock in self.core.live_locks():
+                if lock.lock.lane == lane:
+                    lock.release()
 
     def _begins_anew(self, lock: MultiLock, attempt: int) -> bool:
         """Whether a lock that came to rest should be asked for once more; pauses before that."""

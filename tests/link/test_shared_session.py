@@ -191,6 +191,56 @@ def test_lane_of_a_lock_that_is_interrupted_as_it_begins_is_given_back_once(
     assert sorted(lanes._free) == list(range(lanes._made))
 
 
+@pytest.mark.parametrize("attempt", [1, 2])
+def test_lock_that_is_interrupted_before_it_is_noted_is_no_lock(session, monkeypatch, attempt):
+    """Keep-alives would name it for ever: no lost release of its lane would be repaired."""
+    client, begun, made = session.client, [], []
+    begin = Client.begin
+
+    def interrupted(*arguments, **named):
+        made.append(begin(*arguments, **named))
+        if len(made) == attempt:
+            raise KeyboardInterrupt
+        return made[-1]
+
+    def lose(lock, **_):
+        lock.lose("on purpose")
+
+    monkeypatch.setattr(client, "_drive", lose)
+    monkeypatch.setattr(Client, "begin", interrupted)
+    item = Item(int(Access.WRITE), "online", "cup", "count")
+    with pytest.raises(KeyboardInterrupt):
+        client.acquire([item], wait_s=1.0, hold_s=1.0, begun=begun)
+
+    lanes = client._lanes
+    assert (len(made), len(begun)) == (attempt, attempt - 1)
+    assert client.core.live_locks() == []
+    assert sorted(lanes._free) == list(range(lanes._made))
+
+
+def test_lock_that_begins_anew_is_noted_before_the_one_before_it_lets_go(session, monkeypatch):
+    """Interrupted in between, the lane would be nobody's, and the lock a live one for ever."""
+    client = session.client
+
+    class Begun(list):
+        def append(self, lock):
+            if self:
+                raise KeyboardInterrupt
+            super().append(lock)
+
+    def lose(lock, **_):
+        lock.lose("on purpose")
+
+    monkeypatch.setattr(client, "_drive", lose)
+    item = Item(int(Access.WRITE), "online", "cup", "count")
+    with pytest.raises(KeyboardInterrupt):
+        client.acquire([item], wait_s=1.0, hold_s=1.0, begun=Begun())
+
+    lanes = client._lanes
+    assert client.core.live_locks() == []
+    assert sorted(lanes._free) == list(range(lanes._made))
+
+
 # ---------------------------------------------------------------- looked at while it grows
 
 
