@@ -336,7 +336,7 @@ class PayloadDesk:
             if draft is None or draft.size != size or not draft.whole:
                 return None
             del self._drafts[file]
-            self._adopted[file] = weakref.ref(draft.memory)
+            self._adopted[file] = weakref.ref(draft.memory, partial(self._unadopted, file))
             self._over.add(file)
         if draft.shared and self._folder is not None:
             try:
@@ -358,7 +358,12 @@ class PayloadDesk:
             self._bytes -= counted
             self._files -= folder is not None
             self._gone += 1
-            self._adopted.pop(file, None)
+
+    def _unadopted(self, file: str, gone: weakref.ref[Pages | Plain]) -> None:
+        """Forget an adopted payload; others of its name, too late to be a draft, end unnoticed."""
+        with self._mutex:
+            if self._adopted.get(file) is gone:
+                del self._adopted[file]
 
     # ---------------------------------------------------------------- life
 

@@ -76,6 +76,31 @@ def test_late_slice_makes_no_draft_of_what_was_adopted(folder, kept):
         assert adopted(desk) == (HALF + HALF if kept else b"")
 
 
+@pytest.mark.parametrize("shared", [True, False], ids=["file", "memory"])
+def test_late_slice_that_opens_what_was_adopted_leaves_it_adopted(folder, shared):
+    """The draft came, whole, and was adopted after the look at its name: a commit may repeat."""
+    desk = PayloadDesk(folder if shared else None, 10 * SIZE)
+    commits = []
+
+    class Drafts(dict):
+        def get(self, file):
+            if not commits:
+                commits.append(None)
+                staged(desk, 0, HALF)
+                staged(desk, len(HALF), HALF)
+                write = WriteItem(Slot("online", "arm", "cloud"), Datum(b"", b"", SIZE, 7, FILE))
+                commit = Commit(LockId(SESSION, 0, 1), Token(1, 1), (write,), 0)
+                commits[:] = [desk.with_bodies(commit)]
+            return super().get(file)
+
+    desk._drafts = Drafts()
+    staged(desk, 0, HALF)
+
+    assert adopted(desk) == HALF + HALF
+    commits.clear()
+    assert adopted(desk) == b""
+
+
 def test_late_slice_makes_no_draft_of_what_was_given_up():
     """Nor of what its client has dropped; of very old names nothing is kept."""
     desk = PayloadDesk(None, 10 * SIZE)
