@@ -32,8 +32,11 @@ LOOK_S: Final = 0.1
 """How often is looked while a connection is lost, and how soon a host has to answer."""
 COST: Final = 50
 """A look lists all descriptors of the process; the pause after it is this many times as long."""
+FAILED_S: Final = 1.0
+"""The pause after a look that failed."""
 JOIN_S: Final = 1.0
 
+_FAILED: Final = "connections are not looked after at the moment: %s"
 _log = logging.getLogger("enact.link")
 
 
@@ -49,6 +52,7 @@ class LinkWatch:
     def __init__(self, session: zenoh.Session, connect: Sequence[str], patience_s: float) -> None:
         self._connect = tuple(connect)
         self._patience_s = patience_s
+        self._lost = 0
         self._closing = threading.Event()
         self._listener = session.info.declare_link_events_listener(
             zenoh.handlers.FifoChannel(EVENTS_MAX), history=True
@@ -61,40 +65,54 @@ class LinkWatch:
     def _run(self, events: zenoh.Handler[zenoh.LinkEvent]) -> None:
         while True:
             try:
-                here = _all_here(events, events.recv())
-                _settle_new(here, self._patience_s)
-                lost = _lost_after(here)
-                if lost and self._connect:
-                    self._knock(events, lost)
+                self._note(_all_here(events, events.recv()))
+                if self._lost and self._connect:
+                    self._knock(events)
             except zenoh.ZError:  # the session is closed
                 return
             except Exception as error:  # noqa: BLE001 - no descriptor is free, most likely
-                _log.warning("connections are not looked after at the moment: %s", error)
+                _log.warning(_FAILED, error)
 
-    def _knock(self, events: zenoh.Handler[zenoh.LinkEvent], lost: int) -> None:
+    def _note(self, here: Sequence[zenoh.LinkEvent]) -> None:
+        """Count what is lost, and settle what has come if that can be done."""
+        self._lost = _lost_after(here, self._lost)
+        try:
+            _settle_new(here, self._patience_s)
+        except Exception as error:  # noqa: BLE001 - what is lost is looked after all the same
+            _log.warning(_FAILED, error)
+
+    def _knock(self, events: zenoh.Handler[zenoh.LinkEvent]) -> None:
         """Look at what waits for an answer until every lost connection is back."""
         hosts, pause_s = list(_hosts_of(self._connect)), LOOK_S
         waited: set[int] = set()
         while not self._closing.wait(pause_s):
             event = events.try_recv()
             if event is not None:
-                here = _all_here(events, event)
-                _settle_new(here, self._patience_s)
-                lost = _lost_after(here, lost)
-            if not lost:
+                self._note(_all_here(events, event))
+            if not self._lost:
                 return
             began_s = time.thread_time()
-            waiting = {host: unanswered(*host) for host in hosts}
-            pause_s = max(LOOK_S, COST * (time.thread_time() - began_s))
-            for host, inodes in waiting.items():
-                if inodes & waited and _answers(*host):
-                    give_up(inodes & waited)
-            waited = set().union(*waiting.values())
+            try:
+                waited = _given_up(hosts, waited)
+            except Exception as error:  # noqa: BLE001 - as above; nothing else would wake us
+                _log.warning(_FAILED, error)
+                pause_s = FAILED_S
+            else:
+                pause_s = max(LOOK_S, COST * (time.thread_time() - began_s))
 
     def join(self) -> None:
         """Wait for the end of the thread, which follows that of the session."""
         self._closing.set()
         self._thread.join(JOIN_S)
+
+
+def _given_up(hosts: Iterable[tuple[str, int]], waited: set[int]) -> set[int]:
+    """Give up what has `waited` since the last look for a host that answers; return what waits."""
+    waiting = {host: unanswered(*host) for host in hosts}
+    for host, inodes in waiting.items():
+        if inodes & waited and _answers(*host):
+            give_up(inodes & waited)
+    return set().union(*waiting.values())
 
 
 def _all_here(

@@ -230,30 +230,74 @@ def test_connection_that_nobody_answers_is_given_up_and_no_other():
                 one.close()
 
 
-def test_connections_are_looked_after_again_after_an_error(monkeypatch):
+@pytest.fixture
+def watching(monkeypatch):
+    """Watch made-up events: `watching(connect)` gives their queue; `None` ends it."""
+    made = []
+
+    def make(connect=()):
+        events = queue.SimpleQueue()
+
+        def taken(event):
+            if event is None:
+                raise zenoh.ZError("closed")
+            return event
+
+        def try_recv():
+            return None if events.empty() else taken(events.get())
+
+        handler = SimpleNamespace(recv=lambda: taken(events.get()), try_recv=try_recv)
+        listener = SimpleNamespace(handler=handler)
+        info = SimpleNamespace(declare_link_events_listener=lambda *_, **__: listener)
+        made.append((zenoh_links.LinkWatch(SimpleNamespace(info=info), connect, 1.0), events))
+        return events
+
+    yield make
+    for watch, events in made:
+        events.put(None)
+        watch.join()
+        assert not watch._thread.is_alive()
+
+
+def test_connections_are_looked_after_again_after_an_error(watching, monkeypatch):
     """A process that is short of descriptors for a moment cannot list its connections."""
-    events, settled = queue.SimpleQueue(), queue.SimpleQueue()
+    settled = queue.SimpleQueue()
 
     def settle_or_fail(ports, _):
         settled.put(ports)
         raise OSError(errno.EMFILE, "too many open files")
 
-    def recv():
-        event = events.get()
-        if event is None:
-            raise zenoh.ZError("closed")
-        return event
-
     monkeypatch.setattr(zenoh_links, "settle", settle_or_fail)
-    handler = SimpleNamespace(recv=recv, try_recv=lambda: None)
-    listener = SimpleNamespace(handler=handler)
-    info = SimpleNamespace(declare_link_events_listener=lambda *_, **__: listener)
-    watch = zenoh_links.LinkWatch(SimpleNamespace(info=info), (), 1.0)
-    for port in (1, 2):
-        link = SimpleNamespace(src=f"tcp/h:{port}", dst="tcp/h:7")
-        events.put(SimpleNamespace(kind=zenoh.SampleKind.PUT, link=link))
-    found = [settled.get(timeout=30) for _ in range(2)]
-    events.put(None)
-    watch.join()
+    events, found = watching(), []
+    for event in link_events("++"):
+        events.put(event)
+        found.append(settled.get(timeout=30))
 
-    assert found == [{(1, 7)}, {(2, 7)}]
+    assert found == [{(2, 1)}, {(3, 1)}]
+
+
+def test_lost_connection_is_looked_after_though_others_cannot_be_settled(watching, monkeypatch):
+    """It is lost with the descriptors of this process used up, at which a look fails, too."""
+    looks = queue.SimpleQueue()
+
+    def fail(*_):
+        raise OSError(errno.EMFILE, "too many open files")
+
+    def fail_once(*host):
+        looks.put(host)
+        if looks.qsize() == 1:
+            fail()
+        return set()
+
+    monkeypatch.setattr(zenoh_links, "FAILED_S", 0.0)
+    monkeypatch.setattr(zenoh_links, "settle", fail)
+    monkeypatch.setattr(zenoh_links, "unanswered", fail_once)
+    came, lost = link_events("+-")
+    monkeypatch.setattr(zenoh_links, "_all_here", lambda *_: [came, lost])
+
+    watching(["tcp/127.0.0.1:7"]).put(came)
+
+    until = time.monotonic() + 30.0
+    while looks.qsize() < 2:
+        assert time.monotonic() < until, "nobody looks"
+        time.sleep(0.005)  # nothing tells of a look that did not fail
