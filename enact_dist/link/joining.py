@@ -43,7 +43,8 @@ def join(
         carrier: How messages travel, one of `CARRIERS`.
 
     Raises:
-        LinkError: Another cell answers, or the socket is asked for and no shard has one to use.
+        LinkError: Another cell answers, or the socket is asked for and no shard has one to use;
+            where the first one has none and another does not answer, only after `timeout_s`.
         ShardUnreachableError: None answered; the message names the endpoints.
     """
     found, welcome = discover(endpoints, client.hello(""), timeout_s=timeout_s)

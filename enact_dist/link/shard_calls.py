@@ -7,7 +7,6 @@ which is told when a shard comes back into reach.  Whoever submits never waits.
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import threading
 import time
@@ -184,13 +183,20 @@ class _Line:
         session = self._session
         if session is None:
             session = self._session = open_session(connect=self._endpoints, lease_s=self._lease_s)
-            with contextlib.suppress(zenoh.ZError):  # closed meanwhile
-                key = self._key_of(calls[0])
-                self._presence = ShardPresence(session, key, self._tell_returned)
+        if self._presence is None:
+            self._watch(session, self._key_of(calls[0]))
         sent = [(request, self._send(session, request)) for request in calls]
         end_s = time.monotonic() + CALL_S
         received = [(request, _receive(replies, end_s)) for request, replies in sent]
         return [(request, answer) for request, answer in received if answer is not None]
+
+    def _watch(self, session: zenoh.Session, key: str) -> None:
+        """Watch the shard, or leave that to the next calls; these are made all the same."""
+        try:
+            self._presence = ShardPresence(session, key, self._tell_returned)
+        except (zenoh.ZError, RuntimeError) as error:  # closed meanwhile, or no thread is left
+            if not self._ending:
+                _log.warning("shard %s is not watched at the moment: %s", self._shard, error)
 
     def _tell_returned(self) -> None:
         if not self._ending:

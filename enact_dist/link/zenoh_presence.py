@@ -6,6 +6,7 @@ measured on a loopback, against up to a quarter of a TTL until the next keep-ali
 
 from __future__ import annotations
 
+import logging
 import threading
 from typing import TYPE_CHECKING, Final
 
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
 
 EVENTS_MAX: Final = 64
 """Comings and goings of one shard that wait to be looked at."""
+
+_log = logging.getLogger("enact.link")
 
 
 class ShardPresence:
@@ -48,7 +51,10 @@ class ShardPresence:
             except zenoh.ZError:  # the session is closed
                 return
             if event.matching:
-                self._returned()
+                try:
+                    self._returned()
+                except Exception as error:  # noqa: BLE001 - the next return is told all the same
+                    _log.error("a shard came into reach, which could not be told: %s", error)
 
     def join(self, wait_s: float) -> None:
         """Wait for the end of the thread, which follows that of the session."""

@@ -261,6 +261,46 @@ def test_calls_go_on_after_what_nobody_expected(daemon, calling, endpoint, until
     until(lambda: calls.answers or calls.submit("s1", RESOLVE))
 
 
+def test_shard_that_could_not_be_watched_is_watched_from_the_next_call_on(
+    daemon, calling, endpoint, until, monkeypatch
+):
+    """There was no thread for it at the first call; whoever waits for it is told all the same."""
+    calls, before = calling(s1=endpoint), refused.calls
+    with monkeypatch.context() as patch:
+        patch.setattr(shard_calls, "ShardPresence", refused)
+        calls.submit("s1", RESOLVE)
+        until(lambda: refused.calls > before and calls._lines["s1"]._silent_since_s)
+    calls.submit("s1", RESOLVE)
+    until(lambda: calls._lines["s1"]._presence)
+
+    daemon(endpoint, "s1")
+
+    assert until(lambda: calls.returned)
+
+
+def test_shard_that_comes_back_is_told_after_one_that_could_not_be(
+    daemon, calling, endpoint, until, caplog
+):
+    """What failed once at whoever is told ends no watch."""
+    calls, told = calling(s1=endpoint), []
+
+    def tell(shard):
+        told.append(shard)
+        if len(told) == 1:
+            raise RuntimeError("nobody listens")
+
+    calls._returned = tell
+    calls.submit("s1", RESOLVE)
+    until(lambda: calls._lines["s1"]._silent_since_s)
+    first = daemon(endpoint, "s1")
+    until(lambda: told)
+    first.stop(drain_s=0.0)
+    daemon(endpoint, "s1")
+
+    assert until(lambda: len(told) > 1)
+    assert "nobody listens" in caplog.text
+
+
 def refused(*_):
     refused.calls += 1
     raise RuntimeError("can't start new thread")

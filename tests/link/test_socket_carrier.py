@@ -249,8 +249,11 @@ def test_watch_lists_nothing_again_while_only_other_slots_change(daemon, endpoin
 
             def attempt():
                 listed.clear()
-                first, end_s = watch._following["s0"].number, time.monotonic() + 2.0
-                while time.monotonic() < end_s or watch._following["s0"].number < first + 10:
+                following, began_s, passed_s = watch._following, time.monotonic(), 0.0
+                last = following["s0"].number + 10
+                while passed_s < 2.0 or following["s0"].number < last:
+                    assert passed_s < 60.0, "the numbers stand still"
+                    passed_s = time.monotonic() - began_s
                     with Lock(request) as lock:
                         lock[request] += 1
                     assert watch.next(timeout_s=0.01) is None
