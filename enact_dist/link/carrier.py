@@ -105,6 +105,10 @@ class Carrier(Protocol):
     """Moves requests to shards and brings back their answers."""
 
     @property
+    def inside(self) -> bool:
+        """Whether the only shard is in this process, where data need not travel."""
+
+    @property
     def fetch_bytes(self) -> int:
         """How large a slice of a datum is asked for in one call, at most."""
 

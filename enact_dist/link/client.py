@@ -185,7 +185,7 @@ class CellClient(SessionClient):
                         if answer is not None:
                             self._learn(shard, answer)
                         lock.answered(shard, request, answer, self._now_ns())
-                self._follow_placement()
+                self._further.follow(self.core.placement)
         except BaseException:
             with self._mutex:
                 lock.release()

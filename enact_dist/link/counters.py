@@ -147,6 +147,7 @@ OF_A_SHARD: Final[dict[str, Counter]] = {
 }
 
 OF_A_CONNECTION: Final[dict[str, Counter]] = {
+    "connects_failed": Counter("tries to connect to further shards that failed", "see the log"),
     "keep_alives_failed": Counter("answers to keep-alives that made no sense", "see the log"),
     "keep_alives_unanswered": Counter("keep-alives without an answer in time", _NETWORK),
     "releases_unsent": Counter("locks whose release could not be sent; the next one ends them"),

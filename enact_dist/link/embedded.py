@@ -58,10 +58,12 @@ class EmbeddedCarrier:
         session: The session whose token is shown as present until `close`.
 
     Attributes:
+        inside: The only shard is in this process.
         fetch_bytes: How large a slice of a datum is asked for in one call: all, nothing is copied.
     """
 
     def __init__(self, host: ShardHost, session: str) -> None:
+        self.inside = True
         self.fetch_bytes = FETCH_BYTES
         self._host = host
         self._session = session

@@ -34,14 +34,14 @@ from enact_dist.core.messages import (
     Welcome,
 )
 from enact_dist.core.placement import shard_of
-from enact_dist.errors import ConfigError, EnactError, MisuseError
+from enact_dist.errors import EnactError, MisuseError
 from enact_dist.link.catalogue import CATALOGUES, KnownCatalogue
 from enact_dist.link.clock import boottime_ns
+from enact_dist.link.further_shards import FurtherShards
 from enact_dist.link.lanes import Lanes
 from enact_dist.link.payload_client import SharedPayloads
 from enact_dist.link.refusals import error_of, unreachable
 from enact_dist.link.used_names import SERIES_BITS
-from enact_dist.wire.limits import BODY_BYTES_MAX
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -115,11 +115,10 @@ class SessionClient:
             client.session,
             self._staged,
             self.count,
-            inside=carrier.fetch_bytes > BODY_BYTES_MAX,
+            inside=carrier.inside,
         )
         self._registered: dict[str, AspectEntry] = {}
-        self._linked = client.placement
-        self._linking = threading.Lock()
+        self._further = FurtherShards(carrier, client.placement, now_ns, self.count)
         self._renewer: threading.Thread | None = None
         if keep_alive:
             self._renewer = threading.Thread(
@@ -294,7 +293,7 @@ class SessionClient:
         with self._mutex:
             self._learn(shard, answer)
             self.core.answered(shard, request, answer, self._now_ns())
-        self._follow_placement()
+        self._further.follow(self.core.placement)  # outside the mutex
 
     def _learn(self, shard: str, answer: Answer) -> None:
         if isinstance(answer, CATALOGUES):
@@ -303,24 +302,6 @@ class SessionClient:
             if isinstance(answer, Welcome):
                 self.payloads.learn(answer)
             self.notice_numbers[shard] = (answer.epoch, answer.notice_number)
-
-    def _follow_placement(self) -> None:
-        """Connect to the shards of a placement that was just learned; outside the mutex.
-
-        Where that fails, or another thread is at it, whoever gets the next answer looks again.
-        """
-        placement = self.core.placement
-        if placement is self._linked or not self._linking.acquire(blocking=False):
-            return
-        try:
-            if placement != self._linked:
-                self.carrier.add_endpoints(placement.shards)
-            self._linked = placement
-        except ConfigError:  # an endpoint that never can be reached is told once
-            self._linked = placement
-            raise
-        finally:
-            self._linking.release()
 
     def unsettled_ns(self, shard: str) -> int:
         """Return the stamp of a commit of ours that a shard may not show yet (0: none)."""

@@ -56,10 +56,12 @@ class SocketCarrier:
         forced: Whether a socket that cannot be used is an error.
 
     Attributes:
+        inside: No shard is in this process.
         calls: How many calls went over sockets, and how many over Zenoh.
     """
 
     def __init__(self, behind: ZenohCarrier, session: str, *, forced: bool = False) -> None:
+        self.inside = False
         self.calls = {"socket": 0, "zenoh": 0}
         self._behind = behind
         self._session = session

@@ -22,7 +22,7 @@ from enact_dist.errors import EnactError, LeaseLostError, ProtocolError, ShardUn
 from enact_dist.link.refusals import error_of
 from enact_dist.link.session_client import CALL_S, FIRST_STAGED
 from enact_dist.link.transfer import Piece, Transfer, in_turn
-from enact_dist.wire.limits import BODY_BYTES_MAX, PAYLOAD_BYTES_MIN
+from enact_dist.wire.limits import PAYLOAD_BYTES_MIN
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -75,8 +75,7 @@ def stage(
 def _named(client: SessionClient, writes: Sequence[WriteItem]) -> Sequence[WriteItem]:
     """Give each large datum of one shard's writes a name; return `writes` where none travels so."""
     inline = sum(w.datum.size for w in writes if w.datum is not None and not w.datum.file)
-    slice_bytes = client.carrier.fetch_bytes
-    if inline <= INLINE_BYTES_MAX or slice_bytes > BODY_BYTES_MAX:
+    if inline <= INLINE_BYTES_MAX or client.carrier.inside:
         return writes
     session = client.core.session
     return [

@@ -106,6 +106,7 @@ class ZenohCarrier:
     """Reaches the shards of a cell over Zenoh.  See `Carrier` for the methods; thread-safe.
 
     Attributes:
+        inside: No shard is in this process.
         fetch_bytes: How large a slice of a datum is asked for in one call, at most.
 
     Args:
@@ -134,6 +135,7 @@ class ZenohCarrier:
         connect_s: float = CONNECT_S,
         open_s: float = OPEN_S,
     ) -> None:
+        self.inside = False
         self.fetch_bytes = FETCH_BYTES
         self._cell = cell
         self._session = session
@@ -149,7 +151,7 @@ class ZenohCarrier:
         self._endpoints_of: dict[str, tuple[str, ...]] = {}
         self._feeds: dict[NoticeQueue, list[_Pump]] = {}
         self._keys: dict[tuple[str, type], str] = {}
-        self._presences: list[ShardPresence] = []
+        self._presences: dict[str, ShardPresence] = {}
         self._returned: Callable[[str], None] = lambda _: None
         self._unchecked: deque[zenoh.Handler[zenoh.Reply]] = deque(maxlen=UNCHECKED_MAX)
         keep_after_fork(self)
@@ -291,15 +293,15 @@ class ZenohCarrier:
         self._check_usable()
         for name, endpoints in entries:
             self._endpoints_of[name] = endpoints
-            if name in self._link_of or not endpoints:
+            if not endpoints:
                 continue
-            link = self._link_reaching(name, endpoints) or self._open_link(endpoints)
-            self._link_of[name] = link
-            self._presences.append(
-                ShardPresence(
-                    link.session, self._key(name, QUESTION), partial(self._tell_returned, name)
-                )
-            )
+            if name not in self._link_of:
+                reaching = self._link_reaching(name, endpoints)
+                self._link_of[name] = reaching or self._open_link(endpoints)
+            if name not in self._presences:
+                session, key = self._link_of[name].session, self._key(name, QUESTION)
+                told = partial(self._tell_returned, name)
+                self._presences[name] = ShardPresence(session, key, told)
 
     def _link_reaching(self, shard: str, endpoints: Sequence[str]) -> _Link | None:
         """Return the link that leads to `shard` already, perhaps by another of its addresses."""
@@ -394,7 +396,7 @@ class ZenohCarrier:
             close_session(link.session)
         for pump in pumps:
             pump.thread.join(JOIN_S)
-        for presence in self._presences:
+        for presence in list(self._presences.values()):
             presence.join(JOIN_S)
         # A thread that comes back from Zenoh while the interpreter ends would abort the process.
         self._inside.wait_empty(JOIN_S)

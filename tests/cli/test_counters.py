@@ -14,6 +14,7 @@ OF_CLIENTS = {
     "client.py",
     "fetching.py",
     "payload_client.py",
+    "further_shards.py",
     "session_client.py",
     "staging.py",
     "transfer.py",

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from enact_dist import Aspect, local
+from enact_dist import Aspect, Entity, Lock, Write, local
 from enact_dist.core.client import Client, Peer
 from enact_dist.core.datum import Slot
 from enact_dist.core.messages import (
@@ -22,6 +22,8 @@ from enact_dist.core.phase import Phase
 from enact_dist.core.unsettled import Unsettled
 from enact_dist.errors import ConfigError, LinkError
 from enact_dist.link.catalogue import KnownCatalogue
+from enact_dist.link.clock import boottime_ns
+from enact_dist.link.further_shards import PAUSE_NS
 from enact_dist.link.session_client import SessionClient
 from enact_dist.terms import Access
 
@@ -91,6 +93,7 @@ def test_catalogue_shows_a_fork_at_any_moment():
 class Carrier:
     """Connects to shards, or fails as it is told."""
 
+    inside = False
     fetch_bytes = 1 << 20
 
     def __init__(self, *failures):
@@ -103,39 +106,84 @@ class Carrier:
             raise self.failures.pop(0)
 
 
-def client_of(carrier):
-    return SessionClient(carrier, Client("a" * 32, ttl_ns=10**9), keep_alive=False)
+class Clock:
+    """The session's clock, which stands still."""
+
+    ns = 10**12
+
+    def __call__(self):
+        return self.ns
+
+
+def client_of(carrier, now_ns=boottime_ns):
+    client = Client("a" * 32, ttl_ns=10**9)
+    return SessionClient(carrier, client, now_ns=now_ns, keep_alive=False)
 
 
 def hear(client):
     client._take("s0", AwaitStamp(0, 0), Reached(reached=True, stamp_ns=0))
 
 
-def test_shards_that_could_not_be_connected_are_tried_again():
-    """No session could be opened at that moment; whoever asks next has one."""
-    carrier = Carrier(LinkError("no session can be opened"))
-    client = client_of(carrier)
+@pytest.mark.parametrize(
+    "failure", [LinkError("no session can be opened"), RuntimeError("can't start new thread")]
+)
+def test_shards_that_could_not_be_connected_are_tried_again(failure, caplog):
+    """After a pause: the answers that come meanwhile, of healthy shards, are nobody's error."""
+    carrier, clock = Carrier(failure, failure), Clock()
+    client = client_of(carrier, clock)
     client.core.learn_placement(ONE_SHARD)
 
-    with pytest.raises(LinkError):
+    hear(client)
+    hear(client)
+    assert carrier.tried == 1
+    for tried in (2, 3):
+        clock.ns += PAUSE_NS
         hear(client)
+        hear(client)
+        assert carrier.tried == tried
+    clock.ns += PAUSE_NS
     hear(client)
-    hear(client)
 
-    assert carrier.tried == 2
+    assert carrier.tried == 3
+    assert client.counters == {"connects_failed": 2}
+    assert caplog.text.count(str(failure)) == 2
 
 
-def test_endpoint_that_cannot_be_read_is_told_once():
+def test_endpoint_that_cannot_be_read_is_told_once(caplog):
     """What a cell's file says wrongly does not stop who needs other shards."""
-    carrier = Carrier(ConfigError("no endpoint"), ConfigError("no endpoint"))
-    client = client_of(carrier)
+    carrier, clock = Carrier(ConfigError("no endpoint"), ConfigError("no endpoint")), Clock()
+    client = client_of(carrier, clock)
     client.core.learn_placement(ONE_SHARD)
 
-    with pytest.raises(ConfigError):
-        hear(client)
+    hear(client)
+    clock.ns += PAUSE_NS
     hear(client)
 
     assert carrier.tried == 1
+    assert caplog.text.count("no endpoint") == 1
+
+
+@pytest.mark.parametrize("failure", [LinkError("no session"), ConfigError("no endpoint")])
+def test_commit_stands_though_a_further_shard_cannot_be_connected(monkeypatch, failure):
+    """Whoever got an error for it would write once more."""
+    tried, count, cup = [], Aspect("count", int), Entity("cup")
+
+    def fail(_):
+        tried.append(failure)
+        raise failure
+
+    with local(worlds=["online"]) as cell:
+        world, client = cell.world("online"), cell._client
+        world.init(cup, count, 1)
+        request = Write(world, cup, count)
+        with Lock(request) as lock:
+            lock[request] += 1
+            monkeypatch.setattr(client.carrier, "add_endpoints", fail)
+            entries = (*client.core.placement.shards, ShardEntry("s1", ("tcp/127.0.0.1:1",)))
+            client.core.learn_placement(client.core.placement._replace(version=99, shards=entries))
+        assert tried
+        with Lock(request) as lock:
+            assert lock[request] == 2
 
 
 def test_shards_are_connected_once_by_two_threads_that_learn_of_them():

@@ -25,6 +25,7 @@ class Way:
         self.desks = {shard: PayloadDesk(None, bytes_max) for shard in shards or ("s0",)}
         self.core = SimpleNamespace(session=SESSION)
         self.carrier = SimpleNamespace(
+            inside=False,
             fetch_bytes=SLICE,
             endpoint_of=lambda shard: f"tcp/{shard}:1",
             request_all=lambda calls, **_: [self.desks[s].stage(m) for s, m in calls],
@@ -96,7 +97,7 @@ def test_small_writes_and_those_that_nothing_carries_stay_with_their_commit():
     """One slice's worth is not staged, nor anything where the shard lives in this process."""
     way, writes = Way(), {"s0": [write_of("a", 40_000), write_of("b", 20_000)]}
     assert stage(way, writes, lambda: None) == writes
-    way.carrier.fetch_bytes = 1 << 40
+    way.carrier.inside = True
     large = {"s0": [write_of("a", 400_000)]}
     assert stage(way, large, lambda: None) == large
     assert not way.asked

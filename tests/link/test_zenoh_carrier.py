@@ -233,6 +233,26 @@ def test_carrier_tells_when_a_shard_comes_into_reach_again(daemon, carry, endpoi
     assert "enact-presence" not in {thread.name for thread in threading.enumerate()}
 
 
+def test_shard_whose_watch_could_not_begin_is_watched_when_it_is_added_again(
+    daemon, carry, endpoint, monkeypatch
+):
+    """There was no thread for it; its link stays."""
+    daemon(endpoint)
+    carrier, came = carry(endpoint), queue.Queue()
+    carrier.tell_returns(came.put)
+
+    def refused(*_):
+        raise RuntimeError("can't start new thread")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(zenoh_carrier, "ShardPresence", refused)
+        with pytest.raises(RuntimeError):
+            carrier.add_endpoints([ShardEntry("s0", (endpoint,))])
+    carrier.add_endpoints([ShardEntry("s0", (endpoint,))])
+
+    assert came.get(timeout=30) == "s0"
+
+
 @both
 def test_carrier_keeps_its_link_when_a_shard_advertises_another_address(daemon, carry, endpoint):
     """A shard in reach stays reached although its advertised endpoint leads nowhere from here."""
