@@ -207,7 +207,7 @@ def test_client_says_that_shards_disagree_when_their_placements_differ(two):
         online = cell.world("online")
         read, write = Read(online, here, COUNT), Write(online, there, COUNT)
         with pytest.raises(LinkError, match=r"different cell\.toml"):
-            Lock(read, write, wait_s=0.1).__enter__()
+            Lock(read, write, wait_s=1.0).__enter__()
         assert cell.locks() == ()
 
 
