@@ -438,12 +438,15 @@ class ReferenceShard(ReferenceSessions):
         return min(stamps, default=NEVER_NS)
 
     def answer_views(self):
-        """A view waits for the undecided before it, but not for ever."""
+        """A view waits for the undecided before it, but not for ever; its session may end."""
         for handle, (m, end_ns) in list(self.views.items()):
             enough = end_ns <= self.now_ns or self.draining
             if enough or self.undecided_ns(m.items) > m.at_ns:
                 del self.views[handle]
-                self.view(m, handle)
+                if self.known(m.lock.session) is None:
+                    self.answer(handle, "epoch", self.epoch)
+                else:
+                    self.view(m, handle)
 
     def on_fetch(self, m, handle):
         version, text = self.slots.get(m.slot, (0, None))
