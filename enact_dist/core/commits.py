@@ -9,7 +9,7 @@ sends after it lost its lock is refused, so the safety of data depends on no clo
        │
        ├─ epoch or token differ ──> EpochChanged / Fenced, nothing written
        │
-       ├─ all aspects volatile ──> applied and answered at once
+       ├─ all aspects volatile, no slot new ──> applied and answered at once
        └─ else committing ── Persist ── Persisted ──> applied, released, answered
                                                       └─ participants told (see `decisions`)
 
@@ -257,18 +257,21 @@ class Commits:
         """Hand the commit to the store, or apply it at once where nothing is to survive."""
         durability = self._strictest(commit)
         versions, stamp_ns = commit.outcome.versions, commit.outcome.position.stamp_ns
-        records = self.records(commit.writes, versions, stamp_ns, commit.cause)
-        if durability is Durability.VOLATILE:
-            if records:
-                yield Persist(0, records, Durability.OS)
+        kept = self.records(commit.writes, versions, stamp_ns, commit.cause)
+        if durability is Durability.VOLATILE and not kept:
             yield from self._apply(commit, now_ns=now_ns)
             return
         ticket = self.new_ticket()
         commit.tenure.committing = True
         self._in_flight[ticket] = commit
+        if durability is Durability.VOLATILE:
+            # Once per slot: whoever finds it null after a restart is told that it was lost.
+            durability = Durability.OS
+        else:
+            kept = (*kept, commit.outcome)
         decision = (commit.decision,) if commit.decision is not None else ()
         forgotten = self._slots.history.take_forgotten()
-        yield Persist(ticket, (*records, commit.outcome, *decision, *forgotten), durability)
+        yield Persist(ticket, (*kept, *decision, *forgotten), durability)
 
     def _strictest(self, commit: _InFlight) -> Durability:
         """Return what a commit must survive: the most that one of its data asks for.

@@ -120,13 +120,14 @@ class ReferenceShard(ReferenceSessions):
         durability = max(durabilities, key=STRICTER.index, default="volatile")
         durability = "durable" if m.participants else durability
         facts = self.slot_facts(life)
-        if durability == "volatile":
-            if facts:
-                self.persist("os", facts)
+        if durability == "volatile" and not facts:
             self.committed(life)
             return
         life.phase = "deciding" if m.participants else "committing"
-        facts += (("outcome", m.lock, life.versions),)
+        if durability == "volatile":
+            durability = "os"
+        else:
+            facts += (("outcome", m.lock, life.versions),)
         if m.participants:
             facts += (("decision", m.lock, m.participants),)
         self.persist(durability, facts, ("commit", life))

@@ -198,14 +198,33 @@ class TestDurability:
         assert persist.durability is strictest
         assert any(isinstance(record, OutcomeRecord) for record in persist.records)
 
-    def test_volatile_commit_does_not_wait_for_the_disk(self, bench):
-        """What survives nothing is visible at once."""
+    def test_volatile_commit_to_a_known_slot_does_not_wait_for_the_disk(self, bench):
+        """What survives nothing is visible at once, once its slot is known."""
         bench.hello("ann")
+        frame = slot("a", "frame")
+        bench.write("ann", 1, "1", to=frame)
+        again = lock_id("ann", 0, 2)
+        grant = bench.granted(again, item(W, "a", "frame"))
+        bench.disk_is_done = False
+
+        assert isinstance(bench.commit(again, grant.token, (frame, "2")), Committed)
+        assert bench.value(frame) == "2"
+
+    def test_first_volatile_commit_of_a_slot_stands_when_its_existence_is_kept(self, bench):
+        """Whoever has seen it is told after a restart that it is lost, not that it never was."""
+        bench.hello("ann")
+        frame = slot("a", "frame")
         grant = bench.granted(ANN, item(W, "a", "frame"))
         bench.disk_is_done = False
 
-        assert isinstance(bench.commit(ANN, grant.token, (slot("a", "frame"), "1")), Committed)
-        assert bench.value(slot("a", "frame")) == "1"
+        assert bench.commit(ANN, grant.token, (frame, "1")) is None
+        assert bench.value(frame) is None
+        (persist,) = bench.pending
+        assert persist.durability is Durability.OS
+        assert not any(isinstance(record, OutcomeRecord) for record in persist.records)
+
+        bench.finish_disk()
+        assert bench.value(frame) == "1"
 
     def test_volatile_slot_is_null_and_known_as_lost_after_a_restart(self, bench):
         """A volatile datum goes with its shard; that the slot existed is remembered once."""
