@@ -2,7 +2,8 @@
 
 ``backup.json`` has the size and the SHA-256 of every other file, and ends with the SHA-256 of its
 own text before.  A store finds its own damage where it decides something; a backup has lain on
-other disks and gone over networks for a year, and is read once.
+other disks and gone over networks for a year, and is read once.  The text has also who may read the
+shard's files, since the copies are for nobody but their owner.
 """
 
 from __future__ import annotations
@@ -10,6 +11,8 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+import stat
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from enact_dist.errors import StoreError
@@ -18,10 +21,14 @@ from enact_dist.link.store_folder import BLOB_FOLDER, DATABASE_FILE, LOG_FILE
 from enact_dist.link.store_mark import MARK_FILE
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
     from pathlib import Path
 
 BACKUP_FILE: Final = "backup.json"
 FILES: Final = "files"
+MODES: Final = "modes"
+HERE: Final = "."
+MODE_MAX: Final = 0o7777
 _SEAL: Final = re.compile(rb'(?s)(.*), "sha256": "([0-9a-f]{64})"\}')
 _PLAIN: Final = frozenset((FORMAT_FILE, MARK_FILE, DATABASE_FILE, LOG_FILE))
 _COPY_AGAIN: Final = "copy the backup again from where it is whole, or take another one"
@@ -55,9 +62,71 @@ def digests_of(folder: Path) -> dict[str, Digest]:
     Raises:
         OSError: As the system reports it.
     """
+    return {name: digest_of(folder / name) for name in files_of(folder)}
+
+
+def files_of(folder: Path) -> list[str]:
+    """Return the files of a backup, by their path in it, but for what it says of itself.
+
+    Raises:
+        OSError: As the system reports it.
+    """
     names = [name for name in sorted(_PLAIN) if (folder / name).exists()]
     names += sorted(f"{BLOB_FOLDER}/{path.name}" for path in (folder / BLOB_FOLDER).iterdir())
-    return {name: digest_of(folder / name) for name in names}
+    return names
+
+
+# ---------------------------------------------------------------- who may read them
+
+
+def modes_of(folder: Path, names: Iterable[str]) -> dict[str, str]:
+    """Return the permissions of a folder and of what is named in it, in octal digits.
+
+    Raises:
+        OSError: As the system reports it; what is not there has none.
+    """
+    modes: dict[str, str] = {}
+    for name in (HERE, *names):
+        with suppress(FileNotFoundError):
+            modes[name] = mode_of(folder / name)
+    return modes
+
+
+def mode_of(path: Path) -> str:
+    """Return the permissions of a file or folder, in octal digits.
+
+    Raises:
+        OSError: As the system reports it.
+    """
+    return f"{stat.S_IMODE(path.stat().st_mode):o}"
+
+
+def set_modes(folder: Path, modes: dict[str, str]) -> None:
+    """Let who is named there, and nobody else, read and write; the owner may in any case.
+
+    Raises:
+        OSError: As the system reports it.
+    """
+    for name, mode in reversed(modes.items()):  # the folder itself last
+        path = folder / name
+        with suppress(FileNotFoundError):
+            owner = stat.S_IRWXU if path.is_dir() else stat.S_IRUSR | stat.S_IWUSR
+            path.chmod(int(mode, 8) | owner)
+
+
+def check_modes(modes: dict[str, str], files: Iterable[str]) -> dict[str, str]:
+    """Return permissions of a backup.
+
+    Raises:
+        ValueError: They are none, or of something that it does not have.
+        AttributeError: As `ValueError`.
+        TypeError: As `ValueError`.
+    """
+    if modes.keys() - {HERE, BLOB_FOLDER, *files}:
+        raise ValueError("it has permissions of what it does not have")
+    if any(not 0 <= int(mode, 8) <= MODE_MAX for mode in modes.values()):
+        raise ValueError("its permissions are none")
+    return modes
 
 
 # ---------------------------------------------------------------- backup.json

@@ -106,14 +106,19 @@ def sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
-def replace_file(path: Path, content: bytes) -> None:
+def replace_file(path: Path, content: bytes, *, mode: int = 0o644) -> None:
     """Put `content` in place of the file at `path`, durably, whole or not at all.
+
+    Args:
+        path: Whether it is there or not.
+        content: All of it.
+        mode: Who may read and write it, as far as the umask lets them.
 
     Raises:
         OSError: As the system reports it; the file before stands then.
     """
     draft = path.with_name(path.name + ".tmp")
-    descriptor = os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
+    descriptor = os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, mode)
     try:
         os.write(descriptor, content)
         os.fsync(descriptor)

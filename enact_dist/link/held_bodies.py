@@ -2,7 +2,8 @@
 
 The shard unlinks what it replaces, whoever copies meanwhile; a second name keeps the file.  One
 backup at a time holds such links, by a lock that ends with its process: what a killed one leaves is
-let go by the next one, or when the shard starts.
+let go by the next one, or when the shard starts.  Who holds it and where the copy goes is written
+beside the links, for people.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import fcntl
 import logging
 import os
 import shutil
+import socket
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Final
 
@@ -23,6 +25,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 HELD_FOLDER: Final = "backup.held"
+_HOLDER_FILE: Final = "holder"
 
 _log = logging.getLogger("enact.store")
 
@@ -53,13 +56,31 @@ class HeldBodies:
 
 
 @contextmanager
-def held_bodies(folder: Path) -> Iterator[HeldBodies]:
+def held_bodies(folder: Path, into: Path) -> Iterator[HeldBodies]:
     """Hold bodies of a shard's folder; they are let go at the end.
+
+    Args:
+        folder: The shard's.
+        into: Where its copy goes.
 
     Raises:
         StoreError: Another backup of this folder is under way.
         OSError: As the system reports it.
     """
+    with _locked(folder) as held:
+        held.mkdir(mode=0o700)
+        try:
+            (held / _HOLDER_FILE).write_text(
+                f"process {os.getpid()} on host {socket.gethostname()} into {into.absolute()}"
+            )
+            yield HeldBodies(held)
+        finally:
+            shutil.rmtree(held, ignore_errors=True)
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[Path]:
+    """Be the one that backs a folder up; what a killed one has left is gone."""
     held = folder / HELD_FOLDER
     with (folder / FORMAT_FILE).open("rb") as locked:
         try:
@@ -68,16 +89,27 @@ def held_bodies(folder: Path) -> Iterator[HeldBodies]:
             if failure.errno != errno.EWOULDBLOCK:
                 raise
             raise StoreError(
-                f"a backup of {folder} is under way, and one is made at a time: wait for its end",
+                f"a backup of {folder} is under way, by {_holder(held)}; one is made at a time:"
+                " wait for its end",
                 path=str(folder),
             ) from failure
         if held.exists():
+            killed = _holder(held)
+            (held / _HOLDER_FILE).unlink(missing_ok=True)
             shutil.rmtree(held)
-        held.mkdir()
-        try:
-            yield HeldBodies(held)
-        finally:
-            shutil.rmtree(held, ignore_errors=True)
+            _log.warning(
+                "a backup was killed, by %s: what it held is let go; what it has copied lies beside"
+                " its place, until the next backup goes there",
+                killed,
+            )
+        yield held
+
+
+def _holder(held: Path) -> str:
+    try:
+        return (held / _HOLDER_FILE).read_text(errors="replace")
+    except OSError:
+        return "another process"
 
 
 def let_go_of_killed(folder: Path) -> None:
@@ -88,7 +120,7 @@ def let_go_of_killed(folder: Path) -> None:
     if not (folder / HELD_FOLDER).exists():
         return
     try:
-        with suppress(StoreError), held_bodies(folder):
+        with suppress(StoreError), _locked(folder):
             pass
     except OSError as failure:
         _log.warning("what a killed backup has left in %s stays: %s", folder, failure)

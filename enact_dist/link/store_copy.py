@@ -6,7 +6,8 @@ in the log as well, and replaces what was copied torn.  Else both are copied aga
 are files that never change; links hold all that are there just before and just after the log is
 read (`held_bodies`).  The mark is copied before all, so the copy is refused if it lacks anything
 that was acknowledged then.  A copy has its name only when every byte of it was checked and is on
-the disk, with a digest (`backup_digests`) that is made of the copy: the shard waits for none.
+the disk, with a digest (`backup_digests`) that is made of the copy: the shard waits for none.  Who
+makes it may read it and nobody else; what is restored is for those who might read the shard's.
 
 A shard that is restored begins with an epoch above that of its backup, of what was there before,
 and the wall clock: whoever knew a later state is told that the shard has started anew, and no lock
@@ -18,25 +19,35 @@ from __future__ import annotations
 import dataclasses
 import errno
 import os
-import shutil
-import stat
 import time
 from contextlib import closing, suppress
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from enact_dist.errors import StoreError
 from enact_dist.link.backup_digests import (
     BACKUP_FILE,
+    MODES,
     Digest,
     check_files,
+    check_modes,
     digests_of,
+    files_of,
+    mode_of,
+    modes_of,
     read_sealed,
     sealed,
+    set_modes,
 )
 from enact_dist.link.blobs import BlobFolder
 from enact_dist.link.folder_lock import FORMAT_FILE, FolderLock, replace_file, sync_folder
 from enact_dist.link.held_bodies import HeldBodies, held_bodies
+from enact_dist.link.private_copy import (
+    FILE_MODE,
+    FOLDER_MODE,
+    copy_private,
+    partial_folder,
+)
 from enact_dist.link.store import open_store, read_store
 from enact_dist.link.store_errors import store_error
 from enact_dist.link.store_folder import (
@@ -52,6 +63,7 @@ from enact_dist.link.store_recovery import open_database, put_together, read_blo
 from enact_dist.link.wal_check import HEADER_BYTES, check_wal
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
     from pathlib import Path
 
     from enact_dist.core.records import Recovered
@@ -101,24 +113,48 @@ def back_up(folder: Path, into: Path, *, cell: str, shard: str, unix_s: int) -> 
     if not holds_store(folder):
         raise StoreError(f"no shard has its data in {folder}", path=str(folder))
     if into.exists():
-        raise StoreError(f"{into} is there already; name a new folder", path=str(into))
+        raise _is_there(into)
     refuse_moving(folder)
-    partial = into.with_name(into.name + ".partial")
     try:
-        with held_bodies(folder) as bodies:
-            shutil.rmtree(partial, ignore_errors=True)
-            partial.mkdir(parents=True)
+        with held_bodies(folder, into) as bodies, partial_folder(into, ".partial") as partial:
             stored = _copied(folder, bodies, partial)
             backup = _told(stored, cell=cell, shard=shard, unix_s=unix_s)
             told = {name: value for name, value in asdict(backup).items() if name != DIGESTS}
-            replace_file(partial / BACKUP_FILE, sealed(told, digests_of(partial)))
+            files = digests_of(partial)
+            told[MODES] = _modes(folder, bodies, files)
+            replace_file(partial / BACKUP_FILE, sealed(told, files), mode=FILE_MODE)
             read_backup(partial)
             _sync(partial)
-            partial.rename(into)
-            sync_folder(into.parent)
+            if not _renamed(partial, into):
+                raise _is_there(into)
     except OSError as failure:
         raise store_error(into, failure) from failure
     return backup
+
+
+def _is_there(into: Path) -> StoreError:
+    return StoreError(f"{into} is there already; name a new folder", path=str(into))
+
+
+def _renamed(partial: Path, path: Path) -> bool:
+    """Give a folder its name, which an empty one gives up for it; False: one with data has it."""
+    try:
+        partial.rename(path)
+    except OSError as failure:
+        if failure.errno in {errno.ENOTEMPTY, errno.EEXIST}:
+            return False
+        raise
+    sync_folder(path.parent)
+    return True
+
+
+def _modes(folder: Path, bodies: HeldBodies, files: Iterable[str]) -> dict[str, str]:
+    """Return who may read the files of a shard; bodies may be gone from its folder meanwhile."""
+    modes = modes_of(folder, (BLOB_FOLDER, *(name for name in files if "/" not in name)))
+    for name in files:
+        if "/" in name:
+            modes[name] = mode_of(bodies.path(name.rpartition("/")[2]))
+    return modes
 
 
 def _copied(folder: Path, bodies: HeldBodies, partial: Path) -> Recovered:
@@ -131,9 +167,9 @@ def _copied(folder: Path, bodies: HeldBodies, partial: Path) -> Recovered:
             names = {blob.name for blob in contents.states.blobs.values()}
             if not all(bodies.has(name) for name in names):
                 continue
-            (partial / BLOB_FOLDER).mkdir(exist_ok=True)
+            (partial / BLOB_FOLDER).mkdir(mode=FOLDER_MODE, exist_ok=True)
             for name in names:
-                shutil.copyfile(bodies.path(name), partial / BLOB_FOLDER / name)
+                copy_private(bodies.path(name), partial / BLOB_FOLDER / name)
             blobs = BlobFolder(partial / BLOB_FOLDER, epoch=0)
             read_blobs(contents, blobs, power_cut=False)
             put_together(contents, partial / DATABASE_FILE)
@@ -149,14 +185,14 @@ def _copied(folder: Path, bodies: HeldBodies, partial: Path) -> Recovered:
 def _copy_database(folder: Path, bodies: HeldBodies, partial: Path) -> bool:
     """Copy rows and log; False if the log was begun anew meanwhile, so that they do not fit."""
     for name in (FORMAT_FILE, MARK_FILE):
-        shutil.copyfile(folder / name, partial / name)
+        copy_private(folder / name, partial / name)
     log, copy = folder / LOG_FILE, partial / LOG_FILE
     header = _header(log)
-    shutil.copyfile(folder / DATABASE_FILE, partial / DATABASE_FILE)
+    copy_private(folder / DATABASE_FILE, partial / DATABASE_FILE)
     copy.unlink(missing_ok=True)
     bodies.hold(folder / BLOB_FOLDER)
     with suppress(FileNotFoundError):
-        shutil.copyfile(log, copy)
+        copy_private(log, copy)
     bodies.hold(folder / BLOB_FOLDER)
     if _header(log) != header:
         return False
@@ -206,18 +242,33 @@ def _sync(folder: Path) -> None:
 # ---------------------------------------------------------------- restore
 
 
-def read_backup(path: Path) -> tuple[Backup, dict[str, Digest] | None]:
-    """Return what a backup says of itself and of its files; None: it has no digests of them.
+class Contents(NamedTuple):
+    """What a backup says of itself, and of its files.
+
+    Attributes:
+        backup: Of itself.
+        files: Their digests; None: it was made before there were any.
+        modes: Who may read them where they are restored; empty: it was made before it said so.
+    """
+
+    backup: Backup
+    files: dict[str, Digest] | None
+    modes: dict[str, str]
+
+
+def read_backup(path: Path) -> Contents:
+    """Return what a backup says of itself and of its files.
 
     Raises:
         StoreError: It is none, or that is not what it was.
     """
     told, files = read_sealed(path)
     try:
+        modes = check_modes(told.pop(MODES, {}), files) if files is not None else {}
         if told.keys() != {field.name for field in dataclasses.fields(Backup)} - {DIGESTS}:
             raise ValueError(f"it has {', '.join(told)}")
-        return Backup(**told, digests=files is not None), files
-    except (TypeError, ValueError) as failure:
+        return Contents(Backup(**told, digests=files is not None), files, modes)
+    except (TypeError, ValueError, AttributeError) as failure:
         raise StoreError(
             f"{path} is no backup of a shard, or its {BACKUP_FILE} is damaged ({failure}); copy the"
             " backup again from where it is whole, or take another one",
@@ -248,7 +299,8 @@ def restore(
         StoreError: The backup is of another shard, damaged or from the future; the folder is in
             use, or is there and not to be replaced; or it cannot be written.
     """
-    backup, files = read_backup(source)
+    contents = read_backup(source)
+    backup = contents.backup
     if (backup.cell, backup.shard) != (cell, shard):
         raise StoreError(
             f"{source} is a backup of shard {backup.shard} of cell {backup.cell}, not of {shard} of"
@@ -260,34 +312,36 @@ def restore(
             " the restored shard must begin later than all that clients have seen of it: set the"
             " clock first"
         )
-    partial = folder.with_name(folder.name + ".restoring")
     try:
-        if files is not None:
-            check_files(source, files)
-        shutil.rmtree(partial, ignore_errors=True)
-        if not folder.exists() or not any(folder.iterdir()):
-            _build(source, partial, backup, files, unix_s=unix_s, epoch=_epoch_before(folder))
-            try:
-                partial.rename(folder)  # an empty folder gives way, one begun meanwhile does not
-            except OSError as failure:
-                if failure.errno in {errno.ENOTEMPTY, errno.EEXIST}:
-                    raise _has_data(folder) from failure
-                raise
-            sync_folder(folder.parent)
-            return backup, None
-        if not replace:
-            raise _has_data(folder)
-        epoch = _epoch_before(folder)
-        with closing(FolderLock(folder)):
-            _build(source, partial, backup, files, unix_s=unix_s, epoch=epoch)
-            while (aside := folder.with_name(f"{folder.name}{ASIDE}{unix_s}")).exists():
-                unix_s += 1
-            folder.rename(aside)
-            partial.rename(folder)
-            sync_folder(folder.parent)
+        if contents.files is not None:
+            check_files(source, contents.files)
+        with partial_folder(folder, ".restoring") as partial:
+            aside = _put(source, contents, partial, folder, unix_s=unix_s, replace=replace)
     except OSError as failure:
         raise store_error(folder, failure) from failure
     return backup, aside
+
+
+def _put(
+    source: Path, contents: Contents, partial: Path, folder: Path, *, unix_s: int, replace: bool
+) -> Path | None:
+    """Build a folder in `partial` and put it in its place; return where the one before is now."""
+    if not folder.exists() or not any(folder.iterdir()):
+        _build(source, partial, contents, unix_s=unix_s, epoch=_epoch_before(folder))
+        if not _renamed(partial, folder):  # one was begun meanwhile
+            raise _has_data(folder)
+        return None
+    if not replace:
+        raise _has_data(folder)
+    epoch = _epoch_before(folder)
+    with closing(FolderLock(folder)):
+        _build(source, partial, contents, unix_s=unix_s, epoch=epoch)
+        while (aside := folder.with_name(f"{folder.name}{ASIDE}{unix_s}")).exists():
+            unix_s += 1
+        folder.rename(aside)
+        partial.rename(folder)
+        sync_folder(folder.parent)
+    return aside
 
 
 def _has_data(folder: Path) -> StoreError:
@@ -298,25 +352,14 @@ def _has_data(folder: Path) -> StoreError:
     )
 
 
-def _build(
-    source: Path,
-    partial: Path,
-    backup: Backup,
-    files: dict[str, Digest] | None,
-    *,
-    unix_s: int,
-    epoch: int,
-) -> None:
+def _build(source: Path, partial: Path, contents: Contents, *, unix_s: int, epoch: int) -> None:
     """Make a folder of a backup, checked whole, whose next epoch is above `epoch`."""
-    if files is None:
-        shutil.copytree(source, partial, ignore=shutil.ignore_patterns(BACKUP_FILE))
-    else:
-        partial.mkdir(mode=0o700, parents=True)  # nobody else looks in before the modes are right
-        (partial / BLOB_FOLDER).mkdir()
-        for name in files:
-            shutil.copyfile(source / name, partial / name)
-        for name in (*files, BLOB_FOLDER):
-            _keep_mode(source / name, partial / name)
+    backup, files, modes = contents
+    names = files if files is not None else files_of(source)
+    (partial / BLOB_FOLDER).mkdir(mode=FOLDER_MODE)
+    for name in names:
+        copy_private(source / name, partial / name)
+    if files is not None:
         check_files(partial, files)
     with read_store(partial) as stored:
         _check_bodies(stored)
@@ -330,14 +373,8 @@ def _build(
     store, _ = open_store(partial, unix_s=unix_s)
     with closing(store):
         store.raise_epoch(epoch)
-    _keep_mode(source, partial)
+    set_modes(partial, modes or modes_of(source, (BLOB_FOLDER, *names)))
     _sync(partial)
-
-
-def _keep_mode(source: Path, target: Path) -> None:
-    """Let who may read the original, and nobody else, read the copy; its owner writes it."""
-    owner = stat.S_IRWXU if target.is_dir() else stat.S_IRUSR | stat.S_IWUSR
-    target.chmod(stat.S_IMODE(source.stat().st_mode) | owner)
 
 
 def _epoch_before(folder: Path) -> int:

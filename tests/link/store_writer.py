@@ -16,7 +16,7 @@ from pathlib import Path
 from enact_dist.core.datum import Datum, LockId, Position, Slot
 from enact_dist.core.messages import SlotVersion
 from enact_dist.core.records import OutcomeRecord, Persist, SlotRecord
-from enact_dist.link.store import open_store
+from enact_dist.link.store import open_store, read_store
 from enact_dist.link.store_thread import StoreThread
 from enact_dist.terms import Durability
 
@@ -106,6 +106,20 @@ def reopened(folder, *, unix_s=1):
     store, recovered = open_store(folder, unix_s=unix_s)
     store.close()
     return recovered
+
+
+def versions(folder):
+    """Return the newest version of each slot of a folder."""
+    with read_store(folder) as stored:
+        return {record.slot.entity: record.version for record in stored.slots}
+
+
+def fill(folder, version, *, unix_s=1):
+    """Write one version of two slots, one of them large, and close; return the epoch."""
+    store, found = open_store(folder, unix_s=unix_s)
+    store.write([persist(slot_record("a", version, size=LARGE_BYTES), slot_record("b", version))])
+    store.close()
+    return found.epoch
 
 
 def write_until_killed(folder, seed):

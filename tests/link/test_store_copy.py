@@ -1,5 +1,6 @@
 """Back-ups of folders that are written meanwhile, and what a restored one is."""
 
+import errno
 import hashlib
 import json
 import os
@@ -10,35 +11,21 @@ from random import Random
 from types import SimpleNamespace
 
 import pytest
-from store_writer import persist, slot_record
+from store_writer import LARGE_BYTES as LARGE
+from store_writer import fill, persist, slot_record, versions
 
 from enact_dist.errors import StoreError
 from enact_dist.link import held_bodies as held_bodies_module
-from enact_dist.link import store_copy
+from enact_dist.link import private_copy, store_copy
 from enact_dist.link.backup_digests import BACKUP_FILE, read_sealed, sealed
 from enact_dist.link.folder_lock import FolderLock
 from enact_dist.link.held_bodies import HELD_FOLDER, held_bodies
-from enact_dist.link.store import open_store, read_store
+from enact_dist.link.store import open_store
 from enact_dist.link.store_copy import back_up, restore
 from enact_dist.terms import Durability
 
 NAMES = {"cell": "line", "shard": "left"}
-LARGE = 70_000
 GROUPS = 20
-
-
-def versions(folder):
-    """Return the newest version of each slot of a folder."""
-    with read_store(folder) as stored:
-        return {record.slot.entity: record.version for record in stored.slots}
-
-
-def fill(folder, version, *, unix_s=1):
-    """Write one version of two slots, one of them large, and close; return the epoch."""
-    store, found = open_store(folder, unix_s=unix_s)
-    store.write([persist(slot_record("a", version, size=LARGE), slot_record("b", version))])
-    store.close()
-    return found.epoch
 
 
 @pytest.fixture
@@ -129,7 +116,7 @@ def test_a_log_begun_anew_while_it_is_copied_is_copied_again(folder, tmp_path, m
             (folder / "store.db-wal").unlink(missing_ok=True)
         return real(source, target)
 
-    monkeypatch.setattr(store_copy.shutil, "copyfile", copyfile)
+    monkeypatch.setattr(shutil, "copyfile", copyfile)
     back_up(folder, tmp_path / "copy", unix_s=5, **NAMES)
     assert copies.count("store.db") == 3
     assert versions(tmp_path / "copy") == {"a": 1, "b": 1}
@@ -198,24 +185,115 @@ def test_a_damaged_shard_is_not_backed_up(folder, tmp_path):
 
 def test_one_backup_at_a_time(folder, tmp_path):
     """The second is told so, and takes nothing from under the first; nor does a start."""
-    with held_bodies(folder) as bodies:
+    with held_bodies(folder, tmp_path / "first") as bodies:
         bodies.hold(folder / "blobs")
-        with pytest.raises(StoreError, match=r"a backup of .* is under way.*wait for its end"):
+        by = f"by process {os.getpid()} on host .* into {tmp_path / 'first'}; .*wait for its end"
+        with pytest.raises(StoreError, match=f"a backup of .* is under way, {by}"):
             back_up(folder, tmp_path / "copy", unix_s=1, **NAMES)
         fill(folder, 2)
-        assert len(list((folder / HELD_FOLDER).iterdir())) == 1
+        assert len(list((folder / HELD_FOLDER).glob("*.blob"))) == 1
     assert not (folder / HELD_FOLDER).exists()
     back_up(folder, tmp_path / "copy", unix_s=1, **NAMES)
 
 
-def test_a_start_lets_go_of_what_a_killed_backup_held(folder):
-    """Bodies that the shard has replaced since would stay on the disk."""
+def in_a_child(act):
+    """Run `act` in another process until this one kills it; return how, as soon as it says `1`."""
+    heard, said = os.pipe()
+    pid = os.fork()
+    if not pid:
+        try:
+            act(lambda: (os.write(said, b"1"), signal.pause()))
+        finally:
+            os._exit(1)
+    os.close(said)
+    assert os.read(heard, 1) == b"1"
+    os.close(heard)
+
+    def kill():
+        os.kill(pid, signal.SIGKILL)
+        os.waitpid(pid, 0)
+
+    return pid, kill
+
+
+def test_backups_into_one_place_are_told_of_each_other(folder, tmp_path, monkeypatch):
+    """Of two shards, so that each has its own lock; what a killed one has left goes."""
+    fill(tmp_path / "right", 1)
+    copy, right = tmp_path / "copy", {"cell": "line", "shard": "right"}
+
+    def backup(rest):
+        monkeypatch.setattr(store_copy, "_sync", lambda _: rest())
+        back_up(folder, copy, unix_s=1, **NAMES)
+
+    _, kill = in_a_child(backup)
+    try:
+        with pytest.raises(StoreError, match=r"another backup or restore works in .*copy.partial"):
+            back_up(tmp_path / "right", copy, unix_s=1, **right)
+    finally:
+        kill()
+    assert (tmp_path / "copy.partial" / BACKUP_FILE).exists()
+    back_up(tmp_path / "right", copy, unix_s=1, **right)
+    assert not (tmp_path / "copy.partial").exists()
+    assert restore(copy, tmp_path / "new", unix_s=1, **right)[0].shard == "right"
+
+
+def test_a_backup_is_made_where_no_folder_can_be_locked(folder, tmp_path, monkeypatch):
+    """As on NFS; what a killed one has left there goes, too."""
+
+    def refuse(*_):
+        raise OSError(errno.EBADF, "Bad file descriptor")
+
+    (tmp_path / "copy.partial" / "blobs").mkdir(parents=True)
+    monkeypatch.setattr(private_copy, "fcntl", SimpleNamespace(flock=refuse, LOCK_EX=2, LOCK_NB=4))
+    back_up(folder, tmp_path / "copy", unix_s=1, **NAMES)
+    restore(tmp_path / "copy", tmp_path / "new", unix_s=1, **NAMES)
+    assert versions(tmp_path / "new") == {"a": 1, "b": 1}
+
+
+def test_a_place_that_is_taken_meanwhile_is_there_already(folder, tmp_path, monkeypatch):
+    """And no fault of the disk; what was copied for it goes."""
+
+    def taken(_):
+        (tmp_path / "copy").mkdir()
+        (tmp_path / "copy" / "notes.txt").touch()
+
+    monkeypatch.setattr(store_copy, "_sync", taken)
+    with pytest.raises(StoreError, match="copy is there already; name a new folder"):
+        back_up(folder, tmp_path / "copy", unix_s=1, **NAMES)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["copy", "left"]
+
+
+def test_two_restores_at_once_are_told_of_each_other(folder, tmp_path, monkeypatch):
+    """The second must not take from under the first what that has built."""
+    copy, new = tmp_path / "copy", tmp_path / "new"
+    back_up(folder, copy, unix_s=100, **NAMES)
+    build = store_copy._build
+
+    def second(*arguments, **more):
+        build(*arguments, **more)
+        with pytest.raises(StoreError, match=r"another backup or restore works in .*new.restoring"):
+            restore(copy, new, unix_s=100, **NAMES)
+
+    monkeypatch.setattr(store_copy, "_build", second)
+    restore(copy, new, unix_s=100, **NAMES)
+    assert versions(new) == {"a": 1, "b": 1}
+
+
+def test_a_start_lets_go_of_what_a_killed_backup_held(folder, tmp_path, monkeypatch, caplog):
+    """Bodies that the shard has replaced since would stay on the disk; the log says whose it was."""
     links = folder / HELD_FOLDER
-    links.mkdir()
-    body = next((folder / "blobs").iterdir())
-    os.link(body, links / body.name)
+
+    def backup(rest):
+        monkeypatch.setattr(store_copy, "_sync", lambda _: rest())
+        back_up(folder, tmp_path / "copy", unix_s=1, **NAMES)
+
+    pid, kill = in_a_child(backup)
+    kill()
+    assert len(list(links.glob("*.blob"))) == 1
     fill(folder, 2)
     assert not links.exists()
+    assert f"a backup was killed, by process {pid} on host" in caplog.text
+    assert f"into {tmp_path / 'copy'}" in caplog.text
     assert versions(folder) == {"a": 2, "b": 2}
 
 
@@ -309,38 +387,10 @@ def test_a_copy_that_is_not_what_was_copied_is_refused(folder, tmp_path, monkeyp
         if target.name == "mark":
             target.write_bytes(target.read_bytes()[:-1])
 
-    monkeypatch.setattr(store_copy.shutil, "copyfile", copyfile)
+    monkeypatch.setattr(shutil, "copyfile", copyfile)
     with pytest.raises(StoreError, match=r"new.restoring/mark has 43 bytes"):
         restore(copy, new, unix_s=200, **NAMES)
     assert not new.exists()
-
-
-def modes_of(folder):
-    paths = (folder, *folder.rglob("*"))
-    return {path.relative_to(folder).as_posix(): path.stat().st_mode & 0o777 for path in paths}
-
-
-def test_what_nobody_else_may_read_stays_so_when_it_is_restored(folder, tmp_path):
-    """Whatever the umask of whoever restores it; a backup that lies read-only is still written."""
-    copy, new, archived = tmp_path / "copy", tmp_path / "new", tmp_path / "archived"
-    before = os.umask(0o077)
-    try:
-        back_up(folder, copy, unix_s=100, **NAMES)
-        os.umask(0o022)
-        restore(copy, new, unix_s=200, **NAMES)
-        for path in copy.rglob("*"):
-            path.chmod(0o500 if path.is_dir() else 0o400)
-        restore(copy, archived, unix_s=200, **NAMES)
-    finally:
-        os.umask(before)
-
-    blob = next((copy / "blobs").iterdir()).name
-    files = {"mark", "format", "store.db", f"blobs/{blob}"}
-    expected = dict.fromkeys(files, 0o600) | dict.fromkeys((".", "blobs"), 0o700)
-    for restored in (new, archived):
-        found = modes_of(restored)
-        assert {name: found[name] for name in expected} == expected
-        assert versions(restored) == {"a": 1, "b": 1}
 
 
 def test_a_backup_of_before_there_were_digests_is_restored(folder, tmp_path):
@@ -348,11 +398,11 @@ def test_a_backup_of_before_there_were_digests_is_restored(folder, tmp_path):
     copy, new = tmp_path / "copy", tmp_path / "new"
     back_up(folder, copy, unix_s=100, **NAMES)
     told = json.loads((copy / BACKUP_FILE).read_text())
-    for lost in ("sha256", "files"):
+    for lost in ("sha256", "files", "modes"):
         del told[lost]
         (copy / BACKUP_FILE).write_text(json.dumps(told))
-        if lost == "sha256":
-            with pytest.raises(StoreError, match=r"backup.json is damaged .*files"):
+        if lost != "modes":
+            with pytest.raises(StoreError, match=r"backup.json is damaged .*modes"):
                 restore(copy, new, unix_s=200, **NAMES)
     assert restore(copy, new, unix_s=200, **NAMES)[0].digests is False
     assert versions(new) == {"a": 1, "b": 1}
