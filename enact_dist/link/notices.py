@@ -86,7 +86,7 @@ class Source(Protocol):
         """Return the descriptor that becomes readable when something has come."""
 
     def take_notices(self) -> list[Notice | Skipped]:
-        """Return what has come.
+        """Return what has come, if anything has come whole; waits for nothing.
 
         Raises:
             EnactError: It made no sense.
@@ -225,6 +225,7 @@ class NoticeQueue:
         if self._is_inherited():
             return None
         deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
+        late = False
         while True:
             with self._mutex:
                 if self._ear is None:
@@ -234,11 +235,13 @@ class NoticeQueue:
                 if self._notices:
                     return self._notices.popleft()
                 ear = self._ear
-                if ear is None:
+                if ear is None or late:
                     return None
                 self._polling = True
             if not self._read(ear, _left_s(deadline_s)):
                 return None
+            # What came may be a part of a notice, or the end of the source.
+            late = deadline_s is not None and time.monotonic() >= deadline_s
 
     def get_here(self) -> Notice | Skipped | None:
         """Return the next of those that are here already, None if there is none."""

@@ -405,7 +405,7 @@ class _Feed:
         """Move notices from a connection into the queue until it ends."""
         try:
             while True:
-                self._queue.take(connection.take_notices())
+                self._queue.take(connection.take_notices(wait=True))
         except Exception as error:  # noqa: BLE001 - whatever it is, another way is opened
             self._ended(shard, line, connection, error)
 

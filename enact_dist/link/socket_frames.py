@@ -141,13 +141,14 @@ def rounded_s(wait_s: float) -> float:
 class Stream:
     """Reads the frames of one connection.  For one thread at a time."""
 
-    __slots__ = ("_buffer", "_connected", "_filled", "_view")
+    __slots__ = ("_buffer", "_connected", "_filled", "_long", "_view")
 
     def __init__(self, connected: socket.socket) -> None:
         self._connected = connected
         self._buffer = bytearray(BUFFER_BYTES)
         self._view = memoryview(self._buffer)
         self._filled = 0
+        self._long: memoryview | None = None
 
     @property
     def begun(self) -> bool:
@@ -174,16 +175,64 @@ class Stream:
             return self._receive_long(kind, header_bytes, payload_bytes, filled, into)
         while filled < length:
             filled += self._more(view[filled:])
+        return self._taken(kind, header_bytes, length, filled)
+
+    def receive_here(self, *, wait: bool = False) -> tuple[int, bytes, Buffer] | None:
+        """Return kind, header and payload of the next frame if all of it has come, else None.
+
+        What has come of it stays for the next time.
+
+        Args:
+            wait: Whether to wait until something has come; never for the rest of it.
+
+        Raises:
+            EOFError: As `receive`.
+            OSError: As `receive`.
+            ProtocolError: As `receive`.
+        """
+        flags = 0 if wait else socket.MSG_DONTWAIT
+        while (frame := self._whole()) is None:
+            memory = self._long if self._long is not None else self._view
+            try:
+                self._filled += self._more(memory[self._filled :], flags)
+            except BlockingIOError:
+                return None
+            flags = socket.MSG_DONTWAIT
+        return frame
+
+    def _whole(self) -> tuple[int, bytes, Buffer] | None:
+        """Take the next frame, if all of it is in memory."""
+        filled, memory = self._filled, self._long
+        if filled < PREFIX_BYTES:
+            return None
+        kind, header_bytes, payload_bytes = _read_prefix(memory or self._buffer)
+        length = PREFIX_BYTES + header_bytes + payload_bytes
+        if memory is None and length > BUFFER_BYTES:
+            # As in `_receive_long`: a length that is only claimed costs nothing.
+            memory = self._long = memoryview(mmap.mmap(-1, length))
+            memory[:filled] = self._view[:filled]
+        if filled < length:
+            return None
+        if memory is None:
+            return self._taken(kind, header_bytes, length, filled)
+        self._filled, self._long = 0, None
         end = PREFIX_BYTES + header_bytes
+        return kind, bytes(memory[PREFIX_BYTES:end]), memory[end:].toreadonly()
+
+    def _taken(
+        self, kind: int, header_bytes: int, length: int, filled: int
+    ) -> tuple[int, bytes, Buffer]:
+        """Take a frame that is whole in the buffer out of it."""
+        view, end = self._view, PREFIX_BYTES + header_bytes
         header = bytes(view[PREFIX_BYTES:end])
-        payload = bytes(view[end:length]) if payload_bytes else b""
+        payload = bytes(view[end:length]) if end < length else b""
         self._filled = filled - length
         if self._filled:  # notices may follow each other
             view[: self._filled] = bytes(view[length:filled])
         return kind, header, payload
 
-    def _more(self, into: memoryview) -> int:
-        count = self._connected.recv_into(into)
+    def _more(self, into: memoryview, flags: int = 0) -> int:
+        count = self._connected.recv_into(into, 0, flags)
         if not count:
             raise EOFError("the connection was closed")
         return count
@@ -216,7 +265,7 @@ class Stream:
         return kind, bytes(header), payload.toreadonly()
 
 
-def _read_prefix(buffer: bytearray) -> tuple[int, int, int]:
+def _read_prefix(buffer: bytearray | memoryview) -> tuple[int, int, int]:
     """Return kind, length of the header and of the payload.
 
     Raises:

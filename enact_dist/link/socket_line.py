@@ -23,6 +23,7 @@ from enact_dist.link.carrier import read_answer
 from enact_dist.link.notices import Skipped
 from enact_dist.link.shared_folder import open_shared
 from enact_dist.link.socket_frames import (
+    Buffer,
     Kind,
     Stream,
     read_skipped,
@@ -128,21 +129,25 @@ class Connection:
         """Return the descriptor that becomes readable when something has come."""
         return self.socket.fileno()
 
-    def take_notices(self) -> list[Notice | Skipped]:
-        """Return what a shard has sent since `WATCH`; waits if that is nothing.
+    def take_notices(self, *, wait: bool = False) -> list[Notice | Skipped]:
+        """Return what a shard has sent whole since `WATCH`; empty if that is nothing yet.
+
+        Args:
+            wait: Whether to wait until something has come; it may be a part of a notice only.
 
         Raises:
             EOFError: As `receive`.
             OSError: As `receive`.
             ProtocolError: What came is no notice.
         """
-        found = [self._notice()]
-        while self._stream.begun:
-            found.append(self._notice())
+        found: list[Notice | Skipped] = []
+        frame = self._stream.receive_here(wait=wait)
+        while frame is not None:
+            found.append(self._notice(*frame))
+            frame = self._stream.receive_here() if self._stream.begun else None
         return found
 
-    def _notice(self) -> Notice | Skipped:
-        kind, header, payload = self._stream.receive()
+    def _notice(self, kind: int, header: bytes, payload: Buffer) -> Notice | Skipped:
         if kind == Kind.SKIPPED:
             return Skipped(self.shard, *read_skipped(header))
         notice = decode_frame(header, payload) if kind == Kind.MESSAGE else None

@@ -11,6 +11,9 @@ import pytest
 from enact_dist.core.datum import Slot
 from enact_dist.core.messages import Notice, Survey
 from enact_dist.link.notices import Interest, NoticeQueue, Skipped
+from enact_dist.link.socket_frames import prefixed
+from enact_dist.link.socket_line import Connection
+from enact_dist.wire.frames import encode_frame
 
 
 def test_queue_gives_notices_in_order_when_they_are_taken():
@@ -174,6 +177,62 @@ def test_whoever_waits_reads_the_source_itself(piped):
 
     assert [found.number, queue.get(0.0).number, queue.get(0.0).number] == [1, 2, 3]
     assert queue.get(0.01) is None
+
+
+@pytest.fixture
+def watched():
+    """Return a queue that reads the connection to a shard, and the shard's end of it."""
+    near, far = socket.socketpair()
+    queue = NoticeQueue()
+    with near, far:
+        assert queue.read_from(Connection("s0", near), lambda _: None)
+        yield queue, far
+        queue.close()
+
+
+def framed(number, names=("a",)):
+    """Return the bytes of a notice."""
+    changes = tuple((Slot("online", name, "mesh"), number, 1, False, 0) for name in names)
+    header, payload = encode_frame(Notice("s0", 1, number, changes))
+    return prefixed(header, len(payload or b"")) + (payload or b"")
+
+
+@pytest.mark.parametrize("slots", [1, 4000])
+def test_shard_that_stops_in_the_midst_of_a_notice_holds_nobody(watched, slots):
+    """Who waits waits as long as asked; what has come whole is there, the rest when it comes."""
+    queue, far = watched
+    last = framed(3, tuple(f"part/{number}" for number in range(slots)))
+    far.sendall(framed(1) + framed(2) + last[: len(last) // 2])
+    found = []
+
+    def take():
+        found.extend([queue.get(30.0), queue.get(30.0), queue.get(0.05)])
+
+    taker = threading.Thread(target=take, daemon=True)
+    taker.start()
+    taker.join(60)
+    still = taker.is_alive()
+    far.sendall(last[len(last) // 2 :])
+    taker.join(60)
+
+    assert [one and one.number for one in found] == [1, 2, None]
+    assert not still
+    assert len(queue.get(30.0).changes) == slots
+
+
+def test_queue_waits_no_longer_for_a_shard_that_sends_ever_more_of_a_notice(watched):
+    """As asked, though something comes each time that it looks."""
+    queue, far = watched
+    last = framed(1, tuple(f"part/{number}" for number in range(4000)))
+    at, waits = 0, 0
+    while at < len(last) - 1:
+        far.sendall(last[at : at + 1000])
+        at, waits = at + 1000, waits + 1
+        notice = queue.get(0.0)
+        if at < len(last):
+            assert notice is None
+        else:
+            assert notice.number == 1
 
 
 def test_notice_of_another_thread_wakes_whoever_reads_the_source(piped):

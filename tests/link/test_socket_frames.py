@@ -33,18 +33,18 @@ def ends():
     far.close()
 
 
-@pytest.mark.parametrize(
-    ("header", "body"),
-    [
-        (b"", 0),
-        (b"h", 1),
-        (b"h" * 100, BUFFER_BYTES - PREFIX_BYTES - 100),
-        (b"h" * 100, BUFFER_BYTES - PREFIX_BYTES - 99),
-        (b"h" * (BUFFER_BYTES + 1), 0),
-        (b"h" * (BUFFER_BYTES + 1), 5),
-        (b"h" * 50, 3_000_000),
-    ],
-)
+FRAMES = [
+    (b"", 0),
+    (b"h", 1),
+    (b"h" * 100, BUFFER_BYTES - PREFIX_BYTES - 100),
+    (b"h" * 100, BUFFER_BYTES - PREFIX_BYTES - 99),
+    (b"h" * (BUFFER_BYTES + 1), 0),
+    (b"h" * (BUFFER_BYTES + 1), 5),
+    (b"h" * 50, 3_000_000),
+]
+
+
+@pytest.mark.parametrize(("header", "body"), FRAMES)
 def test_frame_arrives_as_it_was_sent(ends, header, body):
     """Short ones and long ones, with the buffer's edge between them."""
     near, far = ends
@@ -57,6 +57,32 @@ def test_frame_arrives_as_it_was_sent(ends, header, body):
     sender.join()
 
     assert (kind, found, bytes(found_payload)) == (Kind.MESSAGE, header, payload)
+
+
+@pytest.mark.parametrize(("header", "body"), FRAMES)
+def test_frame_is_taken_when_all_of_it_is_here(ends, header, body):
+    """However it is cut: a part of it is kept, and nobody waits for the rest."""
+    near, far = ends
+    payload = os.urandom(body)
+    frame = prefixed(header, body) + payload
+    rest = memoryview(frame + prefixed(b"next", 0))
+    stream, found = Stream(far), []
+
+    for length in (1, 14, 3, len(frame) // 2, len(rest)):
+        part, rest = rest[:length], rest[length:]
+        while part:
+            part = part[near.send(part[: 1 << 16]) :]
+            while (one := stream.receive_here()) is not None:
+                found.append(one)
+
+    assert [(kind, head, bytes(body)) for kind, head, body in found] == [
+        (Kind.MESSAGE, header, payload),
+        (Kind.MESSAGE, b"next", b""),
+    ]
+    assert not stream.begun
+    near.close()
+    with pytest.raises(EOFError):
+        stream.receive_here()
 
 
 def test_frames_that_come_in_any_pieces_are_put_together(ends):
