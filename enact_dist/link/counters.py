@@ -106,6 +106,10 @@ OF_A_SHARD: Final[dict[str, Counter]] = {
     "connections_refused": Counter(
         "sockets refused: too many, another user, or no greeting", "see the shard's log"
     ),
+    "metrics_readers_refused": Counter(
+        "readers of /metrics that were not taken: too many, or no descriptor or thread was free",
+        "see the shard's log; raise LimitNOFILE",
+    ),
     "answers_dropped": Counter("answers to clients that did not read them", _SLOW_READER),
     "notices_dropped": Counter(
         "notices to watchers that did not read them; a watch tells its gap", _SLOW_READER

@@ -1,7 +1,8 @@
 """Serves one page over HTTP, from threads that wait for nobody the shard waits for.
 
 Whoever reads slowly holds one of `READERS_MAX` threads, for `READ_S` per step at most; more readers
-are turned away.
+are turned away.  While the process has no descriptor free nobody can be taken, and whoever waits at
+the door stays there: it is looked for again after a pause, not at once.
 """
 
 from __future__ import annotations
@@ -25,6 +26,10 @@ READ_S: Final = 5.0
 PATH: Final = "/metrics"
 POLL_S: Final = 0.1
 """How long `close` may wait for the thread that accepts."""
+PAUSE_S_MIN: Final = 0.05
+PAUSE_S_MAX: Final = 1.0
+"""Pause after a reader that could not be taken; doubles up to the second figure."""
+REFUSED: Final = "metrics_readers_refused"
 
 _log = logging.getLogger("enact.link")
 
@@ -35,6 +40,7 @@ class MetricsServer:
     Args:
         address: Host and port; port 0 takes any that is free.
         page: Makes the page; called from the server's threads.
+        count: Called with `REFUSED` for each reader that is not taken.
 
     Attributes:
         port: At which it listens.
@@ -43,10 +49,12 @@ class MetricsServer:
         LinkError: The address is in use, or not of this host.
     """
 
-    def __init__(self, address: tuple[str, int], page: Callable[[], str]) -> None:
+    def __init__(
+        self, address: tuple[str, int], page: Callable[[], str], count: Callable[[str], None]
+    ) -> None:
         host, port = address
         try:
-            self._server = _Server(address, page)
+            self._server = _Server(address, page, count)
         except OSError as error:
             raise LinkError(
                 f"metrics cannot be served at {host}:{port}: {error.strerror or error}; name"
@@ -60,6 +68,7 @@ class MetricsServer:
 
     def close(self) -> None:
         """Stop listening; twice is harmless."""
+        self._server.ending.set()
         self._server.shutdown()
         self._server.server_close()
         self._thread.join()
@@ -70,20 +79,41 @@ class _Server(ThreadingMixIn, TCPServer):
     daemon_threads = True
     block_on_close = False
 
-    def __init__(self, address: tuple[str, int], page: Callable[[], str]) -> None:
+    def __init__(
+        self, address: tuple[str, int], page: Callable[[], str], count: Callable[[str], None]
+    ) -> None:
         self.address_family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
         self.page = page
+        self.ending = threading.Event()
+        self._count = count
+        self._pause_s = 0.0
         self._room = threading.BoundedSemaphore(READERS_MAX)
         super().__init__(address, _Handler)
 
+    def get_request(self) -> tuple[Any, Any]:
+        """Take who waits; where the system refuses, its caller comes again at once."""
+        try:
+            taken = super().get_request()
+        except OSError as error:
+            if not self._pause_s:
+                _log.warning("a reader of the metrics cannot be taken for now: %s", error)
+            self._count(REFUSED)
+            self._pause_s = min(max(2 * self._pause_s, PAUSE_S_MIN), PAUSE_S_MAX)
+            self.ending.wait(self._pause_s)
+            raise
+        self._pause_s = 0.0
+        return taken
+
     def process_request(self, request: Any, client_address: Any) -> None:
         if not self._room.acquire(blocking=False):
+            self._count(REFUSED)
             self.shutdown_request(request)
             return
         try:
             super().process_request(request, client_address)
         except BaseException:  # the system has no more threads
             self._room.release()
+            self._count(REFUSED)
             raise
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:

@@ -200,7 +200,7 @@ def _metrics_server(settings: DaemonSettings, host: ShardHost) -> MetricsServer:
     from enact_dist.link.metrics_server import MetricsServer
 
     assert settings.metrics is not None
-    return MetricsServer(settings.metrics, lambda: page(host, settings.cell))
+    return MetricsServer(settings.metrics, lambda: page(host, settings.cell), host.count)
 
 
 def _shared_folder(settings: DaemonSettings) -> SharedFolder | None:

@@ -1,8 +1,11 @@
 """`/metrics`: what Prometheus' own reader makes of it, what it costs the shard, who is turned away."""
 
+import errno
 import http.client
+import itertools
 import socket
 import threading
+import time
 import urllib.error
 import urllib.request
 from pathlib import Path
@@ -51,7 +54,7 @@ def peer(host, make_peer):
 @pytest.fixture
 def served(host):
     """Ask a real server for the metrics: `served()` returns its text."""
-    server = MetricsServer(("127.0.0.1", 0), lambda: page(host, 'cell "a"'))
+    server = MetricsServer(("127.0.0.1", 0), lambda: page(host, 'cell "a"'), host.count)
 
     def ask(path="/metrics"):
         with DIRECT.open(f"http://127.0.0.1:{server.port}{path}", timeout=30) as answer:
@@ -165,6 +168,27 @@ def test_readers_that_do_not_read_leave_the_shard_alone(served, host, monkeypatc
         break
 
     assert samples(text)["enact_stalls_total"] == 1
+    assert samples(text)["enact_metrics_readers_refused_total"] >= 1
+
+
+def test_reader_that_cannot_be_taken_is_looked_for_after_a_pause(served, monkeypatch, caplog):
+    """While no descriptor is free its connection stays at the door, and the server does not spin."""
+    tries = []
+    accept = metrics_server.TCPServer.get_request
+
+    def refused(server):
+        tries.append(time.monotonic())
+        if len(tries) < 4:
+            raise OSError(errno.EMFILE, "Too many open files")
+        return accept(server)
+
+    monkeypatch.setattr(metrics_server.TCPServer, "get_request", refused)
+    text = served()
+
+    pauses = [later - earlier for earlier, later in itertools.pairwise(tries)]
+    assert min(pauses) >= 0.04
+    assert samples(text)["enact_metrics_readers_refused_total"] == 3
+    assert caplog.text.count("Too many open files") == 1
 
 
 def test_address_in_use_is_named():
@@ -172,7 +196,7 @@ def test_address_in_use_is_named():
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
         with pytest.raises(LinkError, match=rf"127.0.0.1:{port}: Address already in use; name"):
-            MetricsServer(("127.0.0.1", port), str)
+            MetricsServer(("127.0.0.1", port), str, print)
 
 
 def test_readers_for_whom_there_was_no_thread_take_no_place(served, monkeypatch):
