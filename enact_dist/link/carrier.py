@@ -14,11 +14,11 @@ import os
 from typing import TYPE_CHECKING, Final, Protocol, cast, get_args
 
 from enact_dist.core.messages import Answer
-from enact_dist.errors import MisuseError, ProtocolError
+from enact_dist.errors import ConfigError, LinkError, MisuseError, ProtocolError
 from enact_dist.wire.frames import decode_frame
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from enact_dist.core.messages import Notice, Request, ShardEntry, Survey
     from enact_dist.link.notices import Skipped
@@ -44,6 +44,18 @@ def check_usable(pid: int, *, closed: bool) -> None:
         )
     if closed:
         raise MisuseError("the connection to this cell is closed; connect again")
+
+
+def failure_of(failures: Mapping[str, Exception]) -> Exception:
+    """Return the error of shards that could not be connected, which names all of them.
+
+    It is a `ConfigError` only where each is one: of any other kind may pass.
+    """
+    if len(failures) == 1:
+        return next(iter(failures.values()))
+    text = "; ".join(f"shard {shard}: {error}" for shard, error in failures.items())
+    for_good = all(isinstance(error, ConfigError) for error in failures.values())
+    return ConfigError(text) if for_good else LinkError(text)
 
 
 def read_answer(shard: str, header: bytes, payload: bytes | memoryview) -> Answer:
@@ -151,7 +163,13 @@ class Carrier(Protocol):
         """
 
     def add_endpoints(self, entries: Sequence[ShardEntry]) -> None:
-        """Connect to further shards; those already in reach stay as they are."""
+        """Connect to further shards, to all that can be; those already in reach stay as they are.
+
+        Raises:
+            ConfigError: An endpoint cannot be read.
+            LinkError: Several cannot be connected, for the reasons that it names.
+            MisuseError: As `request`.
+        """
 
     def way_to(self, shard: str) -> str:
         """Return how calls to a shard travel now, for people: "zenoh", "socket", …."""

@@ -240,11 +240,20 @@ class SocketCarrier:
         return f"zenoh ({line.problem})" if line.problem else "socket"
 
     def add_endpoints(self, entries: Sequence[ShardEntry]) -> None:
-        """Connect to further shards; those already in reach stay as they are."""
-        self._behind.add_endpoints(entries)
-        self._shards.update(entry.name for entry in entries)
-        for feed in list(self._feeds.values()):
-            feed.settle()
+        """Connect to further shards, to all that can be; those already in reach stay as they are.
+
+        Raises:
+            ConfigError: An endpoint cannot be read.
+            LinkError: Several cannot be connected, for the reasons that it names.
+            MisuseError: The carrier is closed or was opened before a fork.
+        """
+        self._check_usable()
+        try:
+            self._behind.add_endpoints(entries)
+        finally:
+            self._shards.update(entry.name for entry in entries)
+            for feed in list(self._feeds.values()):
+                feed.settle()
 
     def tell_returns(self, returned: Callable[[str], None]) -> None:
         """Call `returned` with the name of each shard that comes (back) into reach."""

@@ -32,7 +32,7 @@ import zenoh
 
 from enact_dist.core.messages import Answer, AwaitStamp, Commit, Notice, Prepare
 from enact_dist.errors import ProtocolError, ShardUnreachableError
-from enact_dist.link.carrier import check_usable, read_answer
+from enact_dist.link.carrier import check_usable, failure_of, read_answer
 from enact_dist.link.inside import Inside
 from enact_dist.link.notices import NoticeQueue
 from enact_dist.link.zenoh_bulk import BulkWay
@@ -284,24 +284,34 @@ class ZenohCarrier:
     # ---------------------------------------------------------------- links
 
     def add_endpoints(self, entries: Sequence[ShardEntry]) -> None:
-        """Connect to further shards; those already in reach stay as they are.
+        """Connect to further shards, to all that can be; those already in reach stay as they are.
 
         Raises:
             ConfigError: An endpoint cannot be read.
+            LinkError: Several cannot be connected, for the reasons that it names.
             MisuseError: The carrier is closed or was opened before a fork.
         """
         self._check_usable()
+        failures: dict[str, Exception] = {}
         for name, endpoints in entries:
             self._endpoints_of[name] = endpoints
-            if not endpoints:
-                continue
-            if name not in self._link_of:
-                reaching = self._link_reaching(name, endpoints)
-                self._link_of[name] = reaching or self._open_link(endpoints)
-            if name not in self._presences:
-                session, key = self._link_of[name].session, self._key(name, QUESTION)
-                told = partial(self._tell_returned, name)
-                self._presences[name] = ShardPresence(session, key, told)
+            try:
+                if endpoints:
+                    self._connect(name, endpoints)
+            except Exception as error:  # noqa: BLE001 - the next one can be connected
+                self._check_usable()
+                failures[name] = error
+        if failures:
+            raise failure_of(failures)
+
+    def _connect(self, name: str, endpoints: tuple[str, ...]) -> None:
+        if name not in self._link_of:
+            reaching = self._link_reaching(name, endpoints)
+            self._link_of[name] = reaching or self._open_link(endpoints)
+        if name not in self._presences:
+            session, key = self._link_of[name].session, self._key(name, QUESTION)
+            told = partial(self._tell_returned, name)
+            self._presences[name] = ShardPresence(session, key, told)
 
     def _link_reaching(self, shard: str, endpoints: Sequence[str]) -> _Link | None:
         """Return the link that leads to `shard` already, perhaps by another of its addresses."""

@@ -20,7 +20,13 @@ from enact_dist.core.messages import (
     Slice,
     Welcome,
 )
-from enact_dist.errors import MisuseError, ProtocolError, ShardUnreachableError
+from enact_dist.errors import (
+    ConfigError,
+    LinkError,
+    MisuseError,
+    ProtocolError,
+    ShardUnreachableError,
+)
 from enact_dist.link import zenoh_bulk, zenoh_carrier, zenoh_config
 from enact_dist.link.zenoh_config import close_session, open_session
 from enact_dist.link.zenoh_discovery import FoundShard, discover, find_shards
@@ -172,6 +178,34 @@ def test_carrier_reaches_further_shards_when_it_learns_of_them(daemon, carry, en
     answers = carrier.request_all([("s0", ListLocks()), ("s1", ListLocks())], timeout_s=30)
     assert [type(answer) for answer in answers] == [Locks, Locks]
     assert carrier.endpoint_of("s1") == second
+
+
+@both
+def test_shards_that_cannot_be_connected_stop_no_other(daemon, carry, endpoint, free, monkeypatch):
+    """Each is named; only where all have endpoints that cannot be read is that the error."""
+    wrong = {name: (free(),) for name in ("s1", "s3")}
+    second = free()
+    daemon(endpoint)
+    daemon(second, "s2")
+    carrier = carry(endpoint)
+    errors = {wrong["s1"]: ConfigError("no endpoint"), wrong["s3"]: LinkError("no session")}
+
+    def opened(*, connect, **settings):
+        if connect in errors:
+            raise errors[connect]
+        return open_session(connect=connect, **settings)
+
+    monkeypatch.setattr(zenoh_carrier, "open_session", opened)
+    entries = [ShardEntry(name, wrong.get(name, (second,))) for name in ("s1", "s2", "s3")]
+    with pytest.raises(LinkError, match="shard s1: no endpoint; shard s3: no session"):
+        carrier.add_endpoints(entries)
+
+    assert isinstance(carrier.request("s2", ListLocks(), timeout_s=30), Locks)
+    errors[wrong["s3"]] = ConfigError("nor here")
+    with pytest.raises(ConfigError, match="shard s1: no endpoint; shard s3: nor here"):
+        carrier.add_endpoints(entries)
+    with pytest.raises(ConfigError, match=r"^no endpoint$"):
+        carrier.add_endpoints(entries[:2])
 
 
 def test_carrier_that_is_closed_while_it_connects_leaves_nothing_open(
