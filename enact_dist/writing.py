@@ -75,17 +75,21 @@ class Writing:
             MisuseError: It is more than one lock may write.
             NoRoomError: The shard's cap is reached.
         """
-        self._refuse_beyond(slot, encoded.size)
-        self._note(slot, self._written(slot, encoded, shard_of))
+        size = self._size_with(slot, encoded.size)
+        self._note(slot, self._written(slot, encoded, shard_of), size)
 
     def delete(self, slot: Slot) -> None:
         """Set a slot to null."""
-        self._refuse_beyond(slot, 0)
-        self._note(slot, None)
+        self._note(slot, None, self._size_with(slot, 0))
 
-    def _refuse_beyond(self, slot: Slot, size: int) -> None:
-        """Raise before anything is made or given up for what one lock may not write any more."""
-        size = self._bytes_with(slot, size)
+    def _size_with(self, slot: Slot, size: int) -> int:
+        """Return the bytes of all data once a slot is set to one of `size`.
+
+        Raises:
+            MisuseError: It is more than one lock may write; nothing was made or given up for it.
+        """
+        old = self.data.get(slot)
+        size += self._bytes - (old.size if old else 0)
         if slot not in self.data and len(self.data) >= ITEMS_MAX:
             raise MisuseError(f"one lock writes at most {ITEMS_MAX} data; use several locks")
         if size > BODY_BYTES_MAX:
@@ -93,19 +97,14 @@ class Writing:
                 f"the writes of one lock have {size} bytes; at most {BODY_BYTES_MAX}: use several"
                 " locks"
             )
+        return size
 
-    def _bytes_with(self, slot: Slot, size: int) -> int:
-        old = self.data.get(slot)
-        return self._bytes - (old.size if old else 0) + size
-
-    def _note(self, slot: Slot, written: _Written | None) -> None:
-        """Let something take the place of what was written to a slot."""
-        datum = written.datum if written is not None else None
-        size = self._bytes_with(slot, datum.size if datum is not None else 0)
+    def _note(self, slot: Slot, written: _Written | None, size: int) -> None:
+        """Let something take the place of what was written to a slot; `size` as `_size_with`."""
         self._forget(slot)
         if written is not None and (written.draft is not None or written.arrays):
             self._by_slot[slot] = written
-        self.data[slot] = datum
+        self.data[slot] = written.datum if written is not None else None
         self._bytes = size
         self.edits += 1
 
@@ -138,7 +137,7 @@ class Writing:
             NoRoomError: The shard's cap is reached.
         """
         encoded = encode_parts(like, datum_type, stamp_ns=stamp_ns)
-        self._refuse_beyond(slot, encoded.size)
+        size = self._size_with(slot, encoded.size)
         draft, memory, shown = self._memory(shard, encoded)
         encoded.put_texts(memory)
         value, arrays = decode_to_fill(encoded.encoding, memory, datum_type)
@@ -150,7 +149,7 @@ class Writing:
                 " takes any datum"
             )
         datum = encoded.over(shown, draft.file if draft is not None else "")
-        self._note(slot, _Written(datum, draft, arrays))
+        self._note(slot, _Written(datum, draft, arrays), size)
         return value
 
     def _memory(self, shard: str, encoded: Encoded) -> tuple[Draft | None, memoryview, memoryview]:
