@@ -9,28 +9,26 @@ from __future__ import annotations
 
 import contextlib
 import json
-import tempfile
 import threading
 import time
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from enact_dist.bench.place import EMBEDDED, WORLD, Place, environment
+from enact_dist.bench.place import EMBEDDED, WORLD, Place, environment, fresh_place
 from enact_dist.bench.rows import Case, Goal, Key, times, value_row
 from enact_dist.bench.timing import timed
 from enact_dist.bench.updates import WAIT_S, floor_of, update
 from enact_dist.bench.usage import Usage
 from enact_dist.errors import UnknownWorldError
 from enact_dist.forking import drop_world
-from enact_dist.link.shared_folder import MEMORY
 from enact_dist.lock import Lock
 from enact_dist.retention import Retention
 from enact_dist.terms import Aspect, Durability, Entity, View, Write
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
+    from pathlib import Path
 
     from enact_dist.bench.run import Run
     from enact_dist.core.datum import Position
@@ -190,17 +188,7 @@ def _run_cameras(run: Run, floor: Key) -> None:
     """Measure updates beside cameras, and what shared memory and the shard take meanwhile."""
     ticks = max(2 * BLOCK_TICKS, int(TIMES * run.seconds_s * 1e9 / PERIOD_NS))
     run.told(f"history: cameras for {ticks * PERIOD_NS / 1e9:g} s")
-    root = MEMORY if MEMORY.is_dir() else None
-    with contextlib.ExitStack() as stack:
-        folders = [
-            Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="enact-bench-", dir=at)))
-            for at in (None, root)
-        ]
-        shared = folders[1] / "shared"
-        stack.enter_context(environment(**{CAP_VARIABLE: str(CAP_BYTES)}))
-        place = stack.enter_context(
-            Place(folders[0], target=None, shards=1, carriers=("auto",), shared=shared)
-        )
+    with environment(**{CAP_VARIABLE: str(CAP_BYTES)}), fresh_place() as (place, shared):
         measured = _Cameras(place, shared, ticks)
     for side, found_us in zip(SIDES, measured.times_us, strict=True):
         goal = times(1.1, (NAME, BESIDE.format(SIDES[1])), ITS_COST) if side == SIDES[0] else None

@@ -6,17 +6,18 @@ import contextlib
 import json
 import os
 import signal
+import tempfile
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from enact_dist.bench.visit import Visit, anywhere
 from enact_dist.config_values import CARRIERS
 from enact_dist.connecting import connect, local
-from enact_dist.link.shared_folder import SHARED_FOLDER_VARIABLE
+from enact_dist.link.shared_folder import MEMORY, SHARED_FOLDER_VARIABLE
 from enact_dist.verify.daemons import LineProcess, free_port
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
-    from pathlib import Path
 
     from enact_dist.cell import Cell
     from enact_dist.world import WorldContext
@@ -271,3 +272,17 @@ class Place:
     def daemon_pids(self) -> list[int]:
         """Return the process ids of the daemons of an own cell."""
         return [daemon.pid for daemon in self._daemons]
+
+
+@contextlib.contextmanager
+def fresh_place(carrier: str = "auto") -> Iterator[tuple[Place, Path]]:
+    """Give a cell of one daemon that has served nothing before, and its shared folder."""
+    root = MEMORY if MEMORY.is_dir() else None
+    with contextlib.ExitStack() as stack:
+        folder, memory = (
+            Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="enact-bench-", dir=at)))
+            for at in (None, root)
+        )
+        shared = memory / "shared"
+        place = Place(folder, target=None, shards=1, carriers=(carrier,), shared=shared)
+        yield stack.enter_context(place), shared

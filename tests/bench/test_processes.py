@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from enact_dist.bench import history, pipeline
+from enact_dist.bench import history, memory, pipeline
 from enact_dist.bench.command import BENCHES
 from enact_dist.bench.decisions import Decider, granted_of, hand_over_us
 from enact_dist.bench.floors import ECHO, FDATASYNC, PUBLISH, QUERY, Floors
@@ -40,6 +40,27 @@ def new_run(tmp_path):
     for place, floors in opened:
         floors.__exit__()
         place.__exit__()
+
+
+def test_memory_of_a_slot_is_that_of_a_daemon_of_its_own(new_run, monkeypatch):
+    """One that other benches used has freed memory, of which slots take none that is seen."""
+    monkeypatch.setattr(memory, "SETTLE_S", 0.1)
+    run = new_run("auto")
+    run.place.cell("auto")
+    measured = []
+    real = memory.private_bytes
+    monkeypatch.setattr(memory, "private_bytes", lambda pid: measured.append(pid) or real(pid))
+
+    memory.run_memory(run)
+
+    assert len(set(measured)) == 1
+    assert not set(measured) & set(run.place.daemon_pids())
+    slot, commits = run.rows()
+    assert (slot.variant, commits.variant) == (
+        "shard, one slot that holds a number",
+        "shard, growth with commits",
+    )
+    assert 200 < slot.value < 10_000
 
 
 def test_every_kind_of_floor_gives_times(new_run):
