@@ -1,0 +1,126 @@
+"""One feed of notices of a client whose shards may run on its own host.
+
+It has a connection to each shard with a socket, and Zenoh where one has none.  Both may bring the
+same notice for a while; the queue takes each number once, and a number that is missing is noticed
+by whoever watches.  Whoever waits reads the first of the connections itself, and each further one
+has a thread.
+"""
+
+from __future__ import annotations
+
+import logging
+import socket
+import threading
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.errors import LinkError, ProtocolError
+from enact_dist.link.socket_frames import Kind, wait_at_most
+from enact_dist.wire.frames import encode_frame
+
+if TYPE_CHECKING:
+    from enact_dist.core.messages import Survey
+    from enact_dist.link.notices import NoticeQueue
+    from enact_dist.link.socket_carrier import SocketCarrier
+    from enact_dist.link.socket_line import Connection, SocketLine
+
+JOIN_S: Final = 1.0
+
+_log = logging.getLogger("enact.link")
+
+
+class SocketFeed:
+    """A connection to each shard with a socket, Zenoh where one has none.
+
+    Args:
+        carrier: Of the client.
+        queue: Where notices go.
+        interest: What is watched; None for everything.
+    """
+
+    def __init__(self, carrier: SocketCarrier, queue: NoticeQueue, interest: Survey | None) -> None:
+        self._carrier = carrier
+        self._queue = queue
+        self._watch = encode_frame(interest)[0] if interest is not None else b""
+        self._mutex = threading.Lock()
+        self._pumps: dict[str, tuple[SocketLine, Connection, threading.Thread | None]] = {}
+        self._over_zenoh = False
+        self._closed = False
+
+    def settle(self) -> None:
+        """Open and close what has to be, after something changed."""
+        with self._mutex:
+            if self._closed:
+                return
+            shards, lines = self._carrier.lines()
+            for shard, line in lines.items():
+                if shard not in self._pumps:
+                    self._open_pump(shard, line)
+            need_zenoh = not shards or bool(shards - set(self._pumps))
+            if need_zenoh and not self._over_zenoh:
+                self._carrier.behind.feed_into(self._queue)
+            elif self._over_zenoh and not need_zenoh:
+                self._carrier.behind.stop_feeding(self._queue)
+            self._over_zenoh = need_zenoh
+
+    def _open_pump(self, shard: str, line: SocketLine) -> None:
+        connection = self._carrier.tried(line, lambda: self._watching(line))
+        if connection is None:
+            return
+        if self._queue.read_from(
+            connection, lambda error: self._ended(shard, line, connection, error)
+        ):
+            self._pumps[shard] = line, connection, None
+            return
+        thread = threading.Thread(
+            target=self._pump, args=(shard, line, connection), name="enact-notices", daemon=True
+        )
+        self._pumps[shard] = line, connection, thread
+        thread.start()
+
+    def _watching(self, line: SocketLine) -> Connection | None:
+        """Return a new connection that gets notices, None where there is none to be had."""
+        connection = line.connect()
+        if connection is None:
+            return None
+        try:
+            connection.exchange(Kind.WATCH, self._watch)
+        except (LinkError, ProtocolError, EOFError, OSError) as error:
+            _log.info("no notices over the socket to shard %s: %s", line.shard, error)
+            line.drop(connection)
+            return None
+        wait_at_most(connection.socket, socket.SO_RCVTIMEO, 0.0)
+        return connection
+
+    def _pump(self, shard: str, line: SocketLine, connection: Connection) -> None:
+        """Move notices from a connection into the queue until it ends."""
+        try:
+            while True:
+                self._queue.take(connection.take_notices(wait=True))
+        except Exception as error:  # noqa: BLE001 - whatever it is, another way is opened
+            self._ended(shard, line, connection, error)
+
+    def _ended(
+        self, shard: str, line: SocketLine, connection: Connection, error: Exception
+    ) -> None:
+        if not self._closed:
+            _log.info("notices of shard %s end: %s", shard, error)
+        line.drop(connection)
+        with self._mutex:
+            self._pumps.pop(shard, None)
+        if not self._closed:
+            self.settle()
+
+    def close(self) -> None:
+        """End it; waits for its threads."""
+        with self._mutex:
+            self._closed = True
+            pumps = list(self._pumps.values())
+            if self._over_zenoh:
+                self._carrier.behind.stop_feeding(self._queue)
+        for _, connection, _ in pumps:
+            connection.wake()
+        for line, connection, thread in pumps:
+            if thread is None:
+                line.drop(connection)
+            elif thread is not threading.current_thread():
+                thread.join(JOIN_S)
