@@ -149,6 +149,7 @@ class NoticeQueue:
         self._newest: dict[str, tuple[int, int]] = {}
         self._mutex = threading.Lock()
         self._changed = threading.Condition(self._mutex)
+        self._came = threading.Condition(self._mutex)
         self._closed = False
         self._dropped = 0
         self._ear: _Ear | None = None
@@ -171,6 +172,7 @@ class NoticeQueue:
         if self._closed or number <= self._newest.get(notice.shard, (0, 0)):
             return
         self._newest[notice.shard] = number
+        self._came.notify_all()
         if not wanted:
             self._skip(Skipped(notice.shard, notice.epoch, notice.number - 1, notice.number))
             return
@@ -185,6 +187,22 @@ class NoticeQueue:
         self._changed.notify_all()
         if self._ear is not None and self._polling:
             self._ear.ring()
+
+    def wait_for_earlier(self, first: Notice | Skipped, wait_s: float) -> None:
+        """Wait until what a shard has sent before `first` has come by another way.
+
+        Not longer than `wait_s`: it may have been lost, or have come before this feed was opened.
+        """
+        after = first.after if isinstance(first, Skipped) else first.number - 1
+        with self._mutex:
+            self._came.wait_for(
+                lambda: (
+                    self._closed
+                    or not after
+                    or self._newest.get(first.shard, (0, 0)) >= (first.epoch, after)
+                ),
+                wait_s,
+            )
 
     def read_from(self, source: Source, on_end: Callable[[Exception], None]) -> bool:
         """Let `get` read this source, too; say no if there is one, or the feed is closed.
@@ -289,6 +307,7 @@ class NoticeQueue:
                 return
             self._closed = True
             self._wake()
+            self._came.notify_all()
         if self.on_close is not None:
             self.on_close()
 

@@ -19,7 +19,7 @@ import threading
 import weakref
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.core.messages import Welcome
+from enact_dist.core.messages import Alive, Welcome
 from enact_dist.errors import LinkError
 from enact_dist.link.carrier import check_usable
 from enact_dist.link.notices import NoticeQueue
@@ -131,6 +131,8 @@ class SocketCarrier:
                     answers[index] = answer
             for index in list(sent):
                 answers[index] = _received(*sent.pop(index))
+                if type(answers[index]) is Alive:
+                    self._is_near(requests[index][0])
         finally:
             for line, connection in sent.values():  # something was raised before its turn
                 line.drop(connection)
@@ -138,6 +140,13 @@ class SocketCarrier:
             if type(answer) is Welcome:
                 self.learn(answer)
         return answers
+
+    def _is_near(self, shard: str) -> None:
+        """Let feeds that have lost the socket to a shard try it again: its session lives there."""
+        line = self._lines.get(shard)
+        for feed in list(self._feeds.values()):
+            if line is not None:
+                feed.come_back(shard, line)
 
     def begin(self, shard: str, message: Request, *, timeout_s: float) -> Begun:
         """Send one request whose answer is waited for later; each has a connection of its own.

@@ -4,6 +4,11 @@ It has a connection to each shard with a socket, and Zenoh where one has none.  
 same notice for a while; the queue takes each number once, and a number that is missing is noticed
 by whoever watches.  Whoever waits reads the first of the connections itself, and each further one
 has a thread.
+
+A connection that ends is opened again at once.  Where that fails, its shard's notices come over
+Zenoh, and the socket is tried again when a sign of life of this session was answered over one, as
+it is some times per TTL.  Zenoh stays until the first notice has come over the socket and all
+before it over Zenoh, so that none is missed.
 """
 
 from __future__ import annotations
@@ -18,12 +23,14 @@ from enact_dist.link.socket_frames import Kind, wait_at_most
 from enact_dist.wire.frames import encode_frame
 
 if TYPE_CHECKING:
-    from enact_dist.core.messages import Survey
-    from enact_dist.link.notices import NoticeQueue
+    from enact_dist.core.messages import Notice, Survey
+    from enact_dist.link.notices import NoticeQueue, Skipped
     from enact_dist.link.socket_carrier import SocketCarrier
     from enact_dist.link.socket_line import Connection, SocketLine
 
 JOIN_S: Final = 1.0
+EARLIER_S: Final = 1.0
+"""How long what came over Zenoh before the first notice of a socket may be on its way."""
 
 _log = logging.getLogger("enact.link")
 
@@ -43,6 +50,7 @@ class SocketFeed:
         self._watch = encode_frame(interest)[0] if interest is not None else b""
         self._mutex = threading.Lock()
         self._pumps: dict[str, tuple[SocketLine, Connection, threading.Thread | None]] = {}
+        self._coming: dict[str, tuple[Connection | None, threading.Thread]] = {}
         self._over_zenoh = False
         self._closed = False
 
@@ -64,8 +72,11 @@ class SocketFeed:
 
     def _open_pump(self, shard: str, line: SocketLine) -> None:
         connection = self._carrier.tried(line, lambda: self._watching(line))
-        if connection is None:
-            return
+        if connection is not None:
+            self._read_from(shard, line, connection)
+
+    def _read_from(self, shard: str, line: SocketLine, connection: Connection) -> None:
+        """Let whoever waits read a connection, or a thread; the mutex is held."""
         if self._queue.read_from(
             connection, lambda error: self._ended(shard, line, connection, error)
         ):
@@ -76,6 +87,50 @@ class SocketFeed:
         )
         self._pumps[shard] = line, connection, thread
         thread.start()
+
+    def come_back(self, shard: str, line: SocketLine) -> None:
+        """Try the socket to a shard again, if its notices come over Zenoh; does not wait for it."""
+        if shard in self._pumps or shard in self._coming:
+            return
+        thread = threading.Thread(
+            target=self._come_back, args=(shard, line), name="enact-notices", daemon=True
+        )
+        with self._mutex:
+            if self._closed or shard in self._pumps or shard in self._coming:
+                return
+            self._coming[shard] = None, thread
+            try:
+                thread.start()
+            except RuntimeError:  # no more threads: at the next time
+                del self._coming[shard]
+
+    def _come_back(self, shard: str, line: SocketLine) -> None:
+        """Watch over a socket beside Zenoh until it brings what Zenoh need not bring."""
+        connection = self._watching(line)
+        came = False
+        try:
+            with self._mutex:
+                if connection is None or self._closed:
+                    return
+                self._coming[shard] = connection, threading.current_thread()
+            found: list[Notice | Skipped] = []
+            while not found:
+                found = connection.take_notices(wait=True)
+            self._queue.wait_for_earlier(found[0], EARLIER_S)
+            self._queue.take(found)
+            with self._mutex:
+                came = not self._closed and shard not in self._pumps
+                if came:
+                    self._read_from(shard, line, connection)
+        except Exception as error:  # noqa: BLE001 - Zenoh goes on, and the socket is tried again
+            _log.info("notices of shard %s stay with Zenoh: %s", shard, error)
+        finally:
+            with self._mutex:
+                self._coming.pop(shard, None)
+            if connection is not None and not came:
+                line.drop(connection)
+        if came:
+            self.settle()
 
     def _watching(self, line: SocketLine) -> Connection | None:
         """Return a new connection that gets notices, None where there is none to be had."""
@@ -115,10 +170,17 @@ class SocketFeed:
         with self._mutex:
             self._closed = True
             pumps = list(self._pumps.values())
+            coming = list(self._coming.values())
             if self._over_zenoh:
                 self._carrier.behind.stop_feeding(self._queue)
         for _, connection, _ in pumps:
             connection.wake()
+        for woken, _ in coming:
+            if woken is not None:
+                woken.wake()
+        for _, joined in coming:
+            if joined is not threading.current_thread():
+                joined.join(JOIN_S)
         for line, connection, thread in pumps:
             if thread is None:
                 line.drop(connection)
