@@ -362,13 +362,14 @@ def test_feed_that_comes_back_waits_for_what_zenoh_still_brings(
     monkeypatch.setattr(queue, "wait_for_earlier", wait_for_earlier)
     monkeypatch.setattr(socket_feed, "EARLIER_S", 30.0)
     until(lambda: coming(carrier, peer, feed))
+    before = list(late)
     peer.write("cup", b"2")
     assert waited.wait(30)
     assert queue.get(0.0) is None
-    numbers = [notice.number for notice in late]
-    for notice in late:
+    for notice in before:
         put(notice)
 
+    numbers = [notice.number for notice in before]
     assert numbers_until(queue, numbers[-1] + 1) == [*numbers, numbers[-1] + 1]
 
 
