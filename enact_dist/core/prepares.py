@@ -85,7 +85,8 @@ class _AtStore:
     replies: list[int] = field(default_factory=list)
     forced: ForcedRecord | None = None
     holder: Holder | None = None
-    operator: int = 0
+    operators: list[int] = field(default_factory=list)
+    asked: ForceAbort | None = None
     told: Position | None = None
 
 
@@ -329,7 +330,11 @@ class PrepareDesk:
         tenure = state.numbered(message.number, message.epoch)
         record = tenure.prepared if tenure is not None else None
         if tenure is None or record is None or tenure.committing:
-            yield Reply(reply_to, Broken(False, None))
+            under_way = self._at_store_of(tenure.lock) if tenure is not None else None
+            if under_way is not None and under_way.asked == message:
+                under_way.operators.append(reply_to)
+            else:
+                yield Reply(reply_to, state.told_by_hand(message))
             return
         holder = state.describe(tenure, state.now_ns)
         why = message.reason or "no reason given"
@@ -340,7 +345,8 @@ class PrepareDesk:
         state.count("prepared_forced")
         slots = tuple(write.slot for write in record.writes)
         forced = ForcedRecord(tenure.lock, record.primary, record.primary_token, slots)
-        work = _AtStore(tenure, record, forced=forced, holder=holder, operator=reply_to)
+        work = _AtStore(tenure, record, forced=forced, holder=holder, asked=message)
+        work.operators.append(reply_to)
         audit = state.audit.keep(AuditRecord(state.wall_ns, text, FORCED))
         yield Story("lock.forced", text, grave=True)
         yield self._persist(work, (audit, forced, PreparedEnded(tenure.lock)))
@@ -349,7 +355,11 @@ class PrepareDesk:
         """An abort by hand is durable: free the slots, and go on asking the lost shard."""
         yield from self._end(work.tenure)
         self._forced.add(forced)
-        yield Reply(work.operator, Broken(True, work.holder))
+        assert work.asked is not None
+        broken = Broken(True, work.holder)
+        self._state.by_hand[ForceAbort] = work.asked, broken
+        for reply_to in work.operators:
+            yield Reply(reply_to, broken)
         if work.told is not None:
             yield from self._forced.committed(forced.lock, work.told, work.replies)
 

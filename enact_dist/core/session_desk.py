@@ -96,20 +96,24 @@ class SessionDesk:
             yield from self.answer_when_durable(reply_to, welcome, ())
 
     def answer_when_durable(
-        self, reply_to: int, answer: Answer, records: tuple[Record, ...]
+        self,
+        reply_to: int,
+        answer: Answer,
+        records: tuple[Record, ...],
+        durability: Durability = Durability.DURABLE,
     ) -> Iterator[Effect]:
-        """Answer when `records` are durable, and all before them that the answer may tell of."""
+        """Answer when `records` are kept, and all before them that the answer may tell of."""
         if records:
             self._ticket -= 1
             self._answers_after[self._ticket] = [(reply_to, answer)]
-            yield Persist(self._ticket, records, Durability.DURABLE)
+            yield Persist(self._ticket, records, durability)
         elif self._answers_after:
             next(reversed(self._answers_after.values())).append((reply_to, answer))
         else:
             yield Reply(reply_to, answer)
 
     def persisted(self, ticket: int) -> Iterator[Effect]:
-        """The records of one of this desk's answers are durable: answer."""
+        """The records of one of this desk's answers are kept: answer."""
         for session, recording in list(self._recording.items()):
             if recording == ticket:
                 del self._recording[session]

@@ -63,8 +63,8 @@ from enact_dist.core.records import (
     Drain,
     Effect,
     MakeRoom,
-    Persist,
     Persisted,
+    Record,
     Recovered,
     Reply,
     SessionDied,
@@ -324,9 +324,10 @@ class Shard:
         yield Reply(reply_to, answer)
 
     def _on_break(self, message: Break, reply_to: int) -> Iterator[Effect]:
+        tell = self._sessions.answer_when_durable
         found = self.state.numbered(message.number, message.epoch)
         if found is None or found.bound:
-            yield Reply(reply_to, Broken(False, None))
+            yield from tell(reply_to, self.state.told_by_hand(message), ())
             return
         holder = self.state.describe(found, self.state.now_ns)
         cause = f"broken by an operator: {message.reason or 'no reason given'}"
@@ -334,18 +335,21 @@ class Shard:
         self.state.count("locks_broken")
         text = f"lock {message.number} of {holder.actor}@{holder.host} {cause}"
         kept = self.state.audit.keep(AuditRecord(self.state.wall_ns, text, BROKEN))
-        yield Persist(0, (kept,), Durability.OS)
-        yield Reply(reply_to, Broken(True, holder))
+        broken = Broken(True, holder)
+        self.state.by_hand[Break] = message, broken
+        # It holds at once; who did it, and why, is kept before anybody is told.
+        yield from tell(reply_to, broken, (kept,), Durability.OS)
 
     def _on_stage(self, _: Stage, reply_to: int) -> Iterator[Effect]:
         yield Reply(reply_to, Refused("value", "this shard takes no data ahead of their commit"))
 
     def _on_list_audit(self, message: ListAudit, reply_to: int) -> Iterator[Effect]:
         audit = self.state.audit
+        records: tuple[Record, ...] = ()
         if message.settle and audit.may_settle(message.seen_ns):
-            kept = audit.keep(AuditRecord(self.state.wall_ns, message.settle, SETTLED))
-            yield Persist(0, (kept,), Durability.OS)
-        yield Reply(reply_to, Audited(audit.alarms, audit.entries()))
+            records = (audit.keep(AuditRecord(self.state.wall_ns, message.settle, SETTLED)),)
+        answer = Audited(audit.alarms, audit.entries())
+        yield from self._sessions.answer_when_durable(reply_to, answer, records, Durability.OS)
 
     def biggest(self, count: int) -> list[tuple[str, int]]:
         """Return the slots whose newest data are the largest, with their bytes; for messages."""

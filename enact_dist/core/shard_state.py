@@ -14,7 +14,14 @@ from enact_dist.core.catalogue import Catalogue
 from enact_dist.core.commits import Commits
 from enact_dist.core.decisions import Decisions
 from enact_dist.core.forced import Audit
-from enact_dist.core.messages import AspectEntry, EpochChanged, PlacementMap, Refused, WorldEntry
+from enact_dist.core.messages import (
+    AspectEntry,
+    Broken,
+    EpochChanged,
+    PlacementMap,
+    Refused,
+    WorldEntry,
+)
 from enact_dist.core.sessions import Session, SessionTable
 from enact_dist.core.slots import SlotMap
 from enact_dist.core.stamps import Stamps
@@ -24,7 +31,15 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from enact_dist.core.datum import Datum, LockId, Slot
-    from enact_dist.core.messages import Answer, DropWorld, Fork, Holder, KeepVersions
+    from enact_dist.core.messages import (
+        Answer,
+        Break,
+        DropWorld,
+        ForceAbort,
+        Fork,
+        Holder,
+        KeepVersions,
+    )
     from enact_dist.core.records import Effect, Recovered
 
 FETCH_BYTES_MAX: Final = 4 << 20
@@ -68,6 +83,7 @@ class ShardState:
         peers: The other shards of the cell.
         pins: Data that a view without a lock keeps fetchable.
         busy_worlds: What is being done to the context of a name, which is not to be used meanwhile.
+        by_hand: The last lock that people have broken, and the last aborted: asked and answered.
         shortest_ttl_ns: Of all sessions; bounds how often the shard must look at the time.
         draining: The shard is about to stop and grants nothing.
     """
@@ -82,6 +98,7 @@ class ShardState:
         self.counters: dict[str, int] = {}
         self.pins: dict[LockId, dict[tuple[Slot, int], Datum]] = {}
         self.busy_worlds: dict[str, str] = {}
+        self.by_hand: dict[type, tuple[Break | ForceAbort, Broken]] = {}
         names = {shard.name for shard in settings.placement.shards}
         self.peers = frozenset(names - {settings.name})
         self.catalogue = Catalogue(
@@ -211,6 +228,15 @@ class ShardState:
             return None
         found = (t for t in self.tenures.by_lock.values() if t.claim.ticket == number)
         return next(found, None)
+
+    def told_by_hand(self, message: Break | ForceAbort) -> Broken:
+        """Return what is told about a lock that is not there to be ended by hand.
+
+        Who asks again in the same words, as a client does that a slow disk kept waiting, is told
+        what the lock was.
+        """
+        asked, answer = self.by_hand.get(type(message), (None, None))
+        return answer if answer is not None and asked == message else Broken(False, None)
 
     def describe(self, tenure: Tenure, now_ns: int) -> Holder:
         """Describe one lock for people."""

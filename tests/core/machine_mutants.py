@@ -239,8 +239,8 @@ def welcomes_early(patch):
     """A session is welcomed before its record is on disk."""
     answer_when_durable = SessionDesk.answer_when_durable
 
-    def wrong(self, reply_to, answer, records):
-        for effect in answer_when_durable(self, reply_to, answer, records):
+    def wrong(self, reply_to, answer, records, *durability):
+        for effect in answer_when_durable(self, reply_to, answer, records, *durability):
             yield effect
             if isinstance(effect, Persist):
                 yield Reply(*self._answers_after[effect.ticket].pop())

@@ -49,6 +49,8 @@ STATES = (
 LIVE = STATES[1:11]
 PAST = (STATES[0], STATES[0], *STATES[11:], "committed", "validated")
 AT_DISK = ("committing", "deciding", "preparing", "finishing", "aborting", "alarm")
+ABOUT_NO_LOCK = ("welcome", "told")
+"""What the disk works on without any lock waiting for it."""
 HELD = STATES[3:11]
 BY_LOCK = (
     "acquire",
@@ -444,7 +446,7 @@ class ShardMachine(Staging, RuleBasedStateMachine):
             index = self.pair.reported
             if index >= len(self.pair.kept):
                 return
-            if self.pair.kept[index].ticket and works[0][0] != "welcome":
+            if self.pair.kept[index].ticket and works[0][0] not in ABOUT_NO_LOCK:
                 what, about = works[0][:2]
                 state = "alarm" if what == "alarm" else about.state
                 self.coverage.hit(state, "persisted")

@@ -376,25 +376,35 @@ class ReferenceShard(ReferenceSessions):
 
     def on_break(self, m, handle):
         found = [life for life in self.lives.values() if life.number == m.number]
-        if found and not found[0].bound:
+        ends = bool(found) and not found[0].bound
+        told = handle, "broken", ends or m == self.by_hand.get("break")
+        if ends:
             self.end(found[0], "taken")
-            self.persist("os", (("audit", ""),))
-        self.answer(handle, "broken", bool(found) and not found[0].bound)
+            self.by_hand["break"] = m
+            self.persist("os", (("audit", ""),), ("told", [told]))
+        else:
+            self.answer_in_turn(told)
 
     def on_forceabort(self, m, handle):
         found = [life for life in self.lives.values() if life.number == m.number]
         if not found or found[0].phase != "prepared":
-            self.answer(handle, "broken", False)
+            again = [work for work in self.works if work[0] == "abort" and work[2] == m]
+            if again:
+                again[0][3].append(handle)
+            else:
+                self.answer(handle, "broken", m == self.by_hand.get("abort"))
             return
         life = found[0]
         life.phase, life.replies, life.position = "aborting", [], None
         facts = (("audit", ""), ("forced", life.lock), ("prepared over", life.lock, "aborted"))
-        self.persist("durable", facts, ("abort", life, handle))
+        self.persist("durable", facts, ("abort", life, m, [handle]))
 
-    def kept_abort(self, life, handle):
+    def kept_abort(self, life, m, handles):
         """An operator's abort is on disk; the lost primary is asked on, for it may have committed."""
         self.end(life, "aborted")
-        self.answer(handle, "broken", True)
+        self.by_hand["abort"] = m
+        for handle in handles:
+            self.answer(handle, "broken", True)
         self.forced[life.lock] = self.now_ns + FORCED_ASK_NS
         if life.position is not None:
             self.alarm(life.lock, life.replies)

@@ -49,6 +49,7 @@ class ReferenceSessions:
         self.decisions: dict[LockId, Decision] = {}
         self.forced: dict[LockId, int] = {}
         self.tokens_elsewhere: set[str] = set()
+        self.by_hand: dict[str, object] = {}
         self.number = 0
         self.draining = False
         self.disk: list[tuple] = before.disk[:keep] if before else []
@@ -162,17 +163,26 @@ class ReferenceSessions:
         self.shortest_ttl_ns = min(self.shortest_ttl_ns, person.ttl_ns)
         self.end_grace_early()
         welcome = (handle, "welcome", self.epoch, not self.in_grace)
-        waiting = [work for work in self.works if work[0] == "welcome"]
         if not person.durable and m.session not in self.recording:
             self.recording[m.session] = person
             work = ("welcome", m.session, person, [welcome])
             self.persist("durable", (("session", m.session),), work)
             return
         person.present |= person.durable
+        self.answer_in_turn(welcome)
+
+    def answer_in_turn(self, answer: tuple) -> None:
+        """Answer after what was to be told when the disk has it."""
+        waiting = [work for work in self.works if work[0] in ("welcome", "told")]
         if waiting:
-            waiting[-1][3].append(welcome)
+            waiting[-1][-1].append(answer)
         else:
-            self.answer(*welcome)
+            self.answer(*answer)
+
+    def kept_told(self, answers):
+        """What people did is on the disk."""
+        for answer in answers:
+            self.answer(*answer)
 
     def kept_welcome(self, session, person, answers):
         """The record of a session is durable."""

@@ -178,7 +178,7 @@ def test_lost_shard_that_comes_back_is_asked_at_once(bench):
 
 
 def test_second_abort_by_hand_finds_nothing_in_doubt(bench):
-    """The same number again is refused, also while the disk works on the first."""
+    """The same number for another reason is refused, also while the disk works on the first."""
     bench.disk_is_done = False
     force(bench)
     number = bench.shard.state.tenures.by_lock[ANN].claim.ticket
@@ -202,6 +202,77 @@ def test_settled_alarms_are_shown_no_more_and_later_ones_are(bench):
     assert answer.entries[-1].text == "written again by hand"
     bench.restart()
     assert alarms_shown(bench) == 0
+
+
+def test_alarms_are_settled_when_that_is_kept(bench):
+    """Nobody is told that there are no alarms whom a crash would contradict."""
+    force(bench)
+    says(bench, RESOLVED_COMMITTED)
+    bench.disk_is_done = False
+    settle = ListAudit("written again by hand")
+    handles = [bench.send(settle), bench.send(settle), bench.send(ListAudit(""))]
+    assert not set(handles) & set(bench.answers)
+    bench.disk_is_done = True
+    bench.finish_disk()
+
+    assert [bench.answers[handle].alarms for handle in handles] == [0, 0, 0]
+    assert [entry.kind for entry in audit(bench).entries] == ["forced", "alarm", "settled"]
+
+
+def test_alarms_whose_settling_a_crash_took_are_there_again(bench):
+    """Nobody was told that they were settled."""
+    force(bench)
+    says(bench, RESOLVED_COMMITTED)
+    bench.disk_is_done = False
+    settled = bench.send(ListAudit("written again by hand"))
+    assert settled not in bench.answers
+    bench.disk_is_done = True
+    bench.restart()
+
+    assert audit(bench).alarms == 1
+
+
+def broken(bench: ShardBench, reason: str) -> int:
+    """Let bob hold a lock and ask to break it; return the handle of the answer."""
+    bench.granted(BOB, item(Access.WRITE, "other"))
+    number = bench.shard.state.tenures.by_lock[BOB].claim.ticket
+    return bench.send(Break(number, reason))
+
+
+def test_lock_is_broken_at_once_and_that_is_told_when_it_is_kept(bench):
+    """The next one gets it; the operator hears of it when the entry cannot be lost any more."""
+    bench.disk_is_done = False
+    handle = broken(bench, "camera unplugged")
+    following = lock_id("ann", 1)
+
+    assert isinstance(bench.acquire(following, item(Access.WRITE, "other")), Granted)
+    assert handle not in bench.answers
+    bench.disk_is_done = True
+    bench.finish_disk()
+    assert bench.answers[handle].found
+    bench.restart()
+    assert [entry.kind for entry in audit(bench).entries] == ["broken"]
+
+
+@pytest.mark.parametrize("at_disk", [True, False], ids=["at the disk", "answered"])
+@pytest.mark.parametrize("kind", [Break, ForceAbort])
+def test_who_asks_again_in_the_same_words_is_told_the_same(bench, kind, at_disk):
+    """A client asks again after a second; a disk that is slower must not make that a *no*."""
+    lock = ANN if kind is ForceAbort else BOB
+    bench.granted(BOB, item(Access.WRITE, "other"))
+    number = bench.shard.state.tenures.by_lock[lock].claim.ticket
+    bench.disk_is_done = False
+    handles = [bench.send(kind(number, "disk gone")) for _ in range(2 if at_disk else 1)]
+    assert not set(handles) & set(bench.answers)
+    bench.disk_is_done = True
+    bench.finish_disk()
+    handles += [bench.send(kind(number, "disk gone")) for _ in range(0 if at_disk else 1)]
+
+    first, again = (bench.answers[handle] for handle in handles)
+    assert first.found
+    assert again == first
+    assert bench.ask(kind(number, "another reason")) == Broken(False, None)
+    assert len(audit(bench).entries) == 1
 
 
 def test_broken_lock_is_audited(bench):

@@ -28,7 +28,6 @@ from enact_dist.core.messages import (
     Commit,
     Committed,
     Finished,
-    ForceAbort,
     Goodbye,
     Hello,
     ListAudit,
@@ -160,10 +159,8 @@ def unlike(delivery, when):
     message, first, second = delivery.message, delivery.answer, delivery.second
     if not isinstance(message, get_args(Request)) or None in (first, second):
         return
-    # What is not there any more cannot be ended by hand again.
-    by_hand = isinstance(message, Break | ForceAbort)
     told = isinstance(first, TOLD_FOR_GOOD) and isinstance(second, TOLD_FOR_GOOD)
-    if first != second and (told or (when is When.AT_ONCE and not by_hand)):
+    if first != second and (told or when is When.AT_ONCE):
         yield f"answered {first}, then {second}"
 
 

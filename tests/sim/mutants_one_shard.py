@@ -209,7 +209,7 @@ def skips_validation(patch: Patch) -> None:
 def welcomes_early(patch: Patch) -> None:
     """Welcome and Registered do not wait for the disk."""
 
-    def wrong(self: SessionDesk, reply_to: int, answer: Any, records: Any) -> Any:
+    def wrong(self: SessionDesk, reply_to: int, answer: Any, records: Any, *_: Any) -> Any:
         for session in self._state.sessions:
             session.present = session.durable = True
         self._ticket -= 1
