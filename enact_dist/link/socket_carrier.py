@@ -6,9 +6,9 @@ socket in there.  Whenever the socket is not to be had, a call goes over Zenoh i
 notices.  A call that was sent over a socket that then breaks is *unknown*; it is not sent again
 here.
 
-With the socket forced, a WELCOME whose socket cannot be used is an error; before the first one,
-and after a shard went away, calls still take Zenoh, since the WELCOME itself has to come from
-somewhere.
+With the socket forced, a WELCOME whose socket cannot be used is an error, if whoever sent it is
+still there; before the first one, and after a shard went away, calls still take Zenoh, since the
+WELCOME itself has to come from somewhere.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import threading
 import weakref
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.core.messages import Alive, Welcome
+from enact_dist.core.messages import Alive, ListLocks, Locks, Welcome
 from enact_dist.errors import LinkError
 from enact_dist.link.carrier import check_usable
 from enact_dist.link.notices import NoticeQueue
@@ -39,6 +39,8 @@ LATE_S: Final = 1.0
 """How long the numbers of notices of no interest may stay out: four times as a shard says."""
 FORCED_TRIES: Final = 20
 """So often a forced socket is tried: a busy shard may not answer one within half a second."""
+THERE_S: Final = 1.0
+"""How long a shard whose forced socket cannot be used has to say that it is still there."""
 
 _log = logging.getLogger("enact.link")
 _open: weakref.WeakSet[SocketCarrier] = weakref.WeakSet()
@@ -194,7 +196,7 @@ class SocketCarrier:
         Raises:
             LinkError: The socket is forced, and this one cannot be used.
         """
-        shard, old = welcome.shard, None
+        shard, old, connection = welcome.shard, None, None
         with self._mutex:
             if self._closed or welcome.epoch < self._epochs.get(shard, 0):
                 return
@@ -214,7 +216,8 @@ class SocketCarrier:
             connection = self.tried(line, line.take)
             if connection is not None:
                 line.give_back(connection)
-        self._refuse_if_forced(shard, line)
+        if self._forced and (line is None or connection is None):
+            self._refuse_if_there(welcome, line)
         for feed in list(self._feeds.values()):
             feed.settle()
 
@@ -229,9 +232,13 @@ class SocketCarrier:
                 return connection
         return None
 
-    def _refuse_if_forced(self, shard: str, line: SocketLine | None) -> None:
-        problem = line.problem if line is not None else "it offers none"
-        if self._forced and problem:
+    def _refuse_if_there(self, welcome: Welcome, line: SocketLine | None) -> None:
+        """Raise if the shard that sent a WELCOME runs still; else its socket has gone with it."""
+        shard, problem = welcome.shard, line.problem if line is not None else "it offers none"
+        if not problem:
+            return
+        answer = self._behind.request(shard, ListLocks(), timeout_s=THERE_S)
+        if isinstance(answer, Locks) and answer.epoch == welcome.epoch:
             raise LinkError(
                 f"the socket is asked for (ENACT_CARRIER=socket), and that of shard {shard} cannot"
                 f" be used: {problem}"

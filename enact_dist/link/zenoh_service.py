@@ -80,10 +80,12 @@ class ZenohService:
         self._tokens = session.liveliness().declare_subscriber(
             token_key(cell, "*"), zenoh.handlers.FifoChannel(QUEUED_MAX), history=True
         )
+        self._sights: zenoh.Handler[zenoh.Sample] = self._tokens.handler
         self._queryable = session.declare_queryable(
             queryable_key(cell, host.name), zenoh.handlers.FifoChannel(QUEUED_MAX), complete=True
         )
-        # The handlers, not their owners: these cannot be undeclared while a thread waits on them.
+        # The handlers, not their owners: these cannot be undeclared while a thread waits on them,
+        # and have no handler any more for a thread that begins when they are.
         self._inbox: zenoh.Handler[zenoh.Query] = self._queryable.handler
         host.add_inbox(self.drain_inbox)
         self._staged: queue.SimpleQueue[tuple[Stage, _Call] | None] = queue.SimpleQueue()
@@ -197,10 +199,9 @@ class ZenohService:
 
     def _see(self) -> None:
         """Tell the host which sessions' tokens are there, until the subscription ends."""
-        tokens = self._tokens.handler
         try:
             while True:
-                sample = tokens.recv()
+                sample = self._sights.recv()
                 session = session_of(str(sample.key_expr))
                 if session:
                     present = sample.kind == zenoh.SampleKind.PUT

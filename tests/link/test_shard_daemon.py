@@ -24,6 +24,7 @@ from enact_dist.errors import ConfigError, LinkError, StoreError
 from enact_dist.link import shard_daemon
 from enact_dist.link.shard_daemon import DaemonSettings, start_shard
 from enact_dist.link.zenoh_config import close_session, open_session
+from enact_dist.link.zenoh_service import ZenohService
 from enact_dist.wire.frames import decode_frame, encode_frame
 
 
@@ -75,6 +76,27 @@ def test_daemon_refuses_a_folder_that_another_daemon_holds(daemon, endpoint, fre
 
     with pytest.raises(StoreError, match=str(tmp_path)):
         daemon(free(), "s1", folder=tmp_path)
+
+
+def test_daemon_that_ends_before_its_threads_have_begun_ends_quietly(daemon, endpoint, monkeypatch):
+    """On a busy machine a thread may begin after the end of what it serves."""
+    go_on, ended = threading.Event(), threading.Event()
+    failures = []
+
+    def begins_late(service, *, _see=ZenohService._see):
+        assert go_on.wait(60)
+        try:
+            _see(service)
+        except BaseException as failure:
+            failures.append(failure)
+        ended.set()
+
+    monkeypatch.setattr(ZenohService, "_see", begins_late)
+    daemon(endpoint).stop()
+    go_on.set()
+
+    assert ended.wait(60)
+    assert not failures
 
 
 def test_daemon_that_fails_at_its_last_step_lets_go_of_everything(

@@ -105,6 +105,57 @@ def test_socket_that_is_asked_for_and_impossible_is_an_error(
         connect(endpoint)
 
 
+def test_forced_socket_of_a_shard_that_has_gone_since_its_welcome_is_no_error(
+    daemon, endpoint, monkeypatch
+):
+    """It is killed between its welcome and the connection: the client waits for its next start."""
+    first = daemon(endpoint)
+    monkeypatch.setenv("ENACT_CARRIER", "socket")
+    with connect(endpoint) as cell:
+        add_one(cell)
+        first.stop()
+        second = daemon(endpoint)
+        gone, there = threading.Event(), threading.Event()
+
+        def learn_late(carrier, welcome, _learn=SocketCarrier.learn):
+            if welcome.epoch == second.host.epoch:
+                second.stop()
+                gone.set()
+                assert there.wait(60)
+            _learn(carrier, welcome)
+
+        monkeypatch.setattr(SocketCarrier, "learn", learn_late)
+        following = []
+        starting = threading.Thread(
+            target=lambda: (gone.wait(60), following.append(daemon(endpoint)), there.set())
+        )
+        starting.start()
+        add_one(cell)
+        starting.join()
+
+        assert carrier_of(cell).way_to("s0") == "socket"
+        assert [shard.epoch for shard in cell.shards()] == [following[0].host.epoch]
+
+
+def test_forced_socket_that_another_thread_could_not_have_is_no_error(
+    daemon, endpoint, monkeypatch
+):
+    """What is wrong is asked of the own attempt: another one may fail at the same moment."""
+    daemon(endpoint)
+    monkeypatch.setenv("ENACT_CARRIER", "socket")
+
+    def tried(carrier, line, open_one, _tried=SocketCarrier.tried):
+        connection = _tried(carrier, line, open_one)
+        line.problem = "[Errno 104] Connection reset by peer"  # as the other thread was told
+        return connection
+
+    monkeypatch.setattr(SocketCarrier, "tried", tried)
+    with connect(endpoint) as cell:
+        add_one(cell)
+
+        assert carrier_of(cell).calls["zenoh"] == 0
+
+
 # ---------------------------------------------------------------- lost on the way
 
 
