@@ -1,7 +1,7 @@
 """Follows slots of a cell and records every version of them, each commit whole, in order.
 
-A watch tells of commits.  They rest for `SETTLE_S`, so that the notices of all
-shards have come and commits can be put in the order of their stamps; then their data are fetched
+A watch tells of commits.  From when all shards show them they rest for `SETTLE_S`, so that all
+notices have come and commits can be put in the order of their stamps; then their data are fetched
 and handed to the thread that writes.  While that one has no room nothing is fetched: the data stay
 with their shards, as long as their history keeps them.  What is not to be had any more is a gap:
 counted, and written into the recording by name and reason.
@@ -14,7 +14,6 @@ import contextlib
 import itertools
 import threading
 import time
-from collections import deque
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
@@ -26,6 +25,7 @@ from enact_dist.recording.disk import QUEUE_BYTES_MAX, DiskThread
 from enact_dist.recording.exact import Recorded
 from enact_dist.recording.fetching import Found, Wanted, between, explained, found_of
 from enact_dist.recording.file import CHUNK_BYTES, CHUNK_S, RecordingFile
+from enact_dist.recording.settling import END_S, Settling
 from enact_dist.terms import Entities, NullReason
 from enact_dist.watch import Watch
 
@@ -40,7 +40,8 @@ if TYPE_CHECKING:
     from enact_dist.watch import Change
 
 SETTLE_S: Final = 0.25
-"""How long a commit rests before it is recorded; below the 2 s for which all is remembered."""
+"""How long a commit rests before it is recorded; with `settling.SHOWN_S` below the 2 s for which
+all is remembered."""
 POLL_S: Final = 0.05
 HEARD_MAX: Final = 1000
 """Changes that are taken before some are recorded."""
@@ -152,7 +153,7 @@ class Recorder:
         self._queue_bytes = queue_bytes
         self._aspects: dict[str, AspectEntry] = {}
         self._pending: list[Wanted] = []
-        self._arrived: deque[tuple[float, int]] = deque()
+        self._settling = Settling(self._session.client)
         self._settled_ns = self._stalled_ns = self._last_ns = 0
         self._begin_ns = 0
         self._initial: set[Wanted] = set()
@@ -246,6 +247,7 @@ class Recorder:
 
     def _begin(self, watch: Watch) -> None:
         """Take what is there; of each slot the newest version is what the recording begins with."""
+        self._settling.wait_shown(self._begin_ns)
         self._listen_until_settled(watch)
         newest = {w.slot: w for w in self._pending if w.stamp_ns <= self._begin_ns}
         self._initial = set(newest.values())
@@ -312,7 +314,7 @@ class Recorder:
 
     def _want(self, wanted: Wanted) -> None:
         bisect.insort(self._pending, wanted)
-        self._arrived.append((time.monotonic(), wanted.stamp_ns))
+        self._settling.told(wanted.stamp_ns)
         while len(self._pending) > WANTED_MAX:
             oldest = self._pending.pop(0)
             self._nulls.discard(oldest)
@@ -345,9 +347,7 @@ class Recorder:
 
     def _settled(self) -> bool:
         """Whether commits have rested long enough to be recorded."""
-        settled_s = time.monotonic() - SETTLE_S
-        while self._arrived and self._arrived[0][0] <= settled_s:
-            self._settled_ns = max(self._settled_ns, self._arrived.popleft()[1])
+        self._settled_ns = max(self._settled_ns, self._settling.settled_ns(SETTLE_S))
         return bool(self._pending) and self._pending[0].stamp_ns <= self._settled_ns
 
     def _record_settled(self) -> None:
@@ -433,6 +433,7 @@ class Recorder:
 
     def _finish(self, watch: Watch) -> None:
         """Record what was committed until now."""
+        self._settling.wait_shown(wait_s=END_S)
         self._listen_until_settled(watch)
         self._settled_ns = max((w.stamp_ns for w in self._pending), default=0)
         gives_up_s = time.monotonic() + FINISH_S
