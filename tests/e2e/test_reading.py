@@ -73,7 +73,7 @@ def test_watcher_that_was_stopped_resynchronises_and_says_what_it_missed(make_ce
     watcher = cell.worker("watch_ticker")
     ticking = cell.worker("ticker", 100)
     ticking.expect("started")
-    watcher.expect("version 100", 30)
+    watcher.expect("version", 30)  # it follows
     watcher.signal(signal.SIGSTOP)
     with connect(cell.file) as joined:
         view = View(joined.world("online"), Entity("ticker"), COUNT)

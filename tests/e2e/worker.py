@@ -238,10 +238,13 @@ def commit_swift(cell):
 
 
 def watch_ticker(cell):
-    """Follow the ticker up to the version that a line names; say what was seen and was missed."""
+    """Follow the ticker up to the version that a line names; say what was seen and was missed.
+
+    Every fifty versions it says how far it is: whoever is behind may not see each of them.
+    """
     import threading
 
-    seen = gap = last = first = 0
+    seen = gap = last = first = told = 0
     in_order, named = True, []
     threading.Thread(target=lambda: named.append(int(wait_line())), daemon=True).start()
     with cell.world("online").watch(Entities("ticker"), COUNT) as watch:
@@ -252,7 +255,8 @@ def watch_ticker(cell):
             in_order = in_order and change.version > last
             first = first or change.version
             seen, gap, last = seen + 1, gap + change.gap, change.version
-            if last % 50 == 0:
+            if last >= told + 50:
+                told = last
                 say("version", last)
     counts = {"first": first, "seen": seen, "gap": gap, "last": last, "in_order": in_order}
     say("summary", json.dumps(counts))
