@@ -107,7 +107,7 @@ def test_hold_says_that_it_ended_its_command_when_the_shard_went(write_cell, spa
     for started in (shard, other):
         until(started, "ready: shard")
     assert enact("world", "put", "--new", "online", "piece/count", "1", "--cell", file).status == 0
-    hold = spawn("lock", "hold", "--cell", file, "--timeout", "1", "online:piece/count:write",
+    hold = spawn("lock", "hold", "--cell", file, "--timeout", "5", "online:piece/count:write",
                  "--", "sh", "-c", "echo running; sleep 60; echo survived")  # fmt: skip
     until(hold, "running")
     shard.kill()
