@@ -17,11 +17,11 @@ from __future__ import annotations
 import argparse
 import logging
 import os
+import re
 import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final
 
-from enact_dist.cli.times import shielded
 from enact_dist.cli.verbs import DONE, FAILED, UNREACHABLE, USAGE
 from enact_dist.errors import ConfigError, EnactError, ShardUnreachableError
 from enact_dist.supervise import end_with_supervisor
@@ -62,11 +62,12 @@ Exit status: 0 done, 1 refused or failed, 2 usage or configuration, 3 unreachabl
 
 
 class _Parser(argparse.ArgumentParser):
-    """Takes words like ``-30s`` for moments: to `argparse` they would be options."""
+    """Takes words like ``-30s`` for values: to `argparse` they would be options."""
 
-    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """Parse words as `argparse` does, moments shielded."""
-        return super().parse_known_args(shielded(sys.argv[1:] if args is None else args), namespace)
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        # No option of ours begins with a digit: what does (-30s, -1e-3) is a value, right or wrong.
+        self._negative_number_matcher = re.compile(r"-\d")
 
 
 def build_parser(noun: str = "") -> argparse.ArgumentParser:

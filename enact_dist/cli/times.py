@@ -22,8 +22,6 @@ from typing import TYPE_CHECKING, Final
 from enact_dist.core.datum import Position
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
     from enact_dist.moments import When
 
 MOMENT_HELP: Final = (
@@ -56,11 +54,6 @@ def moment(text: str) -> When:
         return datetime.fromisoformat(text).astimezone()
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is no moment; give {MOMENT_HELP}") from None
-
-
-def shielded(words: Iterable[str]) -> list[str]:
-    """Return command line words with those like ``-30s`` made no options: `argparse` would."""
-    return [f" {word}" if _AGO.match(word) else word for word in words]
 
 
 def shown_position(position: Position) -> str:

@@ -73,3 +73,31 @@ def test_moment_ago_is_no_option():
 
     assert began_s - ROUNDED_S < arguments.at + 30.0 < time.time() + ROUNDED_S
     assert began_s - ROUNDED_S < past.moment + 300.0 < time.time() + ROUNDED_S
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "world at online -3x",
+        "world at online -3x tree",
+        "world at online --json -3x get a/b",
+        "world fork online new --at -3x",
+        "world diff online online --at1 -3x",
+        "replay run.mcap --from -3x",
+    ],
+)
+def test_what_is_no_moment_ago_is_told_where_it_stands(line, capsys):
+    """A dash and a digit begin a value: the word is not missing, and not the next one."""
+    with pytest.raises(SystemExit) as ended:
+        build_parser().parse_args(line.split())
+
+    assert ended.value.code == 2
+    assert ": '-3x' is no moment; give a moment: -30s" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("value", ["-30s", "-1e-3", "-3"])
+def test_value_that_begins_with_a_dash_and_a_digit_is_taken_as_it_is(value):
+    """Of other verbs, too: nothing is put before it."""
+    arguments = build_parser().parse_args(["world", "put", "online", "a/b", value])
+
+    assert arguments.value == value
