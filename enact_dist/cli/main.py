@@ -62,12 +62,34 @@ Exit status: 0 done, 1 refused or failed, 2 usage or configuration, 3 unreachabl
 
 
 class _Parser(argparse.ArgumentParser):
-    """Takes words like ``-30s`` for values: to `argparse` they would be options."""
+    """Takes options and arguments in any order, and says its own usage where they are wrong."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
         # No option of ours begins with a digit: what does (-30s, -1e-3) is a value, right or wrong.
         self._negative_number_matcher = re.compile(r"-\d")
+        self._intermixes = False
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Parse words as `argparse` does, but refuse the unknown here and not at the top.
+
+        `argparse` ends arguments that may be left out at the first option, so one that follows
+        (`tree online --json tray`) is left over: then all options are taken out first.
+        """
+        found, left = super().parse_known_args(args, namespace)
+        if self._intermixes:
+            return found, left
+        if left and self._subparsers is None:
+            self._intermixes = True
+            try:
+                found, left = self.parse_known_intermixed_args(args)
+            finally:
+                self._intermixes = False
+        if left:
+            # Behind an option that is not known, what it was to take is left over, too.
+            unknown = [word for word in left if word.startswith("-")] or left
+            self.error(f"unrecognized arguments: {' '.join(unknown)}")
+        return found, left
 
 
 def build_parser(noun: str = "") -> argparse.ArgumentParser:

@@ -71,6 +71,63 @@ def test_usage_is_refused_with_status_2(words, capsys):
     assert "usage: enact" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("words", [w for w, _ in walk_verbs(build_parser())], ids=" ".join)
+def test_wrong_usage_is_told_with_the_usage_of_its_verb(words, capsys):
+    """Not with that of `enact` alone, which tells nothing of the verb."""
+    with pytest.raises(SystemExit) as ended:
+        main([*words, "--no-such-option"])
+
+    assert ended.value.code == 2
+    assert f"usage: enact {' '.join(words)} " in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("line", "found"),
+    [
+        ("world tree online --json robot", {"pattern": "robot", "json": True}),
+        ("world diff online online --at1 1700000000 robot", {"entities": "robot"}),
+        ("world watch online --count 1 robot", {"pattern": "robot", "count": 1}),
+        ("world at online --json -30s --timeout 2 tree robot", {"what": "tree", "name": "robot"}),
+        ("world at online -30s --json tree --timeout 2 robot", {"what": "tree", "name": "robot"}),
+        ("shard check --json left", {"name": "left"}),
+        ("up --debug cell.toml", {"cell": "cell.toml", "debug": True}),
+        ("bench --seconds 3 floor core", {"names": ["floor", "core"]}),
+        ("bench floor --seconds 3 core", {"names": ["floor", "core"]}),
+        ("world keep drop-17 online a/b --json c/d", {"slots": [("a", "b", 0), ("c", "d", 0)]}),
+    ],
+)
+def test_options_may_stand_anywhere(line, found):
+    """Before an argument that may be left out, too, as the usage lists them."""
+    arguments = build_parser().parse_args(line.split())
+
+    assert {name: getattr(arguments, name) for name in found} == found
+
+
+def test_repeated_option_before_the_last_argument_counts_once():
+    """Where options are taken out in a second pass, nothing of the first is left."""
+    arguments = build_parser().parse_args(
+        ["world", "watch", "online", "--aspect", "a", "robot", "--aspect", "b"]
+    )
+
+    assert (arguments.pattern, arguments.aspect) == ("robot", ["a", "b"])
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("world tree online robot other", "enact world tree: error: unrecognized arguments: other"),
+        ("world tree online --jsn robot", "enact world tree: error: unrecognized arguments: --jsn"),
+        ("world --jsn tree online", "enact world: error: unrecognized arguments: --jsn"),
+    ],
+)
+def test_what_is_left_over_is_named_by_its_verb(line, said, capsys):
+    """What is too much, or not known, and nothing else."""
+    with pytest.raises(SystemExit):
+        main(line.split())
+
+    assert capsys.readouterr().err.endswith(f"{said}\n")
+
+
 def test_no_command_prints_help_and_is_usage(enact):
     """`enact` alone shows what there is."""
     result = enact()
