@@ -8,6 +8,7 @@ record that is not whole is counted as missing.
 
 from __future__ import annotations
 
+import os
 import struct
 from io import BytesIO
 from pathlib import Path
@@ -17,6 +18,7 @@ import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
+from mcap.reader import SeekingReader
 from mcap.records import Channel, Chunk, Message, Metadata
 from mcap.stream_reader import CRCValidationError, breakup_chunk
 
@@ -25,7 +27,6 @@ from enact_dist.recording.exact import FORMAT, decode_recorded
 from enact_dist.recording.file import BEGIN_RECORD, END_RECORD, EXACT_TOPIC
 
 if TYPE_CHECKING:
-    import os
     from collections.abc import Iterator
     from typing import BinaryIO
 
@@ -123,6 +124,34 @@ class Recording:
                 log_ns = message.log_time
             if versions:
                 yield Commit(versions[0].commit, log_ns, tuple(versions))
+
+    def look_through(self) -> frozenset[str]:
+        """Learn of all aspects in the file and return the world contexts that it has versions of.
+
+        A recording that was ended whole has an index of them; another one is read through.
+        """
+        indexed = self._indexed()
+        if indexed is None:
+            for _ in self._records():
+                pass
+            indexed = list(self._channels.values())
+        for channel in indexed:
+            self._learn(channel)
+        exact = (channel.metadata for channel in indexed if "exact" in channel.metadata)
+        return frozenset(facts["world"] for facts in exact)
+
+    def _indexed(self) -> list[Channel] | None:
+        """Return the channels that the index of the file names, None where it has no index."""
+        try:
+            with self.path.open("rb") as stream:
+                stream.seek(-len(MAGIC), os.SEEK_END)
+                if stream.read() != MAGIC:
+                    return None
+                stream.seek(0)
+                summary = SeekingReader(stream).get_summary()
+        except (OSError, *_DAMAGES):
+            return None
+        return list(summary.channels.values()) if summary is not None else None
 
     def _records(self, *, until_begin: bool = False) -> Iterator[list[Message]]:
         """Yield the exact messages of each whole chunk; learn from what stands between."""

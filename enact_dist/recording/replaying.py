@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.messages import AspectEntry, Item
-from enact_dist.errors import ConfigError, MisuseError
+from enact_dist.errors import ConfigError, DatumTypeError, MisuseError
 from enact_dist.recording.reading import Commit, Recording
 from enact_dist.terms import Access, checked_name
 from enact_dist.wire.limits import BODY_BYTES_MAX, ITEMS_MAX
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from enact_dist.core.datum import Datum, Slot
     from enact_dist.recording.exact import Recorded
     from enact_dist.session import Session
+    from enact_dist.world import WorldContext
 
 WAIT_S: Final = 10.0
 HOLD_S: Final = 60.0
@@ -146,12 +147,13 @@ class Replay:
             tell: Called after each commit.
 
         Raises:
-            MisuseError: A world context has data, and `overwrite` was not asked.
+            MisuseError: A world context has data, and `overwrite` was not asked; none is made.
             ProtocolError: The recording holds what this version cannot read.
             LockTimeoutError: Somebody else holds the data.
-            DatumTypeError: The cell knows an aspect with another type.
+            DatumTypeError: The cell knows an aspect with another type; no world context is made.
         """
         stop = stop or threading.Event()
+        self._check()
         begun_s = time.monotonic()
         while not stop.is_set():
             self._once(stop, tell)
@@ -237,16 +239,43 @@ class Replay:
     def _opened(self, name: str) -> Session:
         """Return the session of a world context, made if there is none; refuse one with data."""
         world = self._cell.create_world(name)
-        if not self._overwrite:
-            found = [info for info in world.survey() if not info.null_reason]
-            if found:
-                raise MisuseError(
-                    f"world context {name!r} of cell {self._cell.name!r} has {len(found)} data"
-                    f" ({found[0].entity}/{found[0].aspect} …), which a replay would change; take"
-                    f" another one (--world {name}=OTHER), or say that they may be overwritten"
-                    " (--overwrite)"
-                )
+        self._refuse_data(world)
         return world.session
+
+    # ---------------------------------------------------------------- before anything is made
+
+    def _check(self) -> None:
+        """Refuse what cannot be replayed while the cell is as it was."""
+        names = self.recording.look_through()
+        there = self._cell.worlds()
+        for name in sorted(self._worlds.get(name, name) for name in names):
+            if name in there and name not in self._sessions:  # a second run has data of the first
+                self._refuse_data(self._cell.world(name))
+        types = self._cell.aspects()
+        for name, facts in self.recording.aspects.items():
+            if name in types and types[name][0] != facts.fingerprint:
+                raise DatumTypeError(
+                    f"aspect {name!r} is {facts.fingerprint} in {self.recording.path} and"
+                    f" {types[name][0]} in cell {self._cell.name!r}: nobody there could read what"
+                    " a replay sets"
+                )
+
+    def _refuse_data(self, world: WorldContext) -> None:
+        if self._overwrite:
+            return
+        found = [info for info in world.survey() if not info.null_reason]
+        if found:
+            old = self._recorded(world.name)
+            raise MisuseError(
+                f"world context {world.name!r} of cell {self._cell.name!r} has {len(found)} data"
+                f" ({found[0].entity}/{found[0].aspect} …), which a replay would change; take"
+                f" another one (--world {old}=OTHER), or say that they may be overwritten"
+                " (--overwrite)"
+            )
+
+    def _recorded(self, name: str) -> str:
+        """Return what a world context of the cell is called in the recording."""
+        return next((old for old, new in self._worlds.items() if new == name), name)
 
     def _register(self, session: Session, versions: Sequence[Recorded]) -> None:
         """Let the cell know the aspects, with the types that they were recorded with."""

@@ -11,6 +11,7 @@ from enact_dist.core.datum import Slot
 from enact_dist.errors import ConfigError, DatumTypeError, MisuseError
 from enact_dist.recording import Replay
 from enact_dist.recording.exporting import world_as_of
+from enact_dist.recording.reading import Recording
 
 VALUE = Aspect("value", int)
 bench, piece = Entity("bench"), Entity("piece")
@@ -98,6 +99,70 @@ def test_world_with_other_data_is_left_alone(cell, online, run):
     assert replayed(cell, run, overwrite=True).commits == 10
 
 
+@pytest.mark.parametrize("ended", [True, False], ids=["whole", "cut off"])
+def test_refused_replay_makes_no_world(cell, tmp_path, ended):
+    """Not the one that stands first in the recording either, where a later one has data."""
+    path = tmp_path / "run.mcap"
+    recording = file(path, worlds="online training")
+    for number, world in enumerate(("online", "training"), 1):
+        slot = Slot(world, "piece", "value")
+        recording.add_commit([recorded(slot, 1, commit=number)], BEGIN_NS + number)
+        recording.end_chunk()
+    if ended:
+        recording.close({})
+    else:
+        recording.abandon()
+    cell.world("training").init(piece, Aspect("name", str), "mine")
+
+    with pytest.raises(MisuseError, match=r"'training' .* \(--world training=OTHER\)"):
+        replayed(cell, path, worlds={"online": "rep9"})
+
+    assert cell.worlds() == ("online", "training")
+
+
+@pytest.mark.parametrize(("ended", "chunks"), [(True, 0), (False, 10)], ids=["whole", "cut off"])
+def test_index_saves_reading_the_chunks(tmp_path, ended, chunks):
+    """What a whole recording has versions of takes no time to find out, however long it is."""
+    path = tmp_path / "run.mcap"
+    counting(path, 10, worlds="online training").close({})
+    if not ended:
+        path.write_bytes(path.read_bytes()[:-1])
+
+    recording = Recording(path)
+
+    assert recording.look_through() == {"online"}
+    assert (recording.chunks, set(recording.aspects)) == (chunks, {"value"})
+
+
+def test_world_with_data_of_which_the_recording_has_none_is_no_obstacle(cell, tmp_path):
+    """Recorded beside others, it had nothing that was chosen: nothing would be changed in it."""
+    path = tmp_path / "run.mcap"
+    recording = file(path, worlds="online training")
+    recording.add_commit([recorded("piece", 1)], BEGIN_NS)
+    recording.close({})
+    cell.world("training").init(piece, Aspect("name", str), "mine")
+
+    assert replayed(cell, path).commits == 1
+
+
+def test_world_with_data_is_called_as_the_recording_calls_it(cell, run):
+    """The remedy can be typed: --world OLD=NEW takes the recording's name."""
+    cell.world("training").init(piece, Aspect("name", str), "mine")
+
+    with pytest.raises(MisuseError, match=r"'training' .* \(--world online=OTHER\)"):
+        replayed(cell, run, worlds={"online": "training"})
+
+
+def test_refused_type_makes_no_world(cell, online, run):
+    """Nobody could read the data, so there is no context of them."""
+    online.view(View(online, piece, Aspect("value", str)))
+
+    with pytest.raises(DatumTypeError, match=r"aspect 'value' is int in .*run.mcap and str in"):
+        replayed(cell, run, worlds={"online": "rep9"})
+
+    assert cell.worlds() == ("online", "training")
+
+
 def test_aspect_of_another_type_is_refused(cell, online, run):
     """What the cell's actors could not read does not get in."""
     online.view(View(online, piece, Aspect("value", str)))
@@ -134,6 +199,13 @@ def test_loop_goes_on_until_it_is_stopped(cell, run):
     replay = Replay(cell, run, speed=0.0)
     summary = replay.run(stop, loop=True, tell=lambda s: stop.set() if s.commits == 25 else None)
     assert (summary.commits, summary.rounds) == (25, 2)
+
+
+def test_replay_that_is_run_twice_writes_over_its_own_data(cell, run):
+    """They are not somebody else's."""
+    replay = Replay(cell, run, speed=0.0)
+
+    assert [replay.run().commits, replay.run().commits] == [10, 20]
 
 
 def test_part_begins_with_the_state_as_of_its_begin(cell, online, run):
