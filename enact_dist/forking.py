@@ -99,11 +99,11 @@ def _refuse_existing(name: str, there: Mapping[str, WorldEntry]) -> None:
     """Raise if some shard has a world context of that name that is not the fork which is wanted."""
     for shard, (_, source, at_ns) in there.items():
         what = f"a fork of {source!r} as of {moment_name(at_ns)}" if source else "no fork"
-        remedy = f"take another name, or cell.drop_world({name!r})"
+        remedy = f"take another name, or drop it: enact world drop {name}, or cell.drop_world(…)"
         if source:
             remedy += (
                 "; if it is not complete, because a shard was away, ask again with"
-                f" at=Position({at_ns}, {shard!r})"
+                f" --at {at_ns}@{shard}, or at=Position({at_ns}, {shard!r})"
             )
         raise MisuseError(f"there is a world context {name!r} on shard {shard}, {what}; {remedy}")
 
@@ -129,8 +129,9 @@ def _incomplete(session: Session, wanted: WorldEntry, left: list[str], refusal: 
         f"the fork {name!r} of {source!r} is made on {', '.join(done) or 'no shard'} and not on"
         f" {', '.join(left)}, so it is no world context yet: "
         + (refusal or f"no answer came for {FINISH_S:g} s")
-        + f"; complete it with fork({name!r}, at=Position({at_ns}, {left[0]!r})), or give it up"
-        f" with cell.drop_world({name!r})"
+        + f"; complete it with enact world fork {source} {name} --at {at_ns}@{left[0]}, or"
+        f" fork({name!r}, at=Position({at_ns}, {left[0]!r})); or give it up with enact world drop"
+        f" {name}, or cell.drop_world({name!r})"
     )
     if refusal:
         return LinkError(text)
@@ -201,7 +202,7 @@ def _not_dropped(
         state = f"world context {name!r} is dropped on {', '.join(done)}, but not on {shard}"
         remedy = (
             f"; it is no world context any more, and what {shard} has left of it goes when"
-            f" cell.drop_world({name!r}) is called again"
+            f" enact world drop {name}, or cell.drop_world({name!r}), is called again"
         )
     if isinstance(answer, Refused):
         found = error_of(answer)

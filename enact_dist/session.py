@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING, Any, Final
 
+from enact_dist.config_table import suggestion
 from enact_dist.core.messages import AspectEntry, AwaitStamp, Item, Reached
 from enact_dist.core.placement import shard_of
 from enact_dist.core.retaining import said
@@ -156,17 +157,26 @@ class Session:
         """Return the error for a world context that the cell does not have."""
         known = tuple(self.client.worlds())
         part = self.client.worlds_at(name)
-        remedy = f"make one with cell.create_world({name!r})"
+        remedy = f"enact world create {name}, or cell.create_world({name!r}), makes it"
         if part:
             remedy = (
-                f"a part of it is on {', '.join(part)} alone: complete the fork, or"
-                f" cell.drop_world({name!r})"
+                f"a part of it is on {', '.join(part)} alone: complete the fork, or drop it with"
+                f" enact world drop {name}, or cell.drop_world({name!r})"
             )
         return UnknownWorldError(
-            f"the cell has no world context {name!r}; it has {', '.join(known) or 'none'};"
-            f" {remedy}",
+            f"the cell has no world context {name!r}{suggestion(name, known)} (it has"
+            f" {', '.join(known) or 'none'}); {remedy}",
             known=known,
         )
+
+
+def unknown_aspect(name: str, known: Iterable[str]) -> MisuseError:
+    """Return the error for an aspect that nobody has registered."""
+    names = sorted(known)
+    return MisuseError(
+        f"no aspect {name!r} is registered{suggestion(name, names)} (known:"
+        f" {', '.join(names) or 'none'})"
+    )
 
 
 def _remedy(request: object) -> str:

@@ -19,6 +19,7 @@ from enact_dist.errors import MisuseError
 from enact_dist.link.fetching import fetch_all
 from enact_dist.past_context import PastContext
 from enact_dist.reading import is_null
+from enact_dist.session import unknown_aspect
 from enact_dist.terms import Access, Aspect
 from enact_dist.wire.limits import ITEMS_MAX
 
@@ -201,9 +202,7 @@ def aspects_of(
     known = _known(sessions)
     unknown = [name for name in _names(wanted or ()) if name not in known]
     if unknown:
-        raise MisuseError(
-            f"no aspect {unknown[0]!r} is registered; known: {', '.join(sorted(known)) or 'none'}"
-        )
+        raise unknown_aspect(unknown[0], known)
     names = known if wanted is None else _names(wanted)
     return {name: typed.get(name) or _type_used(sessions, name) for name in sorted(names)}
 

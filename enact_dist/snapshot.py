@@ -8,7 +8,7 @@ from enact_dist.core.messages import Survey, Surveyed
 from enact_dist.errors import LeaseLostError, MisuseError, NullDatumError, ProtocolError
 from enact_dist.moments import Moment
 from enact_dist.reading import EachData, Readings, check_requested, null_error, slot_of
-from enact_dist.session import session_of
+from enact_dist.session import session_of, unknown_aspect
 from enact_dist.terms import Aspect, Entity, NullReason, View
 from enact_dist.together import Together, captured_versions, newest_set_ns
 from enact_dist.wire.limits import ITEMS_MAX
@@ -287,7 +287,5 @@ def known_aspect(session: Session, name: str) -> AspectEntry:
         client.greet()
     known = client.aspect_entries()
     if name not in known:
-        raise MisuseError(
-            f"no aspect {name!r} is registered; known: {', '.join(sorted(known)) or 'none'}"
-        )
+        raise unknown_aspect(name, known)
     return known[name]

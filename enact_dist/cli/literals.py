@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from enact_dist.errors import ConfigError, DatumTypeError, MisuseError
+from enact_dist.session import unknown_aspect
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -52,11 +53,8 @@ def type_to_put(aspect: str, known: Mapping[str, tuple[str, str]], text: str, *,
     if fingerprint:
         return type_of(aspect, fingerprint)
     if not new:
-        names = ", ".join(sorted(name for name, entry in known.items() if entry[0])) or "none"
-        raise MisuseError(
-            f"no aspect {aspect!r} is registered (known: {names}); --new registers it by the"
-            " value's type"
-        )
+        error = unknown_aspect(aspect, (name for name, entry in known.items() if entry[0]))
+        raise MisuseError(f"{error}; --new registers it by the value's type")
     value = read(text, object)
     if value is NOTHING:
         raise MisuseError(f"null does not say of which type the new aspect {aspect!r} is")

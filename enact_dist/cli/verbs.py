@@ -165,6 +165,15 @@ def entities(text: str) -> str:
         raise argparse.ArgumentTypeError(str(error)) from None
 
 
+def world_name(text: str) -> str:
+    """Check the name of a world context that is to be made; an `argparse` type."""
+    try:
+        checked_name("world context", text, slashes=False)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+    return text
+
+
 def pair(text: str) -> tuple[str, str]:
     """Read ``name=value``; an `argparse` type."""
     name, equals, value = text.partition("=")

@@ -1,11 +1,13 @@
-"""`enact world ls|tree|get|put|watch`; what is about time, compares or exports stands beside."""
+"""`enact world ls|tree|get|put|create|watch`; about time, comparing and exports see beside."""
 
 from __future__ import annotations
 
+import sys
 import time
 from typing import TYPE_CHECKING, Any
 
 from enact_dist.cli import world_diff, world_export, world_time
+from enact_dist.cli.missing import named_if_missing
 from enact_dist.cli.output import print_json, print_json_line, print_table, shown_bytes
 from enact_dist.cli.slots import print_datum, print_slots
 from enact_dist.cli.verbs import (
@@ -20,14 +22,18 @@ from enact_dist.cli.verbs import (
     slot_name,
     verbs_of,
     whole,
+    world_name,
 )
+from enact_dist.config_table import suggestion
 from enact_dist.errors import DatumTypeError
 from enact_dist.link.signals import StopSignals
 from enact_dist.terms import Entities, Entity
 
 if TYPE_CHECKING:
     import argparse
+    from collections.abc import Iterable
 
+    from enact_dist.cell import Cell
     from enact_dist.cli.verbs import Verb
     from enact_dist.watch import Change
 
@@ -46,6 +52,7 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
     _add_tree(verbs)
     _add_get(verbs)
     _add_put(verbs)
+    _add_create(verbs)
     _add_watch(verbs)
     world_time.add_verbs(verbs)
     world_diff.add_diff(verbs)
@@ -97,6 +104,15 @@ def _add_put(verbs: argparse._SubParsersAction[Verb]) -> None:
     )
     put.add_argument("--wait", type=seconds, default=10.0, metavar="S", help="for the lock")
     add_reader(put)
+
+
+def _add_create(verbs: argparse._SubParsersAction[Verb]) -> None:
+    create = add_verb(
+        verbs, "create", "make a world context, unless the cell has it", run=create_world,
+        example="enact world create planning",
+    )  # fmt: skip
+    create.add_argument("world", metavar="NAME", type=world_name, help="of the world context")
+    add_reader(create)
 
 
 def _add_watch(verbs: argparse._SubParsersAction[Verb]) -> None:
@@ -176,7 +192,9 @@ def get_datum(arguments: argparse.Namespace) -> int:
     """Print or save one datum."""
     entity, aspect = arguments.slot
     with open_cell(arguments) as cell:
-        datum = cell.world(arguments.world).raw(Entity(entity), aspect)
+        world = cell.world(arguments.world)
+        with named_if_missing(world, arguments.slot):
+            datum = world.raw(Entity(entity), aspect)
     print_datum(datum, out=arguments.out, as_json=arguments.json)
     return DONE
 
@@ -210,6 +228,18 @@ def put_datum(arguments: argparse.Namespace) -> int:
     return DONE
 
 
+def create_world(arguments: argparse.Namespace) -> int:
+    """Make a world context; one that is there stays as it is."""
+    with open_cell(arguments, observer=False) as cell:
+        is_new = arguments.world not in cell.worlds()
+        cell.create_world(arguments.world)
+    if arguments.json:
+        print_json({"world": arguments.world, "new": is_new})
+    else:
+        print(f"{arguments.world} {'is made' if is_new else 'was there'}")
+    return DONE
+
+
 # ---------------------------------------------------------------- watch
 
 
@@ -217,6 +247,7 @@ def watch_world(arguments: argparse.Namespace) -> int:
     """Print changes as they come until a signal, or until there were enough."""
     with StopSignals() as stop, open_cell(arguments) as cell:
         world = cell.world(arguments.world)
+        _tell_unknown(arguments.aspect or (), cell)
         shown = 0
         with world.watch(Entities(arguments.pattern)) as watch:
             while not stop.event.is_set() and shown != arguments.count:
@@ -226,6 +257,19 @@ def watch_world(arguments: argparse.Namespace) -> int:
                 _print_change(world.name, change, as_json=arguments.json)
                 shown += 1
     return DONE
+
+
+def _tell_unknown(wanted: Iterable[str], cell: Cell) -> None:
+    """Say which aspects no shard knows so far: what comes of them may never come."""
+    known = cell.aspects()
+    for name in dict.fromkeys(wanted):
+        if name not in known:
+            close = suggestion(name, known)
+            print(
+                f"enact: no shard knows an aspect {name!r} yet{close}; waiting for its first datum",
+                file=sys.stderr,
+                flush=True,
+            )
 
 
 def _print_change(world: str, change: Change, *, as_json: bool) -> None:

@@ -6,6 +6,7 @@ import argparse
 import time
 from typing import TYPE_CHECKING, Any
 
+from enact_dist.cli.missing import missing, named_if_missing
 from enact_dist.cli.output import print_json, print_table, shown_bytes, shown_s
 from enact_dist.cli.slots import print_datum, print_slots
 from enact_dist.cli.times import MOMENT_HELP, moment, shown_position
@@ -125,19 +126,26 @@ def _add_keeping(verbs: argparse._SubParsersAction[Verb]) -> None:
 
 
 def show_history(arguments: argparse.Namespace) -> int:
-    """Print the known versions of one datum, oldest first."""
+    """Print the known versions of one datum, oldest first.
+
+    Raises:
+        NullDatumError: There are none: nothing was ever set there.
+    """
     entity, aspect = arguments.slot
     with open_cell(arguments) as cell:
-        versions = cell.world(arguments.world).history(
+        world = cell.world(arguments.world)
+        versions = world.history(
             Entity(entity), Aspect(aspect, object), since=arguments.since, count=arguments.count
         )
+        if not versions:
+            raise missing(world, arguments.slot)
     if arguments.json:
         print_json([_facts(version) for version in versions])
     else:
         print_table(
             ("version", "time", "age", "size", "actor", "position", ""),
             [_row(version) for version in versions],
-            empty=f"nothing is known of {arguments.world}:{entity}/{aspect}",
+            empty="",
         )
     return DONE
 
@@ -210,7 +218,8 @@ def show_past(arguments: argparse.Namespace) -> int:
     with open_cell(arguments) as cell:
         past = cell.world(arguments.world).at(arguments.moment)
         if gets:
-            datum = past.raw(Entity(slot[0]), slot[1])
+            with named_if_missing(past, slot):
+                datum = past.raw(Entity(slot[0]), slot[1])
             print_datum(datum, out=arguments.out, as_json=arguments.json)
             return DONE
         infos = past.survey(pattern)

@@ -237,7 +237,9 @@ def test_error_of_a_comparator_names_its_data(training, online):
 def test_unknown_aspect_and_another_type_are_refused(training, online):
     """A name that nobody registered is a mistake, and so is a type that is not the registered one."""
     put(online, piece, COUNT, 1)
-    with pytest.raises(MisuseError, match="no aspect 'cuont' is registered; known: count"):
+    with pytest.raises(
+        MisuseError, match=r"'cuont' is registered; did you mean 'count'\? \(known: count\)"
+    ):
         training.diff(online, aspects=["cuont"])
     with pytest.raises(MisuseError, match="no aspect 'cuont'"):
         training.diff(online, aspects=[Aspect("cuont", object)])

@@ -281,7 +281,7 @@ def test_fork_on_one_shard_alone_is_told_and_completed_later(two_shards, deaf):
     for use in (cell.world, cell.create_world):
         with pytest.raises(UnknownWorldError, match=r"a part of it is on left alone"):
             use("what_if")
-    with pytest.raises(MisuseError, match=r"ask again with at=Position"):
+    with pytest.raises(MisuseError, match=r"ask again with --at \d+@left, or at=Position"):
         online.fork("what_if")
 
     what_if = online.fork("what_if", at=Position(position.stamp_ns, "right"))

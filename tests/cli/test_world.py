@@ -2,6 +2,7 @@
 
 import json
 import signal
+import time
 from dataclasses import dataclass
 
 import numpy as np
@@ -103,6 +104,69 @@ def test_get_of_null_is_refused_with_its_reason(at):
     assert "never set" in result.err
 
 
+@pytest.mark.parametrize("past", [False, True], ids=["now", "past"])
+def test_what_is_null_is_told_in_words_of_the_command_line(at, past):
+    """What is close to what was typed, and which command shows it; nothing of Python."""
+    words = ("at", "online", time.time(), "get") if past else ("get", "online")
+
+    told = at(*words, "tray/pakage/1/count").err
+
+    assert told == (
+        "enact: online:tray/pakage/1/count is null (never set); enact world tree online shows"
+        " what there is; did you mean 'tray/package/1/count'?\n"
+    )
+
+
+def test_what_was_deleted_was_not_misspelt(at):
+    """Where the datum was there once, nothing else is proposed."""
+    at("put", "online", "tray/package/3/count", "5")
+    at("put", "online", "tray/package/3/count", "null")
+
+    told = at("get", "online", "tray/package/3/count").err
+
+    assert "tray/package/3/count is null (deleted)" in told
+    assert "did you mean" not in told
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("tree", "onlin"), "did you mean 'online'? (it has online, training"),
+        (("tree", "onlin"), "; enact world create onlin, or cell.create_world('onlin'), makes it"),
+        (("get", "online", "camera/imge"), "'imge' is registered; did you mean 'image'? (known: "),
+        (("put", "online", "a/cuont", "1"), "did you mean 'count'? (known: "),
+        (("diff", "online", "training", "--aspect", "cuont"), "did you mean 'count'? (known: "),
+    ],
+)
+def test_name_that_is_close_is_proposed(at, words, said):
+    """Of world contexts and of aspects, with all that there are."""
+    result = at(*words)
+
+    assert (result.status, result.out) == (1, "")
+    assert said in result.err
+
+
+def test_create_makes_a_world_context_once(at, cell):
+    """A second time it is there and stays as it is."""
+    try:
+        assert at("create", "planning").out == "planning is made\n"
+        at("put", "planning", "piece/count", "3")
+        assert at("create", "planning", "--json").json == {"world": "planning", "new": False}
+        assert at("create", "planning").out == "planning was there\n"
+        assert at("get", "planning", "piece/count").out == "3\n"
+    finally:
+        cell.drop_world("planning")
+
+
+def test_name_that_no_world_context_can_have_is_a_usage_error(at, capsys):
+    """It is refused where it is read."""
+    with pytest.raises(SystemExit) as caught:
+        at("create", "a/b")
+
+    assert caught.value.code == 2
+    assert "argument NAME: 'a/b' cannot name a world context" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("words", "reason"),
     [
@@ -155,6 +219,23 @@ def test_watch_shows_what_is_there_and_leaves_after_enough(at):
     assert sorted(line.split()[1] for line in lines) == [
         "online:tray/package/1/count", "online:tray/package/2/count"
     ]  # fmt: skip
+
+
+def test_watch_of_an_aspect_that_nobody_knows_says_so_and_goes_on(spawn, until, at, cell_file):
+    """It may come later: then it is shown."""
+    words = ("world", "watch", "online", "--cell", cell_file, "--count", "1")
+    watch = spawn(*words, "--aspect", "coutn_of_later", "--aspect", "count_of_later")
+
+    at("put", "online", "bench/count_of_later", "3", "--new")
+
+    told = "".join(until(watch, "online:bench/count_of_later  v1"))
+    assert "enact: no shard knows an aspect 'coutn_of_later' yet" in told
+    assert watch.wait(60) == 0
+
+
+def test_watch_of_known_aspects_says_nothing_else(at):
+    """Standard error is for what is not as it was asked."""
+    assert at("watch", "online", "tray/**", "--aspect", "count", "--count", "1").err == ""
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

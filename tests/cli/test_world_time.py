@@ -75,10 +75,16 @@ def test_history_since_a_moment_has_what_was_current_after_it(at, made):
 
 
 def test_history_of_nothing_is_told(at, made):
-    """An unknown datum is no error, an unknown context is."""
-    told = at("history", made.name, "nobody/time_count")
+    """An unknown datum is refused as `get` refuses it, with what it may have been meant to be."""
+    told = at("history", made.name, "amr/time_count")
+    as_json = at("history", made.name, "amr/time_count", "--json")
 
-    assert (told.status, told.out) == (0, f"nothing is known of {made.name}:nobody/time_count\n")
+    assert (told.status, told.out, as_json.out, as_json.status) == (1, "", "", 1)
+    assert told.err == as_json.err
+    assert told.err == (
+        f"enact: {made.name}:amr/time_count is null (never set); enact world tree {made.name} shows"
+        " what there is; did you mean 'arm/time_count'?\n"
+    )
     unknown = at("history", "nowhere", "arm/time_count")
     assert unknown.status == 1
     assert "no world context 'nowhere'" in unknown.err
