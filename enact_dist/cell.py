@@ -26,6 +26,7 @@ from enact_dist.core.messages import (
     Locks,
     Reached,
     Sessions,
+    Welcome,
 )
 from enact_dist.errors import EnactError, LinkError, MisuseError
 from enact_dist.forking import drop_world
@@ -400,6 +401,14 @@ class Cell(Closing):
             carrier=client.carrier.way_to(shard),
             counters={counter.name: counter.value for counter in answer.counters},
         )
+
+    def welcomes(self) -> dict[str, Welcome]:
+        """Return what each shard that answers at once says of the cell: its placement, contexts."""
+        client = self._client
+        names = client.shards()
+        answers = client.call_once([(name, client.core.hello(name)) for name in names])
+        said = zip(names, answers, strict=True)
+        return {name: answer for name, answer in said if isinstance(answer, Welcome)}
 
     def actors(self) -> tuple[ActorInfo, ...]:
         """Return the sessions of named actors over all shards.

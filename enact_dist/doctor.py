@@ -19,11 +19,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.core.epochs import state_of
+from enact_dist.core.epochs import is_kept, state_of
 from enact_dist.errors import ConfigError, EnactError, ShardUnreachableError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Generator, Iterator
 
     from enact_dist.cell import Cell
     from enact_dist.cell_info import ShardInfo
@@ -108,7 +108,11 @@ def examine(target: str, *, timeout_s: float = 5.0) -> Iterator[Finding]:
             return
         yield Finding(Level.OK, "cell.toml", f"{target}: cell {config.name}, {_counts(config)}")
         yield from _folders(config)
-    yield from _cell(target, config, timeout_s)
+    kept = yield from _cell(target, config, timeout_s)
+    if config is not None:
+        from enact_dist.doctor_cell import without_folder
+
+        yield from without_folder(config, kept)
 
 
 def _config(target: str) -> CellConfig:
@@ -224,14 +228,7 @@ def shared_memory(folder: Path) -> Finding:
 def _folders(config: CellConfig) -> Iterator[Finding]:
     host = socket.gethostname()
     for shard in config.shards:
-        if shard.folder is None:
-            yield Finding(
-                Level.WARN,
-                f"disk of {shard.name}",
-                "no folder: everything is lost when the shard stops",
-                f"write data_folder, or a folder in [shards.{shard.name}]",
-            )
-        elif shard.host in {"", host}:
+        if shard.folder is not None and shard.host in {"", host}:
             yield data_folder(shard.name, shard.folder)
 
 
@@ -261,23 +258,31 @@ def data_folder(shard: str, folder: Path) -> Finding:
 # ---------------------------------------------------------------- the cell
 
 
-def _cell(target: str, config: CellConfig | None, timeout_s: float) -> Iterator[Finding]:
+def _cell(
+    target: str, config: CellConfig | None, timeout_s: float
+) -> Generator[Finding, None, frozenset[str]]:
+    """Check the cell; return the names of the shards that keep data in a folder now."""
     from enact_dist.connecting import connect
+    from enact_dist.doctor_cell import differences
 
+    kept: frozenset[str] = frozenset()
     try:
         with connect(target, actor="enact", timeout_s=timeout_s, observer=True) as cell:
-            for shard in _best_rounds(cell):
+            shards = _best_rounds(cell)
+            kept = frozenset(one.name for one in shards if one.reachable and is_kept(one.epoch))
+            for shard in shards:
                 yield from _shard(shard)
+            yield from differences(config, shards, cell.welcomes())
     except ShardUnreachableError as error:
         if config is None:
             yield _unreachable("cell", target)
-        for known in config.shards if config else ():
+            return kept
+        for known in config.shards:
             yield _unreachable(f"shard {known.name}", known.advertise[0])
-        if config is None:
-            return
         yield Finding(Level.FAIL, "cell", str(error), f"enact up {target}")
     except EnactError as error:
         yield Finding(Level.FAIL, "cell", f"{type(error).__name__}: {error}")
+    return kept
 
 
 def _best_rounds(cell: Cell) -> list[ShardInfo]:

@@ -1,13 +1,18 @@
 """The doctor: each check, good and bad, with its remedy."""
 
 import socket
+import time
 from dataclasses import replace
 
 import pytest
 
 from enact_dist import doctor
 from enact_dist.cell_info import ShardInfo
+from enact_dist.config import load_config
+from enact_dist.core.epochs import unkept_epoch
+from enact_dist.core.messages import AspectEntry, Welcome
 from enact_dist.doctor import Level
+from enact_dist.doctor_cell import differences
 
 
 def test_python_older_than_3_11_fails():
@@ -105,6 +110,110 @@ def test_doctor_reports_each_shard_of_a_running_cell(enact, cell_file):
         levels
     )
     assert levels["shard left"] in {"ok", "warn"}
+
+
+def told(findings, subject):
+    return [(found["level"], found["text"]) for found in findings if found["subject"] == subject]
+
+
+def test_cell_that_runs_by_its_file_differs_in_nothing(enact, cell_file):
+    """What the shards say of themselves is what the file says."""
+    findings = enact("doctor", "--cell", cell_file, "--json").json
+
+    assert told(findings, "placement") == told(findings, "cell.toml and cell") == []
+    assert not [found for found in findings if found["text"].startswith("the running shard")]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "subject", "text"),
+    [
+        (
+            "[shards.left]",
+            '[[pins]]\nentities = "tray/**"\nshard = "right"\n[shards.left]',
+            "cell.toml and cell",
+            "the file has tray/** pinned to right; the running cell has no pins",
+        ),
+        (
+            "[shards.left]",
+            '[shards.middle]\nlisten = "tcp/127.0.0.1:9"\n[shards.left]',
+            "cell.toml and cell",
+            "the file has shards left, middle, right; the running cell has left, right",
+        ),
+        (
+            'data_folder = "data"',
+            "",
+            "disk of left",
+            (
+                "the running shard keeps its data in a folder, this file names none: started with it,"
+                " the shard would begin empty"
+            ),
+        ),
+        (
+            '"training"]',
+            '"training", "planning"]',
+            "cell.toml and right",
+            "the shard has no world context planning of this file",
+        ),
+    ],
+    ids=["pins", "shards", "folder", "worlds"],
+)
+def test_file_that_the_cell_does_not_run_by_is_told(
+    enact, cell_file, tmp_path, old, new, subject, text
+):
+    """What differs, and what to do; nothing that is not so of the shards that run."""
+    file = tmp_path / "other.toml"
+    assert old in cell_file.read_text(encoding="utf-8")
+    file.write_text(cell_file.read_text(encoding="utf-8").replace(old, new, 1), encoding="utf-8")
+
+    result = enact("doctor", "--cell", file, "--json")
+
+    assert (result.status, told(result.json, subject)) == (0, [("warn", text)])
+    assert not [found for found in result.json if "everything is lost" in found["text"]]
+    assert all(found["remedy"] for found in result.json if found["subject"] == subject)
+
+
+def welcome(name, config, aspects=()):
+    return Welcome(name, 1, True, 1, 1, 0, config.placement_map(), ("online",), aspects)
+
+
+def test_shards_that_were_started_with_different_files_fail(tmp_path):
+    """Told without a file, too: each refuses what the other sends."""
+    texts = ["", '[[pins]]\nentities = "tray/**"\nshard = "a"\n']
+    welcomes = {}
+    for name, text in zip("ab", texts, strict=True):
+        file = tmp_path / f"{name}.toml"
+        shards = "".join(f'[shards.{one}]\nlisten = "tcp/127.0.0.1:{ord(one)}"\n' for one in "ab")
+        file.write_text(f'name = "c"\n{text}{shards}', encoding="utf-8")
+        welcomes[name] = welcome(name, load_config(file))
+
+    (found,) = differences(None, [], welcomes)
+
+    assert found.level is Level.FAIL
+    assert found.text == (
+        "a and b were started with different shards or pins: a has shards a, b and no pins;"
+        " b has shards a, b and tray/** pinned to a"
+    )
+    assert found.remedy == "start all shards with the same cell.toml"
+
+
+def test_shard_without_the_folder_of_its_file_and_another_durability_are_told(tmp_path):
+    """What is lost when it stops, and what an aspect's commits survive."""
+    file = tmp_path / "cell.toml"
+    file.write_text(
+        'name = "c"\nworlds = ["online"]\ndata_folder = "data"\n[shards.a]\n'
+        'listen = "tcp/127.0.0.1:9"\n[aspects.pose]\ndurability = "os"\n',
+        encoding="utf-8",
+    )
+    config = load_config(file)
+    shard = ShardInfo("a", "tcp/h:1", reachable=True, epoch=unkept_epoch(time.time_ns()))
+    durable = AspectEntry("pose", "int", "durable")
+
+    folder, aspect = differences(config, [shard], {"a": welcome("a", config, (durable,))})
+
+    assert folder.text.startswith(
+        f"the running shard has no folder, though this file names {tmp_path}"
+    )
+    assert aspect.text == "aspect pose is durable there and os in this file"
 
 
 @pytest.mark.carrier("auto")

@@ -1,0 +1,140 @@
+"""Compares a `cell.toml` with the cell that runs: what the shards say of themselves.
+
+Clients go by what the shards say, so they work with an old file, too; a shard that is started with
+another file than the rest does not.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from enact_dist.core.epochs import is_kept
+from enact_dist.doctor import Finding, Level
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterable, Iterator, Mapping
+
+    from enact_dist.cell_info import ShardInfo
+    from enact_dist.config_types import CellConfig, ShardConfig
+    from enact_dist.core.answers import Welcome
+    from enact_dist.core.message_parts import PlacementMap
+
+_RESTART = (
+    "take the file that the shards were started with; or stop them all, move entities with"
+    " enact shard rebalance, and start all with this one"
+)
+
+
+def differences(
+    config: CellConfig | None, shards: Iterable[ShardInfo], welcomes: Mapping[str, Welcome]
+) -> Iterator[Finding]:
+    """Name what the running shards say otherwise than each other, or than the file.
+
+    Args:
+        config: The file; None where there is none.
+        shards: The shards of the running cell.
+        welcomes: What those that answer say of the cell.
+    """
+    placements = {name: welcome.placement for name, welcome in welcomes.items()}
+    versions = {placement.version: name for name, placement in placements.items()}
+    if len(versions) > 1:
+        first, other = list(versions.values())[:2]
+        yield Finding(
+            Level.FAIL,
+            "placement",
+            f"{first} and {other} were started with different shards or pins: {_shown(placements)}",
+            "start all shards with the same cell.toml",
+        )
+    elif config is not None:
+        for placement in list(placements.values())[:1]:
+            yield from _placement(config, placement)
+    if config is None:
+        return
+    running = {shard.name: shard for shard in shards if shard.reachable}
+    for shard in config.shards:
+        if shard.name in running:
+            yield from _folder(shard, kept=is_kept(running[shard.name].epoch))
+    yield from _catalogue(config, welcomes)
+
+
+def without_folder(config: CellConfig, kept: Collection[str]) -> Iterator[Finding]:
+    """Name the shards that keep nothing by the file; those of `kept` do so all the same."""
+    for shard in config.shards:
+        if shard.folder is None and shard.name not in kept:
+            yield Finding(
+                Level.WARN,
+                f"disk of {shard.name}",
+                "no folder: everything is lost when the shard stops",
+                f"write data_folder, or a folder in [shards.{shard.name}]",
+            )
+
+
+def _placement(config: CellConfig, running: PlacementMap) -> Iterator[Finding]:
+    """Compare which shards there are, and where entities live."""
+    ours = config.placement_map()
+    if running.version == ours.version:
+        return
+    names = sorted(shard.name for shard in running.shards)
+    wanted = sorted(shard.name for shard in ours.shards)
+    if names != wanted:
+        text = f"shards {', '.join(wanted)}; the running cell has {', '.join(names)}"
+    else:
+        text = f"{_pins(ours)}; the running cell has {_pins(running)}"
+    yield Finding(Level.WARN, "cell.toml and cell", f"the file has {text}", _RESTART)
+
+
+def _folder(shard: ShardConfig, *, kept: bool) -> Iterator[Finding]:
+    """Compare whether a shard keeps what is committed."""
+    subject = f"disk of {shard.name}"
+    if shard.folder is None and kept:
+        yield Finding(
+            Level.WARN,
+            subject,
+            "the running shard keeps its data in a folder, this file names none: started with it,"
+            " the shard would begin empty",
+            f"write the folder into [shards.{shard.name}], or data_folder for all",
+        )
+    elif shard.folder is not None and not kept:
+        yield Finding(
+            Level.WARN,
+            subject,
+            f"the running shard has no folder, though this file names {shard.folder}: everything"
+            " is lost when it stops",
+            "save what is needed (enact world export), and start the shard with this file",
+        )
+
+
+def _catalogue(config: CellConfig, welcomes: Mapping[str, Welcome]) -> Iterator[Finding]:
+    """Compare world contexts and what commits survive."""
+    for name, welcome in welcomes.items():
+        lacking = [world for world in config.worlds if world not in welcome.worlds]
+        if lacking:
+            yield Finding(
+                Level.WARN,
+                f"cell.toml and {name}",
+                f"the shard has no world context {', '.join(lacking)} of this file",
+                "restart it with this file, or: "
+                + "; ".join(f"enact world create {world}" for world in lacking),
+            )
+        known = {entry.name: entry.durability for entry in welcome.aspects}
+        for aspect in config.aspects:
+            asked = aspect.durability.value if aspect.durability is not None else ""
+            if asked and known.get(aspect.name, asked) != asked:
+                yield Finding(
+                    Level.WARN,
+                    f"cell.toml and {name}",
+                    f"aspect {aspect.name} is {known[aspect.name]} there and {asked} in this file",
+                    "start all shards with the same cell.toml",
+                )
+
+
+def _shown(placements: Mapping[str, PlacementMap]) -> str:
+    return "; ".join(
+        f"{name} has shards {', '.join(sorted(shard.name for shard in placement.shards))}"
+        f" and {_pins(placement)}"
+        for name, placement in placements.items()
+    )
+
+
+def _pins(placement: PlacementMap) -> str:
+    return ", ".join(f"{pin.pattern} pinned to {pin.shard}" for pin in placement.pins) or "no pins"
