@@ -21,7 +21,8 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
     doctor = add_verb(
         nouns,
         "doctor",
-        "check this machine and the way to the cell: libraries, shards, clocks, memory, disk",
+        "check this machine, the way to the cell, and whether that runs by its cell.toml:"
+        " libraries, memory, disk, shards, clocks",
         run=run_doctor,
         example="enact doctor --cell cell.toml",
     )

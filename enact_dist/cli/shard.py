@@ -86,7 +86,7 @@ def _add_run(verbs: argparse._SubParsersAction[Verb]) -> None:
         example="enact shard run left --cell cell.toml",
     )
     run.add_argument("name", metavar="NAME", help="name of the shard in cell.toml")
-    add_cell(run)
+    add_cell(run, file_only=True)
     run.add_argument(
         "--listen",
         action="append",

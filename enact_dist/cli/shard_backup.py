@@ -42,7 +42,7 @@ def add_to(verbs: argparse._SubParsersAction[Verb]) -> None:
         verb.add_argument("name", metavar="NAME", help="name of the shard in cell.toml")
         verb.add_argument(option, dest="path", type=Path, required=True, metavar="DIR", help=text)
         verb.add_argument("--folder", type=Path, metavar="DIR", help="the shard's, if not as usual")
-        add_cell(verb)
+        add_cell(verb, file_only=True)
         verb.add_argument("--json", action="store_true", help="print JSON instead of a sentence")
     restore.add_argument(
         "--replace", action="store_true", help="put what is there now aside, beside it"

@@ -36,7 +36,7 @@ def add_to(verbs: argparse._SubParsersAction[Verb]) -> None:
         "enact shard rebalance --cell cell.toml --store right=/mnt/copy/right\n"
         "enact shard rebalance --cell cell.toml --store gone=data/gone",
     )
-    add_cell(verb)
+    add_cell(verb, file_only=True)
     verb.add_argument(
         "--store",
         action="append",

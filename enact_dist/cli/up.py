@@ -9,7 +9,14 @@ import time
 from typing import TYPE_CHECKING
 
 from enact_dist.cli.output import coloured
-from enact_dist.cli.verbs import add_log, add_verb, cell_config, see_working_folder
+from enact_dist.cli.verbs import (
+    CELL_DEFAULT,
+    CELL_VARIABLE,
+    add_log,
+    add_verb,
+    cell_config,
+    see_working_folder,
+)
 from enact_dist.errors import ConfigError
 from enact_dist.link.signals import StopSignals
 
@@ -30,7 +37,12 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
         run=run_up,
         example="enact up cell.toml\nenact up cell.toml --no-actors",
     )
-    up.add_argument("cell", metavar="CELL", nargs="?", help="the cell.toml (default: ./cell.toml)")
+    up.add_argument(
+        "cell",
+        metavar="CELL",
+        nargs="?",
+        help=f"the cell.toml (default: ${CELL_VARIABLE}, else ./{CELL_DEFAULT})",
+    )
     up.add_argument("--host", metavar="NAME", help="act as this machine (default: its host name)")
     up.add_argument("--no-actors", action="store_true", help="run the shards only")
     add_log(up)

@@ -68,13 +68,13 @@ def verbs_of(noun: Verb) -> argparse._SubParsersAction[Verb]:
     return noun.add_subparsers(metavar="VERB", required=True)
 
 
-def add_cell(parser: Verb) -> None:
-    """Add the option that names the cell."""
+def add_cell(parser: Verb, *, file_only: bool = False) -> None:
+    """Add the option that names the cell; some verbs need what only its file says."""
     parser.add_argument(
         "--cell",
-        metavar="CELL",
-        help="a cell.toml or an endpoint such as tcp/host:7447"
-        f" (default: ${CELL_VARIABLE}, else ./{CELL_DEFAULT})",
+        metavar="FILE" if file_only else "CELL",
+        help=("a cell.toml" if file_only else "a cell.toml or an endpoint such as tcp/host:7447")
+        + f" (default: ${CELL_VARIABLE}, else ./{CELL_DEFAULT})",
     )
 
 
@@ -86,7 +86,7 @@ def add_world(parser: Verb) -> None:
 def add_reader(parser: Verb) -> None:
     """Add the options of a verb that only looks."""
     add_cell(parser)
-    parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
+    parser.add_argument("--json", action="store_true", help="print JSON instead of text")
     add_timeout(parser)
 
 

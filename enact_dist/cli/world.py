@@ -43,7 +43,9 @@ WATCH_SLICE_S = 0.2
 
 def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
     """Add the noun and its verbs."""
-    verbs = verbs_of(add_noun(nouns, "world", "look into world contexts and set data"))
+    verbs = verbs_of(
+        add_noun(nouns, "world", "look into world contexts, make and compare them, set data")
+    )
     ls = add_verb(
         verbs, "ls", "list the world contexts of the cell", run=list_worlds,
         example="enact world ls",
@@ -66,7 +68,12 @@ def _add_tree(verbs: argparse._SubParsersAction[Verb]) -> None:
     )  # fmt: skip
     add_world(tree)
     tree.add_argument(
-        "pattern", metavar="PATTERN", type=entities, nargs="?", default="**", help="of entities"
+        "pattern",
+        metavar="PATTERN",
+        type=entities,
+        nargs="?",
+        default="**",
+        help="of entities (default: all)",
     )
     tree.add_argument("--null", action="store_true", help="show slots without a datum, too")
     add_reader(tree)
@@ -102,7 +109,9 @@ def _add_put(verbs: argparse._SubParsersAction[Verb]) -> None:
     put.add_argument(
         "--new", action="store_true", help="register the aspect, if unknown, by the value's type"
     )
-    put.add_argument("--wait", type=seconds, default=10.0, metavar="S", help="for the lock")
+    put.add_argument(
+        "--wait", type=seconds, default=10.0, metavar="S", help="for the lock (default: 10)"
+    )
     add_reader(put)
 
 
@@ -122,9 +131,19 @@ def _add_watch(verbs: argparse._SubParsersAction[Verb]) -> None:
     )  # fmt: skip
     add_world(watch)
     watch.add_argument(
-        "pattern", metavar="PATTERN", type=entities, nargs="?", default="**", help="of entities"
+        "pattern",
+        metavar="PATTERN",
+        type=entities,
+        nargs="?",
+        default="**",
+        help="of entities (default: all)",
     )
-    watch.add_argument("--aspect", action="append", metavar="NAME", help="only these")
+    watch.add_argument(
+        "--aspect",
+        action="append",
+        metavar="NAME",
+        help="only these, as soon as a shard knows them",
+    )
     watch.add_argument("--count", type=whole, metavar="N", help="leave after N changes")
     add_reader(watch)
 

@@ -68,7 +68,10 @@ def _add_at(verbs: argparse._SubParsersAction[Verb]) -> None:
         "what", nargs="?", choices=("tree", "get"), default="tree", help="(default: tree)"
     )
     at.add_argument(
-        "name", metavar="NAME", nargs="?", help="a pattern of entities, or ENTITY/ASPECT for get"
+        "name",
+        metavar="NAME",
+        nargs="?",
+        help="a pattern of entities (default: all), or ENTITY/ASPECT for get",
     )
     at.add_argument(
         "--out", metavar="FILE", help="save a datum: .npz (arrays), .npy (one array) or .json"

@@ -31,6 +31,36 @@ def test_help_of_every_verb_ends_with_an_example(words, capsys):
 
 
 @pytest.mark.parametrize(
+    "words",
+    [
+        "shard run left",
+        "shard rebalance",
+        "shard backup left --to b",
+        "shard restore left --from b",
+    ],
+)
+def test_help_of_what_needs_the_file_does_not_offer_an_endpoint(words, enact, capsys):
+    """It would be refused, as what the verb needs stands in the file alone."""
+    with pytest.raises(SystemExit):
+        main([*words.split()[:2], "--help"])
+    shown = " ".join(capsys.readouterr().out.split())
+
+    assert "--cell FILE a cell.toml (default: $ENACT_CELL, else ./cell.toml)" in shown
+    assert "endpoint such as" not in shown
+    assert "is an endpoint" in enact(*words.split(), "--cell", "tcp/host:7447").err
+
+
+def test_help_of_up_names_the_variable_that_it_goes_by(capsys, enact, monkeypatch):
+    """Where no file is named, ENACT_CELL names it, as everywhere."""
+    monkeypatch.setenv("ENACT_CELL", "elsewhere.toml")
+    with pytest.raises(SystemExit):
+        main(["up", "--help"])
+
+    assert "$ENACT_CELL" in capsys.readouterr().out
+    assert "elsewhere.toml" in enact("up").err
+
+
+@pytest.mark.parametrize(
     ("words", "example"),
     [
         (w, line)
