@@ -306,6 +306,15 @@ def _check_schedule(actor_class: type[Actor], declaration: Declaration) -> None:
             )
 
 
+def check_update(actor_class: type[Actor]) -> None:
+    """Raise `MisuseError` unless an actor class says what an update does."""
+    if actor_class.update is Actor.update:
+        raise MisuseError(
+            f"{actor_class.__qualname__} of {actor_class.__module__} is no actor that can run; make"
+            " an instance of a subclass of Actor that defines update(self, lock)"
+        )
+
+
 def check_period(name: str, every_s: object) -> None:
     """Raise `MisuseError` unless `every_s` is a period."""
     number = every_s if isinstance(every_s, (int, float)) else math.nan

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-from enact_dist.actor import Actor, Declared, same_data, stands_for_trigger
+from enact_dist.actor import Actor, Declared, check_update, same_data, stands_for_trigger
 from enact_dist.actor_lock import ActorLock
 from enact_dist.actor_sets import PendingSets
 from enact_dist.errors import MisuseError
@@ -58,11 +58,9 @@ class BoundActor:
     __slots__ = ("_by_entity", "actor", "cell", "contexts", "declaration")
 
     def __init__(self, actor: Actor, cell: Cell, worlds: Mapping[str, str] | None = None) -> None:
-        if not isinstance(actor, Actor) or type(actor).update is Actor.update:
-            raise MisuseError(
-                f"{actor!r} is no actor that can run; make an instance of a subclass of Actor that"
-                " defines update(self, lock)"
-            )
+        if not isinstance(actor, Actor):
+            raise MisuseError(f"{actor!r} is no actor that can run; make an instance of an Actor")
+        check_update(type(actor))
         self.actor = actor
         self.cell = cell
         self.declaration = actor.declaration
@@ -70,6 +68,19 @@ class BoundActor:
         self.contexts = {role: cell.world(name) for role, name in names.items()}
         self._check(names)
         self._by_entity: dict[Entity | None, Mapping[Declared, Declared]] = {}
+
+    def register(self) -> None:
+        """Let the shards know the actor's aspects: those of its data, with a trigger all.
+
+        Raises:
+            DatumTypeError: A shard knows one of them with another type.
+            ShardUnreachableError: A shard that is needed does not answer.
+        """
+        aspects = [request.aspect for request in self.declaration.requests.values()]
+        # The watch of a trigger needs all shards.
+        requests = None if self.declaration.triggers else self._bound_for(None).values()
+        for context in list(self.contexts.values())[:1]:  # all are of one session
+            context.session.register_aspects(aspects, requests=requests, wait_s=0.0)
 
     def lock(
         self,

@@ -14,7 +14,7 @@ import typing
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.actor import Actor, check_period
+from enact_dist.actor import Actor, check_period, check_update
 from enact_dist.config_table import suggestion
 from enact_dist.errors import ConfigError, MisuseError
 
@@ -43,7 +43,8 @@ def load_class(target: str) -> type[Actor]:
         target: ``MODULE:CLASS``, for example ``actors.palletizing.deviation:DeviationDetection``.
 
     Raises:
-        ConfigError: Not of that form, no such module or class, or the class is no `Actor`.
+        ConfigError: Not of that form, no such module or class, or the class is no `Actor` that
+            defines `update`.
         MisuseError: The class declares something that cannot work.
     """
     module_name, colon, class_name = target.partition(":")
@@ -77,6 +78,10 @@ def load_class(target: str) -> type[Actor]:
             f"{module_name} has {kind} under the name {class_name!r}; its actors:"
             f" {', '.join(actors) or 'none'}{suggestion(class_name, actors)}"
         )
+    try:
+        check_update(found)
+    except MisuseError as error:
+        raise ConfigError(str(error)) from None
     return found
 
 

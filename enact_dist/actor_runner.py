@@ -14,6 +14,9 @@ any other exception                       counted, logged, kept as last error; r
                                           entity changes
 ========================================  =====================================================
 
+Before that the shards of its data have to accept its requests: one that is away is waited for, and
+a type other than the registered one ends the run.
+
 A source takes its next tick instead of trying again; an actor that runs once tries again after
 the first kind, and after the second it is over.  `KeyboardInterrupt` and the like end the run.
 """
@@ -104,6 +107,7 @@ def run_actor(
 
     Raises:
         MisuseError: The actor cannot be bound like this, or the cell was closed under it.
+        DatumTypeError: A shard knows one of its aspects with another type.
         UnknownWorldError: The cell has no such world context.
     """
     return ActorRun(
@@ -160,10 +164,21 @@ class ActorRun:
             unstamped=sets.unstamped,
         )
 
-    def run(self) -> ActorStatistics:
-        """Run until stopped or done; see `run_actor`."""
+    def run(self, *, on_ready: Callable[[], None] | None = None) -> ActorStatistics:
+        """Run until stopped or done; see `run_actor`.
+
+        Args:
+            on_ready: Called once the shards of the actor's data have accepted what it requests and
+                its `start` is over; an actor that is stopped before never is ready.
+        """
+        if not self._accepted():
+            self._record.state = "stopped"
+            self._report(now=True)
+            return self.statistics()
         self._actor.start()
         try:
+            if on_ready is not None:
+                on_ready()
             self._record.state = "running"
             self._report(now=True)
             if self._sets is not None:
@@ -180,6 +195,23 @@ class ActorRun:
             self._report(now=True)
             self._actor.stop()
         return self.statistics()
+
+    def _accepted(self) -> bool:
+        """Let the shards accept the actor's requests, waiting for them; False: stopped first."""
+        refused = 0
+        while not self._stop.is_set():
+            try:
+                self._bound.register()
+            except LinkError as error:
+                self._record.refused(error, unknown=False)
+                if not refused:
+                    log.warning("%s: not ready before its shards answer: %s", self.name, error)
+                self._report()
+                self._stop.wait(self._pause_s(refused))
+                refused += 1
+            else:
+                return True
+        return False
 
     def _run_triggered(self) -> None:
         with watching(self._bound, self._inbox) as changes:

@@ -27,7 +27,7 @@ from enact_dist.cli.verbs import (
     see_working_folder,
     verbs_of,
 )
-from enact_dist.errors import ConfigError, ProtocolError
+from enact_dist.errors import ConfigError, MisuseError, ProtocolError, UnknownWorldError
 from enact_dist.link.log import READY, JsonLines, say
 from enact_dist.link.service_manager import ServiceManager
 from enact_dist.link.signals import StopSignals
@@ -38,6 +38,8 @@ if TYPE_CHECKING:
 
     from enact_dist.actor import Actor
     from enact_dist.actor_report import ActorStatistics
+    from enact_dist.actor_runner import ActorRun
+    from enact_dist.cell import Cell
     from enact_dist.cell_info import ActorInfo
     from enact_dist.cli.verbs import Verb
 
@@ -106,8 +108,6 @@ def _add_run(verbs: argparse._SubParsersAction[Verb]) -> None:
 
 def run_actor(arguments: argparse.Namespace) -> int:
     """Run one actor until it is done or a signal comes."""
-    from enact_dist.actor_runner import run_actor as run
-
     see_working_folder()
     manager = ServiceManager()
     json_lines = JsonLines(process=f"actor {arguments.name or arguments.target}")
@@ -118,14 +118,36 @@ def run_actor(arguments: argparse.Namespace) -> int:
         stop = StopWithPulse(manager.alive)
         with open_cell(arguments, observer=False, actor=name) as cell:
             json_lines.cell, json_lines.process = cell.name, f"actor {name}"
-            say(formatter, "actor.ready", f"{READY} actor {name} in cell {cell.name}")
-            manager.ready()
             signals.call(lambda _: manager.stopping())
             signals.call(lambda _: stop.set())
-            statistics = run(actor, cell, worlds, stop=stop, name=name)
+
+            def ready() -> None:
+                say(formatter, "actor.ready", f"{READY} actor {name} in cell {cell.name}")
+                manager.ready()
+
+            statistics = _bound(actor, cell, worlds, stop, name).run(on_ready=ready)
     counted = {key: getattr(statistics, key) for key in ("state", "updates", "failures", "refused")}
     say(formatter, "actor.end", _farewell(name, statistics), **counted)
     return DONE
+
+
+def _bound(
+    actor: Actor, cell: Cell, worlds: dict[str, str] | None, stop: StopWithPulse, name: str
+) -> ActorRun:
+    """Return the run of an actor whose roles are bound.
+
+    Raises:
+        ConfigError: They cannot be bound like this: the same command would fail the same way.
+        UnknownWorldError: The cell has no such world context; it may be made yet.
+    """
+    from enact_dist.actor_runner import ActorRun
+
+    try:
+        return ActorRun(actor, cell, worlds, stop=stop, name=name)
+    except UnknownWorldError:
+        raise
+    except MisuseError as error:
+        raise ConfigError(str(error)) from error
 
 
 def _log_to_stderr(formatter: logging.Formatter) -> None:

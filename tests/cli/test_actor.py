@@ -125,12 +125,12 @@ def test_run_refuses_a_wrong_command_line(module, enact, cell_file, words, reaso
 
 
 def test_run_refuses_an_unknown_role(module, enact, cell_file):
-    """A role that the class does not have is named."""
+    """A role that the class does not have is named; the same command would fail the same way."""
     result = enact(
         "actor", "run", "my_actors:Beat", "--world", "offline=online", "--cell", cell_file
     )
 
-    assert result.status == 1
+    assert result.status == 2
     assert "offline" in result.err
 
 
