@@ -11,7 +11,14 @@ import contextlib
 import time
 from typing import TYPE_CHECKING, Any
 
-from enact_dist.cell_info import ActorInfo, AuditInfo, LockInfo, ShardInfo, lock_info
+from enact_dist.cell_info import (
+    ActorInfo,
+    AuditInfo,
+    LockInfo,
+    ShardInfo,
+    actor_infos,
+    lock_info,
+)
 from enact_dist.closing import Closing
 from enact_dist.core.datum import Position
 from enact_dist.core.messages import (
@@ -418,24 +425,26 @@ class Cell(Closing):
         """
         shards = self._client.shards()
         answers = self._client.call_all([(shard, ListSessions()) for shard in shards])
-        found: dict[str, ActorInfo] = {}
-        for shard, answer in zip(shards, answers, strict=True):
-            for info in answer.sessions if isinstance(answer, Sessions) else ():
-                if not info.actor:
-                    continue
-                before = found.get(info.session)
-                report = _report(info.report)
-                found[info.session] = ActorInfo(
-                    info.actor,
-                    info.host,
-                    info.pid,
-                    info.session,
-                    (*(before.shards if before else ()), shard),
-                    max(info.lease_left_ns / 1e9, before.lease_left_s if before else 0.0),
-                    info.locks + (before.locks if before else 0),
-                    report or (before.report if before else {}),
-                )
-        return tuple(sorted(found.values(), key=lambda info: (info.actor, info.session)))
+        told = zip(shards, answers, strict=True)
+        return actor_infos((shard, found) for shard, found in told if isinstance(found, Sessions))
+
+    def namesakes(self, name: str) -> tuple[ActorInfo, ...]:
+        """Return the other sessions of actors of a name that are not silent.
+
+        Only the shards that this process has spoken with are asked, and none is waited for long.
+        """
+        client = self._client
+        shards = [shard for shard in client.shards() if not client.core.needs_hello(shard)]
+        answers = client.call_once([(shard, ListSessions()) for shard in shards])
+        told = zip(shards, answers, strict=True)
+        infos = actor_infos((shard, found) for shard, found in told if isinstance(found, Sessions))
+        return tuple(
+            info
+            for info in infos
+            if name in (info.actor, *info.names())
+            and not info.silent
+            and info.session != client.core.session
+        )
 
     def set_report(self, report: bytes) -> None:
         """Let the keep-alives carry an actor's own statistics (msgpack of a map)."""
@@ -465,17 +474,6 @@ class Cell(Closing):
 
     def __repr__(self) -> str:
         return f"<cell {self.name!r}, {len(self._client.shards())} shards>"
-
-
-def _report(encoded: bytes) -> dict[str, Any]:
-    """Return an actor's report; empty where it is none, as any client may send anything."""
-    import msgpack
-
-    try:
-        report = msgpack.unpackb(encoded) if encoded else {}
-    except (ValueError, msgpack.UnpackException):
-        return {}
-    return report if isinstance(report, dict) else {}
 
 
 def _close_all() -> None:

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Final
 
 from enact_dist.core.datum import Position
 from enact_dist.terms import Entity, NullReason
 
 if TYPE_CHECKING:
-    from enact_dist.core.messages import Holder, SlotState
+    from collections.abc import Iterable, Iterator
+
+    from enact_dist.core.messages import Holder, Sessions, SlotState
+
+
+RUNNING: Final = ("starting", "running")
+"""States of an actor's report that are none of an end."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +81,9 @@ class ActorInfo:
     """One session of a named actor, as the shards see it.
 
     Attributes:
+        lease_left_s: Below 0 for as long as its lease has been over, as no shard hears of it.
         report: The actor's own statistics; empty where it gives none.
+        namesakes: Further sessions, none of them silent, with an actor of the same name.
     """
 
     actor: str
@@ -86,6 +94,19 @@ class ActorInfo:
     lease_left_s: float
     locks: int
     report: dict[str, Any] = field(default_factory=dict)
+    namesakes: tuple[str, ...] = ()
+
+    @property
+    def silent(self) -> bool:
+        """Whether its lease is over: what it reported last says nothing of how it is now."""
+        return self.lease_left_s < 0.0
+
+    def names(self) -> frozenset[str]:
+        """Return the names of the actors that run in this session, as they report it."""
+        reported = self.report.get("actors")
+        rows = reported if isinstance(reported, (list, tuple)) else ()
+        running = [row for row in rows if isinstance(row, dict) and row.get("state") in RUNNING]
+        return frozenset(str(row.get("name")) for row in running)
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,6 +157,51 @@ def slot_info(shard: str, state: SlotState) -> SlotInfo:
         NullReason[state.null_reason].value if state.null_reason else "",
         shard,
     )
+
+
+def actor_infos(told: Iterable[tuple[str, Sessions]]) -> tuple[ActorInfo, ...]:
+    """Return the sessions of named actors, of what each shard has told."""
+    found: dict[str, ActorInfo] = {}
+    for shard, answer in told:
+        for info in answer.sessions:
+            if not info.actor:
+                continue
+            before = found.get(info.session)
+            left_s = info.lease_left_ns / 1e9
+            found[info.session] = ActorInfo(
+                info.actor,
+                info.host,
+                info.pid,
+                info.session,
+                (*(before.shards if before else ()), shard),
+                max(left_s, before.lease_left_s) if before else left_s,
+                info.locks + (before.locks if before else 0),
+                _report(info.report) or (before.report if before else {}),
+            )
+    infos = sorted(found.values(), key=lambda info: (info.actor, info.session))
+    return tuple(_with_namesakes(infos))
+
+
+def _with_namesakes(infos: list[ActorInfo]) -> Iterator[ActorInfo]:
+    sessions: dict[str, list[str]] = {}
+    for info in infos:
+        for name in info.names() if not info.silent else ():
+            sessions.setdefault(name, []).append(info.session)
+    for info in infos:
+        same = {other for name in info.names() for other in sessions.get(name, ())}
+        others = tuple(sorted(same - {info.session}))
+        yield replace(info, namesakes=others) if others else info
+
+
+def _report(encoded: bytes) -> dict[str, Any]:
+    """Return an actor's report; empty where it is none, as any client may send anything."""
+    import msgpack
+
+    try:
+        report = msgpack.unpackb(encoded) if encoded else {}
+    except (ValueError, msgpack.UnpackException):
+        return {}
+    return report if isinstance(report, dict) else {}
 
 
 def lock_info(shard: str, holder: Holder) -> LockInfo:

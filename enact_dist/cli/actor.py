@@ -6,6 +6,7 @@ import logging
 import os
 import socket
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.actor_life import StopWithPulse
@@ -27,7 +28,13 @@ from enact_dist.cli.verbs import (
     see_working_folder,
     verbs_of,
 )
-from enact_dist.errors import ConfigError, MisuseError, ProtocolError, UnknownWorldError
+from enact_dist.errors import (
+    ConfigError,
+    EnactError,
+    MisuseError,
+    ProtocolError,
+    UnknownWorldError,
+)
 from enact_dist.link.log import READY, JsonLines, say
 from enact_dist.link.service_manager import ServiceManager
 from enact_dist.link.signals import StopSignals
@@ -43,6 +50,8 @@ if TYPE_CHECKING:
     from enact_dist.cell_info import ActorInfo
     from enact_dist.cli.verbs import Verb
 
+_log = logging.getLogger("enact.actor")
+
 _TEXT: Final = "%(levelname)s %(name)s: %(message)s"
 
 
@@ -53,7 +62,7 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
     ls = add_verb(
         verbs,
         "ls",
-        "list the sessions of the cell with what their actors report",
+        "list the sessions of the cell with what their actors report, and which are silent",
         run=list_actors,
         example="enact actor ls --json",
     )
@@ -124,6 +133,7 @@ def run_actor(arguments: argparse.Namespace) -> int:
             def ready() -> None:
                 say(formatter, "actor.ready", f"{READY} actor {name} in cell {cell.name}")
                 manager.ready()
+                _warn_of_namesakes(cell, name)
 
             statistics = _bound(actor, cell, worlds, stop, name).run(on_ready=ready)
     counted = {key: getattr(statistics, key) for key in ("state", "updates", "failures", "refused")}
@@ -148,6 +158,27 @@ def _bound(
         raise
     except MisuseError as error:
         raise ConfigError(str(error)) from error
+
+
+def _warn_of_namesakes(cell: Cell, name: str) -> None:
+    """Say which other actors of this name run; several may be meant, so none is refused."""
+    try:
+        others = cell.namesakes(name)
+    except EnactError as error:
+        _log.info("whether another actor %s runs is not known: %s", name, error)
+        return
+    for other in others:
+        gone = other.host == socket.gethostname() and not _runs(other.pid)
+        if not gone:  # else a predecessor, whose session has not ended yet
+            _log.warning(
+                "another actor named %s runs, process %d on %s; unless both are meant, end one",
+                name, other.pid, other.host,
+            )  # fmt: skip
+
+
+def _runs(pid: int) -> bool:
+    """Whether a process of this host, and of this container, runs beside this one."""
+    return pid != os.getpid() and Path(f"/proc/{pid}").exists()
 
 
 def _log_to_stderr(formatter: logging.Formatter) -> None:
@@ -233,18 +264,27 @@ def _reports(info: ActorInfo) -> tuple[ActorStatistics, ...]:
 
 
 def _rows(info: ActorInfo) -> Iterator[tuple[object, ...]]:
-    here, left = (info.host, info.pid), (shown_s(info.lease_left_s), info.locks)
+    here = (info.host, info.pid)
+    left_s = info.lease_left_s
+    left = (f"over for {shown_s(-left_s)}" if info.silent else shown_s(left_s), info.locks)
     reports = _reports(info)
     for report in reports:
         ago_s = time.time() - report.last_update_unix_s
         last = f"{shown_s(max(0.0, ago_s))} ago" if report.last_update_unix_s else "never"
         yield (
-            report.name, *here, report.state, report.updates, f"{report.rate_hz:.1f}/s",
+            report.name, *here, _state(info, report.state), report.updates,
+            "-" if info.silent else f"{report.rate_hz:.1f}/s",
             report.failures, report.refused, report.incomplete,
             f"{report.lock_wait_p99_ms:.1f} ms", last, *left, report.last_error or "-",
         )  # fmt: skip
     if not reports:
-        yield (info.actor, *here, "connected", *["-"] * 7, *left, "-")
+        yield (info.actor, *here, _state(info, "connected"), *["-"] * 7, *left, "-")
+
+
+def _state(info: ActorInfo, reported: str) -> str:
+    """Return how an actor is: of one that is silent nobody knows whether it still runs."""
+    state = "silent" if info.silent else reported
+    return f"{state}, one of {len(info.namesakes) + 1}" if info.namesakes else state
 
 
 def check_actors(arguments: argparse.Namespace) -> int:

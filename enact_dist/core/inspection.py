@@ -75,7 +75,7 @@ def sessions(state: ShardState) -> Sessions:
                 session.actor,
                 session.host,
                 session.pid,
-                max(0, session.lease_end_ns(now_ns) - now_ns),
+                session.lease_end_ns(now_ns) - now_ns,
                 session.token_present,
                 len(state.tenures.by_session.get(session.session, {})),
                 session.report,

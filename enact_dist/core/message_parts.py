@@ -204,7 +204,10 @@ class PlacementMap(NamedTuple):
 
 
 class SessionInfo(NamedTuple):
-    """One session at a shard, for `enact actor ls` and `enact shard ls`."""
+    """One session at a shard, for `enact actor ls` and `enact shard ls`.
+
+    `lease_left_ns` below 0 says how long its lease has been over: so long nobody has heard of it.
+    """
 
     session: str
     actor: str

@@ -310,6 +310,17 @@ class TestPeople:
         assert (answer.epoch, answer.open, answer.slots) == (1, True, 0)
         assert [info.session for info in answer.sessions] == ["ann"]
 
+    def test_sessions_tell_for_how_long_a_lease_has_been_over(self, bench):
+        """A frozen actor is not to be taken for one whose lease ends just now."""
+        bench.hello("ann")
+        bench.wait(TTL_NS // 4)
+        bench.keep_alive("ann")
+        bench.wait(3 * TTL_NS)
+
+        (ann,) = bench.ask(ListSessions()).sessions
+
+        assert ann.lease_left_ns == -2 * TTL_NS
+
 
 class TestWaitingForStamps:
     def test_stamp_is_reached_when_no_older_commit_is_in_flight(self, bench):

@@ -1,0 +1,81 @@
+"""`enact actor ls` tells a frozen actor from one that runs, and two of one name from one."""
+
+import os
+import signal
+import time
+
+import pytest
+
+MODULE = """\
+from enact_dist import Actor, Aspect, Entity, World, Write
+
+
+class Beat(Actor):
+    count = Write(World("online"), Entity("beat/ls"), Aspect("count_of_ls", int))
+    every_s = 0.05
+
+    def update(self, lock):
+        lock[self.count] = lock.get(self.count, 0) + 1
+"""
+PATIENCE_S = 60.0
+
+
+@pytest.fixture
+def start(tmp_path, spawn, until, cell_file):
+    """Start an actor of a name; it and what it has said until it is ready."""
+    (tmp_path / "my_actors.py").write_text(MODULE, encoding="utf-8")
+
+    def begin(name):
+        actor = spawn("actor", "run", "my_actors:Beat", "--cell", cell_file, "--name", name)
+        until(actor, f"ready: actor {name}")
+        return actor
+
+    return begin
+
+
+def listed(enact, cell_file, wanted):
+    """Return the rows and the JSON of `actor ls` once they are as wanted."""
+    end_s = time.monotonic() + PATIENCE_S
+    while True:
+        infos = enact("actor", "ls", "--json", "--cell", cell_file).json
+        if wanted(infos) or time.monotonic() > end_s:
+            return infos
+
+
+def test_frozen_actor_is_silent(start, enact, cell_file):
+    """What it reported last says nothing of how it is; its lease has been over for some time."""
+    frozen = start("frozen")
+    os.kill(frozen.pid, signal.SIGSTOP)
+
+    infos = listed(enact, cell_file, lambda infos: any(i["lease_left_s"] < 0 for i in infos))
+    (row,) = [
+        line
+        for line in enact("actor", "ls", "--cell", cell_file).out.splitlines()
+        if line.startswith("frozen")
+    ]
+
+    assert [info["actor"] for info in infos if info["lease_left_s"] < 0] == ["frozen"]
+    assert "silent" in row
+    assert "running" not in row
+    assert "over for" in row
+
+
+def test_two_actors_of_one_name_are_told_of(start, until, enact, cell_file):
+    """Both run, as replicas may be meant; the second one's log and the list say so."""
+    first, alone = start("twin"), start("alone")
+    second = start("twin")
+
+    said = until(second, "another actor named twin runs")
+    infos = listed(
+        enact,
+        cell_file,
+        lambda infos: sum(len(info["namesakes"]) for info in infos) == 2,
+    )
+    table = enact("actor", "ls", "--cell", cell_file).out.splitlines()
+
+    assert f"process {first.pid} on " in said[-1]
+    sessions = {info["pid"]: info for info in infos}
+    assert sessions[first.pid]["namesakes"] == [sessions[second.pid]["session"]]
+    assert sessions[second.pid]["namesakes"] == [sessions[first.pid]["session"]]
+    assert sessions[alone.pid]["namesakes"] == []
+    assert [line.split()[0] for line in table if "running, one of 2" in line] == ["twin", "twin"]
