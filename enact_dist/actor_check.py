@@ -6,6 +6,7 @@ Reported are (error: `enact up` refuses; warning: it starts):
 level    kind                 what
 =======  ===================  ===================================================================
 error    no such actor        a class, option or period of `cell.toml` that cannot be used
+error    broken module        a module that raises at its import, and where
 error    unbound role         a role that no world context is bound to
 error    unknown role         a binding for a role that the actor does not have
 error    unknown world        a world context that the cell does not list
@@ -20,20 +21,27 @@ warning  set not retained     an aspect of a `Together` has no history (retentio
 warning  unused aspect        `cell.toml` configures an aspect that no actor names: misspelt?
 =======  ===================  ===================================================================
 
-World contexts and aspects are checked only against a list that is given.  What a patterned write
-without `Each` can reach is narrowed by what triggers its actor only as far as the pattern says.
+World contexts and aspects are checked only against a list that is given, types against each other:
+no shard is asked, and an actor whose type a shard knows otherwise is refused at its start.  What a
+patterned write without `Each` can reach is narrowed by what triggers its actor only as far as the
+pattern says.
 """
 
 from __future__ import annotations
 
+import os
+import sysconfig
+import traceback
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, Literal
 
 from enact_dist.actor import same_data
 from enact_dist.actor_load import check_every_s, load_class, read_options
 from enact_dist.config_table import suggestion
 from enact_dist.core.messages import AspectEntry
 from enact_dist.core.retaining import limits_of, said, with_larger
+from enact_dist.errors import ConfigError
 from enact_dist.retention import checked_retention
 
 if TYPE_CHECKING:
@@ -43,6 +51,10 @@ if TYPE_CHECKING:
     from enact_dist.config_types import CellConfig
 
 Level = Literal["error", "warning"]
+
+_BASE: Final = ("<", f"{Path(__file__).parent}{os.sep}", sysconfig.get_path("stdlib") + os.sep)
+"""How names of files begin that import a user's code, or that it calls."""
+_LIBRARIES: Final = (*_BASE, sysconfig.get_path("purelib") + os.sep)
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,8 +165,12 @@ def check_cell(config: CellConfig, *, initial: Collection[str] = ()) -> tuple[Fi
             read_options(actor_class, actor.options)
             if actor.every_s is not None:
                 check_every_s(actor_class, actor.every_s)
+        except ConfigError as error:
+            text = f"actor {actor.name}: {error}"
+            findings.append(Finding("error", "no such actor", (actor.name,), text))
         except Exception as error:  # noqa: BLE001 (importing a module can raise anything)
-            findings.append(Finding("error", "no such actor", (actor.name,), str(error)))
+            text = f"actor {actor.name} ({actor.class_path}): {_raised(error)}"
+            findings.append(Finding("error", "broken module", (actor.name,), text))
     findings += check_actors(actors, worlds=config.worlds, initial=initial)
     findings += _sets(actors, {entry.name: entry for entry in config.aspect_entries()})
     named = {
@@ -174,6 +190,24 @@ def check_cell(config: CellConfig, *, initial: Collection[str] = ()) -> tuple[Fi
                 )
             )
     return _ordered(findings)
+
+
+def _raised(error: Exception) -> str:
+    """Return what an error is and where the user's code raised it."""
+    kind = type(error).__name__
+    if isinstance(error, SyntaxError) and error.filename:
+        return f"{kind} at {_shown(error.filename)}:{error.lineno}: {error.msg}"
+    lines = [(frame.filename, frame.lineno) for frame in traceback.extract_tb(error.__traceback__)]
+    for others in (_LIBRARIES, _BASE):
+        if own := [line for line in lines if not line[0].startswith(others)]:
+            break
+    file, number = (own or lines)[-1]
+    return f"{kind} at {_shown(file)}:{number}: {error}"
+
+
+def _shown(file: str) -> str:
+    here = f"{Path.cwd()}{os.sep}"
+    return file.removeprefix(here)
 
 
 def _sets(

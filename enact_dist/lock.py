@@ -81,6 +81,9 @@ def _refuse_released(requests: Iterable[LockRequest[Any]]) -> None:
 class Lock:
     """A set of data, granted at once or not at all.
 
+    An array arrives read-only: ``lock[joints] += 1`` works on it in place, which numpy refuses
+    ("output array is read-only").  Write ``lock[joints] = lock[joints] + 1``.
+
     Args:
         requests: What to read, write and view; of one cell, of any of its contexts and shards.
             Writes on several shards become visible all or none, whatever crashes.

@@ -11,6 +11,10 @@
 
     online.view(masks)[masks]              # the newest complete set
 
+A comprehension in the body of a class sees no name of that body but in its first ``in …``: with
+``online = World("online")`` inside `Fusion`, the list above raises `NameError`.  So roles and sets
+stand before the class, as here.
+
 The stamps are those of `lock.put(request, datum, stamp_ns=…)`.  While the slots move on, a set is
 found again among the versions that its aspects retain (`Aspect(…, retention=n)` or `cell.toml`):
 retain as many as may be under way at once.  All data of a set are of one consistent cut, over

@@ -232,3 +232,35 @@ def test_check_cell_finds_actors_that_cannot_be_made(cell_file: Path, lines: str
 
     assert (found.level, found.kind, found.actors) == ("error", "no such actor", ("wrong",))
     assert message in found.text
+
+
+@pytest.mark.parametrize(
+    ("code", "message"),
+    [
+        ("\nimages = [online]\n", "NameError at {file}:2: name 'online' is not defined"),
+        (
+            "import dataclasses\n@dataclasses.dataclass\nclass Plan:\n    v: int = 1\n    avoid: str\n",
+            "TypeError at {file}:2: non-default argument 'avoid' follows default argument",
+        ),
+        ("class Plan\n", "SyntaxError at {file}:1: expected ':'"),
+        (
+            "from enact_dist import Actor\nclass Idle(Actor):\n    triggers = (3,)\n",
+            "MisuseError at {file}:2: Idle",
+        ),
+    ],
+)
+def test_check_cell_says_where_a_module_raises(
+    cell_file: Path, monkeypatch: pytest.MonkeyPatch, code: str, message: str
+):
+    """Which actor, which module, what and in which line; the actor itself may well be there."""
+    (cell_file.parent / "broken_cell.py").write_text(code)
+    monkeypatch.syspath_prepend(cell_file.parent)
+    monkeypatch.chdir(cell_file.parent)
+    cell_file.write_text(f'{CELL}\n[actors.planner]\nclass = "broken_cell:Planner"\n')
+
+    found = check_cell(load_config(cell_file))[0]
+
+    assert (found.level, found.kind) == ("error", "broken module")
+    assert found.actors == ("planner",)
+    wanted = "actor planner (broken_cell:Planner): " + message.format(file="broken_cell.py")
+    assert found.text.startswith(wanted)
