@@ -7,7 +7,7 @@ import os
 import socket
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from enact_dist.actor_life import StopWithPulse
 from enact_dist.cli.output import print_json, print_table, shown_s
@@ -35,7 +35,7 @@ from enact_dist.errors import (
     ProtocolError,
     UnknownWorldError,
 )
-from enact_dist.link.log import READY, JsonLines, say
+from enact_dist.link.log import READY, TEXT, JsonLines, say
 from enact_dist.link.service_manager import ServiceManager
 from enact_dist.link.signals import StopSignals
 
@@ -51,8 +51,6 @@ if TYPE_CHECKING:
     from enact_dist.cli.verbs import Verb
 
 _log = logging.getLogger("enact.actor")
-
-_TEXT: Final = "%(levelname)s %(name)s: %(message)s"
 
 
 def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
@@ -120,7 +118,7 @@ def run_actor(arguments: argparse.Namespace) -> int:
     see_working_folder()
     manager = ServiceManager()
     json_lines = JsonLines(process=f"actor {arguments.name or arguments.target}")
-    formatter = json_lines if arguments.log == "json" else logging.Formatter(_TEXT)
+    formatter = json_lines if arguments.log == "json" else logging.Formatter(TEXT)
     _log_to_stderr(formatter)
     with StopSignals() as signals:
         actor, name, worlds = _made(arguments)

@@ -269,6 +269,10 @@ def open_shared(name: str, nonce: bytes, *, root: Path | None = None) -> OpenedF
     try:
         flags = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
         opened = os.open(name, flags, dir_fd=above)
+    except FileNotFoundError:
+        raise LinkError(
+            f"{path} is not shared with this process, or its shard is gone: there is none"
+        ) from None
     except OSError as error:
         raise LinkError(f"{path} is not shared with this process: {error.strerror}") from None
     finally:

@@ -230,11 +230,13 @@ class SocketLine:
             connection = self._connected()
         except (EnactError, EOFError, OSError) as error:
             none = isinstance(error, FileNotFoundError)
+            before = self.problem
             self.problem = "it offers none" if none else str(error) or type(error).__name__
             with self._mutex:
                 self._retry_at_s = time.monotonic() + self._retry_s
                 self._retry_s = min(2 * self._retry_s, RETRY_S_MAX)
-            _log.info("no socket to shard %s: %s", self.shard, self.problem)
+            if self.problem != before:  # not at each further attempt
+                _log.info("no socket to shard %s: %s", self.shard, self.problem)
             return None
         self.problem, self._retry_s = "", RETRY_S_MIN
         with self._mutex:

@@ -1,6 +1,7 @@
 """`enact actor ls` tells a frozen actor from one that runs, and two of one name from one."""
 
 import os
+import re
 import signal
 import time
 
@@ -74,6 +75,7 @@ def test_two_actors_of_one_name_are_told_of(start, until, enact, cell_file):
     table = enact("actor", "ls", "--cell", cell_file).out.splitlines()
 
     assert f"process {first.pid} on " in said[-1]
+    assert re.match(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d,\d{3} WARNING enact.actor ", said[-1])
     sessions = {info["pid"]: info for info in infos}
     assert sessions[first.pid]["namesakes"] == [sessions[second.pid]["session"]]
     assert sessions[second.pid]["namesakes"] == [sessions[first.pid]["session"]]

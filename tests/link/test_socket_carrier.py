@@ -1,5 +1,6 @@
 """Sockets between client and shard on one host: when they are taken, lost and found again."""
 
+import logging
 import os
 import signal
 import statistics
@@ -533,3 +534,16 @@ def test_signals_do_not_lengthen_a_call(daemon, carry, endpoint):
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         signal.signal(signal.SIGALRM, before)
+
+
+def test_shard_that_offers_no_socket_is_told_of_once(tmp_path, monkeypatch, caplog):
+    """Its line tries again and again while the shard is gone; its log is not filled by that."""
+    monkeypatch.setenv("ENACT_SHARED_FOLDER", str(tmp_path))
+    line = SocketLine("s0", "s0-1", bytes(16), "session")
+    with caplog.at_level(logging.INFO, "enact.link"):
+        for _ in range(3):
+            line._retry_at_s = 0.0
+            assert line.connect() is None
+
+    (said,) = caplog.messages
+    assert "is not shared with this process, or its shard is gone" in said
