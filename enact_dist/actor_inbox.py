@@ -14,6 +14,7 @@ import threading
 import time
 from typing import TYPE_CHECKING, Final, Generic, Self, TypeVar
 
+from enact_dist.actor_log import Repeated
 from enact_dist.actor_sets import PendingSets
 from enact_dist.actor_triggers import BackOff, PendingTriggers, Trigger
 from enact_dist.errors import LinkError
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 
     from enact_dist.actor_binding import BoundActor, Watched
+    from enact_dist.actor_sets import IncompleteSet
     from enact_dist.terms import Entity
     from enact_dist.watch import Change, Watch
 
@@ -116,6 +118,10 @@ class Inbox(_Box[PendingTriggers]):
 class SetInbox(_Box[PendingSets]):
     """`PendingSets` that the watching threads fill and the actor's thread empties."""
 
+    def __init__(self, sets: PendingSets) -> None:
+        super().__init__(sets)
+        self._repeated = Repeated()
+
     @property
     def sets(self) -> PendingSets:
         """The account of the sets, for its counters."""
@@ -139,15 +145,34 @@ class SetInbox(_Box[PendingSets]):
                 self._filled.notify_all()
             given_up = self._pending.incomplete - before
             told = list(self._pending.told)[-given_up:] if given_up else []
-        for incomplete in told:
-            log.warning("incomplete %s", incomplete)
+            counts = [self._count("", incomplete) for incomplete in told]
+        for incomplete, count in zip(told, counts, strict=True):
+            _tell(f"incomplete {incomplete}", count)
 
     def gone(self, stamp_ns: int, missing: Sequence[int]) -> None:
         """Count a complete set whose data were outside retention before its update could run."""
         with self._filled:
             self._pending.gone(stamp_ns, missing)
             told = self._pending.told[-1]
-        log.warning("incomplete, outside retention before its update: %s", told)
+            count = self._count("gone", told)
+        _tell(f"incomplete, outside retention before its update: {told}", count)
+
+    def _count(self, how: str, incomplete: IncompleteSet) -> int | None:
+        """Return how often sets without the same data are to be told of now, as `Repeated`."""
+        return self._repeated.tell((how, incomplete.missing), str(incomplete), monotonic_ns())
+
+    def tell_left(self) -> None:
+        """Tell of the incomplete sets that were only counted so far."""
+        with self._filled:
+            left = self._repeated.left()
+        for count, newest in left:
+            log.warning("%d more incomplete sets, the newest a %s", count, newest)
+
+
+def _tell(line: str, count: int | None) -> None:
+    """Write a line about an incomplete set: the first, or one for `count` without the same data."""
+    if count is not None:
+        log.warning("%s%s", line, f" ({count} like it since the last line)" if count else "")
 
 
 def _by_context(watched: Iterable[Watched]) -> dict[str, list[Watched]]:

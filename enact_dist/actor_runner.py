@@ -10,8 +10,8 @@ error                                     the run
 `ChangedError` expected view moved on     trigger must not be lost
 `LinkError` shard away
 `CommitUnknownError` may stand            the same: the new update reads what stands (`unknown`)
-any other exception                       counted, logged, kept as last error; run again when the
-                                          entity changes
+any other exception                       counted, logged (one like before as a count), kept as last
+                                          error; run again when the entity changes
 ========================================  =====================================================
 
 Before that the shards of its data have to accept its requests: one that is away is waited for, and
@@ -34,6 +34,7 @@ from weakref import WeakKeyDictionary
 from enact_dist.actor import Actor, check_period
 from enact_dist.actor_binding import BoundActor
 from enact_dist.actor_inbox import Inbox, SetInbox, watching
+from enact_dist.actor_log import Repeated, kind_of
 from enact_dist.actor_report import (
     ERROR_LENGTH_MAX,
     ActorRecord,
@@ -139,6 +140,7 @@ class ActorRun:
         self._sets = SetInbox(sets) if sets is not None else None
         self._inbox = Inbox(per_entity=self._bound.declaration.per_entity)
         self._back_off = BackOff()
+        self._failures = Repeated()
         self.name = name or type(actor).__name__
         self._record = ActorRecord(self.name, now_ns=monotonic_ns())
         self._board = ReportBoard.of(cell)
@@ -193,6 +195,7 @@ class ActorRun:
             if self._record.state == "running":
                 self._record.state = "stopped"
             self._report(now=True)
+            self._tell_left()
             self._actor.stop()
         return self.statistics()
 
@@ -288,10 +291,10 @@ class ActorRun:
             self._record.refused(error, unknown=isinstance(error, CommitUnknownError))
             log.warning("%s%s: refused: %s", self.name, _about(entity), error)
             ending: Exception | None = error
-        except Exception as error:
+        except Exception as error:  # noqa: BLE001 (an update can raise anything)
             self._bound.check_usable()
             self._record.failed(error)
-            log.exception("%s%s: update failed", self.name, _about(entity))
+            self._tell(entity, error)
             ending = error
         else:
             ended_ns = monotonic_ns()
@@ -307,6 +310,25 @@ class ActorRun:
         if ending is not None and self._on_error is not None:
             self._on_error(entity, ending)
         return ending
+
+    def _tell(self, entity: Entity | None, error: Exception) -> None:
+        """Log an error of an update: its traceback, or a count where it is one like before."""
+        text = f"{type(error).__name__}: {error}"
+        count = self._failures.tell(kind_of(error), text, monotonic_ns())
+        if count == 0:
+            log.error("%s%s: update failed", self.name, _about(entity), exc_info=error)
+        elif count is not None:
+            log.error(
+                "%s%s: update failed as before, %d times since the last line: %s",
+                self.name, _about(entity), count, text,
+            )  # fmt: skip
+
+    def _tell_left(self) -> None:
+        """Log what was only counted so far."""
+        for count, newest in self._failures.left():
+            log.error("%s: update failed as before %d more times: %s", self.name, count, newest)
+        if self._sets is not None:
+            self._sets.tell_left()
 
     def _seen(self, lock: ActorLock) -> dict[tuple[int, Entity], tuple[int, int]]:
         return {
