@@ -254,7 +254,8 @@ class PrepareDesk:
             yield from self._finish(tenure, answer.position, [])
         elif answer.kind == RESOLVED_ABORTED and not tenure.committing:
             self._state.count("resolved_aborted")
-            yield Story("lock.aborted", f"{tenure.lock}: {message.shard} has not committed it")
+            told = self._state.tenures.told(tenure, self._state.now_ns)
+            yield Story("lock.aborted", f"{told}: {message.shard} has not committed it")
             yield Persist(0, (PreparedEnded(tenure.lock),), Durability.OS)
             yield from self._end(tenure)
 

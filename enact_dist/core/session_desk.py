@@ -164,7 +164,8 @@ class SessionDesk:
         for tenure in self._state.tenures.of_session(message.session):
             if tenure.lock.seq < lowest.get(tenure.lock.lane, 0) and not tenure.bound:
                 self._state.count("orphans_freed")
-                yield Story("lock.orphan", f"{tenure.lock} is not wanted any more")
+                told = self._state.tenures.told(tenure, self._state.now_ns)
+                yield Story("lock.orphan", f"{told}, is not wanted any more")
                 yield from self._state.tenures.remove(tenure, now_ns=self._state.now_ns)
         for lock in [lock for lock in self._state.pins if lock.session == message.session]:
             if lock.seq < lowest.get(lock.lane, 0):
@@ -196,9 +197,11 @@ class SessionDesk:
 
     def on_session_died(self, message: SessionDied, _: int) -> Iterator[Effect]:
         """End a session whose process is proven to be gone: nobody believes in its locks."""
-        if message.session in self._state.sessions.by_id:
+        found = self._state.sessions.by_id.get(message.session)
+        if found is not None:
             self._state.count("sessions_died")
-            yield Story("session.died", f"the process of session {message.session} ended")
+            who = f"{found.actor or 'client'}@{found.host} pid {found.pid}"
+            yield Story("session.died", f"the process of {who} ended, session {found.session}")
             yield from self.end(message.session, "its process died")
 
     def end(self, session: str, cause: str) -> Iterator[Effect]:

@@ -265,8 +265,14 @@ class Tenures:
         session = self._sessions.by_id.get(tenure.lock.session)
         if session is not None and tenure.token is not None:
             session.lane(tenure.lock.lane).ended = (tenure.lock, cause)
-        yield Story("lock.taken", f"{tenure.lock}: {cause}")
+        yield Story("lock.taken", f"{self.told(tenure, now_ns)}: {cause}")
         yield from self.remove(tenure, now_ns=now_ns)
+
+    def told(self, tenure: Tenure, now_ns: int) -> str:
+        """Return a lock as the log names it: whose it is, and of what."""
+        holder = self.describe(tenure, now_ns)
+        who = f"{holder.actor or 'client'}@{holder.host} pid {holder.pid}"
+        return f"{tenure.lock} of {who}, {', '.join(holder.slots) or 'views alone'}"
 
     def end_slices(self, now_ns: int) -> Iterator[Effect]:
         """Answer the parked requests whose slice of waiting is over."""

@@ -36,6 +36,7 @@ from enact_dist.core.records import (
     Record,
     Recovered,
     Reply,
+    Story,
     Tick,
 )
 from enact_dist.core.shard import Shard
@@ -96,6 +97,7 @@ class ShardBench:
         self.log: list[Record] = []
         self.pending: list[Persist] = []
         self.notices: list[object] = []
+        self.stories: list[Story] = []
         self.calls: list[tuple[str, object]] = []
         self.answers: dict[int, Answer] = {}
         self._handles = count(1)
@@ -138,6 +140,8 @@ class ShardBench:
                 self.calls.append((effect.shard, effect.request))
             elif isinstance(effect, Publish):
                 self.notices.append(effect.notice)
+            elif isinstance(effect, Story):
+                self.stories.append(effect)
         if self.disk_is_done:
             self.finish_disk()
 

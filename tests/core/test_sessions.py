@@ -115,6 +115,17 @@ class TestEnd:
         assert bench.counter("sessions_died") == 1
         assert [record.session for record in bench.recovered(2).sessions] == ["bob"]
 
+    def test_log_names_whose_process_ended_and_what_it_had_locked(self, bench):
+        """Ids of sessions and locks tell nobody which actor it was."""
+        bench.hello("ann")
+        bench.granted(ANN, item(W))
+        bench.event(SessionDied("ann"))
+
+        died, taken = bench.stories
+        assert died.text.startswith("the process of ann@host pid 1 ended")
+        assert taken.text.startswith(f"{ANN} of ann@host pid 1, ")
+        assert f"{slot()} (write)" in taken.text
+
     def test_proven_death_ends_the_grace_that_waits_for_it(self, bench):
         """After a restart nobody waits for a dead process to acknowledge the epoch."""
         bench.hello("ann")
