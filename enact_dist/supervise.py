@@ -302,7 +302,7 @@ class Supervisor:
 
     def _judge(self, child: _Child, status: int) -> None:
         """Decide what the end of a child means while nobody asked for it."""
-        how = f"ended by {signal.Signals(-status).name}" if status < 0 else f"exit status {status}"
+        how = ended_how(status)
         if child.task.kind == "actor" and status == 0:
             child.over = True
             self._say(child.task.name, "done; it is not started again")
@@ -347,7 +347,17 @@ class Supervisor:
             if isinstance(event, _Ended):
                 event.child.ended()
                 if event.status:
-                    self._say(event.child.task.name, f"ended with status {event.status}")
+                    self._say(event.child.task.name, ended_how(event.status))
+
+
+def ended_how(status: int) -> str:
+    """Return how a process ended: its exit status, or the signal by its name."""
+    if status >= 0:
+        return f"exit status {status}"
+    try:
+        return f"ended by {signal.Signals(-status).name}"
+    except ValueError:  # one of those for programs' own use
+        return f"ended by signal {-status}"
 
 
 def _say_nothing(_name: str, _line: str) -> None:

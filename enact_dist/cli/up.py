@@ -6,7 +6,7 @@ import json
 import socket
 import sys
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from enact_dist.cli.output import coloured
 from enact_dist.cli.verbs import (
@@ -17,15 +17,23 @@ from enact_dist.cli.verbs import (
     cell_config,
     see_working_folder,
 )
-from enact_dist.errors import ConfigError
+from enact_dist.errors import ConfigError, LinkError
 from enact_dist.link.signals import StopSignals
 
 if TYPE_CHECKING:
     import argparse
 
     from enact_dist.cli.verbs import Verb
-    from enact_dist.config_types import CellConfig
+    from enact_dist.config_types import CellConfig, ShardConfig
     from enact_dist.supervise import Say, Task
+
+
+LOOK_S: Final = 0.2
+"""How often a shard that runs already is looked at."""
+
+
+ANSWER_S: Final = 2.0
+"""How long who listens where a shard should may take to say what it is."""
 
 
 def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
@@ -62,6 +70,8 @@ def run_up(arguments: argparse.Namespace) -> int:
         raise ConfigError(f"no shard and no actor of {config.path} runs on host {host!r}")
     if actors:
         _refuse_misfits(config)
+    for shard in shards:
+        _refuse_second(config, shard)
     tasks = [
         *(_task(config, "shard", shard.name, arguments.log, shard.drain_s) for shard in shards),
         *(_task(config, "actor", actor.name, arguments.log) for actor in actors),
@@ -94,6 +104,35 @@ def _refuse_misfits(config: CellConfig) -> None:
             f"{config.path}: {'; '.join(wrong)} (enact actor check shows all)",
             path=str(config.path),
         )
+
+
+def _refuse_second(config: CellConfig, shard: ShardConfig) -> None:
+    """Raise if a shard runs already, and does not end in the time that an ending one has.
+
+    One that a supervisor has left behind ends by itself; one of another `enact up` does not.
+
+    Raises:
+        LinkError: It does; the message says where.
+    """
+    from enact_dist.link.endpoints import somebody_listens
+
+    if not any(somebody_listens(endpoint) for endpoint in shard.listen):
+        return
+    from enact_dist.link.shard_daemon import DRAIN_S, DaemonSettings, refuse_second_daemon
+    from enact_dist.supervise import END_S
+
+    settings = DaemonSettings(config.name, config.shard_settings(shard.name), shard.listen)
+    drain_s = DRAIN_S if shard.drain_s is None else shard.drain_s
+    end_s = time.monotonic() + drain_s + END_S["shard"]
+    while True:
+        try:
+            refuse_second_daemon(settings, probe_s=ANSWER_S)
+        except LinkError:
+            if time.monotonic() > end_s:
+                raise
+            time.sleep(LOOK_S)
+        else:
+            return
 
 
 def _task(config: CellConfig, kind: str, name: str, log: str, drain_s: float | None = None) -> Task:

@@ -1,6 +1,23 @@
-"""Zenoh's names of places, as ``tcp/host:7447?option#setting``."""
+"""Zenoh's names of places, as ``tcp/host:7447?option#setting``, and what is known of them soon.
+
+Nothing of Zenoh is loaded here.
+"""
 
 from __future__ import annotations
+
+import queue
+import socket
+import threading
+import time
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+LISTENS_S: Final = 0.3
+"""How long a place may take to say that somebody listens."""
+LOOK_UP_S: Final = 1.0
+"""How long host names may take to be looked up where that only explains an error."""
 
 
 def split_endpoint(endpoint: str) -> tuple[str, str, str]:
@@ -11,3 +28,40 @@ def split_endpoint(endpoint: str) -> tuple[str, str, str]:
     protocol, _, address = endpoint.partition("/")
     host, _, port = address.partition("?")[0].partition("#")[0].rpartition(":")
     return protocol, host, port
+
+
+def somebody_listens(endpoint: str) -> bool:
+    """Say whether it is worth asking there; a refused connection saves the time of asking."""
+    protocol, host, port = split_endpoint(endpoint)
+    if protocol != "tcp" or not port.isdecimal():
+        return True
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), LISTENS_S).close()
+    except (OSError, ValueError):
+        return False
+    return True
+
+
+def unknown_hosts(endpoints: Sequence[str]) -> list[str]:
+    """Return the hosts of endpoints whose names cannot be resolved, as far as is known soon."""
+    hosts = list(dict.fromkeys(split_endpoint(endpoint)[1].strip("[]") for endpoint in endpoints))
+    found: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+
+    def look_up(host: str) -> None:
+        try:
+            socket.getaddrinfo(host, None)
+        except (OSError, ValueError):
+            found.put(host)
+        else:
+            found.put(None)
+
+    for host in hosts:  # in threads of their own: a silent name server is waited for much longer
+        threading.Thread(target=look_up, args=(host,), name="look-up", daemon=True).start()
+    unknown: set[str | None] = set()
+    end_s = time.monotonic() + LOOK_UP_S
+    for _ in hosts:
+        try:
+            unknown.add(found.get(timeout=max(0.0, end_s - time.monotonic())))
+        except queue.Empty:
+            break
+    return [host for host in hosts if host in unknown]

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import gc
 import logging
-import socket
 import sys
 import threading
 from contextlib import ExitStack
@@ -21,7 +20,7 @@ from typing import TYPE_CHECKING, Final
 from enact_dist.core.messages import ListLocks, Locks
 from enact_dist.core.records import ShardReturned
 from enact_dist.errors import ConfigError, EnactError, LinkError
-from enact_dist.link.endpoints import split_endpoint
+from enact_dist.link.endpoints import somebody_listens
 from enact_dist.link.host import open_host
 from enact_dist.link.log import READY, TEXT, JsonLines, Log, say
 from enact_dist.link.service_manager import ServiceManager
@@ -234,8 +233,12 @@ def start_shard(settings: DaemonSettings) -> RunningShard:
     return RunningShard(settings)
 
 
-def refuse_second_daemon(settings: DaemonSettings) -> None:
+def refuse_second_daemon(settings: DaemonSettings, *, probe_s: float = PROBE_S) -> None:
     """Raise if a daemon already serves this shard where its clients look for it.
+
+    Args:
+        settings: Of the shard.
+        probe_s: How long who listens there may take to say what it is.
 
     Raises:
         LinkError: One does.
@@ -247,25 +250,13 @@ def refuse_second_daemon(settings: DaemonSettings) -> None:
         endpoint for shard in shards if shard.name == name for endpoint in shard.endpoints
     ]
     endpoints = list(dict.fromkeys(map(to_reach, (*settings.listen, *advertised))))
-    listening = [endpoint for endpoint in endpoints if _somebody_listens(endpoint)]
-    found = find_shards(listening, timeout_s=PROBE_S) if listening else ()
+    listening = [endpoint for endpoint in endpoints if somebody_listens(endpoint)]
+    found = find_shards(listening, timeout_s=probe_s) if listening else ()
     if FoundShard(settings.cell, name) in found:
         raise LinkError(
             f"shard {name} of cell {settings.cell} already runs at {' or '.join(listening)}; two"
             " daemons must not serve one shard: stop the other, or give this one another name"
         )
-
-
-def _somebody_listens(endpoint: str) -> bool:
-    """Say whether it is worth asking there; a refused connection saves the time of asking."""
-    protocol, host, port = split_endpoint(endpoint)
-    if protocol != "tcp" or not port.isdecimal():
-        return True
-    try:
-        socket.create_connection((host.strip("[]"), int(port)), PROBE_S).close()
-    except (OSError, ValueError):
-        return False
-    return True
 
 
 def run_shard(settings: DaemonSettings) -> int:

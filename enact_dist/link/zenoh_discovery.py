@@ -14,6 +14,7 @@ import zenoh
 
 from enact_dist.core.messages import Welcome
 from enact_dist.errors import ProtocolError, ShardUnreachableError
+from enact_dist.link.endpoints import unknown_hosts
 from enact_dist.link.zenoh_carrier import NAMELESS, POLL_S, QUESTION, answer_in, wait_connected
 from enact_dist.link.zenoh_config import close_session, open_session
 from enact_dist.wire.frames import encode_frame
@@ -80,9 +81,11 @@ def discover(endpoints: Sequence[str], hello: Hello, *, timeout_s: float) -> tup
             shard=silent,
             endpoint=where,
         )
+    unknown = ", ".join(unknown_hosts(endpoints))
     raise ShardUnreachableError(
-        f"no shard answers at {where} (waited {timeout_s:g} s); is one running there?"
-        " (enact shard run, enact doctor)",
+        f"no shard answers at {where} (waited {timeout_s:g} s);"
+        + (f" the host name {unknown} cannot be resolved;" if unknown else "")
+        + " is one running there? (enact shard run, enact doctor)",
         endpoint=where,
     )
 

@@ -4,6 +4,12 @@ import signal
 
 import pytest
 
+from enact_dist import supervise
+from enact_dist.cli import up
+from enact_dist.config import load_config
+from enact_dist.errors import LinkError
+from enact_dist.link import endpoints, shard_daemon
+
 MODULE = """\
 from enact_dist import Actor, Aspect, Entity, Entities, View, World, Write
 
@@ -202,3 +208,35 @@ def test_up_refuses_a_host_that_runs_nothing(enact, write_cell):
 
     assert result.status == 2
     assert "runs on host 'c'" in result.err
+
+
+def test_second_up_of_a_cell_ends_with_what_is_wrong(spawn, until, write_cell, enact, monkeypatch):
+    """It would start its shards for ever, each refused because the first one's runs."""
+    file = write_cell()
+    first = spawn("up", file, "--no-actors")
+    for _ in range(2):
+        until(first, "ready: shard")
+    monkeypatch.setitem(supervise.END_S, "shard", 0.1)
+
+    second = enact("up", file, "--no-actors")
+
+    assert second.status == 1
+    assert "of cell clitest already runs at tcp/127.0.0.1:" in second.err
+    assert "ready:" not in second.out
+
+
+def test_up_waits_for_a_shard_that_is_just_ending(write_cell, monkeypatch):
+    """A supervisor that was killed leaves its shards behind, which end by themselves."""
+    config = load_config(write_cell())
+    refusals = [LinkError("already runs"), LinkError("already runs")]
+
+    def refuse(*_, **__):
+        if refusals:
+            raise refusals.pop()
+
+    monkeypatch.setattr(endpoints, "somebody_listens", lambda _: True)
+    monkeypatch.setattr(shard_daemon, "refuse_second_daemon", refuse)
+
+    up._refuse_second(config, config.shards[0])
+
+    assert refusals == []

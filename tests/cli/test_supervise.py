@@ -127,6 +127,29 @@ def test_shard_that_can_never_run_ends_everything():
     assert story.lines[-1] == ": stopped: shard bad cannot run"
 
 
+@pytest.mark.parametrize(
+    ("status", "said"),
+    [
+        (0, "exit status 0"),
+        (3, "exit status 3"),
+        (-15, "ended by SIGTERM"),
+        (-44, "ended by signal 44"),
+    ],
+)
+def test_end_by_a_signal_is_named(status, said):
+    """Nobody should have to look up what -15 is, in one line or another."""
+    assert supervise.ended_how(status) == said
+
+
+def test_child_that_a_signal_ends_while_it_drains_is_said_to():
+    """It has no handler of its own; a kill by hand and one of the supervisor read the same."""
+    story = Story("ready:")
+
+    story.run(task("plain", "shard", "import signal; print('ready:'); signal.pause()"))
+
+    assert story.lines[-1] == "plain: ended by SIGTERM"
+
+
 def test_second_signal_kills_what_does_not_leave():
     """Whoever asks twice does not wait for a child that ignores SIGTERM."""
     deaf = "import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('ready:'); signal.pause()"
