@@ -3,9 +3,15 @@
 import os
 import re
 import signal
+import socket
 import time
+from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
+
+from enact_dist.cell_info import ActorInfo
+from enact_dist.cli.actor import _warn_of_namesakes
 
 MODULE = """\
 from enact_dist import Actor, Aspect, Entity, World, Write
@@ -81,3 +87,14 @@ def test_two_actors_of_one_name_are_told_of(start, until, enact, cell_file):
     assert sessions[second.pid]["namesakes"] == [sessions[first.pid]["session"]]
     assert sessions[alone.pid]["namesakes"] == []
     assert [line.split()[0] for line in table if "running, one of 2" in line] == ["twin", "twin"]
+
+
+def test_predecessor_that_is_gone_is_no_namesake(caplog):
+    """Its session lasts a lease longer; of another host nobody can know."""
+    gone = ActorInfo("twin", socket.gethostname(), (1 << 22) + 1, "s1", ("left",), 0.5, 0)
+    cell = SimpleNamespace(namesakes=lambda _: (gone, replace(gone, host=f"not-{gone.host}")))
+
+    _warn_of_namesakes(cell, "twin")
+
+    (said,) = caplog.messages
+    assert said.startswith(f"another actor named twin runs, process {gone.pid} on not-")
