@@ -27,11 +27,8 @@ if TYPE_CHECKING:
     from enact_dist.config_types import CellConfig, ShardConfig
     from enact_dist.supervise import Say, Task
 
-
 LOOK_S: Final = 0.2
 """How often a shard that runs already is looked at."""
-
-
 ANSWER_S: Final = 2.0
 """How long who listens where a shard should may take to say what it is."""
 
@@ -123,13 +120,19 @@ def _refuse_second(config: CellConfig, shard: ShardConfig) -> None:
 
     settings = DaemonSettings(config.name, config.shard_settings(shard.name), shard.listen)
     drain_s = DRAIN_S if shard.drain_s is None else shard.drain_s
-    end_s = time.monotonic() + drain_s + END_S["shard"]
+    wait_s = drain_s + END_S["shard"]
+    end_s = time.monotonic() + wait_s
+    told = False
     while True:
         try:
             refuse_second_daemon(settings, probe_s=ANSWER_S)
         except LinkError:
             if time.monotonic() > end_s:
                 raise
+            if not told:
+                text = f"shard {shard.name} runs already; waiting up to {wait_s:g} s for its end"
+                print(f"enact: {text}", file=sys.stderr, flush=True)
+            told = True
             time.sleep(LOOK_S)
         else:
             return

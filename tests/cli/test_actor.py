@@ -221,6 +221,7 @@ def test_second_up_of_a_cell_ends_with_what_is_wrong(spawn, until, write_cell, e
     second = enact("up", file, "--no-actors")
 
     assert second.status == 1
+    assert second.err.startswith("enact: shard left runs already; waiting up to ")
     assert "of cell clitest already runs at tcp/127.0.0.1:" in second.err
     assert "ready:" not in second.out
 
