@@ -29,7 +29,6 @@ POLL_S: Final = 0.1
 PAUSE_S_MIN: Final = 0.05
 PAUSE_S_MAX: Final = 1.0
 """Pause after a reader that could not be taken; doubles up to the second figure."""
-REFUSED: Final = "metrics_readers_refused"
 
 _log = logging.getLogger("enact.link")
 
@@ -40,7 +39,7 @@ class MetricsServer:
     Args:
         address: Host and port; port 0 takes any that is free.
         page: Makes the page; called from the server's threads.
-        count: Called with `REFUSED` for each reader that is not taken.
+        count: Called with "metrics_readers_refused" for each reader that is not taken.
 
     Attributes:
         port: At which it listens.
@@ -97,7 +96,7 @@ class _Server(ThreadingMixIn, TCPServer):
         except OSError as error:
             if not self._pause_s:
                 _log.warning("a reader of the metrics cannot be taken for now: %s", error)
-            self._count(REFUSED)
+            self._count("metrics_readers_refused")
             self._pause_s = min(max(2 * self._pause_s, PAUSE_S_MIN), PAUSE_S_MAX)
             self.ending.wait(self._pause_s)
             raise
@@ -106,14 +105,14 @@ class _Server(ThreadingMixIn, TCPServer):
 
     def process_request(self, request: Any, client_address: Any) -> None:
         if not self._room.acquire(blocking=False):
-            self._count(REFUSED)
+            self._count("metrics_readers_refused")
             self.shutdown_request(request)
             return
         try:
             super().process_request(request, client_address)
         except BaseException:  # the system has no more threads
             self._room.release()
-            self._count(REFUSED)
+            self._count("metrics_readers_refused")
             raise
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
