@@ -20,6 +20,7 @@ from enact_dist.core.ledger import Ledger
 from enact_dist.core.messages import (
     AspectEntry,
     AwaitStamp,
+    Commit,
     Reached,
     Register,
     TakeView,
@@ -256,6 +257,9 @@ class Pair:
                     self.reference.lives[fact[1]].stamp_ns = stamp_ns
                     if fact[0] == "prepared":
                         self.reference.prepared_as[fact[1]].stamp_ns = stamp_ns
+                elif fact[0] == "slot" and isinstance(message, Commit):
+                    # The first commit of a volatile slot leaves no outcome behind.
+                    self.reference.lives[message.lock].stamp_ns = stamp_ns
 
     def _judge_changes(self, effects, expected) -> None:
         changes = [c for e in effects if isinstance(e, Publish) for c in e.notice.changes]
