@@ -24,6 +24,7 @@ from enact_dist.errors import (
     MisuseError,
     ReadonlyError,
 )
+from enact_dist.in_place import refuse_changed
 from enact_dist.lock_reads import reads_of
 from enact_dist.lock_statistics import LockStatistics
 from enact_dist.reading import EachData, Readings, check_requested, null_error, slot_of
@@ -31,7 +32,7 @@ from enact_dist.session import session_of
 from enact_dist.terms import Access, Entity, refuse_duplicates
 from enact_dist.together import Together
 from enact_dist.wire.limits import ITEMS_MAX
-from enact_dist.wire.payload import decode_datum, encode_parts
+from enact_dist.wire.payload import encode_parts
 from enact_dist.writable import WritableEach
 from enact_dist.writing import Writing, template
 
@@ -84,6 +85,9 @@ class Lock:
     An array arrives read-only: ``lock[joints] += 1`` works on it in place, which numpy refuses
     ("output array is read-only").  Write ``lock[joints] = lock[joints] + 1``.
 
+    What is assigned is published, nothing else: a list or dict that was changed in place is to be
+    assigned, too (``lock[flags] = {**lock[flags], "b": True}``).  What a block reads is its own.
+
     Args:
         requests: What to read, write and view; of one cell, of any of its contexts and shards.
             Writes on several shards become visible all or none, whatever crashes.
@@ -98,6 +102,8 @@ class Lock:
     Leaving raises (after a clean block):
         LeaseLostError: The lock was lost meanwhile; nothing was written.
         ChangedError: An expected view has moved on; nothing was written.
+        MisuseError: A list or dict that may be written was changed in place and not assigned;
+            nothing was written.
         CommitUnknownError: The commit was sent and never answered.
 
     Attributes:
@@ -201,6 +207,9 @@ class Lock:
                 _thread.lock = None
             if kind is None:
                 client.check_usable()
+                shown, assigned = self._readings.changeable, self._writing.looked_at
+                if shown or assigned:
+                    refuse_changed(shown, assigned, self._writing.data, self._requests)
                 self._writing.fix()
                 writes = self._writing.by_shard(lock.shard_of)
                 reads = reads_of(self._readings, self._requests, self._each) if writes else ((), 0)
@@ -301,7 +310,7 @@ class Lock:
         datum = self._writing.data[slot]
         if datum is None:
             raise null_error(slot, None)
-        value: T = decode_datum(datum, aspect.datum_type)
+        value: T = self._writing.value(slot, datum, aspect.datum_type)
         return value
 
     def __setitem__(self, request: Write[T], datum: T) -> None:

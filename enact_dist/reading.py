@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 from enact_dist.core.datum import Slot
 from enact_dist.core.messages import DatumRead
 from enact_dist.errors import MisuseError, NotRequestedError, NullDatumError
+from enact_dist.in_place import Shown, changeable
 from enact_dist.link.fetching import fetch_all
 from enact_dist.terms import Access, Aspect, Entity, LockRequest, NullReason, pattern_matches
 from enact_dist.wire.payload import decode_datum
@@ -49,6 +50,7 @@ class Readings:
     Attributes:
         decoded: How many data were decoded so far.
         looked_at: Those that are here still.
+        changeable: Of these the ones that can be changed in place, with their bytes.
         asked: The requests they were asked for with, where not all may be read.
     """
 
@@ -65,6 +67,7 @@ class Readings:
         self._lock = lock
         self._readings = {reading.state.slot: reading for reading in readings}
         self.looked_at: dict[Slot, Any] = {}
+        self.changeable: dict[Slot, Shown] = {}
         self._kept: dict[Slot, Datum] = {}
         self._fetched_alone = 0
         self.asked: Iterable[LockRequest[Any]] = ()
@@ -76,6 +79,7 @@ class Readings:
         self.usable = usable
         self._readings.clear()
         self.looked_at.clear()
+        self.changeable.clear()
         self._kept.clear()
 
     def state(self, slot: Slot) -> SlotState | None:
@@ -155,8 +159,11 @@ class Readings:
             reading = self._readings.get(slot)
             if reading is None or reading.state.null_reason:
                 raise null_error(slot, self.state(slot))
-            value = self.looked_at[slot] = decode_datum(self.datum(slot), aspect.datum_type)
+            datum, datum_type = self.datum(slot), aspect.datum_type
+            value = self.looked_at[slot] = decode_datum(datum, datum_type)
             self.decoded += 1
+            if changeable(datum_type):
+                self.changeable[slot] = Shown(value, datum, datum_type)
         return value
 
     def matching(self, request: LockRequest[Any]) -> list[Slot]:

@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, cast
 from enact_dist.core.datum import Datum, Slot
 from enact_dist.core.messages import WriteItem
 from enact_dist.errors import DatumTypeError, MisuseError
+from enact_dist.in_place import Shown, changeable
 from enact_dist.wire.limits import BODY_BYTES_MAX, ITEMS_MAX, PAYLOAD_BYTES_MIN
-from enact_dist.wire.payload import decode_to_fill, encode_parts, joined
+from enact_dist.wire.payload import decode_datum, decode_to_fill, encode_parts, joined
 from enact_dist.wire.shapes import ArrayOf, RecordOf, shape_of
 
 if TYPE_CHECKING:
@@ -50,9 +51,10 @@ class Writing:
     Attributes:
         data: What the commit sets; None writes null.
         edits: How often that was changed.
+        looked_at: What of it was handed out since it was set, and can be changed in place.
     """
 
-    __slots__ = ("_by_slot", "_bytes", "_payloads", "data", "edits")
+    __slots__ = ("_by_slot", "_bytes", "_payloads", "data", "edits", "looked_at")
 
     def __init__(self, payloads: SharedPayloads) -> None:
         self._payloads = payloads
@@ -60,6 +62,7 @@ class Writing:
         self._bytes = 0
         self.data: dict[Slot, Datum | None] = {}
         self.edits = 0
+        self.looked_at: dict[Slot, Shown] = {}
 
     def by_shard(self, shard_of: Callable[[Slot], str]) -> dict[str, list[WriteItem]]:
         """Return what each shard has to set."""
@@ -77,6 +80,16 @@ class Writing:
         """
         size = self._size_with(slot, encoded.size)
         self._note(slot, self._written(slot, encoded, shard_of), size)
+
+    def value(self, slot: Slot, datum: Datum, datum_type: Any) -> Any:
+        """Return the value of a datum that was set."""
+        shown = self.looked_at.get(slot)
+        if shown is not None:
+            return shown.value
+        value = decode_datum(datum, datum_type)
+        if changeable(datum_type):
+            self.looked_at[slot] = Shown(value, datum, datum_type)
+        return value
 
     def delete(self, slot: Slot) -> None:
         """Set a slot to null."""
@@ -105,6 +118,7 @@ class Writing:
         if written is not None and (written.draft is not None or written.arrays):
             self._by_slot[slot] = written
         self.data[slot] = written.datum if written is not None else None
+        self.looked_at.pop(slot, None)
         self._bytes = size
         self.edits += 1
 
@@ -150,6 +164,8 @@ class Writing:
             )
         datum = encoded.over(shown, draft.file if draft is not None else "")
         self._note(slot, _Written(datum, draft, arrays), size)
+        if changeable(datum_type):
+            self.looked_at[slot] = Shown(value, datum, datum_type)
         return value
 
     def _memory(self, shard: str, encoded: Encoded) -> tuple[Draft | None, memoryview, memoryview]:
@@ -194,6 +210,7 @@ class Writing:
             else:
                 self._forget(slot)
         self.data.clear()
+        self.looked_at.clear()
 
 
 def _fix(written: _Written) -> None:
