@@ -102,6 +102,7 @@ class Cell(Closing):
 
         Raises:
             LockHeldError: This thread holds a lock.
+            MisuseError: The connection only observes.
             UnknownWorldError: Some shards have it as a fork that is not complete.
             ValueError: The name is not allowed.
         """

@@ -45,7 +45,8 @@ def connect(
         patience_s: How long a question waits for a shard that does not answer, before it counts as
             unreachable; locks bring a time of their own, and a commit takes as long as it takes to
             know its end.
-        observer: Only look: no lock can be taken, and a shard keeps no record of the session.
+        observer: Only look: no lock can be taken, no world context or aspect comes to be, and a
+            shard keeps no record of the session.
 
     Raises:
         ShardUnreachableError: No shard answered in time; the message names shards and endpoints.

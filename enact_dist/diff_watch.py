@@ -51,7 +51,7 @@ class DiffWatch(Following["Comparison"]):
         if not present or left.session is not right.session:
             why = "they are of two connections" if present else "both are past and never change"
             raise MisuseError(f"{left!r} and {right!r} cannot be watched: {why}; use diff")
-        self._types = aspects_of(self._worlds, aspects or None)
+        self._types = aspects_of(self._worlds, aspects or None, later=True)
         self._pattern = str(Entities(pattern))
         self._told: dict[Place, DiffKind] = {}
         self._seen: dict[tuple[str, Place], int] = {}

@@ -157,10 +157,7 @@ class Lock:
             raise LockReleasedError(f"{self!r} was used already; make a new lock")
         client = self._session.client
         client.check_usable()
-        aspects = {request.aspect.name: request.aspect for request in self._requests}
-        self._session.register_aspects(
-            aspects.values(), requests=self._requests, wait_s=self._wait_s
-        )
+        self._session.prepare(self._requests, wait_s=self._wait_s)
         begun: list[MultiLock] = []
         self._asked_s = time.monotonic()
         try:
@@ -173,6 +170,7 @@ class Lock:
                 interrupt=self._interrupt,
                 begun=begun,
             )
+            self._session.check_shown(lock.states)
             self._granted_s = time.monotonic()
             self._readings = Readings(
                 client, self._session.cache, lock.lock, lock.states, self._use

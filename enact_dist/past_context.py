@@ -99,7 +99,6 @@ class PastContext(Context):
         client.greet()
         known = client.aspect_entries()
         asked = [name for name in (aspects or known) if name in known]
-        client.register(aspects=[known[name] for name in asked])
         items = [Item(int(Access.VIEW_EACH), self.name, pattern, name) for name in asked]
         if self.stamp_ns:
             items = [

@@ -10,6 +10,7 @@ from collections.abc import ItemsView, Iterator, Mapping, ValuesView
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
+from enact_dist.config_table import suggestion
 from enact_dist.core.datum import Slot
 from enact_dist.core.messages import DatumRead
 from enact_dist.errors import MisuseError, NotRequestedError, NullDatumError
@@ -158,13 +159,21 @@ class Readings:
         if value is UNSET:
             reading = self._readings.get(slot)
             if reading is None or reading.state.null_reason:
-                raise null_error(slot, self.state(slot))
+                raise self.null_error(slot)
             datum, datum_type = self.datum(slot), aspect.datum_type
             value = self.looked_at[slot] = decode_datum(datum, datum_type)
             self.decoded += 1
             if changeable(datum_type):
                 self.changeable[slot] = Shown(value, datum, datum_type)
         return value
+
+    def null_error(self, slot: Slot) -> NullDatumError:
+        """Return the error for reading a slot that was shown null, or not at all."""
+        return null_error(slot, self.state(slot), self._client.aspect_entries())
+
+    def readings(self) -> Iterable[Reading]:
+        """Return what was shown of every slot."""
+        return self._readings.values()
 
     def matching(self, request: LockRequest[Any]) -> list[Slot]:
         """Return the slots of a pattern request that are not null, in order of their names."""
@@ -196,11 +205,22 @@ def is_null(state: SlotState) -> bool:
     return bool(state.null_reason)
 
 
-def null_error(slot: Slot, state: SlotState | None) -> NullDatumError:
-    """Return the error for reading a null slot, with the reason."""
+def null_error(
+    slot: Slot, state: SlotState | None, aspects: Collection[str] | None = None
+) -> NullDatumError:
+    """Return the error for reading a null slot, with the reason.
+
+    Args:
+        slot: The slot.
+        state: What was shown of it.
+        aspects: Those that the cell knows; None where that is of no matter.
+    """
     reason = NullReason[state.null_reason].value if state else NullReason.NEVER_SET.value
+    unknown = ""
+    if aspects is not None and slot.aspect not in aspects:
+        unknown = f"; no shard knows an aspect {slot.aspect!r}{suggestion(slot.aspect, aspects)}"
     return NullDatumError(
-        f"{slot.entity}/{slot.aspect} is null in {slot.context} ({reason});"
+        f"{slot.entity}/{slot.aspect} is null in {slot.context} ({reason}{unknown});"
         " use .get(request, default) where that is expected",
         reason=reason,
     )

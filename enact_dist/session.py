@@ -6,10 +6,16 @@ import time
 from typing import TYPE_CHECKING, Any, Final
 
 from enact_dist.config_table import suggestion
+from enact_dist.core.catalogue import other_type
 from enact_dist.core.messages import AspectEntry, AwaitStamp, Item, Reached
 from enact_dist.core.placement import shard_of
 from enact_dist.core.retaining import said
-from enact_dist.errors import MisuseError, ShardUnreachableError, UnknownWorldError
+from enact_dist.errors import (
+    DatumTypeError,
+    MisuseError,
+    ShardUnreachableError,
+    UnknownWorldError,
+)
 from enact_dist.link.datum_cache import DatumCache
 from enact_dist.link.session_client import CALL_S
 from enact_dist.reading import slot_of
@@ -19,9 +25,10 @@ from enact_dist.together import Together
 from enact_dist.wire.fingerprint import fingerprint
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable, Sequence
 
     from enact_dist.core.datum import Slot
+    from enact_dist.core.lock_parts import Reading
     from enact_dist.link.client import CellClient
     from enact_dist.terms import Aspect
 
@@ -31,6 +38,8 @@ SETTLE_S: Final = 10.0
 SETTLE_SLICE_NS: Final = 500_000_000
 ENTRIES_MAX: Final = 1024
 """Aspect objects whose catalogue entries are remembered."""
+LOOKED_UP_S: Final = 1.0
+"""So long the shards are not asked again about an aspect that is only read and not in use yet."""
 
 
 class Session:
@@ -40,37 +49,99 @@ class Session:
         self.client = client
         self.cache = DatumCache()
         self._entries: dict[int, tuple[Aspect[Any], AspectEntry]] = {}
+        self._looked_up: dict[AspectEntry, float] = {}
+        self._unknown: set[AspectEntry] = set()
 
-    def register_aspects(
-        self,
-        aspects: Iterable[Aspect[Any]],
-        *,
-        requests: Iterable[LockRequest[Any]] | None = None,
-        wait_s: float | None = None,
-    ) -> None:
-        """Make sure that shards know these aspects with these datum types.
+    def prepare(self, requests: Iterable[LockRequest[Any]], *, wait_s: float | None = None) -> None:
+        """Make sure that the aspects of a lock or view can be used: register what it may write.
 
         Args:
-            aspects: The aspects.
-            requests: What they are wanted for: only the shards of these are asked; None: all.
+            requests: The requests; only their shards are asked.
             wait_s: How long the caller would wait at most; no shard gets less than one call's
                 time.
+
+        Raises:
+            DatumTypeError: A shard knows one of the aspects with another type.
+            ShardUnreachableError: A shard that is asked does not answer.
+        """
+        aspects = {request.aspect.name: request.aspect for request in requests}
+        entries = [self._entry(aspect) for aspect in aspects.values()]
+        if self.client.knows(entries):
+            return
+        patience_s = self.client.patience_s
+        timeout_s = patience_s if wait_s is None else min(patience_s, max(wait_s, CALL_S))
+        writing = [request for request in requests if request.access.writes]
+        written = {request.aspect.name for request in writing}
+        if written:
+            self.client.register(
+                aspects=[entry for entry in entries if entry.name in written],
+                needed=lambda: self.shards_of(writing),
+                timeout_s=timeout_s,
+            )
+        reading = [request for request in requests if request.aspect.name not in written]
+        if reading:
+            read = [entry for entry in entries if entry.name not in written]
+            self._look_up(read, lambda: self.shards_of(reading), timeout_s)
+
+    def look_up(self, aspects: Iterable[Aspect[Any]]) -> None:
+        """Make sure that no shard knows one of these aspects, which are only read, otherwise.
 
         Raises:
             DatumTypeError: A shard knows one with another type.
             ShardUnreachableError: A shard that is asked does not answer.
         """
         entries = [self._entry(aspect) for aspect in aspects]
-        if self.client.knows(entries):
+        if not self.client.knows(entries):
+            self._look_up(entries, self.client.shards, None)
+
+    def _look_up(
+        self,
+        entries: Sequence[AspectEntry],
+        needed: Callable[[], Iterable[str]],
+        timeout_s: float | None,
+    ) -> None:
+        """Check aspects that are only read; nothing comes to be by being asked for.
+
+        Of one that the cell has, a reader may want more to be retained, and it may be new to some
+        shard: that is said, but not by an observer.
+        """
+        client, now_s = self.client, time.monotonic()
+        due = [e for e in entries if now_s >= self._looked_up.get(e, -LOOKED_UP_S) + LOOKED_UP_S]
+        lacking = client.lacking(due, needed)
+        if not lacking:
+            self._unknown.difference_update(due)
             return
-        patience_s = self.client.patience_s
-        timeout_s = patience_s if wait_s is None else min(patience_s, max(wait_s, CALL_S))
-        if requests is None:
-            self.client.register(aspects=entries)
-        else:
-            self.client.register(
-                aspects=entries, needed=lambda: self.shards_of(requests), timeout_s=timeout_s
-            )
+        client.greet(lacking, timeout_s=timeout_s)
+        known = client.aspect_entries()
+        for entry in due:
+            wrong = other_type(known[entry.name], entry) if entry.name in known else ""
+            if wrong:
+                raise DatumTypeError(wrong)
+        used = [entry for entry in due if entry.name in known]
+        if used and not client.core.observer:
+            client.register(aspects=used, needed=needed, timeout_s=timeout_s)
+        if len(self._looked_up) >= ENTRIES_MAX:
+            self._looked_up.clear()
+            self._unknown.clear()
+        self._looked_up.update(dict.fromkeys(due, now_s))
+        self._unknown -= set(used)
+        self._unknown |= set(due) - set(used)
+
+    def check_shown(self, readings: Iterable[Reading]) -> None:
+        """Check aspects that came into use after they were looked up, by what is shown of them.
+
+        Raises:
+            DatumTypeError: One has another type.
+            ShardUnreachableError: A shard does not answer.
+        """
+        if not self._unknown:
+            return  # the usual case
+        shown = {one.state.slot.aspect for one in readings if not one.state.null_reason}
+        entries = [entry for entry in list(self._unknown) if entry.name in shown]
+        for entry in entries:
+            self._looked_up.pop(entry, None)
+        if entries:
+            self._look_up(entries, self.client.shards, None)
 
     def shards_of(self, requests: Iterable[LockRequest[Any]]) -> set[str]:
         """Return the shards on which the requests lie; a pattern lies on all."""

@@ -97,8 +97,8 @@ def look(worlds: Sequence[Viewable], places: Iterable[Place], *, each: bool) -> 
 
     Args:
         worlds: One or two.
-        places: Entities (patterns with `each`) and aspects; of an aspect that the cell does not
-            know there is nothing to see.
+        places: Entities (patterns with `each`) and aspects; of an aspect that a shard does not
+            know it shows nothing.
         each: Whether these are patterns.
 
     Raises:
@@ -108,8 +108,7 @@ def look(worlds: Sequence[Viewable], places: Iterable[Place], *, each: bool) -> 
         ShardUnreachableError: A shard does not answer.
     """
     client = worlds[0].session.client
-    known = client.aspect_entries()
-    asked = [place for place in places if place[1] in known]
+    asked = list(places)
     names = dict.fromkeys(world.name for world in worlds)
     access = int(Access.VIEW_EACH if each else Access.VIEW)
     items = [Item(access, name, *place) for name in names for place in asked]
@@ -118,8 +117,6 @@ def look(worlds: Sequence[Viewable], places: Iterable[Place], *, each: bool) -> 
             f"asked {len(asked)} data of each of {len(names)} world contexts at once, found room"
             f" for {ITEMS_MAX} in all; name fewer aspects"
         )
-    # A shard may never have held one of these aspects, and would not know its name.
-    client.register(aspects=[known[name] for name in {aspect for _, aspect in asked}])
     past_ns = past_ns_of(worlds[0])
     lock = client.acquire(items, wait_s=client.patience_s, hold_s=SIGHT_S, past_ns=past_ns)
     if lock.parts:
@@ -180,16 +177,20 @@ def _is_fork(world: Viewable) -> bool:
 
 
 def aspects_of(
-    worlds: Sequence[Viewable], wanted: Iterable[Aspect[Any] | str] | None
+    worlds: Sequence[Viewable],
+    wanted: Iterable[Aspect[Any] | str] | None,
+    *,
+    later: bool = False,
 ) -> dict[str, Aspect[Any]]:
     """Return the aspects to look at by name, each with its type as far as that is known here.
 
     Args:
         worlds: Where they are looked at.
         wanted: Aspects, or names; None stands for all that these cells know.
+        later: Whether an aspect that no cell knows may still come.
 
     Raises:
-        MisuseError: A name that no cell knows.
+        MisuseError: An aspect that no cell knows.
         DatumTypeError: An aspect is registered with another type.
     """
     sessions = dict.fromkeys(world.session for world in worlds)
@@ -198,11 +199,12 @@ def aspects_of(
             session.client.greet()
     typed = {one.name: one for one in wanted or () if isinstance(one, Aspect)}
     for session in sessions:
-        session.register_aspects(one for one in typed.values() if one.datum_type is not object)
+        session.look_up(one for one in typed.values() if one.datum_type is not object)
     known = _known(sessions)
-    unknown = [name for name in _names(wanted or ()) if name not in known]
-    if unknown:
-        raise unknown_aspect(unknown[0], known)
+    expected = typed.keys() if later else ()
+    for name in _names(wanted or ()):
+        if name not in known and name not in expected:
+            raise unknown_aspect(name, known)
     names = known if wanted is None else _names(wanted)
     return {name: typed.get(name) or _type_used(sessions, name) for name in sorted(names)}
 

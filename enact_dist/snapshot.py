@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar, overload
 from enact_dist.core.messages import Survey, Surveyed
 from enact_dist.errors import LeaseLostError, MisuseError, NullDatumError, ProtocolError
 from enact_dist.moments import Moment
-from enact_dist.reading import EachData, Readings, check_requested, null_error, slot_of
+from enact_dist.reading import EachData, Readings, check_requested, slot_of
 from enact_dist.session import session_of, unknown_aspect
 from enact_dist.terms import Aspect, Entity, NullReason, View
 from enact_dist.together import Together, captured_versions, newest_set_ns
@@ -47,13 +47,14 @@ def take_snapshot(
             raise MisuseError(f"{request!r} locks; view(…) takes View and ViewEach, or use Lock(…)")
     moment = _moment_of(requests, together)
     if register:
-        aspects = {request.aspect.name: request.aspect for request in requests}
-        session.register_aspects(aspects.values(), requests=requests)
+        session.prepare(requests)
     for attempt in range(1, VIEWS_MAX + 1):
         try:
             captured_ns = _newest_set_ns(session, together) if together is not None else 0
             items = _items(session, requests, moment, together, captured_ns)
             readings = take_readings(session, items, past_ns=moment.at_ns)
+            if register:
+                session.check_shown(readings.readings())
             snapshot = Snapshot(readings, requests, together, captured_ns)
             if together is None or attempt == VIEWS_MAX or snapshot.has_set():
                 return snapshot  # what has left retention just now is null in it
@@ -260,7 +261,7 @@ class Snapshot:
         slot = slot_of(request)
         state = self._readings.state(slot)
         if state is None or state.null_reason:
-            raise null_error(slot, state)
+            raise self._readings.null_error(slot)
         return self._readings.datum(slot)
 
     def __repr__(self) -> str:
@@ -269,10 +270,8 @@ class Snapshot:
 
 def raw_datum(context: Context, session: Session, entity: Entity, aspect: str) -> object:
     """Return a datum without knowing its Python type; as `WorldContext.raw`."""
-    known = known_aspect(session, aspect)
+    known_aspect(session, aspect)
     request = View(context, entity, Aspect(aspect, object))
-    # Its shard may never have held this aspect; then the datum is null, not the aspect unknown.
-    session.client.register(aspects=[known], needed=lambda: session.shards_of((request,)))
     return decode_untyped(take_snapshot((request,), register=False).encoded(request))
 
 

@@ -218,6 +218,8 @@ class Durability(enum.Enum):
 class Aspect(Generic[T]):
     """A property class of entities with the type of its data (the paper's a_j with D_j).
 
+    A cell knows an aspect from the first lock on that may write it; reading registers nothing.
+
     Args:
         name: Letters, digits, ``_ . -``.
         datum_type: `int`, `float`, `bool`, `str`, `bytes`, `list`, `dict`, `numpy.ndarray`, a

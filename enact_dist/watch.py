@@ -248,7 +248,7 @@ class Watch(Following[Change]):
         version, stamp_ns = state.state
         if known is None:
             gap = version - 1 if self._following[shard].listed else 0
-        elif known.epoch != state.epoch and not self._goes_on(slot, state.epoch):
+        elif known.epoch != state.epoch and not self._goes_on(shard, slot, state.epoch):
             gap = max(1, version - 1)
         else:
             last = known.state[0]
@@ -261,8 +261,11 @@ class Watch(Following[Change]):
             Change(entity, slot.aspect, version, position, gap, null, captured, slot.context)
         )
 
-    def _goes_on(self, slot: Slot, epoch: int) -> bool:
+    def _goes_on(self, shard: str, slot: Slot, epoch: int) -> bool:
         """Whether a restarted shard goes on counting the versions of a slot."""
+        if slot.aspect not in self._client.aspect_entries():
+            # It came into use after the shard was greeted, and nobody has registered it here.
+            self._client.call_once([(shard, self._client.core.hello(shard))])
         entry = self._client.aspect_entries().get(slot.aspect)
         kept = entry is not None and entry.durability != Durability.VOLATILE.value
         return kept and is_kept(epoch)

@@ -100,7 +100,7 @@ class WorldContext(Context):
         self.session.client.check_usable()
         aspects = tuple(aspects)
         if aspects:
-            self.session.register_aspects(aspects)
+            self.session.look_up(aspects)
         names = tuple(aspect.name for aspect in aspects)
         return Watch(self.session.client, (self.name,), tuple(patterns), names)
 

@@ -61,11 +61,9 @@ class Catalogue:
         if known is None:
             self._set(wanted)
             return wanted, True
-        if known.fingerprint != wanted.fingerprint:
-            return (
-                f"aspect {entry.name!r} is registered with datum type {known.fingerprint}, and was"
-                f" now asked with {wanted.fingerprint}; use the registered type or another name"
-            )
+        wrong = other_type(known, wanted)
+        if wrong:
+            return wrong
         if entry.durability and known.durability != wanted.durability:
             return (
                 f"aspect {entry.name!r} is registered as {known.durability}, and was now asked as"
@@ -91,6 +89,16 @@ class Catalogue:
     def durability(self, aspect: str) -> Durability:
         """Return what a commit of this (registered) aspect survives."""
         return _DURABILITIES[self.aspects[aspect].durability]
+
+
+def other_type(known: AspectEntry, wanted: AspectEntry) -> str:
+    """Return that an aspect is of another type than is `wanted`; nothing where it is of that."""
+    if known.fingerprint == wanted.fingerprint:
+        return ""
+    return (
+        f"aspect {known.name!r} is registered with datum type {known.fingerprint}, and was"
+        f" now asked with {wanted.fingerprint}; use the registered type or another name"
+    )
 
 
 _DURABILITIES: Final = {durability.value: durability for durability in Durability}

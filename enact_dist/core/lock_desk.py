@@ -21,6 +21,7 @@ from enact_dist.core.messages import (
 )
 from enact_dist.core.records import Effect, Reply
 from enact_dist.core.sessions import LANES_MAX, Session
+from enact_dist.terms import ACCESSES
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -118,7 +119,8 @@ class LockDesk:
         for item in items:
             if item.context not in worlds:
                 return unknown_world(item.context, worlds)
-            if item.aspect not in aspects:
+            if item.aspect not in aspects and ACCESSES[item.access].writes:
+                # Of what nobody has registered there is only null to be read, which is no fault.
                 return Refused("unknown_aspect", f"aspect {item.aspect!r} is not registered here")
         return None
 

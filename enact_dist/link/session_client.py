@@ -323,9 +323,10 @@ class SessionClient:
         """Return the shard on which an entity of that name lies."""
         return shard_of(entity, self.core.placement)
 
-    def greet(self, *, timeout_s: float | None = None) -> None:
-        """Say hello to every shard (again), which refreshes the catalogue."""
-        hellos = [(shard, self.core.hello(shard)) for shard in self.shards()]
+    def greet(self, shards: Iterable[str] | None = None, *, timeout_s: float | None = None) -> None:
+        """Say hello to shards (None: to all) again, which refreshes the catalogue."""
+        wanted = self.shards() if shards is None else shards
+        hellos = [(shard, self.core.hello(shard)) for shard in wanted]
         for answer in self.call_all(hellos, timeout_s=timeout_s):
             if isinstance(answer, Refused):
                 raise error_of(answer)
@@ -345,6 +346,16 @@ class SessionClient:
     def knows(self, aspects: Sequence[AspectEntry]) -> bool:
         """Whether every shard of the cell is known to know these aspects: the usual case."""
         return self._catalogue.settled(aspects, self.core.placement)
+
+    def lacking(
+        self, aspects: Sequence[AspectEntry], needed: Callable[[], Iterable[str]]
+    ) -> list[str]:
+        """Return those of the needed shards that are not known to know all these aspects."""
+        missing = [shard for shard in self.shards() if self._catalogue.lacks(shard, (), aspects)]
+        if not missing:
+            return []
+        wanted = set(needed())
+        return [shard for shard in missing if shard in wanted]
 
     def register(
         self,
@@ -366,8 +377,14 @@ class SessionClient:
         Raises:
             DatumTypeError: An aspect is registered with another type or durability.
             ShardUnreachableError: A shard does not answer.
+            MisuseError: This session only observes.
         """
         worlds, aspects = tuple(worlds), tuple(aspects)
+        if self.core.observer and (worlds or aspects):
+            raise MisuseError(
+                "this session only observes: it cannot lock, and makes no world contexts and"
+                " aspects; connect without observer=True"
+            )
         self._registered.update((entry.name, entry) for entry in aspects)
         missing = [
             shard for shard in self.shards() if self._catalogue.lacks(shard, worlds, aspects)

@@ -64,8 +64,6 @@ def world_as_of(world: WorldContext, at_ns: int = 0) -> Iterator[Recorded]:
     items = [Item(int(Access.VIEW_EACH), world.name, "**", aspect) for aspect in sorted(aspects)]
     if not items:
         return
-    # A pattern goes to all shards, and one may never have held some aspect.
-    session.client.register(aspects=aspects.values())
     with viewed(session, items, at_ns=at_ns) as view:
         states = [reading for reading in view.states if not reading.state.null_reason]
         for portion in _portions(sorted(states, key=lambda reading: reading.state.slot)):

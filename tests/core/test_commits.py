@@ -337,6 +337,19 @@ def test_unregistered_aspect_is_refused_by_name(bench):
     assert answer.code == "unknown_aspect"
 
 
+def test_unregistered_aspect_is_null_to_readers(bench):
+    """Reading needs no registration: there is null, and the catalogue stays as it was."""
+    bench.hello("ann")
+    before = dict(bench.shard.state.catalogue.aspects)
+    each = Item(Access.READ_EACH, "online", "*", "nonsense")
+    grant = bench.granted(ANN, Item(R, "online", "a", "nonsense"), each)
+
+    assert [(state.version, state.null_reason) for state in grant.states] == [(0, "NEVER_SET")]
+    assert bench.shard.state.catalogue.aspects == before
+    answer = bench.commit(ANN, grant.token, (slot("a", "nonsense"), "1"))
+    assert isinstance(answer, Refused)
+
+
 def test_unknown_world_is_refused_with_those_that_exist(bench):
     """A lock in a world context that does not exist names those that do."""
     bench.hello("ann")

@@ -319,10 +319,10 @@ def test_aspect_that_was_used_is_found_while_another_thread_uses_one(session):
         __hash__ = str.__hash__
 
         def __eq__(self, other):
-            session.register_aspects([Aspect(f"other{len(session._entries)}", int)])
+            session.look_up([Aspect(f"other{len(session._entries)}", int)])
             return False
 
-    session.register_aspects([Aspect("count", int), Aspect("pose", int)])
+    session.look_up([Aspect("count", int), Aspect("pose", int)])
 
     assert session.aspect_used(Named("none")) is None
 

@@ -155,7 +155,7 @@ def test_world_with_data_is_called_as_the_recording_calls_it(cell, run):
 
 def test_refused_type_makes_no_world(cell, online, run):
     """Nobody could read the data, so there is no context of them."""
-    online.view(View(online, piece, Aspect("value", str)))
+    cell.world("training").init(piece, Aspect("value", str), "a")
 
     with pytest.raises(DatumTypeError, match=r"aspect 'value' is int in .*run.mcap and str in"):
         replayed(cell, run, worlds={"online": "rep9"})
@@ -165,7 +165,7 @@ def test_refused_type_makes_no_world(cell, online, run):
 
 def test_aspect_of_another_type_is_refused(cell, online, run):
     """What the cell's actors could not read does not get in."""
-    online.view(View(online, piece, Aspect("value", str)))
+    cell.create_world("another").init(piece, Aspect("value", str), "a")
     with pytest.raises(DatumTypeError):
         replayed(cell, run)
 
