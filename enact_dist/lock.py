@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, overload
 from enact_dist.core.messages import SlotVersion
 from enact_dist.core.phase import Phase
 from enact_dist.errors import (
+    DatumTypeError,
     LockHeldError,
     LockReleasedError,
     MisuseError,
@@ -27,7 +28,14 @@ from enact_dist.errors import (
 from enact_dist.in_place import refuse_changed
 from enact_dist.lock_reads import reads_of
 from enact_dist.lock_statistics import LockStatistics
-from enact_dist.reading import EachData, Readings, check_requested, null_error, slot_of
+from enact_dist.reading import (
+    EachData,
+    Readings,
+    check_requested,
+    misfit,
+    null_error,
+    slot_of,
+)
 from enact_dist.session import session_of
 from enact_dist.terms import Access, Entity, refuse_duplicates
 from enact_dist.together import Together
@@ -332,7 +340,10 @@ class Lock:
         self._put(slot_of(request), request.aspect, datum, stamp_ns=stamp_ns)
 
     def _put(self, slot: Slot, aspect: Aspect[T], datum: T, *, stamp_ns: int = 0) -> None:
-        encoded = encode_parts(datum, aspect.datum_type, stamp_ns=stamp_ns)
+        try:
+            encoded = encode_parts(datum, aspect.datum_type, stamp_ns=stamp_ns)
+        except DatumTypeError as error:
+            raise misfit(slot, "is not set", error) from error.__cause__
         self._writing.put(slot, encoded, self._shard)
 
     def _shard(self, slot: Slot) -> str:
@@ -375,8 +386,11 @@ class Lock:
         self._check_writable(request)
         slot, asked = slot_of(request), request.aspect.datum_type
         self._writing.refuse_second(slot, request)
-        wanted = template(asked, like, shape, dtype)
-        value: T = self._writing.blank(slot, self._shard(slot), wanted, asked, stamp_ns)
+        try:
+            wanted = template(asked, like, shape, dtype)
+            value: T = self._writing.blank(slot, self._shard(slot), wanted, asked, stamp_ns)
+        except DatumTypeError as error:
+            raise misfit(slot, "is not set", error) from error.__cause__
         return value
 
     def __delitem__(self, request: Write[Any]) -> None:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 from enact_dist.config_table import suggestion
 from enact_dist.core.datum import Slot
 from enact_dist.core.messages import DatumRead
-from enact_dist.errors import MisuseError, NotRequestedError, NullDatumError
+from enact_dist.errors import DatumTypeError, MisuseError, NotRequestedError, NullDatumError
 from enact_dist.in_place import Shown, changeable
 from enact_dist.link.fetching import fetch_all
 from enact_dist.terms import Access, Aspect, Entity, LockRequest, NullReason, pattern_matches
@@ -161,7 +161,11 @@ class Readings:
             if reading is None or reading.state.null_reason:
                 raise self.null_error(slot)
             datum, datum_type = self.datum(slot), aspect.datum_type
-            value = self.looked_at[slot] = decode_datum(datum, datum_type)
+            try:
+                value = decode_datum(datum, datum_type)
+            except DatumTypeError as error:
+                raise misfit(slot, "cannot be read", error) from error.__cause__
+            self.looked_at[slot] = value
             self.decoded += 1
             if changeable(datum_type):
                 self.changeable[slot] = Shown(value, datum, datum_type)
@@ -224,6 +228,11 @@ def null_error(
         " use .get(request, default) where that is expected",
         reason=reason,
     )
+
+
+def misfit(slot: Slot, what: str, error: DatumTypeError) -> DatumTypeError:
+    """Return the error for a datum of another type, with the slot that it is in."""
+    return DatumTypeError(f"{slot.context}:{slot.entity}/{slot.aspect} {what}: {error}")
 
 
 def slot_of(request: LockRequest[Any]) -> Slot:

@@ -25,7 +25,6 @@ from enact_dist.cli.verbs import (
     world_name,
 )
 from enact_dist.config_table import suggestion
-from enact_dist.errors import DatumTypeError
 from enact_dist.link.signals import StopSignals
 from enact_dist.terms import Entities, Entity
 
@@ -230,15 +229,12 @@ def put_datum(arguments: argparse.Namespace) -> int:
         datum_type = literals.type_to_put(name, cell.aspects(), arguments.value, new=arguments.new)
         value = literals.read(arguments.value, datum_type)
         request = Write(world, Entity(entity), Aspect(name, datum_type))
-        try:
-            with Lock(request, wait_s=arguments.wait) as lock:
-                version = lock.version(request) + 1
-                if value is literals.NOTHING:
-                    del lock[request]
-                else:
-                    lock[request] = value
-        except DatumTypeError as error:
-            raise DatumTypeError(f"{world.name}:{entity}/{name} is not set: {error}") from error
+        with Lock(request, wait_s=arguments.wait) as lock:
+            version = lock.version(request) + 1
+            if value is literals.NOTHING:
+                del lock[request]
+            else:
+                lock[request] = value
     if arguments.json:
         print_json({"world": world.name, "entity": entity, "aspect": name, "version": version})
     else:
