@@ -38,6 +38,10 @@ T_contra = TypeVar("T_contra", contravariant=True)
 
 BLOCK_ELEMENTS: Final = 1 << 17
 """Elements of an array that are compared in one step: a few MB of memory, whatever its size."""
+FIGURES_MIN: Final = 4
+"""So many digits of a distance are shown where they are enough."""
+FIGURES_MAX: Final = 17
+"""No two numbers are the same in so many."""
 SHOWN_MAX: Final = 40
 """Characters of a value that a difference quotes."""
 _EXACT_KINDS: Final = "bSUVmMO"
@@ -81,8 +85,17 @@ class Difference:
         if math.isinf(self.distance):
             return f"differ{place}{what}"
         unit = f" {self.unit}" if self.unit else ""
-        allowed = f" ({self.tolerance:.4g}{unit} allowed)" if self.tolerance else ""
-        return f"{self.distance:.4g}{unit} apart{allowed}{place}{what}"
+        distance, tolerance = self._figures()
+        allowed = f" ({tolerance}{unit} allowed)" if self.tolerance else ""
+        return f"{distance}{unit} apart{allowed}{place}{what}"
+
+    def _figures(self) -> tuple[str, str]:
+        """Return distance and tolerance, with so many digits that an excess is to be seen."""
+        for digits in range(FIGURES_MIN, FIGURES_MAX + 1):
+            distance, tolerance = f"{self.distance:.{digits}g}", f"{self.tolerance:.{digits}g}"
+            if distance != tolerance or not self.crossed:
+                break
+        return distance, tolerance
 
 
 EQUAL: Final = Difference(0.0)
