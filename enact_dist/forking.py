@@ -75,12 +75,14 @@ def fork_world(session: Session, source: str, name: str, *, at_ns: int = 0) -> N
     while left and (left_s := deadline_s - time.monotonic()) > 0.0:
         answers = client.ask_each(left, request_of, timeout_s=left_s)
         done += [shard for shard, answer in answers.items() if isinstance(answer, Forked)]
+        forgotten = [answer for answer in answers.values() if isinstance(answer, Forgotten)]
+        latest = max(forgotten, key=lambda each: each.oldest_ns, default=None)
         for answer in answers.values():
             if isinstance(answer, Refused) and _is_busy(answer):
                 refusal = answer.text  # an undecided commit stands in the way: ask again
             elif answer is not None and not isinstance(answer, Forked):
                 _take_back(session, name, [shard for shard in done if shard not in there])
-                raise _failure(answer)
+                raise _failure(latest or answer)
         left = [shard for shard in left if shard not in done]
         if left:
             client.rest(PAUSE_S)

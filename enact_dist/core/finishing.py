@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from enact_dist.core.datum import Token
-from enact_dist.core.messages import Commit, Prepare, Validate
+from enact_dist.core.messages import Commit, Prepare, SlotVersion, Validate
 from enact_dist.core.placement import shard_of
 
 if TYPE_CHECKING:
@@ -25,11 +25,11 @@ if TYPE_CHECKING:
     from enact_dist.core.datum import LockId
     from enact_dist.core.lock_parts import Part
     from enact_dist.core.messages import (
+        Changed,
         DatumRead,
         PlacementMap,
         Prepared,
         Request,
-        SlotVersion,
         WriteItem,
     )
 
@@ -65,6 +65,11 @@ class Finishing:
         self.primary = min(self.writes, default="")
         self.left = dict.fromkeys(self.tokens)
         self.left.pop(self.primary, None)
+
+    def moved(self, answer: Changed) -> SlotVersion | None:
+        """Return what stands where a lock expected another version; None: nothing does as yet."""
+        found = SlotVersion(answer.slot, answer.version)
+        return None if any(found in each for each in self.expects.values()) else found
 
     def votes_to_ask(self, seen_stamp_ns: int) -> list[tuple[str, Request]]:
         """Return what to ask the shards that have not said yes."""

@@ -92,6 +92,7 @@ class MultiLock:
     phase: Phase = Phase.ACQUIRING
     cause: str = ""
     refusal: Refused | Forgotten | None = None
+    moved: SlotVersion | None = None
     silent_shard: str = ""
     blockers: tuple[Holder, ...] = ()
     taken_from: Part | None = None
@@ -209,7 +210,9 @@ class MultiLock:
     def _on_refusal(
         self, shard: str, request: Request, answer: Refused | Forgotten | WrongShard | EpochChanged
     ) -> None:
-        if isinstance(answer, Refused | Forgotten):
+        if isinstance(answer, Forgotten) and isinstance(self.refusal, Forgotten):
+            self.refusal = max(answer, self.refusal, key=lambda each: each.oldest_ns)
+        elif isinstance(answer, Refused | Forgotten):
             code = answer.code if isinstance(answer, Refused) else ""
             if code == NO_PAYLOAD and self._finishing and self._finishing.unname(request):
                 return  # asked again, with the bytes
@@ -450,7 +453,9 @@ class MultiLock:
             self._changed(answer)
 
     def _changed(self, answer: Changed) -> None:
-        self.cause = f"{answer.slot} is now at version {answer.version} or being written"
+        self.moved = self._finishing.moved(answer) if self._finishing is not None else None
+        how = f"has moved on to version {answer.version} since it was viewed"
+        self.cause = f"{answer.slot} {how if self.moved else 'is about to be written'}"
         self._end(Phase.CHANGED)
 
     def _on_committing(self, answer: Answer, now_ns: int) -> None:

@@ -74,7 +74,7 @@ from enact_dist.core.records import (
 )
 from enact_dist.core.session_desk import SessionDesk
 from enact_dist.core.shard_state import ShardSettings, ShardState
-from enact_dist.core.tenures import WAIT_SLICE_NS_MAX
+from enact_dist.core.tenures import HELD_TOO_LONG, WAIT_SLICE_NS_MAX
 from enact_dist.core.view_desk import ViewDesk
 from enact_dist.core.worlds import WorldDesk
 from enact_dist.terms import Durability
@@ -271,7 +271,7 @@ class Shard:
             yield from self._expire(session)
         for tenure in self.state.tenures.held_too_long(now_ns):
             self.state.count("held_too_long")
-            cause = f"held longer than its limit of {tenure.hold_ns / 1e9:g} s"
+            cause = f"{HELD_TOO_LONG} {tenure.hold_ns / 1e9:g} s"
             yield from self.state.tenures.take_away(tenure, cause, now_ns=now_ns)
         for idle in self.state.sessions.idle(now_ns):
             yield from self._sessions.end(idle.session, "its session stayed away")

@@ -41,6 +41,8 @@ WAIT_SLICE_NS_MAX: Final = 1_000_000_000
 """Longest time one request is parked; a client that still waits asks again (long poll)."""
 HOLD_NS_MAX: Final = 24 * 3600 * 1_000_000_000
 """Nobody holds a lock longer than a day without asking for it anew."""
+HELD_TOO_LONG: Final = "held longer than its limit of"
+"""So begins the cause of a lock that ends by its hold limit."""
 STALE_ENDS_MAX: Final = 1024
 """Entries of ended locks that the deadline heaps may hold before they are swept."""
 BLOCKERS_TOLD_MAX: Final = 8

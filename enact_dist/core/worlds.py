@@ -183,21 +183,23 @@ class WorldDesk:
         del self._waiting[message.world]
         made: list[tuple[Slot, Content]] = []
         records: list[Record] = [WorldRecord(message.world, message.source, message.at_ns)]
-        forgotten: Forgotten | None = None
+        unknown, latest = False, Forgotten(Slot(message.source, "", ""), 0)
         fork = _Making(self._state, message)
         for source, newest in slots.of_context(message.source):
             is_newest = newest.version > 0 and newest.stamp_ns <= message.at_ns
             content = newest if is_newest else slots.as_of(source, message.at_ns)
+            since_ns = slots.known_since_ns(source, newest)
+            if since_ns > latest.oldest_ns:
+                latest = Forgotten(source, since_ns)  # from then on all of them are known
             if isinstance(content, int):
-                if forgotten is None or content > forgotten.oldest_ns:
-                    forgotten = Forgotten(source, content)
+                unknown = True
             elif content is not NOTHING:
                 slot, shared = fork.shared(source, content)
                 made.append((slot, shared))
                 records.append(fork.record(slot, shared, source, content))
-        if forgotten is not None:
+        if unknown:
             self._end(act)
-            yield from self._told(act, forgotten)
+            yield from self._told(act, latest)
             return
         act.made = tuple(made)
         yield self._persist(act, tuple(records))

@@ -18,10 +18,12 @@ from enact_dist.core.messages import (
     OUTCOME_COMMITTED,
     OUTCOME_PENDING,
     OUTCOME_UNSEEN,
+    Explain,
     Outcome,
     OutcomeIs,
     Refused,
     Release,
+    Versions,
 )
 from enact_dist.core.multilock import MultiLock
 from enact_dist.core.phase import Phase
@@ -280,6 +282,7 @@ class CellClient(SessionClient):
     ) -> EnactError:
         waited_s = (self._now_ns() - started_ns) / 1e9
         self._ask_cause(lock)
+        self._ask_who(lock)
         name = name_of(lock.lock, writes)
         return not_committed(lock, waited_s, self.carrier.endpoint_of, name=name)
 
@@ -366,3 +369,18 @@ class CellClient(SessionClient):
                 lock.told_cause(self.call_once([call])[0])
             except EnactError as error:
                 _log.info("why lock %s was lost cannot be asked: %s", lock.lock, error)
+
+    def _ask_who(self, lock: MultiLock) -> None:
+        """Let the shard say who committed what a lock did not expect."""
+        moved = lock.moved
+        if moved is None:
+            return
+        try:
+            answer = self.call_once([(self.shard_of(moved.slot.entity), Explain((moved,)))])[0]
+        except EnactError as error:
+            _log.info("who changed %s cannot be asked: %s", moved.slot, error)
+            return
+        for entry in answer.entries if isinstance(answer, Versions) else ():
+            if entry.cause is not None:
+                by = entry.cause
+                lock.cause += f", by {by.actor or 'client'}@{by.host} pid {by.pid}"

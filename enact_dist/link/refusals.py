@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from enact_dist.core.messages import Forgotten
 from enact_dist.core.multilock import MultiLock
 from enact_dist.core.phase import Phase
+from enact_dist.core.tenures import HELD_TOO_LONG
 from enact_dist.errors import (
     ChangedError,
     ClockSkewError,
@@ -112,10 +113,16 @@ def not_committed(
     if lock.phase is Phase.UNREACHABLE:
         return unreachable(lock.silent_shard, finish_s, endpoint_of)
     if lock.phase is Phase.CHANGED:
-        return ChangedError(f"{lock.cause} since it was viewed; nothing was written")
+        return ChangedError(
+            f"{lock.cause}; nothing was written: take the lock again and redo the work with what is"
+            " there then, or ask with Read, so that nobody changes it"
+        )
+    remedy = "take the lock again and redo the work"
+    if lock.cause.startswith(HELD_TOO_LONG):
+        remedy = "raise hold_s, or shorten the block: look by a View and compute before it"
     return LeaseLostError(
         f"lock {lock.lock} on {_wanted(lock)} was lost: {lock.cause}; nothing was written;"
-        " take the lock again and redo the work",
+        f" {remedy}",
         cause=lock.cause,
     )
 
@@ -152,8 +159,10 @@ def moment_name(stamp_ns: int) -> str:
 
 def forgotten(answer: Forgotten) -> ForgottenError:
     """Return the error for a past state that its shard does not keep any more."""
+    # Rounded up: what is copied from here must not lie before it.
     known = (
-        f"known from {moment_name(answer.oldest_ns)} on (stamp {answer.oldest_ns})"
+        f"all that was asked is known from {moment_name(answer.oldest_ns + 999_999)} on (stamp"
+        f" {answer.oldest_ns})"
         if answer.oldest_ns
         else "nothing of it is known"
     )

@@ -165,7 +165,9 @@ def test_what_has_left_its_retention_names_the_oldest_known_moment(online, loose
     loose.end()
     positions += [put(online, ARM, number, FLEETING) for number in range(4, 6)]
 
-    with pytest.raises(ForgottenError, match=r"older than its retention; known from") as error:
+    with pytest.raises(
+        ForgottenError, match=r"older than its retention; all .* is known from"
+    ) as error:
         value_of(online.at(positions[0]), ARM, FLEETING)
 
     oldest = Position(error.value.oldest_ns, "")
