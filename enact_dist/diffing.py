@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
+from enact_dist.arguments import check_pattern, check_viewable, checked_each
 from enact_dist.cell_info import slot_info
 from enact_dist.comparing import EQUAL, EXACT, Difference
 from enact_dist.errors import LeaseLostError
@@ -135,6 +136,11 @@ def diff(
     aspects: Iterable[Aspect[Any] | str] | None = None,
 ) -> Diff:
     """Compare two world contexts; see `WorldContext.diff`."""
+    call = "diff(other, entities, aspects)"
+    check_viewable(call, right)
+    check_pattern(call, "entities", entities)
+    if aspects is not None:
+        aspects = checked_each(call, "aspects", aspects, Aspect, str)
     types = aspects_of((left, right), aspects)
     places = [(str(Entities(str(entities))), name) for name in types]
     for attempt in range(1, ATTEMPTS_MAX + 1):

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, ClassVar, NoReturn
 
+from enact_dist.arguments import check_pattern, checked_each
 from enact_dist.cell_info import SlotInfo, slot_info
 from enact_dist.core.messages import Item
 from enact_dist.errors import MisuseError
@@ -94,6 +95,8 @@ class PastContext(Context):
             UnknownWorldError: The cell has no such world context any more.
             ShardUnreachableError: A shard does not answer.
         """
+        check_pattern("survey(entities, aspects)", "entities", entities)
+        aspects = checked_each("survey(entities, aspects)", "aspects", aspects, str)
         client, pattern = self.session.client, str(Entities(str(entities)))
         client.check_usable()
         client.greet()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Final, TypeVar, overload
 
+from enact_dist.arguments import check_argument
 from enact_dist.core.messages import Survey, Surveyed
 from enact_dist.errors import LeaseLostError, MisuseError, NullDatumError, ProtocolError
 from enact_dist.moments import Moment
@@ -270,6 +271,8 @@ class Snapshot:
 
 def raw_datum(context: Context, session: Session, entity: Entity, aspect: str) -> object:
     """Return a datum without knowing its Python type; as `WorldContext.raw`."""
+    check_argument("raw(entity, aspect)", "entity", entity, Entity)
+    check_argument("raw(entity, aspect)", "aspect", aspect, str)
     known_aspect(session, aspect)
     request = View(context, entity, Aspect(aspect, object))
     return decode_untyped(take_snapshot((request,), register=False).encoded(request))

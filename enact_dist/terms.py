@@ -359,14 +359,12 @@ class LockRequest(Generic[T_co]):
     _hash: int = field(init=False)
 
     def __post_init__(self) -> None:
-        allowed = Entities if self.access.each else (Entity, Entities)
-        for name, wanted in (("world", Context), ("entity", allowed), ("aspect", Aspect)):
+        allowed = (Entities,) if self.access.each else (Entity, Entities)
+        for name, wanted in (("world", (Context,)), ("entity", allowed), ("aspect", (Aspect,))):
             found = getattr(self, name)
             if not isinstance(found, wanted):
-                raise TypeError(
-                    f"{type(self).__name__}(world, entity, aspect): {name} is {found!r}, which is"
-                    f" no {getattr(wanted, '__name__', 'Entity or Entities')}"
-                )
+                call = f"{type(self).__name__}(world, entity, aspect)"
+                raise wrong_argument(call, name, found, *wanted)
         # Every lock asks for both several times, and a request never changes.
         address = self.world.name, str(self.entity), self.aspect.name
         object.__setattr__(self, "address", address)
@@ -440,6 +438,17 @@ class WriteEach(LockRequestEach[T]):
 
     __slots__ = ()
     access = Access.WRITE_EACH
+
+
+def wrong_argument(call: str, name: str, found: object, *wanted: type[Any]) -> TypeError:
+    """Return the error for an argument of a type that its call cannot use."""
+    kinds = " or ".join(kind.__name__ for kind in wanted)
+    remedy = ""
+    if isinstance(found, str) and Entity in wanted:
+        remedy = f"; write Entity({found!r})"
+    elif isinstance(found, str) and Aspect in wanted:
+        remedy = f"; write Aspect({found!r}, TYPE)"
+    return TypeError(f"{call}: {name} is {found!r}, which is no {kinds}{remedy}")
 
 
 def refuse_duplicates(requests: Iterable[LockRequest[Any]]) -> None:

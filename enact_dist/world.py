@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, TypeVar, overload
 
+from enact_dist.arguments import check_argument, check_pattern, check_viewable, checked_each
 from enact_dist.cell_info import SlotInfo, slot_info
 from enact_dist.errors import MisuseError
 from enact_dist.forking import fork_world
@@ -91,8 +92,11 @@ class WorldContext(Context):
 
         Raises:
             LockHeldError: This thread holds a lock.
+            TypeError: An argument is of another type.
         """
         refuse_inside_lock("watch")
+        check_pattern("watch(entities, *aspects)", "entities", entities)
+        checked_each("watch(entities, *aspects)", "aspects", aspects, Aspect)
         return self.watch_all((str(entities),), aspects)
 
     def watch_all(self, patterns: Iterable[str], aspects: Iterable[Aspect[Any]]) -> Watch:
@@ -126,6 +130,7 @@ class WorldContext(Context):
         Raises:
             LockHeldError: This thread holds a lock.
             ForgottenError: A past one has left its retention.
+            TypeError: An argument is of another type.
             MisuseError: An aspect is named that nobody has registered.
             UnknownWorldError: The cell has one of them no more.
             DatumTypeError: An aspect is registered with another type.
@@ -155,6 +160,7 @@ class WorldContext(Context):
         Raises:
             LockHeldError: This thread holds a lock.
             ForgottenError: A past one has left its retention.
+            TypeError: An argument is of another type.
             MisuseError: The two cannot be watched together.
             UnknownWorldError: The cell has one of them no more.
             ShardUnreachableError: A shard does not answer.
@@ -162,6 +168,9 @@ class WorldContext(Context):
         from enact_dist.diff_watch import DiffWatch
 
         refuse_inside_lock("watch_diff")
+        check_viewable("watch_diff(other, entities, *aspects)", other)
+        check_pattern("watch_diff(other, entities, *aspects)", "entities", entities)
+        checked_each("watch_diff(other, entities, *aspects)", "aspects", aspects, Aspect, str)
         return DiffWatch(self, other, str(entities), aspects)
 
     def survey(
@@ -172,7 +181,9 @@ class WorldContext(Context):
         Raises:
             ShardUnreachableError: A shard does not answer.
         """
-        found = survey_states(self.session, self.name, str(Entities(str(entities))), tuple(aspects))
+        check_pattern("survey(entities, aspects)", "entities", entities)
+        names = checked_each("survey(entities, aspects)", "aspects", aspects, str)
+        found = survey_states(self.session, self.name, str(Entities(str(entities))), names)
         infos = [slot_info(shard, state) for shard, state in found]
         return tuple(sorted(infos, key=lambda info: (info.entity, info.aspect)))
 
@@ -212,9 +223,12 @@ class WorldContext(Context):
 
         Raises:
             UnknownWorldError: The cell has this world context no more.
+            TypeError: `entity` or `aspect` is of another type.
             MisuseError: `since` is no moment of the past, or `count` no number above 0.
             ShardUnreachableError: The entity's shard does not answer.
         """
+        check_argument("history(entity, aspect)", "entity", entity, Entity)
+        check_argument("history(entity, aspect)", "aspect", aspect, Aspect)
         if count is not None and (type(count) is not int or count < 1):
             raise MisuseError(f"count is {count!r}; it must be a number of versions above 0")
         since_ns = stamp_of(since, seen_ns=self._seen_ns) if since is not None else 0

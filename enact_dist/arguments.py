@@ -1,0 +1,56 @@
+"""What a call is given: refused at once, by name, where it is of no use.
+
+Entities, aspects and names are told apart by their types alone: an aspect in place of an entity
+would be looked for by its name, and nothing found.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any, TypeVar
+
+from enact_dist.terms import Aspect, Context, Entities, Entity, wrong_argument
+
+T = TypeVar("T")
+
+
+def check_argument(call: str, name: str, found: object, *wanted: type[Any]) -> None:
+    """Raise `TypeError` unless an argument is of one of the wanted types.
+
+    Args:
+        call: The call as it is written: ``history(entity, aspect)``.
+        name: The argument's name.
+        found: What was given.
+        wanted: The types.
+    """
+    if not isinstance(found, wanted):
+        raise wrong_argument(call, name, found, *wanted)
+
+
+def check_pattern(call: str, name: str, found: object) -> None:
+    """Raise `TypeError` unless an argument is a pattern of entities, or one entity."""
+    check_argument(call, name, found, Entities, Entity, str)
+
+
+def check_viewable(call: str, found: object) -> None:
+    """Raise `TypeError` unless an argument is a world context of a cell, present or past."""
+    if not isinstance(found, Context) or getattr(found, "session", None) is None:
+        raise TypeError(
+            f"{call}: other is {found!r}, which is no world context of a cell;"
+            " take cell.world(name), or world.at(moment)"
+        )
+
+
+def checked_each(call: str, name: str, found: Iterable[T], *wanted: type[Any]) -> tuple[T, ...]:
+    """Return a collection that holds only things of the wanted types.
+
+    Raises:
+        TypeError: It is none, or holds something else.
+    """
+    if isinstance(found, str | Aspect) or not isinstance(found, Iterable):
+        kinds = " or ".join(kind.__name__ for kind in wanted)
+        raise TypeError(f"{call}: {name} is {found!r}, which is no list of {kinds}")
+    each = tuple(found)
+    for one in each:
+        check_argument(call, f"one of {name}", one, *wanted)
+    return each
