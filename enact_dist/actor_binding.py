@@ -70,17 +70,19 @@ class BoundActor:
         self._by_entity: dict[Entity | None, Mapping[Declared, Declared]] = {}
 
     def register(self) -> None:
-        """Let the shards know the actor's aspects: those of its data, with a trigger all.
+        """Let the shards of its data look at the actor's aspects; with a trigger, all shards.
 
         Raises:
             DatumTypeError: A shard knows one of them with another type.
             ShardUnreachableError: A shard that is needed does not answer.
         """
-        aspects = [request.aspect for request in self.declaration.requests.values()]
-        # The watch of a trigger needs all shards.
-        requests = None if self.declaration.triggers else self._bound_for(None).values()
         for context in list(self.contexts.values())[:1]:  # all are of one session
-            context.session.register_aspects(aspects, requests=requests, wait_s=0.0)
+            if self.declaration.triggers:  # its watch needs all shards
+                context.session.look_up(
+                    request.aspect for request in self.declaration.requests.values()
+                )
+            else:
+                context.session.prepare(self._bound_for(None).values(), wait_s=0.0)
 
     def lock(
         self,
