@@ -432,10 +432,11 @@ class Cell(Closing):
     def namesakes(self, name: str) -> tuple[ActorInfo, ...]:
         """Return the other sessions of actors of a name that are not silent.
 
-        Only the shards that this process has spoken with are asked, and none is waited for long.
+        All shards are asked: the other may have spoken with one of them alone.  None is waited
+        for longer than one call takes.
         """
         client = self._client
-        shards = [shard for shard in client.shards() if not client.core.needs_hello(shard)]
+        shards = client.shards()
         answers = client.call_once([(shard, ListSessions()) for shard in shards])
         told = zip(shards, answers, strict=True)
         infos = actor_infos((shard, found) for shard, found in told if isinstance(found, Sessions))
