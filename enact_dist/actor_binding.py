@@ -13,6 +13,7 @@ from enact_dist.actor import Actor, Declared, check_update, same_data, stands_fo
 from enact_dist.actor_lock import ActorLock
 from enact_dist.actor_sets import PendingSets
 from enact_dist.errors import MisuseError
+from enact_dist.link.session_client import CALL_S
 from enact_dist.reading import slot_of
 from enact_dist.terms import Entities, Entity, View, refuse_duplicates
 
@@ -78,8 +79,10 @@ class BoundActor:
         """
         for context in list(self.contexts.values())[:1]:  # all are of one session
             if self.declaration.triggers:  # its watch needs all shards
+                # Tried again while the actor is not stopped, so no try takes long.
                 context.session.look_up(
-                    request.aspect for request in self.declaration.requests.values()
+                    (request.aspect for request in self.declaration.requests.values()),
+                    timeout_s=CALL_S,
                 )
             else:
                 context.session.prepare(self._bound_for(None).values(), wait_s=0.0)

@@ -3,7 +3,8 @@
 What a commit publishes is what was assigned.  Arrays are read-only, so that numpy says so at once;
 a list or dict can be changed all the same, also one inside a dataclass.  So what a block has looked
 at of such data, and might have written, is compared with its bytes before the commit.  Numbers,
-texts, arrays and values of codecs cost nothing: they are not remembered.
+texts and arrays cost nothing: they are not remembered.  Nor is what has a value of a codec in it:
+a codec may write the same value in other bytes each time.
 """
 
 from __future__ import annotations
@@ -17,10 +18,19 @@ from enact_dist.errors import DatumTypeError, MisuseError
 from enact_dist.terms import Access, pattern_matches
 from enact_dist.wire import codecs
 from enact_dist.wire.payload import decode_datum, encode_parts
-from enact_dist.wire.shapes import DictOf, ListOf, OptionalOf, Plain, RecordOf, TupleOf, shape_of
+from enact_dist.wire.shapes import (
+    CodecOf,
+    DictOf,
+    ListOf,
+    OptionalOf,
+    Plain,
+    RecordOf,
+    TupleOf,
+    shape_of,
+)
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Collection, Iterable, Iterator, Mapping
 
     from enact_dist.core.datum import Slot
     from enact_dist.terms import LockRequest
@@ -46,30 +56,39 @@ def changeable(datum_type: Any) -> bool:
     """Whether a value of this type can be changed in place: it is, or has, a list or dict."""
     known = _changeable.get(datum_type)
     if known is None:
-        known = _changeable[datum_type] = _has_container(shape_of(datum_type))
+        parts = list(_parts(shape_of(datum_type)))
+        known = any(map(_is_container, parts)) and not any(
+            isinstance(part, CodecOf) for part in parts
+        )
+        _changeable[datum_type] = known
     return known
 
 
-def _has_container(shape: Shape) -> bool:
+def _is_container(shape: Shape) -> bool:
+    if isinstance(shape, Plain):
+        return shape.kind in (list, dict, object)
+    return isinstance(shape, ListOf | DictOf)
+
+
+def _parts(shape: Shape) -> Iterator[Shape]:
+    """Yield a shape and all that it is made of."""
+    yield shape
     match shape:
-        case Plain(kind):
-            return kind in (list, dict, object)
-        case ListOf() | DictOf():
-            return True
+        case ListOf(inner) | DictOf(_, inner) | OptionalOf(inner):
+            yield from _parts(inner)
         case TupleOf(parts, _):
-            return any(map(_has_container, parts))
-        case OptionalOf(inner):
-            return _has_container(inner)
+            for part in parts:
+                yield from _parts(part)
         case RecordOf(_, fields):
-            return any(_has_container(part) for _, part in fields)
-    return False
+            for _, part in fields:
+                yield from _parts(part)
 
 
 def refuse_changed(
     shown: Mapping[Slot, Shown],
     assigned: Mapping[Slot, Shown],
     written: Mapping[Slot, Datum | None],
-    requests: Iterable[LockRequest[Any]],
+    requests: Collection[LockRequest[Any]],
 ) -> None:
     """Raise `MisuseError` if what a block could have written was changed and not assigned.
 
@@ -82,13 +101,13 @@ def refuse_changed(
     looked_at = {slot: one for slot, one in shown.items() if slot not in written} | {**assigned}
     if not looked_at:
         return
-    writing = [request for request in requests if request.access.writes]
-    changed = {
-        slot: request
-        for slot, one in looked_at.items()
-        for request in writing
-        if _allows(request, slot) and _was_changed(one)
-    }
+    single = {one.address: one for one in requests if one.access.writes and not one.access.each}
+    each = [one for one in requests if one.access.writes and one.access.each]
+    changed = {}
+    for slot, one in looked_at.items():
+        request = single.get(slot) or _allowing(each, slot)
+        if request is not None and _was_changed(one):
+            changed[slot] = request
     if changed:
         slot, request = next(iter(changed.items()))
         names = [f"{slot.entity}/{slot.aspect} in {slot.context}" for slot in changed]
@@ -102,12 +121,15 @@ def refuse_changed(
         )
 
 
-def _allows(request: LockRequest[Any], slot: Slot) -> bool:
-    """Whether a writing request allows to write a slot."""
-    context, pattern, aspect = request.address
-    if (context, aspect) != (slot.context, slot.aspect):
-        return False
-    return pattern_matches(pattern, slot.entity) if request.access.each else pattern == slot.entity
+def _allowing(each: Iterable[LockRequest[Any]], slot: Slot) -> LockRequest[Any] | None:
+    """Return the pattern that allows to write a slot, None where none does."""
+    for request in each:
+        context, pattern, aspect = request.address
+        if (context, aspect) == (slot.context, slot.aspect) and pattern_matches(
+            pattern, slot.entity
+        ):
+            return request
+    return None
 
 
 def _was_changed(shown: Shown) -> bool:

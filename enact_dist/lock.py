@@ -178,7 +178,7 @@ class Lock:
                 interrupt=self._interrupt,
                 begun=begun,
             )
-            self._session.check_shown(lock.states)
+            self._session.check_shown(lock.states, self._requests)
             self._granted_s = time.monotonic()
             self._readings = Readings(
                 client, self._session.cache, lock.lock, lock.states, self._use

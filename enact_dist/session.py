@@ -83,8 +83,12 @@ class Session:
             read = [entry for entry in entries if entry.name not in written]
             self._look_up(read, lambda: self.shards_of(reading), timeout_s)
 
-    def look_up(self, aspects: Iterable[Aspect[Any]]) -> None:
+    def look_up(self, aspects: Iterable[Aspect[Any]], *, timeout_s: float | None = None) -> None:
         """Make sure that no shard knows one of these aspects, which are only read, otherwise.
+
+        Args:
+            aspects: The aspects.
+            timeout_s: How long shards have to answer; None: as long as this client has patience.
 
         Raises:
             DatumTypeError: A shard knows one with another type.
@@ -92,7 +96,7 @@ class Session:
         """
         entries = [self._entry(aspect) for aspect in aspects]
         if not self.client.knows(entries):
-            self._look_up(entries, self.client.shards, None)
+            self._look_up(entries, self.client.shards, timeout_s)
 
     def _look_up(
         self,
@@ -127,8 +131,12 @@ class Session:
         self._unknown -= set(used)
         self._unknown |= set(due) - set(used)
 
-    def check_shown(self, readings: Iterable[Reading]) -> None:
+    def check_shown(
+        self, readings: Iterable[Reading], requests: Iterable[LockRequest[Any]]
+    ) -> None:
         """Check aspects that came into use after they were looked up, by what is shown of them.
+
+        Only those of these requests, at the shards that show them.
 
         Raises:
             DatumTypeError: One has another type.
@@ -136,12 +144,18 @@ class Session:
         """
         if not self._unknown:
             return  # the usual case
-        shown = {one.state.slot.aspect for one in readings if not one.state.null_reason}
-        entries = [entry for entry in list(self._unknown) if entry.name in shown]
+        shown = [one.state.slot for one in readings if not one.state.null_reason]
+        names = {slot.aspect for slot in shown}
+        wanted = {self._entry(one.aspect) for one in requests if one.aspect.name in names}
+        entries = [entry for entry in wanted if entry in self._unknown]
         for entry in entries:
             self._looked_up.pop(entry, None)
+            self._unknown.discard(entry)  # whatever comes out, it is not unknown any more
         if entries:
-            self._look_up(entries, self.client.shards, None)
+            new = {entry.name for entry in entries}
+            placement = self.client.core.placement
+            shards = {shard_of(slot.entity, placement) for slot in shown if slot.aspect in new}
+            self._look_up(entries, lambda: shards, CALL_S)
 
     def shards_of(self, requests: Iterable[LockRequest[Any]]) -> set[str]:
         """Return the shards on which the requests lie; a pattern lies on all."""

@@ -187,26 +187,28 @@ def aspects_of(
     Args:
         worlds: Where they are looked at.
         wanted: Aspects, or names; None stands for all that these cells know.
-        later: Whether an aspect that no cell knows may still come.
+        later: Whether an aspect without a type that no cell knows may still come; one with a type
+            is null until then, as it is for a view.
 
     Raises:
-        MisuseError: An aspect that no cell knows.
+        MisuseError: A name that no cell knows.
         DatumTypeError: An aspect is registered with another type.
     """
     sessions = dict.fromkeys(world.session for world in worlds)
     if wanted is None or not set(_names(wanted := tuple(wanted))) <= _known(sessions):
         for session in sessions:
             session.client.greet()
-    typed = {one.name: one for one in wanted or () if isinstance(one, Aspect)}
+    given = {one.name: one for one in wanted or () if isinstance(one, Aspect)}
+    typed = {name: one for name, one in given.items() if one.datum_type is not object}
     for session in sessions:
-        session.look_up(one for one in typed.values() if one.datum_type is not object)
+        session.look_up(typed.values())
     known = _known(sessions)
-    expected = typed.keys() if later else ()
+    expected = given if later else typed
     for name in _names(wanted or ()):
         if name not in known and name not in expected:
             raise unknown_aspect(name, known)
     names = known if wanted is None else _names(wanted)
-    return {name: typed.get(name) or _type_used(sessions, name) for name in sorted(names)}
+    return {name: given.get(name) or _type_used(sessions, name) for name in sorted(names)}
 
 
 def _names(aspects: Iterable[Aspect[Any] | str]) -> list[str]:

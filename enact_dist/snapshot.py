@@ -55,7 +55,7 @@ def take_snapshot(
             items = _items(session, requests, moment, together, captured_ns)
             readings = take_readings(session, items, past_ns=moment.at_ns)
             if register:
-                session.check_shown(readings.readings())
+                session.check_shown(readings.readings(), requests)
             snapshot = Snapshot(readings, requests, together, captured_ns)
             if together is None or attempt == VIEWS_MAX or snapshot.has_set():
                 return snapshot  # what has left retention just now is null in it

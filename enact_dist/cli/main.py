@@ -66,8 +66,8 @@ class _Parser(argparse.ArgumentParser):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
-        # No option of ours begins with a digit: what does (-30s, -1e-3) is a value, right or wrong.
-        self._negative_number_matcher = re.compile(r"-\d")
+        # No option of ours begins with a digit: what does (-30s, -.5) is a value, right or wrong.
+        self._negative_number_matcher = re.compile(r"-\.?\d")
         self._intermixes = False
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:

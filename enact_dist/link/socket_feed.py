@@ -85,8 +85,8 @@ class SocketFeed:
         thread = threading.Thread(
             target=self._pump, args=(shard, line, connection), name="enact-notices", daemon=True
         )
+        thread.start()  # its end waits for the mutex
         self._pumps[shard] = line, connection, thread
-        thread.start()
 
     def come_back(self, shard: str, line: SocketLine) -> None:
         """Try the socket to a shard again, if its notices come over Zenoh; does not wait for it."""
@@ -119,9 +119,9 @@ class SocketFeed:
             self._queue.wait_for_earlier(found[0], EARLIER_S)
             self._queue.take(found)
             with self._mutex:
-                came = not self._closed and shard not in self._pumps
-                if came:
+                if not self._closed and shard not in self._pumps:
                     self._read_from(shard, line, connection)
+                    came = True
         except Exception as error:  # noqa: BLE001 - Zenoh goes on, and the socket is tried again
             _log.info("notices of shard %s stay with Zenoh: %s", shard, error)
         finally:

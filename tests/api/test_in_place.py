@@ -186,6 +186,17 @@ def test_a_codecs_values_are_not_compared(online):
         assert isinstance(lock[odd], Odd)
 
 
+def test_nor_is_a_list_that_has_some(online):
+    """Bytes that differ each time would say of every block that it changed something."""
+    odds, way = Write(online, robot, Aspect("odds", list[Odd])), Write(online, robot, WAY)
+    online.init(robot, odds.aspect, [Odd(), Odd()])
+    with Lock(odds, way) as lock:
+        assert len(lock[odds]) == 2
+        lock[way] = [1.0]
+
+    assert online.view(View(online, robot, WAY))[View(online, robot, WAY)] == [1.0]
+
+
 def test_block_that_fails_tells_its_own_error(online):
     """An exception of the block is not hidden behind what it changed before."""
     way = Write(online, robot, WAY)

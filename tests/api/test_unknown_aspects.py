@@ -171,10 +171,11 @@ def test_observer_registers_nothing(two_shards):
 
 
 @pytest.mark.carrier("local")
-def test_comparison_by_a_misspelt_aspect_is_refused(world, cell):
-    """Two contexts are not called equal in an aspect that there is none of."""
+def test_comparison_by_a_misspelt_name_is_refused(world, cell):
+    """A name alone says nothing of an aspect; one with its type is null until somebody writes it."""
     with pytest.raises(MisuseError, match=r"no aspect 'plann' is registered.*'plan'\?"):
-        world.diff(cell.world("training"), aspects=[MISSPELT])
+        world.diff(cell.world("training"), aspects=["plann"])
+    assert world.diff(cell.world("training"), aspects=[MISSPELT]).rows == ()
     with world.watch_diff(cell.world("training"), "**", MISSPELT) as watch:
         assert watch.next(0.0) is None
         world.init(robot, MISSPELT, [1.0])
@@ -206,3 +207,35 @@ def test_watch_begun_before_its_aspect_came_counts_right_over_a_restart(two_stor
             lock[write] = 2
         change = watch.next(10.0)
         assert (change.version, change.gap) == (2, 0)
+
+
+@pytest.mark.carrier("local")
+def test_early_reader_of_a_wrong_type_keeps_nobody_from_the_right_one(world, cell):
+    """Who corrects the type in a notebook goes on; who does not is told each time."""
+    wrong, right = Aspect("late", int), Aspect("late", str)
+    assert world.view(View(world, robot, wrong)).get(View(world, robot, wrong)) is None
+    world.init(robot, right, "there")
+
+    for _ in range(2):
+        with pytest.raises(DatumTypeError, match="late"):
+            world.view(View(world, robot, wrong))
+        assert world.view(View(world, robot, right))[View(world, robot, right)] == "there"
+        with Lock(Read(world, robot, right)) as lock:
+            assert lock[Read(world, robot, right)] == "there"
+
+
+@pytest.mark.carrier("socket", "zenoh")
+def test_reader_of_an_aspect_that_comes_into_use_needs_no_other_shard(two_shards):
+    """Who asked before it was written reads it while a shard that it does not need is away."""
+    box, goal = Entity("left/box"), Aspect("goal", int)
+    world = two_shards.cell.world("online")
+    with two_shards.connect() as reader:
+        read = Read(reader.world("online"), box, goal)
+        two_shards.stop("right")
+        with Lock(read) as lock:
+            assert lock.is_null(read)
+        with Lock(Write(world, box, goal)) as lock:
+            lock[Write(world, box, goal)] = 3
+
+        with Lock(read, wait_s=1.0) as lock:
+            assert lock[read] == 3

@@ -95,7 +95,7 @@ def test_what_is_no_moment_ago_is_told_where_it_stands(line, capsys):
     assert ": '-3x' is no moment; give a moment: -30s" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("value", ["-30s", "-1e-3", "-3"])
+@pytest.mark.parametrize("value", ["-30s", "-1e-3", "-.5", "-3"])
 def test_value_that_begins_with_a_dash_and_a_digit_is_taken_as_it_is(value):
     """Of other verbs, too: nothing is put before it."""
     arguments = build_parser().parse_args(["world", "put", "online", "a/b", value])
