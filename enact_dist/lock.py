@@ -95,6 +95,7 @@ class Lock:
 
     What is assigned is published, nothing else: a list or dict that was changed in place is to be
     assigned, too (``lock[flags] = {**lock[flags], "b": True}``).  What a block reads is its own.
+    An assignment takes what the value is at that moment; a later change needs another one.
 
     Args:
         requests: What to read, write and view; of one cell, of any of its contexts and shards.

@@ -72,7 +72,7 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
         run=check_actors,
         example="enact actor check --cell cell.toml",
     )
-    add_cell(check)
+    add_cell(check, file_only=True)
     check.add_argument("--json", action="store_true", help="print JSON instead of lines")
     check.add_argument(
         "--initial",
