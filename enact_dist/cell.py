@@ -426,8 +426,7 @@ class Cell(Closing):
         """
         shards = self._client.shards()
         answers = self._client.call_all([(shard, ListSessions()) for shard in shards])
-        told = zip(shards, answers, strict=True)
-        return actor_infos((shard, found) for shard, found in told if isinstance(found, Sessions))
+        return actor_infos(zip(shards, answers, strict=True))
 
     def namesakes(self, name: str) -> tuple[ActorInfo, ...]:
         """Return the other sessions of actors of a name that are not silent.
@@ -438,8 +437,7 @@ class Cell(Closing):
         client = self._client
         shards = client.shards()
         answers = client.call_once([(shard, ListSessions()) for shard in shards])
-        told = zip(shards, answers, strict=True)
-        infos = actor_infos((shard, found) for shard, found in told if isinstance(found, Sessions))
+        infos = actor_infos(zip(shards, answers, strict=True))
         return tuple(
             info
             for info in infos

@@ -6,12 +6,13 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Final
 
 from enact_dist.core.datum import Position
+from enact_dist.core.messages import Sessions
 from enact_dist.terms import Entity, NullReason
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from enact_dist.core.messages import Holder, Sessions, SlotState
+    from enact_dist.core.messages import Answer, Holder, SlotState
 
 
 RUNNING: Final = ("starting", "running")
@@ -159,11 +160,11 @@ def slot_info(shard: str, state: SlotState) -> SlotInfo:
     )
 
 
-def actor_infos(told: Iterable[tuple[str, Sessions]]) -> tuple[ActorInfo, ...]:
-    """Return the sessions of named actors, of what each shard has told."""
+def actor_infos(told: Iterable[tuple[str, Answer | None]]) -> tuple[ActorInfo, ...]:
+    """Return the sessions of named actors, of what each shard has told, if it has."""
     found: dict[str, ActorInfo] = {}
     for shard, answer in told:
-        for info in answer.sessions:
+        for info in answer.sessions if isinstance(answer, Sessions) else ():
             if not info.actor:
                 continue
             before = found.get(info.session)

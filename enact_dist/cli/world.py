@@ -66,7 +66,13 @@ def _add_tree(verbs: argparse._SubParsersAction[Verb]) -> None:
         example="enact world tree online 'tray/**'",
     )  # fmt: skip
     add_world(tree)
-    tree.add_argument(
+    _add_pattern(tree)
+    tree.add_argument("--null", action="store_true", help="show slots without a datum, too")
+    add_reader(tree)
+
+
+def _add_pattern(verb: Verb) -> None:
+    verb.add_argument(
         "pattern",
         metavar="PATTERN",
         type=entities,
@@ -74,8 +80,6 @@ def _add_tree(verbs: argparse._SubParsersAction[Verb]) -> None:
         default="**",
         help="of entities (default: all)",
     )
-    tree.add_argument("--null", action="store_true", help="show slots without a datum, too")
-    add_reader(tree)
 
 
 def _add_get(verbs: argparse._SubParsersAction[Verb]) -> None:
@@ -129,14 +133,7 @@ def _add_watch(verbs: argparse._SubParsersAction[Verb]) -> None:
         example="enact world watch online 'tray/**' --aspect surface",
     )  # fmt: skip
     add_world(watch)
-    watch.add_argument(
-        "pattern",
-        metavar="PATTERN",
-        type=entities,
-        nargs="?",
-        default="**",
-        help="of entities (default: all)",
-    )
+    _add_pattern(watch)
     watch.add_argument(
         "--aspect",
         action="append",
