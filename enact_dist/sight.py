@@ -103,6 +103,7 @@ def look(worlds: Sequence[Viewable], places: Iterable[Place], *, each: bool) -> 
 
     Raises:
         ForgottenError: They are of a past that is not known any more.
+        LockTimeoutError: No view of one moment came within `patience_s`.
         MisuseError: More is asked than one view can hold.
         UnknownWorldError: The cell has one of them no more; told where patterns show nothing.
         ShardUnreachableError: A shard does not answer.
@@ -144,6 +145,7 @@ def both_in_sight(
 
     Raises:
         ForgottenError: See `look`.
+        LockTimeoutError: See `look`.
         ShardUnreachableError: See `look`.
     """
     one_cut = left.session is right.session and past_ns_of(left) == past_ns_of(right)

@@ -77,8 +77,11 @@ class WorldContext(Context):
 
         Raises:
             LockHeldError: This thread holds a lock; name the views in it instead.
+            LockTimeoutError: No view of one moment came within `patience_s`: shards restart again
+                and again, or what is written all the time is locked for long.
             MisuseError: A request locks.
             NullDatumError: The `Together` has no complete set.
+            ShardUnreachableError: A shard does not answer.
         """
         refuse_inside_lock("view")
         return take_snapshot(requests)

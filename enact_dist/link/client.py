@@ -123,7 +123,7 @@ class CellClient(SessionClient):
                     self.count("views_locked")
                 begin(lock_views=lock_views)
             waited_s = (self._now_ns() - started_ns) / 1e9
-            raise not_granted(lock, waited_s, self.carrier.endpoint_of)
+            raise not_granted(lock, waited_s, self.carrier.endpoint_of, items)
         except BaseException:
             self._release_of(lane)
             if begun:

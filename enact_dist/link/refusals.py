@@ -30,11 +30,12 @@ from enact_dist.errors import (
     StoreError,
     UnknownWorldError,
 )
+from enact_dist.terms import ACCESSES
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from enact_dist.core.messages import Holder, Refused
+    from enact_dist.core.messages import Holder, Item, Refused
 
 
 def unreachable(
@@ -54,8 +55,13 @@ def unreachable(
     )
 
 
-def not_granted(lock: MultiLock, waited_s: float, endpoint_of: Callable[[str], str]) -> EnactError:
-    """Return the error for a lock that came to rest before it was held."""
+def not_granted(
+    lock: MultiLock,
+    waited_s: float,
+    endpoint_of: Callable[[str], str],
+    asked: tuple[Item, ...],
+) -> EnactError:
+    """Return the error for a lock, or a view, that came to rest before it was held."""
     if lock.phase is Phase.REFUSED and lock.refusal is not None:
         return error_of(lock.refusal)
     if lock.phase is Phase.UNREACHABLE:
@@ -86,8 +92,11 @@ def not_granted(lock: MultiLock, waited_s: float, endpoint_of: Callable[[str], s
         why = "; ".join(holders)
     else:
         why = "the shard grants nothing yet: it restarted and waits for older leases to end"
+    remedy = "raise wait_s, or shorten what holds it"
+    if not any(ACCESSES[item.access].locks for item in asked):  # a view: it has no wait_s
+        remedy = "look again, or raise patience_s of connect(…)"
     return LockTimeoutError(
-        f"waited {waited_s:.1f} s for {wanted}; {why}; raise wait_s, or shorten what holds it",
+        f"waited {waited_s:.1f} s for {wanted}; {why}; {remedy}",
         holders=holders,
         waited_s=waited_s,
     )

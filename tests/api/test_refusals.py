@@ -20,7 +20,13 @@ from enact_dist import (
     testing,
 )
 from enact_dist.core.datum import Position
-from enact_dist.errors import ChangedError, DatumTypeError, ForgottenError, LeaseLostError
+from enact_dist.errors import (
+    ChangedError,
+    DatumTypeError,
+    ForgottenError,
+    LeaseLostError,
+    LockTimeoutError,
+)
 
 SPEED = Aspect("speed", float)
 NAME = Aspect("name", str)
@@ -163,6 +169,33 @@ def test_view_that_is_about_to_be_written_is_told_as_such(two_shards):
     finally:
         done.set()
         holder.join()
+
+
+def test_view_that_finds_no_moment_waits_for_locks_and_says_who_holds_them(two_shards, monkeypatch):
+    """Read locks stand in for a cut; a view has no `wait_s` to raise."""
+    cell = two_shards.cell
+    online, left, right = cell.world("online"), Entity("left/arm"), Entity("right/arm")
+    held, done = threading.Event(), threading.Event()
+    monkeypatch.setattr("enact_dist.core.multilock.ROUNDS_MAX", 0)
+    monkeypatch.setattr("enact_dist.core.cuts.Cut.settled", lambda *_, **__: None)
+    monkeypatch.setattr(cell._client, "patience_s", 1.0)
+
+    def hold() -> None:
+        with Lock(Write(online, left, SPEED)):
+            held.set()
+            done.wait(60.0)
+
+    holder = threading.Thread(target=hold)
+    holder.start()
+    try:
+        assert held.wait(60.0)
+        with pytest.raises(LockTimeoutError, match=r"left/arm/speed \(write\) held by") as told:
+            online.view(View(online, left, SPEED), View(online, right, SPEED))
+    finally:
+        done.set()
+        holder.join()
+    assert str(told.value).endswith("look again, or raise patience_s of connect(…)")
+    assert len(told.value.holders) == 1
 
 
 def test_excess_over_a_tolerance_is_not_rounded_away():

@@ -1,5 +1,6 @@
 """Real daemons and real client processes on loopback, started and ended by each test."""
 
+import contextlib
 import os
 import queue
 import signal
@@ -62,8 +63,13 @@ class Process:
         return f"output {self.seen[-20:]}, stderr:\n{self.log.read_text()[-3000:]}"
 
     def tell(self, line):
-        self.popen.stdin.write(line + "\n")
-        self.popen.stdin.flush()
+        try:
+            self.popen.stdin.write(line + "\n")
+            self.popen.stdin.flush()
+        except BrokenPipeError:
+            raise AssertionError(
+                f"ended ({self.popen.wait()}) before it was told {line!r}; {self.story()}"
+            ) from None
 
     def signal(self, number):
         self.popen.send_signal(number)
@@ -78,7 +84,8 @@ class Process:
         self.popen.wait()
         self._reader.join()
         self.popen.stdout.close()
-        self.popen.stdin.close()
+        with contextlib.suppress(BrokenPipeError):  # a line that it was told after its end
+            self.popen.stdin.close()
 
 
 class Cell:

@@ -297,8 +297,8 @@ def audit(cell):
     while not stop.is_set():
         try:
             seen = world.view(*requests)
-        except ShardUnreachableError:
-            continue
+        except (LockTimeoutError, ShardUnreachableError):
+            continue  # it was killed, or both by turns for as long as a view has patience
         views += 1
         sums.add(sum(seen[request] for request in requests))
     say("summary", json.dumps({"views": views, "sums": sorted(sums)}))
