@@ -275,6 +275,7 @@ def _command_name(arguments: argparse.Namespace) -> str:
 def _item(cell: Cell, request: tuple[str, str, str, str], default: str | None) -> Item:
     """Return the protocol's line for a request, whose datum type is of no matter here."""
     from enact_dist.core.messages import Item
+    from enact_dist.session import unknown_aspect
 
     world, entity, aspect, access = request
     worlds = cell.worlds()
@@ -284,10 +285,9 @@ def _item(cell: Cell, request: tuple[str, str, str, str], default: str | None) -
             f"in which world context is {entity}/{aspect}? write WORLD:{entity}/{aspect}:{access}"
             f" or --world WORLD (known: {', '.join(worlds) or 'none'})"
         )
-    known = cell.aspects()
-    if not known.get(aspect, ("", ""))[0]:
-        names = ", ".join(sorted(name for name, entry in known.items() if entry[0]))
-        raise MisuseError(f"no aspect {aspect!r} is registered (known: {names or 'none'})")
+    known = [name for name, entry in cell.aspects().items() if entry[0]]
+    if aspect not in known:
+        raise unknown_aspect(aspect, known)
     cell.world(world)  # refuses an unknown one by name
     return Item(int(_ACCESSES[access, "*" in entity]), world, entity, aspect)
 

@@ -157,7 +157,7 @@ def test_hold_of_a_pattern_keeps_newcomers_out(at, cell, spawn, until, cell_file
         (("online:piece/count:write",), 2, "needs a command"),
         (("piece/count:write", "--", "true"), 2, "in which world context is piece/count?"),
         (("nowhere:piece/count:write", "--", "true"), 1, "no world context 'nowhere'"),
-        (("online:piece/cuont:write", "--", "true"), 1, "no aspect 'cuont' is registered"),
+        (("online:piece/cuont:write", "--", "true"), 1, "did you mean 'count'? (known: "),
         (("online:piece/count:write", "--", "no-such-command"), 2, "cannot run 'no-such-command'"),
     ],
 )
