@@ -243,13 +243,24 @@ def list_actors(arguments: argparse.Namespace) -> int:
         empty="no actor is connected",
     )  # fmt: skip
     for report in (report for info in infos for report in _reports(info)):
-        if report.incomplete or report.late or report.unstamped:
-            last = f", the newest a {report.last_incomplete}" if report.last_incomplete else ""
-            print(
-                f"{report.name}: {report.incomplete} incomplete sets{last}; {report.late} data too"
-                f" late for their set, {report.unstamped} without a stamp"
-            )
+        for line in _losses(report):
+            print(f"{report.name}: {line}")
     return DONE
+
+
+def _losses(report: ActorStatistics) -> Iterator[str]:
+    """Yield what an actor has lost and the table does not show."""
+    if report.incomplete or report.late or report.unstamped:
+        last = f", the newest a {report.last_incomplete}" if report.last_incomplete else ""
+        yield (
+            f"{report.incomplete} incomplete sets{last}; {report.late} data too late for their"
+            f" set, {report.unstamped} without a stamp"
+        )
+    if report.missed or report.unknown:
+        yield (
+            f"{report.missed} ticks missed; {report.unknown} commits never answered, which may"
+            " stand (see its log)"
+        )
 
 
 def _reports(info: ActorInfo) -> tuple[ActorStatistics, ...]:

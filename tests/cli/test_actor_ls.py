@@ -67,6 +67,25 @@ def test_frozen_actor_is_silent(start, enact, cell_file):
     assert "over for" in row
 
 
+def test_ticks_that_an_actor_missed_are_told_of(start, enact, cell_file):
+    """One that was frozen and goes on has missed those of that time."""
+    frozen = start("late")
+
+    def missed(infos):
+        reports = [one for info in infos for one in info["report"].get("actors", ())]
+        return sum(report["missed"] for report in reports if report["name"] == "late")
+
+    os.kill(frozen.pid, signal.SIGSTOP)
+    listed(enact, cell_file, lambda infos: any(i["lease_left_s"] < 0 for i in infos))
+    os.kill(frozen.pid, signal.SIGCONT)
+    known = missed(listed(enact, cell_file, missed))
+    table = enact("actor", "ls", "--cell", cell_file).out
+
+    assert known > 0
+    (told,) = re.findall(r"^late: (\d+) ticks missed; \d+ commits never", table, re.MULTILINE)
+    assert int(told) >= known
+
+
 def test_two_actors_of_one_name_are_told_of(start, until, enact, cell_file):
     """Both run, as replicas may be meant; the second one's log and the list say so."""
     first, alone = start("twin"), start("alone")
