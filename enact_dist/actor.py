@@ -73,6 +73,10 @@ class Actor:
     The worlds are roles, bound to world contexts when the actor runs.  A pattern in a request
     without ``Each`` stands for the triggering entity; ``…Each`` always means all that match.
 
+    `only_entity` makes an actor one of several alike: every pattern without ``Each`` stands for
+    that entity, and only its data trigger.  So one class serves eight cameras, and each of them
+    has a process, a lock and a slot of its own.
+
     When `update` runs:
 
     - with `triggers`: once per existing entity at the start, then once per entity whose trigger
@@ -97,6 +101,8 @@ class Actor:
     Attributes:
         triggers: Declared reading requests; the actor must not write what triggers it.
         every_s: Period of a source in seconds; may be set per instance.
+        only_entity: The one entity that an instance works on, of those that its patterns match; a
+            source needs it where it names a pattern.  `entity` in `cell.toml`, ``--entity``.
         wait_s: How long one attempt waits for its lock.
         hold_s: How long an update may hold its lock; a longer one loses it and commits nothing.
         shared: Declared writes whose slots other actors write too, on purpose; any two other
@@ -109,6 +115,7 @@ class Actor:
     ] = ()
     shared: ClassVar[Sequence[LockRequest[Any]]] = ()
     every_s: float | None = None
+    only_entity: Entity | None = None
     wait_s: float = 10.0
     hold_s: float = 60.0
     declaration: ClassVar[Declaration]
@@ -203,10 +210,55 @@ class Declaration:
             if stands_for_trigger(request) and isinstance(request.entity, Entities)
         )
 
+    def check_entity(self, only: Entity | None) -> None:
+        """Check which one entity an instance works on.
+
+        Raises:
+            MisuseError: It is none though a pattern without a trigger needs one, or it is one that
+                a pattern does not match or that cannot trigger.
+        """
+        patterned = [one for one in self.requests.values() if stands_for_trigger(one)]
+        if only is None:
+            if patterned and not self.triggers:
+                raise MisuseError(
+                    f"{self.name_of(patterned[0])} is {patterned[0]!r}: its pattern stands for one"
+                    f" entity, but {self.actor} has no triggers and no only_entity; say which one"
+                    " (entity in cell.toml, --entity, actor.only_entity), or use"
+                    f" {type(patterned[0]).__name__}Each for all that match"
+                )
+            return
+        if not isinstance(only, Entity):
+            raise MisuseError(f"{self.actor}.only_entity is {only!r}; it must be an Entity")
+        if not patterned:
+            raise MisuseError(
+                f"{self.actor} has no request whose pattern could stand for {only}; leave"
+                " only_entity out"
+            )
+        for request in (*patterned, *self.triggers):
+            if not patterns_overlap(str(request.entity), only.name):
+                raise MisuseError(
+                    f"{self.name_of(request)} is {request!r}, which {only} does not match; give"
+                    f" {self.actor} another only_entity"
+                )
+
 
 def stands_for_trigger(request: Declared) -> bool:
     """Say whether a request's entity is the triggering one: a pattern without `Each`."""
     return isinstance(request.entity, Entities) and not request.access.each
+
+
+def narrowed(request: Declared, only: Entity | None) -> Declared:
+    """Return what a request stands for in an actor that works on one entity only."""
+    if only is None or not stands_for_trigger(request):
+        return request
+    return type(request)(request.world, only, request.aspect)
+
+
+def name_of(actor: Actor) -> str:
+    """Return how an actor is called that nobody has named: as its class, and its one entity."""
+    only = actor.only_entity
+    own = f"-{only.name.replace('/', '-')}" if isinstance(only, Entity) else ""
+    return f"{type(actor).__name__}{own}"
 
 
 def same_data(one: Declared, other: Declared) -> bool:
@@ -346,12 +398,6 @@ def _check_patterns(declaration: Declaration) -> None:
         if not stands_for_trigger(request):
             continue
         where = declaration.name_of(request)
-        if not declaration.triggers:
-            raise MisuseError(
-                f"{where} is {request!r}: its pattern stands for the triggering entity, but"
-                f" {declaration.actor} has no triggers; name one entity, or use"
-                f" {type(request).__name__}Each for all that match"
-            )
         for trigger in declaration.triggers:
             if not patterns_overlap(str(request.entity), str(trigger.entity)):
                 raise MisuseError(

@@ -51,12 +51,13 @@ class BoundActor:
         worlds: Role → name of a world context; None binds each role to the context of its name.
 
     Raises:
-        MisuseError: `update` is not defined, a role is unbound or unknown, or roles bound to one
-            context make the actor write what triggers it or ask for a datum in two ways.
+        MisuseError: `update` is not defined, a role is unbound or unknown, its `only_entity` does
+            not fit what it declares, or roles bound to one context make the actor write what
+            triggers it or ask for a datum in two ways.
         UnknownWorldError: The cell has no world context of such a name.
     """
 
-    __slots__ = ("_by_entity", "actor", "cell", "contexts", "declaration")
+    __slots__ = ("_by_entity", "actor", "cell", "contexts", "declaration", "only")
 
     def __init__(self, actor: Actor, cell: Cell, worlds: Mapping[str, str] | None = None) -> None:
         if not isinstance(actor, Actor):
@@ -65,6 +66,8 @@ class BoundActor:
         self.actor = actor
         self.cell = cell
         self.declaration = actor.declaration
+        self.declaration.check_entity(actor.only_entity)
+        self.only = actor.only_entity
         names = self._names(worlds)
         self.contexts = {role: cell.world(name) for role, name in names.items()}
         self._check(names)
@@ -85,7 +88,7 @@ class BoundActor:
                     timeout_s=CALL_S,
                 )
             else:
-                context.session.prepare(self._bound_for(None).values(), wait_s=0.0)
+                context.session.prepare(self._bound_for(self.only).values(), wait_s=0.0)
 
     def lock(
         self,
@@ -98,11 +101,13 @@ class BoundActor:
         """Return the lock of one update, not yet taken.
 
         Args:
-            entity: The triggering entity; None for a source or an actor that runs once.
+            entity: The triggering entity; None for a source or an actor that runs once, which then
+                works on its `only_entity`, if it has one.
             wait_s: How long to wait for it; None: as long as the actor says.
             stop: Ends the waiting once it is set.
             captured_ns: Capture stamp of the set that triggered it; 0 without one.
         """
+        entity = entity or self.only
         return ActorLock(
             self._bound_for(entity),
             entity=entity,
@@ -137,13 +142,18 @@ class BoundActor:
         names = [str(slot_of(view)) for view in views]
         return PendingSets(names, entity=first, open_max=together.open_max)
 
+    def covers(self, entity: Entity) -> bool:
+        """Say whether a change of `entity` is one that the actor can be updated for."""
+        return self.declaration.covers(entity) and self.only in (None, entity)
+
     def watched(self) -> tuple[Watched, ...]:
         """Return what must be watched to see every change of a trigger datum."""
         groups: dict[tuple[str, str], list[int]] = {}
         triggers = self.declaration.triggers
         for index, trigger in enumerate(triggers):
             context = self.contexts[trigger.world.name].name
-            groups.setdefault((context, str(trigger.entity)), []).append(index)
+            entities = self.only or trigger.entity
+            groups.setdefault((context, str(entities)), []).append(index)
         watched = []
         for (_, pattern), indices in groups.items():
             aspects = {triggers[index].aspect.name: triggers[index].aspect for index in indices}

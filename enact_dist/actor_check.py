@@ -11,6 +11,8 @@ error    unbound role         a role that no world context is bound to
 error    unknown role         a binding for a role that the actor does not have
 error    unknown world        a world context that the cell does not list
 error    unknown aspect       an aspect that the cell does not list
+error    no such entity       an actor without triggers whose pattern is given no `entity`, or one
+                              that does not match
 error    two types            one aspect name with two datum types
 error    own trigger          an actor that, as bound, writes what triggers it
 error    two writers          two actors that write one slot, not both declaring it as `shared`
@@ -36,13 +38,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
-from enact_dist.actor import same_data
+from enact_dist.actor import narrowed, same_data
 from enact_dist.actor_load import check_every_s, load_class, read_options
 from enact_dist.config_table import suggestion
 from enact_dist.core.messages import AspectEntry
 from enact_dist.core.retaining import limits_of, said, with_larger
-from enact_dist.errors import ConfigError
+from enact_dist.errors import ConfigError, MisuseError
 from enact_dist.retention import checked_retention
+from enact_dist.terms import Entity
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -61,12 +64,14 @@ _LIBRARIES: Final = (*_BASE, sysconfig.get_path("purelib") + os.sep)
 class ActorDeclaration:
     """One actor of a cell: under which name it runs, its class, what its roles are bound to.
 
-    `worlds` None binds each role to the world context of the same name, as running it does.
+    `worlds` None binds each role to the world context of the same name, as running it does;
+    `entity` is the one that it works on, None where it has no such.
     """
 
     name: str
     actor_class: type[Actor]
     worlds: Mapping[str, str] | None = None
+    entity: Entity | None = None
 
     def world_of(self, role: str) -> str | None:
         """Return the world context that a role is bound to."""
@@ -103,14 +108,19 @@ class _Use:
     world: str
 
     @property
+    def named(self) -> Declared:
+        """What the request can name in this actor."""
+        return narrowed(self.request, self.actor.entity)
+
+    @property
     def shared(self) -> bool:
         return self.request in self.actor.actor_class.declaration.shared
 
     def meets(self, other: _Use) -> bool:
-        return self.world == other.world and same_data(self.request, other.request)
+        return self.world == other.world and same_data(self.named, other.named)
 
     def __str__(self) -> str:
-        _, entity, aspect = self.request.address
+        _, entity, aspect = self.named.address
         access = type(self.request).__name__
         return f"{self.actor.name}.{self.name} ({access} {self.world}/{entity} {aspect})"
 
@@ -136,6 +146,7 @@ def check_actors(
     uses = [use for actor in actors for use in _uses_of(actor)]
     findings = [
         *_roles(actors, worlds),
+        *_entities(actors),
         *_aspects(uses, aspects),
         *_types(uses),
         *_own_triggers(uses),
@@ -161,7 +172,8 @@ def check_cell(config: CellConfig, *, initial: Collection[str] = ()) -> tuple[Fi
     for actor in config.actors:
         try:
             actor_class = load_class(actor.class_path)
-            actors.append(ActorDeclaration(actor.name, actor_class, actor.worlds or None))
+            only = Entity(actor.entity) if actor.entity else None
+            actors.append(ActorDeclaration(actor.name, actor_class, actor.worlds or None, only))
             read_options(actor_class, actor.options)
             if actor.every_s is not None:
                 check_every_s(actor_class, actor.every_s)
@@ -272,6 +284,15 @@ def _roles(actors: Iterable[ActorDeclaration], worlds: Collection[str]) -> Itera
                     (actor.name,),
                     f"actor {actor.name} has no role {role}; it has {', '.join(roles)}",
                 )
+
+
+def _entities(actors: Iterable[ActorDeclaration]) -> Iterator[Finding]:
+    for actor in actors:
+        try:
+            actor.actor_class.declaration.check_entity(actor.entity)
+        except MisuseError as error:
+            text = f"actor {actor.name}: {error}"
+            yield Finding("error", "no such entity", (actor.name,), text)
 
 
 def _aspects(uses: Iterable[_Use], aspects: Collection[str]) -> Iterator[Finding]:

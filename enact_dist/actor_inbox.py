@@ -283,7 +283,7 @@ class Watching:
 
     def _note(self, watched: Watched, change: Change) -> None:
         declaration = self._bound.declaration
-        if not declaration.covers(change.entity):
+        if not self._bound.covers(change.entity):
             return
         if isinstance(self._inbox, SetInbox):
             for index in watched.triggers.get(str(change.aspect), ()):

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Final
 from enact_dist.actor import Actor, check_period, check_update
 from enact_dist.config_table import suggestion
 from enact_dist.errors import ConfigError, MisuseError
+from enact_dist.terms import Entity
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -104,7 +105,7 @@ def load_actor(target: str, options: Mapping[str, object] | None = None) -> Acto
 
 
 def configured_actor(config: ActorConfig) -> Actor:
-    """Make an actor as `cell.toml` configures it, its period included.
+    """Make an actor as `cell.toml` configures it, its period and its entity included.
 
     Raises:
         ConfigError: See `load_actor`; a period for an actor that data trigger.
@@ -114,6 +115,8 @@ def configured_actor(config: ActorConfig) -> Actor:
     if config.every_s is not None:
         check_every_s(type(actor), config.every_s)
         actor.every_s = config.every_s
+    if config.entity:
+        actor.only_entity = Entity(config.entity)
     return actor
 
 

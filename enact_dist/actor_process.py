@@ -36,7 +36,7 @@ class ActorThread:
         actor: The actor; a fresh instance, run once.
         cell: Where its world contexts are; several threads may share it.
         worlds: Role → name of a world context; None binds each role to the context of its name.
-        name: Name in logs and reports; by default the class's.
+        name: Name in logs and reports; by default the class's, with that of its `only_entity`.
         wait_s: How long an attempt waits for its lock; None: as long as the actor says.
         on_error: Told of each error beside the log, in the actor's thread.
 
@@ -113,6 +113,7 @@ def actor_command(
     name: str = "",
     worlds: Mapping[str, str] | None = None,
     options: Mapping[str, object] | None = None,
+    entity: str = "",
 ) -> list[str]:
     """Return the command that runs an actor as a process of its own.
 
@@ -122,6 +123,7 @@ def actor_command(
         name: Name of the actor; by default its class's.
         worlds: Role → name of a world context.
         options: Parameters of the class, as text, numbers or truth values.
+        entity: The one entity that it works on; by default all that its patterns match.
     """
     command = [sys.executable, "-m", "enact_dist.cli.main", "actor", "run", target]
     command += ["--cell", str(cell)]
@@ -130,6 +132,7 @@ def actor_command(
         command += ["--world", f"{role}={world}"]
     for option, value in (options or {}).items():
         command += ["--option", f"{option}={value}"]
+    command += ["--entity", entity] if entity else []
     return command
 
 
@@ -140,6 +143,7 @@ def spawn_actor(
     name: str = "",
     worlds: Mapping[str, str] | None = None,
     options: Mapping[str, object] | None = None,
+    entity: str = "",
 ) -> subprocess.Popen[bytes]:
     """Start an actor as a process of its own; arguments as for `actor_command`.
 
@@ -147,6 +151,6 @@ def spawn_actor(
     error.
     """
     return subprocess.Popen(
-        actor_command(target, cell=cell, name=name, worlds=worlds, options=options),
+        actor_command(target, cell=cell, name=name, worlds=worlds, options=options, entity=entity),
         stdin=subprocess.DEVNULL,
     )

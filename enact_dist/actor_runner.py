@@ -31,7 +31,7 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, ClassVar, Final
 from weakref import WeakKeyDictionary
 
-from enact_dist.actor import Actor, check_period
+from enact_dist.actor import Actor, check_period, name_of
 from enact_dist.actor_binding import BoundActor
 from enact_dist.actor_inbox import Inbox, SetInbox, watching
 from enact_dist.actor_log import Repeated, kind_of
@@ -99,7 +99,7 @@ def run_actor(
         cell: Where its world contexts are.
         worlds: Role → name of a world context; None binds each role to the context of its name.
         stop: Set from another thread or a signal handler to end the run.
-        name: Name in logs and reports; by default the class's.
+        name: Name in logs and reports; by default the class's, with that of its `only_entity`.
         wait_s: How long an attempt waits for its lock; None: as long as the actor says.
         on_error: Told of each error beside the log.
 
@@ -141,7 +141,7 @@ class ActorRun:
         self._inbox = Inbox(per_entity=self._bound.declaration.per_entity)
         self._back_off = BackOff()
         self._failures = Repeated()
-        self.name = name or type(actor).__name__
+        self.name = name or name_of(actor)
         self._record = ActorRecord(self.name, now_ns=monotonic_ns())
         self._board = ReportBoard.of(cell)
         self._reported_ns = 0

@@ -76,6 +76,8 @@ shared_bytes_max       none           cap of each shard's large data in the memo
   worlds               {}             role of the class = world context of the cell
   options              {}             keyword arguments of the class
   every_s              the class's    period of a source, seconds
+  entity               all            the one entity that it works on, of those that the patterns
+                                      of its class match: one class for several cameras
   host                 this machine   host name of the machine that runs it
 =====================  =============  =====================================================
 
@@ -117,7 +119,7 @@ from enact_dist.config_values import (
 from enact_dist.core.messages import Pin
 from enact_dist.errors import ConfigError
 from enact_dist.retention import AGE_S_MAX, Retention, checked_retention
-from enact_dist.terms import Durability, Entities, checked_name
+from enact_dist.terms import Durability, Entities, Entity, checked_name
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -363,7 +365,7 @@ def _retention(table: Table) -> Retention | None:
 
 
 def _actor(name: str, table: Table, worlds: tuple[str, ...]) -> ActorConfig:
-    table.refuse_unknown("class", "worlds", "options", "every_s", "host")
+    table.refuse_unknown("class", "worlds", "options", "every_s", "entity", "host")
     _check_title(name, "actor", table)
     class_path = table.take_str("class")
     if not _DOTTED_NAME.match(class_path):
@@ -377,8 +379,17 @@ def _actor(name: str, table: Table, worlds: tuple[str, ...]) -> ActorConfig:
         worlds=_roles(table.take_table("worlds"), worlds),
         options=MappingProxyType(dict(table.take_table("options").values)),
         every_s=every_s,
+        entity=_entity(table),
         host=_host(table),
     )
+
+
+def _entity(table: Table) -> str:
+    """Return the name of the one entity of an actor, or nothing."""
+    if "entity" not in table.values:
+        return ""
+    name = table.take_str("entity")
+    return table.checked("entity", lambda: Entity(name).name)
 
 
 def _roles(table: Table, worlds: tuple[str, ...]) -> Mapping[str, str]:

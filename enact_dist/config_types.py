@@ -88,6 +88,7 @@ class ActorConfig:
         worlds: Role of the actor class to world context of the cell.
         options: Keyword arguments of the class, as TOML gives them.
         every_s: Period in seconds that replaces the one of a source, or ``None``.
+        entity: The one entity that it works on, of those that its patterns match; empty: all.
         host: Host name of the machine it runs on; empty: wherever `enact up` is called.
     """
 
@@ -96,6 +97,7 @@ class ActorConfig:
     worlds: Mapping[str, str]
     options: Mapping[str, object]
     every_s: float | None = None
+    entity: str = ""
     host: str = ""
 
 

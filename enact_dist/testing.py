@@ -191,7 +191,7 @@ def _pending(actor: Actor, bound: BoundActor) -> PendingTriggers:
     for watched in bound.watched():
         found = watched.context.survey(str(watched.entities), tuple(watched.triggers))
         for slot in found:
-            if not bound.declaration.covers(slot.entity):
+            if not bound.covers(slot.entity):
                 continue
             state = (slot.version, slot.position.stamp_ns)
             for index in watched.triggers[slot.aspect]:

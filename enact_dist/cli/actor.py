@@ -21,6 +21,7 @@ from enact_dist.cli.verbs import (
     add_timeout,
     add_verb,
     cell_config,
+    one_entity,
     open_cell,
     pair,
     pairs,
@@ -99,7 +100,7 @@ def _add_run(verbs: argparse._SubParsersAction[Verb]) -> None:
     add_cell(run)
     add_timeout(run)
     add_log(run)
-    run.add_argument("--name", default="", help="how others see it (default: its class)")
+    run.add_argument("--name", default="", help="how others see it (default: class and entity)")
     run.add_argument(
         "--world",
         action="append",
@@ -109,6 +110,12 @@ def _add_run(verbs: argparse._SubParsersAction[Verb]) -> None:
     )
     run.add_argument(
         "--option", action="append", type=pair, metavar="KEY=VALUE", help="argument of the class"
+    )
+    run.add_argument(
+        "--entity",
+        type=one_entity,
+        metavar="NAME",
+        help="the one entity that it works on, of those that its patterns match",
     )
     run.add_argument("--every", type=seconds, metavar="S", help="period of a source, seconds")
 
@@ -188,13 +195,14 @@ def _log_to_stderr(formatter: logging.Formatter) -> None:
 
 def _made(arguments: argparse.Namespace) -> tuple[Actor, str, dict[str, str] | None]:
     """Return the actor that the command names, its name and its roles' world contexts."""
+    from enact_dist.actor import name_of
     from enact_dist.actor_load import check_every_s, configured_actor, load_actor
 
     worlds = pairs(arguments.world, "--world") or None
     options = pairs(arguments.option, "--option")
     if ":" in arguments.target:
         actor = load_actor(arguments.target, options)
-        name = arguments.name or type(actor).__name__
+        name = ""
     else:
         config = cell_config(arguments)
         for entry in config.actors:
@@ -209,12 +217,18 @@ def _made(arguments: argparse.Namespace) -> tuple[Actor, str, dict[str, str] | N
         if options:
             raise ConfigError(f"the options of {entry.name} stand in {config.path}; leave --option")
         actor = configured_actor(entry)
-        name = arguments.name or entry.name
+        name = entry.name
         worlds = worlds or dict(entry.worlds) or None
     if arguments.every is not None:
         check_every_s(type(actor), arguments.every)
         actor.every_s = arguments.every
-    return actor, name, worlds
+    if arguments.entity is not None:
+        actor.only_entity = arguments.entity
+    try:
+        actor.declaration.check_entity(actor.only_entity)
+    except MisuseError as error:
+        raise ConfigError(str(error)) from None
+    return actor, arguments.name or name or name_of(actor), worlds
 
 
 def _farewell(name: str, statistics: ActorStatistics) -> str:

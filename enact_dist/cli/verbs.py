@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.config_values import checked_endpoint, metrics_address
 from enact_dist.errors import ConfigError
-from enact_dist.terms import Entities, checked_name
+from enact_dist.terms import Entities, Entity, checked_name
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -126,6 +126,14 @@ def seconds(text: str) -> float:
     if not 0.0 < value < float("inf"):
         raise argparse.ArgumentTypeError(f"{text!r} is no number of seconds above zero")
     return value
+
+
+def one_entity(text: str) -> Entity:
+    """Read the name of one entity; an `argparse` type."""
+    try:
+        return Entity(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def whole(text: str) -> int:

@@ -136,11 +136,6 @@ def test_declaration_covers_an_entity_only_when_every_pattern_without_each_match
             id="own trigger",
         ),
         pytest.param(
-            {"cloud": View(online, PRODUCTS, SURFACE), "every_s": 0.1},
-            r"Sample\.cloud.*has no triggers; name one entity, or use ViewEach",
-            id="pattern without trigger",
-        ),
-        pytest.param(
             {
                 "seen": View(online, PRODUCTS, SURFACE),
                 "mark": Write(online, Entities("tray/*"), FLAGS),

@@ -51,6 +51,7 @@ worlds = { training = "training", now = "online" }
 options = { voxel_m = 0.002, names = ["a", "b"] }
 every_s = 0.5
 host = "tray-pc"
+entity = "view/1"
 """
 
 SHARD = '[shards.left]\nlisten = "tcp/127.0.0.1:7447"\n'
@@ -125,7 +126,7 @@ def test_config_holds_every_key_when_the_file_gives_all():
     assert (fusion.name, fusion.class_path) == ("fusion", "actors.palletizing.fusion:Fusion")
     assert dict(fusion.worlds) == {"training": "training", "now": "online"}
     assert dict(fusion.options) == {"voxel_m": 0.002, "names": ["a", "b"]}
-    assert (fusion.every_s, fusion.host) == (0.5, "tray-pc")
+    assert (fusion.every_s, fusion.host, fusion.entity) == (0.5, "tray-pc", "view/1")
 
 
 def test_config_needs_only_a_name_and_a_shard():
@@ -240,6 +241,7 @@ WRONG = {
     "role type": ('name = "c"\n' + SHARD + '[actors.x]\nclass = "a:B"\nworlds = { now = 1 }\n', 6, "'now' in [actors.x.worlds] is a string, not an integer (1)"),
     "options type": ('name = "c"\n' + SHARD + '[actors.x]\nclass = "a:B"\noptions = []\n', 6, "'options' in [actors.x] is a table, not an array ([])"),
     "period": ('name = "c"\n' + SHARD + '[actors.x]\nclass = "a:B"\nevery_s = 0\n', 6, "'every_s' in [actors.x] must lie between 0.001 and 86400, not 0"),
+    "entity": ('name = "c"\n' + SHARD + '[actors.x]\nclass = "a:B"\nentity = "camera/*"\n', 6, "'camera/*' cannot name an entity"),
     "no toml": ('name = "c"\nworlds = [\n', 2, ""),
     "twice": ('name = "c"\nname = "d"\n', 2, "Cannot overwrite a value"),
 }  # fmt: skip

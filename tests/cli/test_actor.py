@@ -43,6 +43,14 @@ class Rival(Beat):
     pass
 
 
+class Camera(Actor):
+    count = Write(World("online"), Entities("camera/*"), Aspect("count_of_camera", int))
+    every_s = 0.05
+
+    def update(self, lock):
+        lock[self.count] = lock.get(self.count, 0) + 1
+
+
 class Broken(Actor):
     online = World("online")
     count = Write(online, Entity("broken"), COUNT)
@@ -61,6 +69,17 @@ every_s = 0.1
 [actors.double]
 class = "my_actors:Double"
 worlds = { online = "online" }
+"""
+
+
+CAMERAS = """
+[actors.camera-0]
+class = "my_actors:Camera"
+entity = "camera/0"
+
+[actors.camera-1]
+class = "my_actors:Camera"
+entity = "camera/1"
 """
 
 
@@ -138,6 +157,39 @@ def test_run_refuses_an_unknown_role(module, enact, cell_file):
 
     assert result.status == 2
     assert "offline" in result.err
+
+
+def test_one_class_serves_several_entities(module, spawn, until, cell_file, tmp_path, enact):
+    """Each writes its own: the one of the file, or the one that the command line names."""
+    file = tmp_path / "cameras.toml"
+    file.write_text(cell_file.read_text(encoding="utf-8") + CAMERAS, encoding="utf-8")
+    first = spawn("actor", "run", "camera-1", "--cell", file)
+    until(first, "ready: actor camera-1 in cell clitest")
+    second = spawn("actor", "run", "my_actors:Camera", "--entity", "camera/7", "--cell", file)
+    until(second, "ready: actor Camera-camera-7 in cell clitest")
+    for number in (1, 7):
+        one = ("online", f"camera/{number}", "--aspect", "count_of_camera", "--count", "2")
+        assert enact("world", "watch", *one, "--cell", file).status == 0
+    tree = enact("world", "tree", "online", "--cell", file).out
+
+    assert tree.count("count_of_camera") == 2
+
+
+def test_entity_that_is_missing_or_does_not_fit_is_refused(module, enact, write_cell):
+    """By the run itself, and by the check before it, with what to do."""
+    file = write_cell(CAMERAS + '\n[actors.lost]\nclass = "my_actors:Camera"\n')
+    run = enact("actor", "run", "my_actors:Camera", "--cell", file)
+    other = enact("actor", "run", "camera-0", "--entity", "tray/1", "--cell", file)
+    check = enact("actor", "check", "--cell", file)
+
+    assert (run.status, other.status) == (2, 2)
+    assert "has no triggers and no only_entity" in run.err
+    assert "which tray/1 does not match" in other.err
+    assert check.status == 1
+    assert "error: no such entity: actor lost: Camera.count is " in check.out
+    with pytest.raises(SystemExit) as ended:
+        enact("actor", "run", "camera-0", "--entity", "camera/*", "--cell", file)
+    assert ended.value.code == 2
 
 
 def test_check_accepts_actors_that_fit(module, enact, write_cell):
