@@ -6,7 +6,7 @@ import os
 import sys
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.cli import shard_backup, shard_rebalance
+from enact_dist.cli import shard_backup, shard_forget, shard_rebalance
 from enact_dist.cli.output import print_json, print_table, shown_bytes, shown_s
 from enact_dist.cli.verbs import (
     DONE,
@@ -74,6 +74,7 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
     add_reader(check)
     check.set_defaults(timeout_s=CHECK_S)
     shard_rebalance.add_to(verbs)
+    shard_forget.add_to(verbs)
     shard_backup.add_to(verbs)
 
 

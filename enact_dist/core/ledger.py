@@ -10,6 +10,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from enact_dist.core.records import (
+    AspectForgotten,
     AspectRecord,
     AuditRecord,
     BasesMoved,
@@ -46,6 +47,7 @@ class Ledger:
         self.worlds: dict[str, WorldRecord] = {}
         self.dropped: dict[str, WorldDropped] = {}
         self.aspects: dict[str, AspectRecord] = {}
+        self.forgotten: dict[str, AspectForgotten] = {}
         self.slots: dict[Slot, SlotRecord] = {}
         self.history: dict[tuple[Slot, int], SlotRecord] = {}
         self.kept: dict[str, KeptRecord] = {}
@@ -73,8 +75,12 @@ class Ledger:
                 self.worlds[record.name] = record
             case WorldDropped():
                 self._drop(record)
-            case BasesMoved():
-                self.dropped[record.world.name] = record.world
+            case AspectForgotten():
+                self._forget(record)
+            case BasesMoved(base=AspectForgotten() as base):
+                self.forgotten[base.name] = base
+            case BasesMoved(base=WorldDropped() as base):
+                self.dropped[base.name] = base
             case EntitiesMoved():
                 gone = frozenset(record.entities)
                 self._keep_only(lambda slot: slot.entity not in gone)
@@ -112,6 +118,11 @@ class Ledger:
         self.dropped[record.name] = record
         self._keep_only(lambda slot: slot.context != record.name)
 
+    def _forget(self, record: AspectForgotten) -> None:
+        self.aspects.pop(record.name, None)
+        self.forgotten[record.name] = record
+        self._keep_only(lambda slot: slot.aspect != record.name)
+
     def _keep_only(self, stays: Callable[[Slot], bool]) -> None:
         self.slots = {slot: found for slot, found in self.slots.items() if stays(slot)}
         self.history = {key: found for key, found in self.history.items() if stays(key[0])}
@@ -124,6 +135,7 @@ class Ledger:
             worlds=list(self.worlds.values()),
             dropped=list(self.dropped.values()),
             aspects=[record.entry for record in self.aspects.values()],
+            forgotten=list(self.forgotten.values()),
             slots=list(self.slots.values()),
             history=sorted(self.history.values(), key=lambda r: (r.slot, r.version)),
             kept=list(self.kept.values()),

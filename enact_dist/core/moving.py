@@ -7,18 +7,19 @@ change must keep:
   batch of its new shard; then one batch of the old one forgets it.  Cut off between the two, it is
   on both, and the next plan only lets the old one forget.
 - What all shards must know before the first entity moves, every one of them learns first: contexts,
-  forks, aspects, and above which versions those of dropped contexts start.
+  forks, aspects, and above which versions those of dropped contexts and forgotten aspects start.
 - Where that cannot be done without losing something there is no plan, but what stands in the way.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
 from enact_dist.core.messages import SlotVersion
 from enact_dist.core.placement import shard_of
 from enact_dist.core.records import (
+    AspectForgotten,
     AspectRecord,
     BasesMoved,
     EntitiesMoved,
@@ -35,6 +36,8 @@ if TYPE_CHECKING:
     from enact_dist.core.datum import Slot
     from enact_dist.core.messages import AspectEntry, PlacementMap
     from enact_dist.core.records import Record, Recovered
+
+    Gone = WorldDropped | AspectForgotten
 
 NAMED_MAX: Final = 5
 """So many entities are named where more stand in the way."""
@@ -109,14 +112,17 @@ class Shards:
         worlds, aspects = self._worlds(plan.obstacles), self._aspects(plan.obstacles)
         if plan.obstacles:
             return plan
-        bases = self._bases()
+        bases = self._bases(self._worlds_dropped(), "context")
+        for shard, found in self._bases(self._aspects_forgotten(), "aspect").items():
+            bases[shard] += found
         for shard in (entry.name for entry in self._placement.shards):
             stored = self._stores[shard]
             here = {record.name for record in stored.worlds}
             known = {entry.name: entry for entry in stored.aspects}
             records: list[Record] = [world for world in worlds if world.name not in here]
             records += [AspectRecord(entry) for entry in aspects if known.get(entry.name) != entry]
-            records += [BasesMoved(base) for base in bases[shard] if base not in stored.dropped]
+            known_gone: list[Gone] = [*stored.dropped, *stored.forgotten]
+            records += [BasesMoved(base) for base in bases[shard] if base not in known_gone]
             if records:
                 plan.first[shard] = tuple(records)
         return plan
@@ -195,30 +201,56 @@ class Shards:
                     aspects[entry.name] = with_larger(known, entry)
         return list(aspects.values())
 
-    def _bases(self) -> dict[str, list[WorldDropped]]:
-        """Return above which versions those of dropped contexts start, alike on all shards.
-
-        What was made since the drop began above the base of its own shard, and goes on so; who has
-        it before it moves is told as well, as a run that is cut off may leave it there.
-        """
-        bases: dict[str, list[WorldDropped]] = {entry.name: [] for entry in self._placement.shards}
-        names = sorted({drop.name for stored in self._stores.values() for drop in stored.dropped})
-        for name in names:
-            by_shard = {
-                shard: next((d for d in stored.dropped if d.name == name), WorldDropped(name, 0))
+    def _worlds_dropped(self) -> Iterator[dict[str, Gone]]:
+        """Yield what each shard knows of each context that any one has dropped."""
+        for name in sorted(
+            {gone.name for stored in self._stores.values() for gone in stored.dropped}
+        ):
+            none = WorldDropped(name, 0)
+            yield {
+                shard: next((gone for gone in stored.dropped if gone.name == name), none)
                 for shard, stored in self._stores.items()
             }
-            top = max(dropped.version_base for dropped in by_shard.values())
-            moved = {e: base for dropped in by_shard.values() for e, base in dropped.entity_bases}
+
+    def _aspects_forgotten(self) -> Iterator[dict[str, Gone]]:
+        """Yield what each shard knows of each aspect that any one has forgotten."""
+        all_gone = [gone for stored in self._stores.values() for gone in stored.forgotten]
+        for name in sorted({gone.name for gone in all_gone}):
+            at_ns = max(gone.at_ns for gone in all_gone if gone.name == name)
+            none = AspectForgotten(name, 0, 0)
+            found = {
+                shard: next((gone for gone in stored.forgotten if gone.name == name), none)
+                for shard, stored in self._stores.items()
+            }
+            yield {shard: replace(gone, at_ns=at_ns) for shard, gone in found.items()}
+
+    def _bases(
+        self, by_name: Iterable[dict[str, Gone]], part: Literal["context", "aspect"]
+    ) -> dict[str, list[Gone]]:
+        """Return above which versions what is gone starts when it is made again: alike everywhere.
+
+        What was made since began above the base of its own shard, and goes on so; who has it before
+        it moves is told as well, as a run that is cut off may leave it there.
+
+        Args:
+            by_name: What each shard knows of what is gone.
+            part: Which part of a slot its name is.
+        """
+        bases: dict[str, list[Gone]] = {entry.name: [] for entry in self._placement.shards}
+        for by_shard in by_name:
+            known = next(iter(by_shard.values()))
+            top = max(gone.version_base for gone in by_shard.values())
+            moved = {shard: dict(gone.entity_bases) for shard, gone in by_shard.items()}
             own: dict[str, dict[str, int]] = {shard: {} for shard in bases}
             for entity, holders in self._states.items():
                 for shard, slots in holders.items():
-                    base = moved.get(entity, by_shard[shard].version_base)
-                    if base < top and any(slot.context == name for slot in slots):
+                    base = moved[shard].get(entity, by_shard[shard].version_base)
+                    if base < top and any(getattr(slot, part) == known.name for slot in slots):
                         for place in own.keys() & {shard, shard_of(entity, self._placement)}:
                             own[place][entity] = base
             for shard, found in bases.items():
-                found.append(WorldDropped(name, top, tuple(sorted(own[shard].items()))))
+                entity_bases = tuple(sorted(own[shard].items()))
+                found.append(replace(known, version_base=top, entity_bases=entity_bases))
         return bases
 
     # ---------------------------------------------------------------- records

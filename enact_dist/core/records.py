@@ -52,10 +52,25 @@ class WorldDropped:
 
 
 @dataclass(frozen=True, slots=True)
-class BasesMoved:
-    """What is known of a context that was dropped once, now that entities move; drops nothing."""
+class AspectForgotten:
+    """An aspect is registered no more, and all states of its slots are gone.
 
-    world: WorldDropped
+    If it is registered again, versions of its slots start above `version_base`: none is ever used
+    twice.  Those of `entity_bases` were moved here, as those of `WorldDropped`.  What they were up
+    to the stamp `at_ns` is not known.
+    """
+
+    name: str
+    version_base: int
+    at_ns: int
+    entity_bases: tuple[tuple[str, int], ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class BasesMoved:
+    """What is known of a context or aspect that is gone, now that entities move; drops nothing."""
+
+    base: WorldDropped | AspectForgotten
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,6 +210,7 @@ Record = (
     | SessionEnded
     | WorldRecord
     | WorldDropped
+    | AspectForgotten
     | BasesMoved
     | EntitiesMoved
     | AspectRecord
@@ -224,6 +240,7 @@ class Recovered:
     worlds: list[WorldRecord] = field(default_factory=list)
     dropped: list[WorldDropped] = field(default_factory=list)
     aspects: list[AspectEntry] = field(default_factory=list)
+    forgotten: list[AspectForgotten] = field(default_factory=list)
     slots: list[SlotRecord] = field(default_factory=list)
     history: list[SlotRecord] = field(default_factory=list)
     kept: list[KeptRecord] = field(default_factory=list)

@@ -114,6 +114,8 @@ class ShardState:
         stamps = [record.stamp_ns for record in recovered.slots]
         # A fork without slots here was made as of then, too: nothing may be committed before.
         stamps += [record.at_ns for record in recovered.worlds]
+        # Nor before what was forgotten with its aspect.
+        stamps += [record.at_ns for record in recovered.forgotten]
         stamps += [record.position.stamp_ns for record in recovered.outcomes]
         stamps += [record.position.stamp_ns for record in recovered.decisions]
         stamps += [record.stamp_ns for record in recovered.prepared]
@@ -124,6 +126,7 @@ class ShardState:
             since_ns=max(self.stamps.last_ns, wall_ns),
             answer_bytes_max=ANSWER_FETCHES * settings.fetch_bytes_max,
             dropped=recovered.dropped,
+            forgotten=recovered.forgotten,
         )
         self.slots.recover_history(recovered.history, recovered.kept)
         self.sessions = SessionTable(recovered.sessions, outcomes=recovered.outcomes, now_ns=now_ns)

@@ -12,6 +12,7 @@ import heapq
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+from enact_dist.core.bases import Bases
 from enact_dist.core.datum import Column, Datum, Slot
 from enact_dist.core.history import History
 from enact_dist.core.messages import Cause, Forgotten, SlotState, SlotVersion
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 
     from enact_dist.core.history import Policy
     from enact_dist.core.messages import Item
-    from enact_dist.core.records import KeptRecord, SlotRecord, WorldDropped
+    from enact_dist.core.records import AspectForgotten, KeptRecord, SlotRecord, WorldDropped
 
 INLINE_BYTES_MAX: Final = 64 * 1024
 """Data up to this size travel with the grant; larger ones are fetched when they are read."""
@@ -70,16 +71,18 @@ class SlotMap:
         since_ns: Stamp of the start of this epoch: what is lost is lost from then on.
         answer_bytes_max: So many bytes of small data travel with one answer.
         dropped: The contexts that were dropped, and above which versions theirs start now.
+        forgotten: The aspects that were forgotten, likewise.
     """
 
     __slots__ = (
         "_answer_bytes_max",
+        "_aspect_bases",
         "_columns",
-        "_entity_bases",
+        "_context_bases",
+        "_forgotten_ns",
         "_lost",
         "_payloads",
         "_since_ns",
-        "_version_bases",
         "bytes",
         "count",
         "history",
@@ -93,12 +96,11 @@ class SlotMap:
         since_ns: int = 0,
         answer_bytes_max: int = ANSWER_BYTES_MAX,
         dropped: Iterable[WorldDropped] = (),
+        forgotten: Collection[AspectForgotten] = (),
     ) -> None:
-        self._version_bases: dict[str, int] = {}
-        self._entity_bases: dict[str, dict[str, int]] = {}
-        for world in dropped:
-            self._version_bases[world.name] = world.version_base
-            self._entity_bases[world.name] = dict(world.entity_bases)
+        self._context_bases = Bases(dropped)
+        self._aspect_bases = Bases(forgotten)
+        self._forgotten_ns = {aspect.name: aspect.at_ns for aspect in forgotten}
         self._answer_bytes_max = answer_bytes_max
         self._since_ns = since_ns
         self._columns: dict[Column, dict[str, Content]] = {}
@@ -136,21 +138,21 @@ class SlotMap:
     def next_version(self, slot: Slot) -> int:
         """Return the version that the next write of a slot makes.
 
-        In a context that was dropped before, the first one lies above all that it had then.
+        In a context that was dropped before, or of an aspect that was forgotten, the first one lies
+        above all that there was then.
         """
         version = self[slot].version
         return version + 1 if version else self._first_version(slot)
 
     def version_base(self, context: str) -> int:
         """Return the largest version of a context, the nulls of a drop counted as versions."""
-        before = self._version_bases.get(context, 0)
+        before = self._context_bases.of_name(context)
         return max([before, *(content.version + 1 for _, content in self.of_context(context))])
 
     def drop(self, context: str) -> list[tuple[Slot, Content]]:
         """Forget all slots of a context with their past, and return them."""
         gone = list(self.of_context(context))
-        self._version_bases[context] = self.version_base(context)
-        self._entity_bases[context] = {}
+        self._context_bases.set(context, self.version_base(context))
         self.history.drop(slot for slot, _ in gone)
         for slot, content in gone:
             self._lost.discard(slot)
@@ -195,7 +197,8 @@ class SlotMap:
         oldest = self._oldest(slot, newest)
         if oldest.version > self._first_version(slot):
             return oldest.stamp_ns
-        return self._since_ns if slot in self._lost else 0
+        forgotten_ns = self._forgotten_ns.get(slot.aspect, 0)
+        return max(forgotten_ns, self._since_ns) if slot in self._lost else forgotten_ns
 
     def _oldest(self, slot: Slot, newest: Content) -> Content:
         """Return the oldest state of a slot from which on all are known."""
@@ -203,15 +206,20 @@ class SlotMap:
         return found.states[0] if found is not None and found.states else newest
 
     def _first_version(self, slot: Slot) -> int:
-        base = self._version_bases.get(slot.context, 0)
-        if base:
-            base = self._entity_bases[slot.context].get(slot.entity, base)
-        return base + 1
+        context, entity, aspect = slot
+        return 1 + max(
+            self._context_bases.of(context, entity), self._aspect_bases.of(aspect, entity)
+        )
 
     def forgotten(self, items: Iterable[Item], at_ns: int) -> Forgotten | None:
         """Return what is asked and not known any more as of a stamp, None if all is known."""
         latest, unknown = Forgotten(Slot("", "", ""), 0), False
         for item in items:
+            forgotten_ns = self._forgotten_ns.get(item.aspect, 0)
+            if forgotten_ns > at_ns:  # whatever the slots were that a pattern asks for
+                slot = Slot(item.context, item.entity, item.aspect)
+                latest = max(latest, Forgotten(slot, forgotten_ns), key=lambda one: one.oldest_ns)
+                unknown = True
             for slot, newest in self._asked(item):
                 since_ns = self.known_since_ns(slot, newest)
                 if since_ns > latest.oldest_ns:

@@ -337,7 +337,8 @@ class _Making:
 
     def shared(self, source: Slot, content: Content) -> tuple[Slot, Content]:
         """Return a slot of the fork and what it has."""
-        slot, version = Slot(self._world, source.entity, source.aspect), self._version
+        slot = Slot(self._world, source.entity, source.aspect)
+        version = max(self._version, self._state.slots.next_version(slot))
         read = DatumRead(source, content.version, content.stamp_ns)
         cause = Cause(*self._by, (read,), 0, (SlotVersion(slot, version),))
         return slot, Content(version, self._at_ns, content.datum, content.null_reason, cause)

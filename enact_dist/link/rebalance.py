@@ -16,9 +16,7 @@ one.  While a folder is marked no shard starts from it.  Rules that a change mus
 
 from __future__ import annotations
 
-import json
 import time
-import uuid
 from contextlib import ExitStack
 from itertools import groupby
 from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
@@ -26,9 +24,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 from enact_dist.core.moving import Move, Shards
 from enact_dist.core.records import Persist
 from enact_dist.errors import StoreError
-from enact_dist.link.folder_lock import replace_file, sync_folder
+from enact_dist.link.folder_marks import mark, under_way, unmark
 from enact_dist.link.store import open_store, read_store
-from enact_dist.link.store_folder import MOVING_FILE, moving_mark
 from enact_dist.terms import Durability
 
 if TYPE_CHECKING:
@@ -94,7 +91,7 @@ def look(folders: Mapping[str, Path], placement: PlacementMap) -> Rebalance:
         stored = {
             name: open_folders.enter_context(read_store(folder)) for name, folder in folders.items()
         }
-        resumed = _under_way(folders)
+        resumed = bool(under_way(folders))
         plan = Shards(stored, placement, under_way=resumed).plan()
     _refuse(plan.obstacles)
     return Rebalance(plan.moves, resumed)
@@ -128,12 +125,12 @@ def rebalance(
             stores[name], stored[name] = open_store(folder, unix_s=unix_s, moving=True)
             undo.callback(stores[name].close)
         locked_s = time.monotonic()
-        resumed = _under_way(folders)
+        resumed = bool(under_way(folders))
         shards = Shards(stored, placement, under_way=resumed)
         plan = shards.plan()
         _refuse(plan.obstacles)
         if plan.moves or plan.first or resumed:
-            _mark(folders, progress)
+            mark(folders, progress.act)
         if plan.moves or plan.first:
             epoch = max(found.epoch for found in stored.values())
             for name, store in stores.items():
@@ -149,10 +146,7 @@ def rebalance(
             wait_s = max(0.0, locked_s + ttl_ns / 1e9 - time.monotonic())
             progress.waits(wait_s)
             time.sleep(wait_s)
-        for folder in folders.values():
-            progress.act(f"unmark {folder.name}")
-            (folder / MOVING_FILE).unlink(missing_ok=True)
-            sync_folder(folder)
+        unmark(folders, progress.act)
     return Rebalance(plan.moves, resumed, wait_s)
 
 
@@ -200,38 +194,3 @@ def _refuse(obstacles: list[str]) -> None:
     if obstacles:
         more = f"; and {len(obstacles) - 3} more" if len(obstacles) > 3 else ""
         raise StoreError(f"nothing was moved: {'; '.join(obstacles[:3])}{more}")
-
-
-# ---------------------------------------------------------------- marks
-
-
-def _mark(folders: Mapping[str, Path], progress: Progress) -> None:
-    """Mark all folders as of one rebalance, new or taken up; no shard starts from them then."""
-    found = [mark for folder in folders.values() if (mark := moving_mark(folder)) is not None]
-    number = found[0].number if found else uuid.uuid4().hex
-    content = json.dumps({"rebalance": number, "shards": sorted(folders)}).encode()
-    for name, folder in folders.items():
-        progress.act(f"mark {name}")
-        replace_file(folder / MOVING_FILE, content)
-
-
-def _under_way(folders: Mapping[str, Path]) -> bool:
-    """Whether an earlier run was cut off; all of its folders must be there.
-
-    Raises:
-        StoreError: They are not, or they are of several runs.
-    """
-    marks = {name: mark for name, folder in folders.items() if (mark := moving_mark(folder))}
-    if len({mark.number for mark in marks.values()}) > 1:
-        raise StoreError(
-            f"the folders of {', '.join(sorted(marks))} are in the midst of different rebalances;"
-            " give each one those that were its own"
-        )
-    for name, mark in marks.items():
-        lacking = [shard for shard in mark.shards if shard not in folders]
-        if lacking:
-            raise StoreError(
-                f"the rebalance that was cut off on {name} also moves entities of"
-                f" {', '.join(lacking)}; name their folders too, with --store NAME=PATH"
-            )
-    return bool(marks)

@@ -10,6 +10,7 @@ from collections import Counter
 from typing import TYPE_CHECKING, NamedTuple
 
 from enact_dist.core.records import (
+    AspectForgotten,
     AspectRecord,
     AuditRecord,
     BasesMoved,
@@ -50,6 +51,7 @@ from enact_dist.link.store_rows import (
     cause_key,
     dropped_row,
     ended_row,
+    forgotten_row,
     kept_row,
     key_of,
     outcome_row,
@@ -134,6 +136,8 @@ class Batch:
                         self._forget(slot, version)
                 case WorldDropped():
                     self._drop(record)
+                case AspectForgotten():
+                    self._forget_aspect(record)
                 case EntitiesMoved():
                     self._move_out(frozenset(record.entities))
                 case PreparedRecord():
@@ -175,6 +179,12 @@ class Batch:
         self.changes[key_of(Kind.WORLD, record.name)] = None
         self._remove_slots(lambda slot: slot.context == record.name)
         key, body = dropped_row(record)
+        self.changes[key] = body
+
+    def _forget_aspect(self, record: AspectForgotten) -> None:
+        self.changes[key_of(Kind.ASPECT, record.name)] = None
+        self._remove_slots(lambda slot: slot.aspect == record.name)
+        key, body = forgotten_row(record)
         self.changes[key] = body
 
     def _move_out(self, entities: frozenset[str]) -> None:
@@ -243,8 +253,10 @@ class Batch:
                 key, body = outcome_row(record)
             case WorldRecord():
                 key, body = world_row(record)
-            case BasesMoved():
-                key, body = dropped_row(record.world)
+            case BasesMoved(base=AspectForgotten() as base):
+                key, body = forgotten_row(base)
+            case BasesMoved(base=WorldDropped() as base):
+                key, body = dropped_row(base)
             case AspectRecord():
                 key, body = aspect_row(record.entry)
             case KeptRecord():

@@ -27,6 +27,8 @@ DATABASE_FILE: Final = "store.db"
 LOG_FILE: Final = "store.db-wal"
 BLOB_FOLDER: Final = "blobs"
 MOVING_FILE: Final = "moving"
+REBALANCE: Final = "rebalance"
+FORGET: Final = "forget"
 _REFUSED_SUFFIX: Final = ".refused"
 
 _RESTORE: Final = (
@@ -52,19 +54,34 @@ class Found(NamedTuple):
 
 
 class MovingMark(NamedTuple):
-    """That entities are being moved from or to a folder.
+    """That entities are being moved from or to a folder, or aspects forgotten.
 
     Attributes:
-        number: Tells one rebalance from another.
+        number: Tells one run from another.
         shards: All shards whose folders take part.
+        aspects: Those that are forgotten; none where entities move.
     """
 
     number: str
     shards: tuple[str, ...]
+    aspects: tuple[str, ...] = ()
+
+    @property
+    def what(self) -> str:
+        """What was begun."""
+        return f"forgetting {', '.join(self.aspects)}" if self.aspects else "a rebalance"
+
+
+def way_out(mark: MovingMark) -> str:
+    """Return what lets a run that was cut off come to its end."""
+    command = "enact shard rebalance"
+    if mark.aspects:
+        command = f"enact shard forget {' '.join(mark.aspects)} --yes"
+    return f"let `{command}` come to its end"
 
 
 def moving_mark(folder: Path) -> MovingMark | None:
-    """Return the mark of a rebalance that was begun and has not come to its end.
+    """Return the mark of a run over several folders that was begun and has not come to its end.
 
     Raises:
         StoreError: There is one that cannot be read.
@@ -72,7 +89,10 @@ def moving_mark(folder: Path) -> MovingMark | None:
     path = folder / MOVING_FILE
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
-        return MovingMark(str(found["rebalance"]), tuple(map(str, found["shards"])))
+        shards = tuple(map(str, found["shards"]))
+        if FORGET in found:
+            return MovingMark(str(found[FORGET]), shards, tuple(map(str, found["aspects"])))
+        return MovingMark(str(found[REBALANCE]), shards)
     except FileNotFoundError:
         return None
     except (ValueError, TypeError, KeyError):
@@ -80,17 +100,17 @@ def moving_mark(folder: Path) -> MovingMark | None:
 
 
 def refuse_moving(folder: Path) -> None:
-    """Refuse a folder of which some entities may be on their way.
+    """Refuse a folder of which some entities may be on their way, or an aspect half forgotten.
 
     Raises:
-        StoreError: A rebalance was begun and has not come to its end.
+        StoreError: A rebalance was begun, or a forgetting, and has not come to its end.
     """
     mark = moving_mark(folder)
     if mark is not None:
         refuse(
             folder,
-            f"is in the midst of a rebalance with those of {', '.join(mark.shards)}",
-            "let `enact shard rebalance` come to its end",
+            f"is in the midst of {mark.what} with those of {', '.join(mark.shards)}",
+            way_out(mark),
         )
 
 

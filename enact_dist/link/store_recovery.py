@@ -45,6 +45,7 @@ from enact_dist.link.store_rows import (
     read_dropped,
     read_ended,
     read_epoch,
+    read_forgotten,
     read_kept,
     read_order,
     read_outcome,
@@ -185,6 +186,8 @@ def _read_row(row: DatabaseRow, contents: Contents) -> None:
             recovered.dropped.append(read_dropped(key, row.body))
         case Kind.ASPECT:
             recovered.aspects.append(read_aspect(key, row.body))
+        case Kind.FORGOTTEN:
+            recovered.forgotten.append(read_forgotten(key, row.body))
         case Kind.KEPT:
             recovered.kept.append(read_kept(key, row.body))
         case Kind.SLOT:

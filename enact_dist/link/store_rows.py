@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from enact_dist.core.datum import Datum, LockId, Position, Slot
 from enact_dist.core.messages import AspectEntry
 from enact_dist.core.records import (
+    AspectForgotten,
     AuditRecord,
     KeptRecord,
     OutcomeRecord,
@@ -64,6 +65,7 @@ class Kind(enum.IntEnum):
     DROPPED = 12
     KEPT = 13
     CAUSE = 14
+    FORGOTTEN = 15
 
 
 class Key(NamedTuple):
@@ -119,13 +121,22 @@ def world_row(record: WorldRecord) -> tuple[Key, bytes]:
 
 def dropped_row(record: WorldDropped) -> tuple[Key, bytes]:
     """Return the row of a world context that there was."""
-    moved = [[list(base) for base in record.entity_bases]] if record.entity_bases else []
-    return key_of(Kind.DROPPED, record.name), pack([record.version_base, *moved])
+    return key_of(Kind.DROPPED, record.name), pack([record.version_base, *_moved(record)])
 
 
 def aspect_row(entry: AspectEntry) -> tuple[Key, bytes]:
     """Return the row of an aspect."""
     return key_of(Kind.ASPECT, entry.name), pack(list(entry[1:]))
+
+
+def forgotten_row(record: AspectForgotten) -> tuple[Key, bytes]:
+    """Return the row of an aspect that there was."""
+    body = [record.version_base, record.at_ns, *_moved(record)]
+    return key_of(Kind.FORGOTTEN, record.name), pack(body)
+
+
+def _moved(record: WorldDropped | AspectForgotten) -> list[list[list[object]]]:
+    return [[list(base) for base in record.entity_bases]] if record.entity_bases else []
 
 
 def kept_row(record: KeptRecord) -> tuple[Key, bytes | None]:
@@ -229,13 +240,23 @@ def read_world(key: Key, body: bytes) -> WorldRecord:
 def read_dropped(key: Key, body: bytes) -> WorldDropped:
     """Read the row of a world context that there was."""
     name, fields = Fields(key.name).last(str), Fields(body)
-    version_base = fields.next(int)
+    return WorldDropped(name, fields.next(int), _bases_moved(fields))
+
+
+def read_forgotten(key: Key, body: bytes) -> AspectForgotten:
+    """Read the row of an aspect that there was."""
+    name, fields = Fields(key.name).last(str), Fields(body)
+    return AspectForgotten(name, fields.next(int), fields.next(int), _bases_moved(fields))
+
+
+def _bases_moved(fields: Fields) -> tuple[tuple[str, int], ...]:
+    """Take the last field, if there is one: the bases of entities that were moved here."""
     if fields.at_end:
-        return WorldDropped(name, version_base)
+        return ()
     bases = [Fields(entry) for entry in fields.last(list)]
     if not bases:
         raise DamagedRowError("bases of entities were expected, found none")
-    return WorldDropped(name, version_base, tuple((b.next(str), b.last(int)) for b in bases))
+    return tuple((base.next(str), base.last(int)) for base in bases)
 
 
 def read_aspect(key: Key, body: bytes) -> AspectEntry:

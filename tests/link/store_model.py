@@ -153,6 +153,7 @@ PARTS = {
     "worlds": lambda records: {record.name: record for record in records},
     "dropped": lambda records: {record.name: record for record in records},
     "aspects": lambda entries: {entry.name: entry for entry in entries},
+    "forgotten": lambda records: {record.name: record for record in records},
     "slots": lambda records: {record.slot: _stored(record) for record in records},
     "history": lambda records: {(r.slot, r.version): _stored(r) for r in records},
     "kept": lambda records: {record.label: record for record in records},

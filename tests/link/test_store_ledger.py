@@ -13,6 +13,7 @@ from store_model import State
 from enact_dist.core.datum import Datum, LockId, Position, Slot, Token
 from enact_dist.core.messages import AspectEntry, Cause, DatumRead, Item, SlotVersion, WriteItem
 from enact_dist.core.records import (
+    AspectForgotten,
     AspectRecord,
     AuditRecord,
     BasesMoved,
@@ -37,7 +38,8 @@ from enact_dist.link.store import open_store
 from enact_dist.terms import Durability
 
 CONTEXTS = ("online", "what_if")
-SLOTS = tuple(Slot(context, entity, "pose") for context in CONTEXTS for entity in "ab")
+ASPECTS = ("pose", "x")
+SLOTS = tuple(Slot(context, *of) for context in CONTEXTS for of in (("a", "pose"), ("b", "x")))
 LOCKS = tuple(LockId("session", lane, 1) for lane in range(2))
 VERSIONS = tuple(SlotVersion(slot, version) for slot in SLOTS for version in range(1, 4))
 LARGE = 66_000
@@ -118,7 +120,9 @@ RECORDS = st.one_of(
     st.builds(KeptRecord, NAMES, MANY_VERSIONS),
     st.builds(WorldRecord, st.sampled_from(CONTEXTS), NAMES, STAMPS),
     st.builds(WorldDropped, st.sampled_from(CONTEXTS), STAMPS),
+    st.builds(AspectForgotten, st.sampled_from(ASPECTS), STAMPS, STAMPS),
     st.builds(BasesMoved, st.builds(WorldDropped, st.sampled_from(CONTEXTS), STAMPS, BASES)),
+    st.builds(BasesMoved, st.builds(AspectForgotten, NAMES, STAMPS, STAMPS, BASES)),
     st.builds(EntitiesMoved, st.sampled_from((("a",), ("b",), ("a", "b"), ("c",)))),
     st.builds(SessionRecord, NAMES, STAMPS),
     st.builds(SessionEnded, NAMES, STAMPS),

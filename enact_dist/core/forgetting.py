@@ -1,0 +1,171 @@
+"""What the shards of a stopped cell have of some aspects, and which records let it go.
+
+All that the shards have stored goes in, a plan comes out.  Rules that a change must keep:
+
+- A shard lets an aspect go whole, in one batch: its registration, all its slots in all contexts
+  with their history, and what labels keep of them.
+- Versions are never used twice: on every shard those of an aspect start above all that any shard
+  had, and stamps after all that it has.
+- A commit over shards that names the aspect and is not settled is not to be touched.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, NamedTuple
+
+from enact_dist.core.records import AspectForgotten, KeptRecord
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping
+
+    from enact_dist.core.records import PreparedRecord, Record, Recovered, SlotRecord
+
+
+class Going(NamedTuple):
+    """What one shard has of one aspect.
+
+    Attributes:
+        shard: Its name.
+        aspect: That of the aspect.
+        type: Fingerprint of the type that it is registered with, "" where it is not.
+        slots: How many slots of it there are.
+        versions: How many states these have, replaced ones included.
+        size: Bytes of their data.
+        kept: How many of these versions labels keep.
+        labels: The labels that do.
+    """
+
+    shard: str
+    aspect: str
+    type: str
+    slots: int
+    versions: int
+    size: int
+    kept: int
+    labels: tuple[str, ...]
+
+
+@dataclass(slots=True)
+class Plan:
+    """What is let go.
+
+    Attributes:
+        known: All aspects that some shard has, or has had.
+        going: What there is of those that go; nothing of it on a shard is left out.
+        records: What each shard stores; none where no shard has anything.
+        obstacles: Why nothing may be done at all, for people; then the rest means nothing.
+    """
+
+    known: frozenset[str] = frozenset()
+    going: list[Going] = field(default_factory=list)
+    records: dict[str, tuple[Record, ...]] = field(default_factory=dict)
+    obstacles: list[str] = field(default_factory=list)
+
+
+def planned(stores: Mapping[str, Recovered], aspects: Iterable[str], *, now_ns: int) -> Plan:
+    """Return what is to be done to let aspects go.
+
+    Args:
+        stores: What each shard has stored.
+        aspects: Their names.
+        now_ns: The wall clock.
+    """
+    names = tuple(dict.fromkeys(aspects))
+    plan = Plan(frozenset(name for stored in stores.values() for name in _known(stored)))
+    for shard, stored in stores.items():
+        plan.obstacles += _undecided(shard, stored, frozenset(names), stores.keys())
+        plan.going += [found for name in names if (found := _going(shard, stored, name))]
+    gone = {found.aspect for found in plan.going}
+    ends = [_end(stores.values(), name, now_ns) for name in names if name in gone]
+    for shard, stored in stores.items() if ends else ():
+        plan.records[shard] = (*ends, *_labels_without(stored, gone))
+    return plan
+
+
+def _known(stored: Recovered) -> Iterator[str]:
+    yield from (entry.name for entry in stored.aspects)
+    yield from (record.slot.aspect for record in stored.slots)
+    yield from (record.name for record in stored.forgotten)
+
+
+def _states(stored: Recovered, aspect: str) -> list[SlotRecord]:
+    return [one for one in (*stored.slots, *stored.history) if one.slot.aspect == aspect]
+
+
+def _going(shard: str, stored: Recovered, aspect: str) -> Going | None:
+    """Return what a shard has of an aspect, None where it has nothing."""
+    entry = next((entry for entry in stored.aspects if entry.name == aspect), None)
+    states = _states(stored, aspect)
+    kept = [
+        record.label
+        for record in stored.kept
+        for version in record.versions
+        if version.slot.aspect == aspect
+    ]
+    if entry is None and not states and not kept:
+        return None
+    return Going(
+        shard,
+        aspect,
+        entry.fingerprint if entry is not None else "",
+        len({state.slot for state in states}),
+        len(states),
+        sum(state.datum.size for state in states if state.datum is not None),
+        len(kept),
+        tuple(sorted(set(kept))),
+    )
+
+
+def _end(stores: Iterable[Recovered], aspect: str, now_ns: int) -> AspectForgotten:
+    """Return the record by which every shard lets an aspect go, the same on all."""
+    base, at_ns = 0, now_ns
+    for stored in stores:
+        before = [record for record in stored.forgotten if record.name == aspect]
+        for record in before:
+            base = max(base, record.version_base, *(base for _, base in record.entity_bases))
+            at_ns = max(at_ns, record.at_ns)
+        base = max([base, *(state.version for state in _states(stored, aspect))])
+        at_ns = max([at_ns, *(record.stamp_ns + 1 for record in stored.slots)])
+    return AspectForgotten(aspect, base, at_ns)
+
+
+def _labels_without(stored: Recovered, aspects: set[str]) -> Iterator[KeptRecord]:
+    """Yield what the labels that keep versions of these aspects keep of others."""
+    for record in stored.kept:
+        left = tuple(one for one in record.versions if one.slot.aspect not in aspects)
+        if len(left) < len(record.versions):
+            yield KeptRecord(record.label, left)
+
+
+# ---------------------------------------------------------------- what is in the way
+
+
+def _undecided(
+    shard: str, stored: Recovered, aspects: frozenset[str], shards: Iterable[str]
+) -> Iterator[str]:
+    """Yield the commits over shards that name one of these aspects, or may."""
+    remedy = (
+        "start all shards of the cell, wait until `enact lock ls` shows it no more (or end it with"
+        " `enact lock resolve`), and stop them"
+    )
+    for promise in stored.prepared:
+        named = sorted(_named_by(promise) & aspects)
+        if named:
+            yield (
+                f"the commit of lock {promise.lock} is prepared on {shard}, decided on"
+                f" {promise.primary}, and names {', '.join(named)}: {remedy}"
+            )
+    for decision in stored.decisions:
+        away = sorted(set(decision.participants) - set(shards))
+        if away:
+            yield (
+                f"{shard} has decided the commit of lock {decision.lock}, and {', '.join(away)},"
+                f" of whose data nothing is known here, may not have heard of it: {remedy}"
+            )
+
+
+def _named_by(promise: PreparedRecord) -> set[str]:
+    slots = [item.aspect for item in promise.items]
+    slots += [write.slot.aspect for write in promise.writes]
+    return set(slots)

@@ -1,0 +1,87 @@
+"""Marks on folders of a stopped cell that are changed together: no shard starts from one meanwhile.
+
+The marks are there before the first folder is changed and go after the last one, so a run that is
+cut off anywhere is taken up by the next one.  They come and go in the order of the shards' names:
+where the first of them has none, all is done but to take the others away.
+"""
+
+from __future__ import annotations
+
+import json
+import uuid
+from typing import TYPE_CHECKING
+
+from enact_dist.errors import StoreError
+from enact_dist.link.folder_lock import replace_file, sync_folder
+from enact_dist.link.store_folder import FORGET, MOVING_FILE, REBALANCE, moving_mark, way_out
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection, Mapping
+    from pathlib import Path
+
+    from enact_dist.link.store_folder import MovingMark
+
+
+def mark(
+    folders: Mapping[str, Path], act: Callable[[str], None], aspects: Collection[str] = ()
+) -> None:
+    """Mark all folders as of one change, new or taken up.
+
+    Args:
+        folders: The folder of each shard.
+        act: Told before each one is marked.
+        aspects: Those that are forgotten; none where entities move.
+    """
+    found = [mark for folder in folders.values() if (mark := moving_mark(folder)) is not None]
+    number = found[0].number if found else uuid.uuid4().hex
+    content: dict[str, object] = {FORGET if aspects else REBALANCE: number}
+    content["shards"] = sorted(folders)
+    if aspects:
+        content["aspects"] = sorted(aspects)
+    for name, folder in sorted(folders.items()):
+        act(f"mark {name}")
+        replace_file(folder / MOVING_FILE, json.dumps(content).encode())
+
+
+def unmark(folders: Mapping[str, Path], act: Callable[[str], None]) -> None:
+    """Take all marks away: everything is done, durably."""
+    for name, folder in sorted(folders.items()):
+        act(f"unmark {name}")
+        (folder / MOVING_FILE).unlink(missing_ok=True)
+        sync_folder(folder)
+
+
+def under_way(folders: Mapping[str, Path], *, forgets: bool = False) -> dict[str, MovingMark]:
+    """Return the marks of an earlier run that was cut off; all of its folders must be there.
+
+    Args:
+        folders: The folder of each shard.
+        forgets: Whether aspects are to be forgotten, not entities to be moved.
+
+    Raises:
+        StoreError: They are not, or they are of several runs, or of one that does the other.
+    """
+    marks = {name: mark for name, folder in folders.items() if (mark := moving_mark(folder))}
+    for name, mark in marks.items():
+        if bool(mark.aspects) != forgets:
+            raise StoreError(f"shard {name} is in the midst of {mark.what}; {way_out(mark)} first")
+    if len({mark.number for mark in marks.values()}) > 1:
+        which = "times that aspects were forgotten" if forgets else "rebalances"
+        raise StoreError(
+            f"the folders of {', '.join(sorted(marks))} are in the midst of different {which};"
+            " give each one those that were its own"
+        )
+    for name, mark in marks.items():
+        lacking = [shard for shard in mark.shards if shard not in folders]
+        if lacking:
+            does = "forgets aspects" if forgets else "moves entities"
+            raise StoreError(
+                f"the run that was cut off on {name} also {does} of {', '.join(lacking)}; name"
+                " their folders too, with --store NAME=PATH"
+            )
+    return marks
+
+
+def is_done(marks: Mapping[str, MovingMark]) -> bool:
+    """Whether a run was cut off when it took its marks away."""
+    return any(mark.shards[0] not in marks for mark in marks.values())

@@ -1,0 +1,182 @@
+"""Forgets aspects in the folders of a stopped cell: their types, and all their data.
+
+::
+
+    all folders locked, opened, checked ─> marked ─> shard by shard: one batch ─> marks removed
+
+Each arrow is durable before the next act, so a run that is killed anywhere is taken up by the next
+one; while a folder is marked no shard starts from it.  What a shard has of an aspect goes in one
+batch, so it never has a part of it.  Nobody need wait for leases of before the stop: a lock that
+somebody believes in is refused at its commit, and a shard that starts grants none before.
+"""
+
+from __future__ import annotations
+
+from contextlib import ExitStack, contextmanager
+from typing import TYPE_CHECKING, NamedTuple, Protocol
+
+from enact_dist.core.forgetting import planned
+from enact_dist.core.records import Persist
+from enact_dist.errors import MisuseError, StoreError
+from enact_dist.link.folder_marks import is_done, mark, under_way, unmark
+from enact_dist.link.store import open_store, read_store
+from enact_dist.terms import Durability
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping
+    from pathlib import Path
+
+    from enact_dist.core.forgetting import Going, Plan
+    from enact_dist.core.records import Recovered
+    from enact_dist.link.store import Store
+
+
+class Progress(Protocol):
+    """Is told what goes, and how far it is."""
+
+    def found(self, forgotten: Forgotten) -> None:
+        """Hear what will go; nothing has been changed, and an exception leaves it so."""
+
+    def act(self, name: str) -> None:
+        """Hear what is done next; it is durable before the next one."""
+
+
+class _Nobody:
+    """Is told, and tells nobody."""
+
+    def found(self, forgotten: Forgotten) -> None:
+        """Do nothing."""
+
+    def act(self, name: str) -> None:
+        """Do nothing."""
+
+
+class Forgotten(NamedTuple):
+    """What was let go, or would be.
+
+    Attributes:
+        aspects: The aspects, those of an earlier run that was cut off among them.
+        known: All aspects that these shards have, or have had.
+        going: What each shard has, or had, of each one.
+        resumed: Whether an earlier run was cut off.
+        done: The aspects of one that had only to let the shards start again: they are forgotten,
+            and whatever is there of them has come since.
+    """
+
+    aspects: tuple[str, ...]
+    known: frozenset[str]
+    going: list[Going]
+    resumed: bool
+    done: tuple[str, ...] = ()
+
+
+def look(
+    folders: Mapping[str, Path], aspects: Iterable[str], *, progress: Progress | None = None
+) -> Forgotten:
+    """Return what `forget` would let go, and change nothing.
+
+    Args:
+        folders: The folder of each shard.
+        aspects: Names of the aspects.
+        progress: Told what would go.
+
+    Raises:
+        StoreError: As `forget`.
+        MisuseError: As `forget`.
+    """
+    with ExitStack() as open_folders:
+        stored: dict[str, Recovered] = {}
+        for name, folder in folders.items():
+            with _of_shard(name):
+                stored[name] = open_folders.enter_context(read_store(folder))
+        found, _ = _plan(folders, stored, aspects, now_ns=0)
+    (progress or _Nobody()).found(found)
+    _refuse_unknown(found)
+    return found
+
+
+def forget(
+    folders: Mapping[str, Path],
+    aspects: Iterable[str],
+    *,
+    now_ns: int,
+    progress: Progress | None = None,
+) -> Forgotten:
+    """Let aspects go, with everything that these shards have of them.
+
+    Args:
+        folders: The folder of each shard.
+        aspects: Names of the aspects.
+        now_ns: The wall clock, nanoseconds since 1970.
+        progress: Told what goes and how far it is.
+
+    Raises:
+        StoreError: A folder is in use, damaged or cannot be written, folders of an earlier run are
+            missing, or a commit that names an aspect is not settled; the message says what to do.
+        MisuseError: No shard here has ever known one of the aspects.
+    """
+    progress = progress or _Nobody()
+    with ExitStack() as undo:
+        stores: dict[str, Store] = {}
+        stored: dict[str, Recovered] = {}
+        for name, folder in folders.items():
+            progress.act(f"open {name}")
+            with _of_shard(name):
+                opened = open_store(folder, unix_s=now_ns // 1_000_000_000, moving=True)
+            stores[name], stored[name] = opened
+            undo.callback(stores[name].close)
+        found, plan = _plan(folders, stored, aspects, now_ns=now_ns)
+        progress.found(found)
+        _refuse_unknown(found)
+        if found.done:
+            unmark(folders, progress.act)
+        if plan.records or (found.resumed and not found.done):
+            mark(folders, progress.act, found.aspects)
+        for name, records in plan.records.items():
+            progress.act(f"forget on {name}")
+            stores[name].write([Persist(0, records, Durability.DURABLE)])
+            progress.act(f"unlink on {name}")
+            stores[name].rest()
+        unmark(folders, progress.act)
+    return found
+
+
+def _plan(
+    folders: Mapping[str, Path],
+    stored: Mapping[str, Recovered],
+    aspects: Iterable[str],
+    *,
+    now_ns: int,
+) -> tuple[Forgotten, Plan]:
+    """Return what goes and how; aspects of a run that was cut off go as well.
+
+    Raises:
+        StoreError: Something is in the way.
+    """
+    marks = under_way(folders, forgets=True)
+    begun = dict.fromkeys(name for each in marks.values() for name in each.aspects)
+    done = tuple(begun) if is_done(marks) else ()
+    names = tuple(name for name in dict.fromkeys([*aspects, *begun]) if name not in done)
+    plan = planned(stored, names, now_ns=now_ns)
+    if plan.obstacles:
+        more = f"; and {len(plan.obstacles) - 3} more" if len(plan.obstacles) > 3 else ""
+        raise StoreError(f"nothing was forgotten: {'; '.join(plan.obstacles[:3])}{more}")
+    return Forgotten(names, plan.known, plan.going, bool(marks), done), plan
+
+
+def _refuse_unknown(found: Forgotten) -> None:
+    unknown = [name for name in found.aspects if name not in found.known]
+    if unknown:
+        raise MisuseError(
+            f"no shard here has an aspect {', '.join(unknown)} (known:"
+            f" {', '.join(sorted(found.known)) or 'none'}); nothing was forgotten"
+        )
+
+
+@contextmanager
+def _of_shard(name: str) -> Iterator[None]:
+    """Name the shard whose folder cannot be used."""
+    try:
+        yield
+    except StoreError as error:
+        raise StoreError(f"shard {name}: {error}", path=error.path) from error

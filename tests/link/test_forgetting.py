@@ -1,0 +1,325 @@
+"""Aspects are forgotten in the folders of a stopped cell: whole, for good, and nothing else."""
+
+import os
+import shutil
+import signal
+import time
+
+import pytest
+from rebalance_cells import ENTITIES, POSE, StoppedCell, placement
+from store_writer import persist, slot_record
+
+from enact_dist import Aspect, Lock, Position, View, Write, local
+from enact_dist.core.datum import LockId, Slot, Token
+from enact_dist.core.messages import AspectEntry, Item, SlotVersion, WriteItem
+from enact_dist.core.placement import shard_of
+from enact_dist.core.records import AspectRecord, DecisionRecord, PreparedRecord
+from enact_dist.errors import DatumTypeError, ForgottenError, MisuseError, StoreError
+from enact_dist.link.forgetting import forget, look
+from enact_dist.link.rebalance import rebalance
+from enact_dist.link.store import open_store, read_store
+from enact_dist.link.store_folder import moving_mark
+from enact_dist.terms import Access
+
+TWO = placement("left", "right")
+NEW_POSE = Aspect("pose", str, POSE.durability, retention=POSE.retention)
+NOW_NS = time.time_ns()
+GONE = (False, 0, 0)
+
+
+def of_aspect(folder, name="pose"):
+    """Return how much there is of an aspect in a folder: registered, states, kept versions."""
+    with read_store(folder) as found:
+        states = [one for one in (*found.slots, *found.history) if one.slot.aspect == name]
+        kept = [v for record in found.kept for v in record.versions if v.slot.aspect == name]
+        return name in {entry.name for entry in found.aspects}, len(states), len(kept)
+
+
+def rest_of(folder, name="pose"):
+    """Return everything else that a folder has."""
+    with read_store(folder) as found:
+        states = [one for one in (*found.slots, *found.history) if one.slot.aspect != name]
+        kept = {
+            record.label: {v for v in record.versions if v.slot.aspect != name}
+            for record in found.kept
+        }
+        return (
+            {
+                (s.slot, s.version): (s.stamp_ns, s.datum and bytes(s.datum.body), s.cause)
+                for s in states
+            },
+            {label: versions for label, versions in kept.items() if versions},
+            {entry for entry in found.aspects if entry.name != name},
+            set(found.worlds),
+            set(found.outcomes),
+        )
+
+
+def put(cells, entity, aspect, datum, where=TWO):
+    """Write one datum; return its version."""
+    world = cells[shard_of(entity.name, where)].world("online")
+    with Lock(write := Write(world, entity, aspect)) as lock:
+        lock[write] = datum
+    return world.history(entity, aspect)[-1].version
+
+
+def test_an_aspect_goes_with_all_it_has_and_comes_back_of_another_type(tmp_path):
+    """Nothing else changes; versions go on above, what was is not known, lineage says so."""
+    cell = StoppedCell(tmp_path, TWO)
+    cell.fill(1)
+    entity, note = ENTITIES[0], Aspect("note", str)
+    with cell.opened() as cells:
+        last = cell.put(cells, "online", entity, 2)
+        online = cells[shard_of(entity.name, TWO)].world("online")
+        pose, write = View(online, entity, POSE), Write(online, entity, note)
+        with Lock(pose, write) as lock:
+            lock[write] = f"from {lock[pose]}"
+    before = {name: rest_of(folder) for name, folder in cell.folders.items()}
+    there = {name: of_aspect(folder) for name, folder in cell.folders.items()}
+    states = [one for folder in cell.folders.values() for one in everything(folder)]
+    largest = max(one.version for one in states if one.slot.aspect == "pose")
+
+    found = forget(cell.folders, ["pose"], now_ns=NOW_NS)
+
+    assert {g.shard: (g.type == "list", g.versions, g.kept) for g in found.going} == there
+    assert all(versions and kept for _, versions, kept in there.values())
+    assert all(of_aspect(folder) == GONE for folder in cell.folders.values())
+    assert {name: rest_of(folder) for name, folder in cell.folders.items()} == before
+    assert forget(cell.folders, ["pose"], now_ns=NOW_NS).going == []
+    with cell.opened() as cells:
+        here = cells[shard_of(entity.name, TWO)]
+        online = here.world("online")
+        assert put(cells, entity, NEW_POSE, "new") == largest + 1
+        (newest,) = online.history(entity, NEW_POSE)
+        assert newest.position.stamp_ns > NOW_NS
+        with pytest.raises(DatumTypeError, match="`enact shard forget pose`"):
+            cell.put(cells, "online", entity, 1)
+        past = online.at(lock.position)
+        for aspect, error in ((NEW_POSE, ForgottenError), (POSE, DatumTypeError)):
+            with pytest.raises(error):
+                past.view(View(past, entity, aspect))
+        causes = here.why(online, entity, note).children
+        assert [(c.slot.aspect, c.version, c.kind) for c in causes] == [("pose", last, "forgotten")]
+        assert online.fork("copy").history(entity, NEW_POSE)[-1].version > largest
+
+
+def everything(folder):
+    """Return all states of a folder."""
+    with read_store(folder) as found:
+        return [*found.slots, *found.history]
+
+
+def test_a_look_changes_nothing(tmp_path):
+    """It says the same as is done then."""
+    cell = StoppedCell(tmp_path, TWO)
+    cell.fill(2, rounds=8)
+    rows = {name: everything(folder) for name, folder in cell.folders.items()}
+    found = look(cell.folders, ["pose", "swift"])
+    assert {name: everything(folder) for name, folder in cell.folders.items()} == rows
+    assert {g.aspect for g in found.going} == {"pose", "swift"}
+    assert forget(cell.folders, ["pose", "swift"], now_ns=NOW_NS).going == found.going
+
+
+# ---------------------------------------------------------------- cut off
+
+
+class Killer:
+    """Ends its process like kill -9 before the n-th act; counts them."""
+
+    def __init__(self, at):
+        self.at, self.acts = at, []
+
+    def found(self, forgotten):
+        """Do nothing."""
+
+    def act(self, name):
+        """Die, if it is time."""
+        self.acts.append(name)
+        if len(self.acts) == self.at:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+
+def killed_at(cell, number):
+    """Forget in a child process that is killed at an act; return whether it was."""
+    child = os.fork()
+    if not child:
+        try:
+            forget(cell.folders, ["pose"], now_ns=NOW_NS, progress=Killer(number))
+        finally:
+            os._exit(0)
+    return os.WIFSIGNALED(os.waitpid(child, 0)[1])
+
+
+def test_killed_at_any_act_it_is_taken_up(tmp_path):
+    """Each shard has all of it or nothing, and serves nobody until a run has come to its end."""
+    origin = StoppedCell(tmp_path / "origin", TWO)
+    origin.fill(4, rounds=12)
+    there = {name: of_aspect(folder) for name, folder in origin.folders.items()}
+    rest = {name: rest_of(folder) for name, folder in origin.folders.items()}
+    number, was_killed, halves = 0, True, 0
+    while was_killed:
+        number += 1
+        cell = StoppedCell(tmp_path / f"run{number}", TWO)
+        shutil.copytree(origin.folder, cell.folder)
+        was_killed = killed_at(cell, number)
+        found = {name: of_aspect(folder) for name, folder in cell.folders.items()}
+        assert all(found[name] in (there[name], GONE) for name in found), number
+        if len({one == GONE for one in found.values()}) == 2:
+            halves += 1
+            for folder in cell.folders.values():
+                with pytest.raises(StoreError, match=r"forgetting pose with .* forget pose --yes"):
+                    open_store(folder, unix_s=1)
+        if was_killed:
+            killed_at(cell, 1 + number % 7)
+            forget(cell.folders, ["pose"], now_ns=NOW_NS)
+        assert all(of_aspect(folder) == GONE for folder in cell.folders.values()), number
+        assert {name: rest_of(folder) for name, folder in cell.folders.items()} == rest, number
+        assert [moving_mark(folder) for folder in cell.folders.values()] == [None, None]
+        shutil.rmtree(cell.folder)
+    assert number > 10
+    assert halves
+
+
+def test_what_came_since_stays_where_only_marks_were_left(tmp_path):
+    """A shard that could start has the new type: who lets the others start takes nothing of it."""
+    cell = StoppedCell(tmp_path, TWO)
+    cell.fill(5, rounds=4)
+    copy = StoppedCell(shutil.copytree(tmp_path, tmp_path.with_name("copy")), TWO)
+    acts = Killer(0)
+    forget(copy.folders, ["pose"], now_ns=NOW_NS, progress=acts)
+    assert killed_at(cell, acts.acts.index("unmark right") + 1)
+    with local(cell.folders["left"]) as left:
+        entity = next(e for e in ENTITIES if shard_of(e.name, TWO) == "left")
+        version = put({"left": left}, entity, NEW_POSE, "new")
+    with pytest.raises(StoreError, match="midst of forgetting pose"):
+        open_store(cell.folders["right"], unix_s=1)
+
+    found = forget(cell.folders, ["pose"], now_ns=NOW_NS)
+
+    assert (found.aspects, found.going, found.done) == ((), [], ("pose",))
+    with cell.opened() as cells:
+        online = cells["left"].world("online")
+        assert [v.version for v in online.history(entity, NEW_POSE)] == [version]
+
+
+# ---------------------------------------------------------------- what is refused
+
+
+def two_stores(tmp_path, **records):
+    """Make two folders with these records each; return them."""
+    folders = {name: tmp_path / name for name in ("left", "right")}
+    for name, folder in folders.items():
+        store, _ = open_store(folder, unix_s=1)
+        known = AspectRecord(AspectEntry("aspect", "int", "durable", 0))
+        store.write([persist(known, *records.get(name, ()))])
+        store.close()
+    return folders
+
+
+LOCK = LockId("ann", 0, 1)
+HERE = slot_record("part/1", 1)
+READ = Item(int(Access.READ), *HERE.slot, 0)
+OTHER = Slot("online", "part/1", "other")
+
+
+def promise(items, *slots):
+    """Return a prepared lock with these items and writes."""
+    writes = tuple(WriteItem(slot, None) for slot in slots)
+    versions = tuple(SlotVersion(slot, 1) for slot in slots)
+    return PreparedRecord(LOCK, Token(1, 2), items, writes, versions, 77, "far", Token(3, 4))
+
+
+@pytest.mark.parametrize(
+    ("record", "said"),
+    [
+        (promise((), HERE.slot), "lock ann.0.1 is prepared on right, decided on far, and names as"),
+        (promise((READ,), OTHER), "lock ann.0.1 is prepared on right, decided on far, and names a"),
+        (DecisionRecord(LOCK, Position(5, "right"), ("left", "far")), "right has decided .* far"),
+    ],
+)
+def test_commits_in_doubt_are_in_the_way(tmp_path, record, said):
+    """If they name the aspect, or may; nothing is changed then."""
+    folders = two_stores(tmp_path, left=[HERE], right=[record])
+    for act in (look, lambda *words: forget(*words, now_ns=NOW_NS)):
+        with pytest.raises(StoreError, match=f"nothing was forgotten: .*{said}"):
+            act(folders, ["aspect"])
+    assert of_aspect(folders["left"], "aspect") == (True, 1, 0)
+    assert moving_mark(folders["left"]) is None
+
+
+@pytest.mark.parametrize(
+    "record", [promise((), OTHER), DecisionRecord(LOCK, Position(5, "right"), ("left",))]
+)
+def test_commits_in_doubt_of_others_are_not(tmp_path, record):
+    """They are settled when the cell runs again."""
+    folders = two_stores(tmp_path, left=[HERE], right=[record])
+    forget(folders, ["aspect"], now_ns=NOW_NS)
+    with read_store(folders["right"]) as found:
+        assert len(found.prepared) + len(found.decisions) == 1
+    assert [of_aspect(folder, "aspect") for folder in folders.values()] == [GONE, GONE]
+
+
+def test_unknown_aspects_are_refused(tmp_path):
+    """Known are those that were forgotten before, too: asked again, nothing is left to do."""
+    folders = two_stores(tmp_path, left=[HERE])
+    for act in (look, lambda *words: forget(*words, now_ns=NOW_NS)):
+        with pytest.raises(
+            MisuseError, match=r"no shard here has an aspect spect \(known: aspect\)"
+        ):
+            act(folders, ["aspect", "spect"])
+    assert of_aspect(folders["left"], "aspect") == (True, 1, 0)
+    for _ in range(2):
+        forget(folders, ["aspect"], now_ns=NOW_NS)
+
+
+def test_a_shard_that_runs_is_named(tmp_path):
+    """By its name, its process and what to do."""
+    folders = two_stores(tmp_path, left=[HERE])
+    store, _ = open_store(folders["right"], unix_s=1)
+    for act in (look, lambda *words: forget(*words, now_ns=NOW_NS)):
+        with pytest.raises(StoreError, match=r"shard right: .* in use by process \d+.*stop that"):
+            act(folders, ["aspect"])
+    store.close()
+    assert of_aspect(folders["left"], "aspect") == (True, 1, 0)
+
+
+# ---------------------------------------------------------------- entities that move
+
+
+def test_versions_are_never_used_again_where_an_entity_moves(tmp_path):
+    """Also on a shard that never had the aspect, or has forgotten it at another time."""
+    cell = StoppedCell(tmp_path, TWO)
+    cell.fill(6, rounds=8)
+    home = shard_of(ENTITIES[0].name, TWO)
+    away = {"left": "right", "right": "left"}[home]
+    entity, stays = (next(e for e in ENTITIES if shard_of(e.name, TWO) == s) for s in (home, away))
+    with cell.opened() as cells:
+        last = cell.put(cells, "online", entity, 40)
+    forget({home: cell.folders[home]}, ["pose"], now_ns=NOW_NS)
+    forget({away: cell.folders[away]}, ["pose"], now_ns=NOW_NS)
+    with cell.opened() as cells:
+        first = put(cells, stays, NEW_POSE, "a")
+        assert first < last
+
+    cell.where = placement("left", "right", pins=[(entity.name, away), ("**", away)])
+    rebalance(cell.folders, cell.where, unix_s=int(time.time()))
+
+    with cell.opened() as cells:
+        assert put(cells, entity, NEW_POSE, "b", where=cell.where) > last
+        assert put(cells, stays, NEW_POSE, "c", where=cell.where) == first + 1
+        online = cells[away].world("online")
+        made = online.history(stays, NEW_POSE)[0].position.stamp_ns
+        before = online.at(Position(made - 1, away))
+        assert before.view(old := View(before, stays, NEW_POSE)).get(old) is None
+
+
+def test_a_rebalance_and_a_forgetting_wait_for_each_other(tmp_path):
+    """Each names the one that was cut off, and what ends it."""
+    cell = StoppedCell(tmp_path, TWO)
+    cell.fill(7, rounds=4)
+    assert killed_at(cell, 5)
+    with pytest.raises(StoreError, match=r"midst of forgetting pose; let `enact shard forget pose"):
+        rebalance(cell.folders, TWO, unix_s=1)
+    (cell.folder / "left" / "moving").write_text('{"rebalance": "x", "shards": ["left", "right"]}')
+    with pytest.raises(StoreError, match=r"midst of a rebalance; let `enact shard rebalance`"):
+        look(cell.folders, ["pose"])
