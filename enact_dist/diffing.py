@@ -206,8 +206,11 @@ def compared(
 
     Raises:
         LeaseLostError: Data are gone: look again.
-        DatumTypeError: A datum is not of its aspect's type.
+        DatumTypeError: A datum is not of its aspect's type, or that is another one meanwhile.
     """
+    typed = [one for one in types.values() if one.datum_type is not object]
+    for session in dict.fromkeys((first.session, second.session)):
+        session.look_up(typed)
     for batch in _batches(pairs):
         whole = [_Whole(*pair) for pair in batch if pair.left and pair.right]  # type: ignore[arg-type]
         same = _same_versions(whole, first, second)

@@ -166,7 +166,7 @@ class Lock:
             raise LockReleasedError(f"{self!r} was used already; make a new lock")
         client = self._session.client
         client.check_usable()
-        self._session.prepare(self._requests, wait_s=self._wait_s)
+        prepared = self._session.prepare(self._requests, wait_s=self._wait_s)
         begun: list[MultiLock] = []
         self._asked_s = time.monotonic()
         try:
@@ -179,7 +179,7 @@ class Lock:
                 interrupt=self._interrupt,
                 begun=begun,
             )
-            self._session.check_shown(lock.states, self._requests)
+            self._session.check_shown(lock.states, self._requests, prepared)
             self._granted_s = time.monotonic()
             self._readings = Readings(
                 client, self._session.cache, lock.lock, lock.states, self._use

@@ -50,9 +50,10 @@ class Session:
         self.cache = DatumCache()
         self._entries: dict[int, tuple[Aspect[Any], AspectEntry]] = {}
         self._looked_up: dict[AspectEntry, float] = {}
+        self._lapses = 0
         self._unknown: set[AspectEntry] = set()
 
-    def prepare(self, requests: Iterable[LockRequest[Any]], *, wait_s: float | None = None) -> None:
+    def prepare(self, requests: Iterable[LockRequest[Any]], *, wait_s: float | None = None) -> int:
         """Make sure that the aspects of a lock or view can be used: register what it may write.
 
         Args:
@@ -60,14 +61,18 @@ class Session:
             wait_s: How long the caller would wait at most; no shard gets less than one call's
                 time.
 
+        Returns:
+            What `check_shown` is told of this, once a grant or view is there.
+
         Raises:
             DatumTypeError: A shard knows one of the aspects with another type.
             ShardUnreachableError: A shard that is asked does not answer.
         """
+        prepared = self._see_lapses()
         aspects = {request.aspect.name: request.aspect for request in requests}
         entries = [self._entry(aspect) for aspect in aspects.values()]
         if self.client.knows(entries):
-            return
+            return prepared
         patience_s = self.client.patience_s
         timeout_s = patience_s if wait_s is None else min(patience_s, max(wait_s, CALL_S))
         writing = [request for request in requests if request.access.writes]
@@ -82,6 +87,15 @@ class Session:
         if reading:
             read = [entry for entry in entries if entry.name not in written]
             self._look_up(read, lambda: self.shards_of(reading), timeout_s)
+        return prepared
+
+    def _see_lapses(self) -> int:
+        """Return how often a shard has forgotten an aspect; what was looked up before is void."""
+        lapses = self.client.lapses
+        if lapses != self._lapses:
+            self._lapses = lapses
+            self._looked_up.clear()
+        return lapses
 
     def look_up(self, aspects: Iterable[Aspect[Any]], *, timeout_s: float | None = None) -> None:
         """Make sure that no shard knows one of these aspects, which are only read, otherwise.
@@ -94,6 +108,7 @@ class Session:
             DatumTypeError: A shard knows one with another type.
             ShardUnreachableError: A shard that is asked does not answer.
         """
+        self._see_lapses()
         entries = [self._entry(aspect) for aspect in aspects]
         if not self.client.knows(entries):
             self._look_up(entries, self.client.shards, timeout_s)
@@ -132,16 +147,25 @@ class Session:
         self._unknown |= set(due) - set(used)
 
     def check_shown(
-        self, readings: Iterable[Reading], requests: Iterable[LockRequest[Any]]
+        self, readings: Iterable[Reading], requests: Iterable[LockRequest[Any]], prepared: int
     ) -> None:
         """Check aspects that came into use after they were looked up, by what is shown of them.
 
-        Only those of these requests, at the shards that show them.
+        Only those of these requests, at the shards that show them.  All are checked again where a
+        shard has restarted in between and does not know some aspect as it did: within an epoch no
+        type changes, and nothing is granted in one before its catalogue is known.
+
+        Args:
+            readings: What is shown.
+            requests: What was asked for.
+            prepared: What `prepare` has returned.
 
         Raises:
             DatumTypeError: One has another type.
             ShardUnreachableError: A shard does not answer.
         """
+        if self.client.lapses != prepared:
+            self.prepare(requests, wait_s=CALL_S)
         if not self._unknown:
             return  # the usual case
         shown = [one.state.slot for one in readings if not one.state.null_reason]

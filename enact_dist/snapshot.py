@@ -47,15 +47,14 @@ def take_snapshot(
         if request.access.locks:
             raise MisuseError(f"{request!r} locks; view(…) takes View and ViewEach, or use Lock(…)")
     moment = _moment_of(requests, together)
-    if register:
-        session.prepare(requests)
+    prepared = session.prepare(requests) if register else 0
     for attempt in range(1, VIEWS_MAX + 1):
         try:
             captured_ns = _newest_set_ns(session, together) if together is not None else 0
             items = _items(session, requests, moment, together, captured_ns)
             readings = take_readings(session, items, past_ns=moment.at_ns)
             if register:
-                session.check_shown(readings.readings(), requests)
+                session.check_shown(readings.readings(), requests, prepared)
             snapshot = Snapshot(readings, requests, together, captured_ns)
             if together is None or attempt == VIEWS_MAX or snapshot.has_set():
                 return snapshot  # what has left retention just now is null in it

@@ -97,7 +97,8 @@ def other_type(known: AspectEntry, wanted: AspectEntry) -> str:
         return ""
     return (
         f"aspect {known.name!r} is registered with datum type {known.fingerprint}, and was"
-        f" now asked with {wanted.fingerprint}; use the registered type or another name"
+        f" now asked with {wanted.fingerprint}; use the registered type or another name, or give up"
+        f" its data for the new type: stop the cell and call `enact shard forget {known.name}`"
     )
 
 

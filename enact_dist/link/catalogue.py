@@ -1,13 +1,15 @@
 """What a client knows of the shards' catalogues: world contexts and aspects, shard by shard.
 
 A shard that keeps nothing on disk forgets its catalogue when it restarts; `forget` then makes the
-client register anew what it needs there.
+client register anew what it needs there.  One with a folder may have forgotten an aspect as well,
+or know it with another type since (`enact shard forget`): `lapses` tells that this has happened.
 """
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
+from enact_dist.core.catalogue import other_type
 from enact_dist.core.messages import AspectEntry, Registered, Welcome, WorldEntry
 from enact_dist.core.retaining import covers
 
@@ -24,24 +26,37 @@ class KnownCatalogue:
     """The newest catalogue of each shard that was greeted.
 
     One thread at a time changes it, any may look: whatever it is shown was made whole before.
+
+    Attributes:
+        lapses: How often a shard knew an aspect no more, or with another type than before.
     """
 
     def __init__(self) -> None:
+        self.lapses = 0
+        self._epochs: dict[str, int] = {}
         self._aspects: dict[str, dict[str, AspectEntry]] = {}
         self._worlds: dict[str, dict[str, WorldEntry]] = {}
         self._settled: tuple[PlacementMap | None, set[AspectEntry]] = (None, set())
 
     def learn(self, shard: str, answer: Welcome | Registered) -> None:
-        """Take the catalogue that an answer carries."""
+        """Take the catalogue that an answer carries; not that of an epoch which is over."""
+        if isinstance(answer, Welcome):
+            if answer.epoch < self._epochs.get(shard, 0):
+                return
+            self._epochs[shard] = answer.epoch
         worlds = {name: WorldEntry(name) for name in answer.worlds}
         self._worlds[shard] = worlds | {entry.name: entry for entry in answer.forks}
-        self._aspects[shard] = {entry.name: entry for entry in answer.aspects}
-        self._settled = (None, set())  # last: nobody settles by what was known before
+        before = self._aspects.get(shard, {})
+        now = self._aspects[shard] = {entry.name: entry for entry in answer.aspects}
+        self._settled = (None, set())  # after it: nobody settles by what was known before
+        if any(name not in now or other_type(now[name], before[name]) for name in before):
+            self.lapses += 1
 
     def forget(self, shard: str) -> None:
         """Forget the aspects of a shard, which does not know what it was said to know."""
         self._aspects.pop(shard, None)
         self._settled = (None, set())
+        self.lapses += 1
 
     def settled(self, aspects: Iterable[AspectEntry], placement: PlacementMap) -> bool:
         """Whether no shard of a placement must be asked before these aspects can be used.

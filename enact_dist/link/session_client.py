@@ -343,6 +343,11 @@ class SessionClient:
         """Return the registered aspects of all greeted shards by name."""
         return self._catalogue.aspects()
 
+    @property
+    def lapses(self) -> int:
+        """How often a shard knew an aspect no more, or with another type than before."""
+        return self._catalogue.lapses
+
     def knows(self, aspects: Sequence[AspectEntry]) -> bool:
         """Whether every shard of the cell is known to know these aspects: the usual case."""
         return self._catalogue.settled(aspects, self.core.placement)
@@ -394,11 +399,14 @@ class SessionClient:
             missing = [shard for shard in missing if shard in wanted]
         if missing:
             request = Register(self.core.session, worlds, aspects)
-            for answer in self.call_all(
-                [(shard, request) for shard in missing], timeout_s=timeout_s
-            ):
+            epochs = {shard: self.core.epoch(shard) for shard in missing}
+            calls = [(shard, request) for shard in missing]
+            for answer in self.call_all(calls, timeout_s=timeout_s):
                 if isinstance(answer, Refused):
                     raise error_of(answer)
+            restarted = [shard for shard in missing if self.core.epoch(shard) != epochs[shard]]
+            if restarted:  # the answer may be of before
+                self.greet(restarted, timeout_s=timeout_s)
 
     def subscribe(self, interest: Survey | None = None) -> NoticeFeed:
         """Open a feed of the notices of all shards that `interest` lists (None: of all slots)."""

@@ -211,13 +211,17 @@ class Replay:
         """Commit data under one lock."""
         slots = [self._slot(recorded.slot) for recorded in versions]
         session = next(iter(self._sessions.values()))
-        self._register(session, versions)
         client = session.client
+        prepared = client.lapses
+        self._register(session, versions)
         items = [Item(int(Access.WRITE), *slot) for slot in slots]
         writing = Writing(client.payloads)
         lock = client.acquire(items, wait_s=WAIT_S, hold_s=HOLD_S)
         committed = False
         try:
+            if client.lapses != prepared:  # a shard has restarted and forgotten an aspect
+                self._registered.clear()
+                self._register(session, versions)
             for slot, recorded in zip(slots, versions, strict=True):
                 if recorded.datum is None:
                     writing.delete(slot)
