@@ -11,6 +11,7 @@ import contextlib
 import time
 from typing import TYPE_CHECKING, Any
 
+from enact_dist.aspect_info import AspectInfo, aspect_infos
 from enact_dist.cell_info import (
     ActorInfo,
     AuditInfo,
@@ -455,6 +456,14 @@ class Cell(Closing):
         self._client.greet()
         entries = self._client.aspect_entries()
         return {name: (entry.fingerprint, entry.durability) for name, entry in entries.items()}
+
+    def aspect_infos(self, world: str = "") -> tuple[AspectInfo, ...]:
+        """Return the registered aspects, and how much of them is in one world context, or all.
+
+        Raises:
+            ShardUnreachableError: A shard does not answer.
+        """
+        return aspect_infos(self._session, world)
 
     def statistics(self) -> dict[str, int]:
         """Return this connection's own counters by name."""

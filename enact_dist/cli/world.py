@@ -6,7 +6,7 @@ import sys
 import time
 from typing import TYPE_CHECKING, Any
 
-from enact_dist.cli import world_diff, world_export, world_time
+from enact_dist.cli import world_aspects, world_diff, world_export, world_time
 from enact_dist.cli.missing import named_if_missing
 from enact_dist.cli.output import print_json, print_json_line, print_table, shown_bytes
 from enact_dist.cli.slots import print_datum, print_slots
@@ -50,6 +50,7 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
         example="enact world ls",
     )  # fmt: skip
     add_reader(ls)
+    world_aspects.add_aspects(verbs)
     _add_tree(verbs)
     _add_get(verbs)
     _add_put(verbs)
