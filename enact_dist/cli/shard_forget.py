@@ -20,6 +20,7 @@ from enact_dist.session import unknown_aspect
 
 if TYPE_CHECKING:
     import argparse
+    from collections.abc import Iterable
 
     from enact_dist.cli.verbs import Verb
     from enact_dist.config_types import CellConfig
@@ -46,6 +47,13 @@ def add_to(verbs: argparse._SubParsersAction[Verb]) -> None:
         metavar="NAME=PATH",
         help="folder of a shard that is not where the cell.toml says",
     )
+    verb.add_argument(
+        "--shard",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="only this one: it was restored from a backup that has the aspect as it was",
+    )
     what = verb.add_mutually_exclusive_group()
     what.add_argument(
         "--dry-run", action="store_true", help="say what would go, change nothing (status 0)"
@@ -63,7 +71,7 @@ def run_forget(arguments: argparse.Namespace) -> int:
     from enact_dist.link.forgetting import forget, look
 
     config = cell_config(arguments)
-    folders, elsewhere = _folders(config, pairs(arguments.store, "--store"), arguments.aspects)
+    folders, elsewhere = _folders(config, pairs(arguments.store, "--store"), arguments)
     told = _Told(as_json=arguments.json, goes="goes" if arguments.yes else "would go")
     if not folders:
         raise ConfigError(f"no shard of {config.path} has its data here: {'; '.join(elsewhere)}")
@@ -82,23 +90,30 @@ def run_forget(arguments: argparse.Namespace) -> int:
         print(f"enact: {line}", file=sys.stderr)
     if arguments.yes or arguments.dry_run or not (found.going or found.resumed):
         return DONE
-    words = shlex.join(["enact", "shard", "forget", *found.aspects, "--yes"])
+    words = _command(found.aspects or found.done, arguments.shard)
     print(f"enact: nothing was changed; to let it go: {words}", file=sys.stderr)
     return FAILED
 
 
+def _command(aspects: Iterable[str], shards: Iterable[str] = ()) -> str:
+    only = [word for name in shards for word in ("--shard", name)]
+    return shlex.join(["enact", "shard", "forget", *aspects, *only, "--yes"])
+
+
 def _folders(
-    config: CellConfig, stores: dict[str, str], aspects: list[str]
+    config: CellConfig, stores: dict[str, str], arguments: argparse.Namespace
 ) -> tuple[dict[str, Path], list[str]]:
     """Return the folders of the shards that have data here, and what is to be said of others."""
     from enact_dist.link.store_folder import holds_store
 
-    for name in stores:
+    for name in (*stores, *arguments.shard):
         config.shard(name)
     folders: dict[str, Path] = {}
     elsewhere: list[str] = []
-    command = f"`{shlex.join(['enact', 'shard', 'forget', *aspects, '--yes'])}`"
+    command = f"`{_command(arguments.aspects)}`"
     for shard in config.shards:
+        if arguments.shard and shard.name not in arguments.shard:
+            continue
         folder = Path(stores[shard.name]) if shard.name in stores else shard.folder
         if folder is None:
             elsewhere.append(
@@ -141,6 +156,10 @@ def _end(found: Forgotten) -> str:
     )
 
 
+def _shown(size: int) -> str:
+    return shown_bytes(size) if size else "-"
+
+
 class _Told:
     """Says what goes before it does, and keeps one line of a terminal up to date."""
 
@@ -170,16 +189,17 @@ class _Told:
         print_table(
             ("shard", "aspect", "type", "slots", "versions", "data", "kept by labels"),
             [
-                (g.shard, g.aspect, g.type or "-", g.slots, g.versions, shown_bytes(g.size),
+                (g.shard, g.aspect, g.type or "-", g.slots, g.versions, _shown(g.size),
                  f"{g.kept} ({', '.join(g.labels)})" if g.kept else "-")
                 for g in found.going
             ],
             empty=f"nothing is here any more of {', '.join(found.aspects)}",
         )  # fmt: skip
         if found.going:
-            size = shown_bytes(sum(g.size for g in found.going))
             versions = sum(g.versions for g in found.going)
-            print(f"{self._goes}: {versions} versions with {size}, for good", flush=True)
+            size = sum(g.size for g in found.going)
+            data = f" with {shown_bytes(size)}" if size else ""
+            print(f"{self._goes}: {versions} versions{data}, for good", flush=True)
 
     def act(self, name: str) -> None:
         """Show what is done next."""

@@ -233,6 +233,9 @@ def put_datum(arguments: argparse.Namespace) -> int:
                 del lock[request]
             else:
                 lock[request] = value
+        if version == 1:  # not where a context was dropped, or an aspect forgotten, before
+            made = world.history(Entity(entity), request.aspect, count=1)
+            version = max((v.version for v in made if v.position == lock.position), default=1)
     if arguments.json:
         print_json({"world": world.name, "entity": entity, "aspect": name, "version": version})
     else:

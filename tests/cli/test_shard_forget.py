@@ -13,8 +13,11 @@ NUMBER, CLOUD = Aspect("number", int), Aspect("cloud", np.ndarray, Durability.OS
 
 @pytest.fixture
 def stopped(write_cell):
-    """A cell that was stopped; entities lie where nobody looks at their names."""
-    file = write_cell()
+    """A cell that was stopped, with one entity on each shard."""
+    file = write_cell(
+        '[[pins]]\nentities = "part/left"\nshard = "left"\n'
+        '[[pins]]\nentities = "part/right"\nshard = "right"\n'
+    )
     for shard in ("left", "right"):
         with local(file.parent / "data" / shard) as cell:
             online = cell.create_world("online")
@@ -31,7 +34,7 @@ def test_what_would_go_is_said_and_stays(enact, stopped):
     for words, status in ((("--dry-run",), 0), ((), 1)):
         told = enact("shard", "forget", "number", "cloud", "--cell", stopped, *words)
         rows = [line.split() for line in told.out.splitlines()]
-        assert rows[1] == ["left", "number", "int", "1", "2", "0", "B", "1", "(best)"]
+        assert rows[1] == ["left", "number", "int", "1", "2", "-", "1", "(best)"]
         assert rows[2] == ["left", "cloud", "ndarray", "1", "2", "160", "kB", "-"]
         assert "would go: 8 versions with 320 kB, for good" in told.out
         assert told.status == status
@@ -43,7 +46,7 @@ def test_it_goes_and_another_type_comes(enact, stopped):
     words = ("shard", "forget", "number", "--cell", stopped, "--yes")
     told = enact(*words)
     assert told.status == 0, told.err
-    assert "goes: 4 versions" in told.out
+    assert "goes: 4 versions, for good" in told.out
     assert "forgot number: 2 slots with 4 versions; the shards may start" in told.out
     again = enact(*words, "--json")
     assert (again.status, again.json["going"], again.json["done"]) == (0, [], True)
@@ -101,3 +104,25 @@ def test_shards_elsewhere_are_named_with_what_to_do_there(enact, stopped):
         "shard", "forget", "number", "--cell", stopped, "--yes", "--json", "--store", right
     )
     assert [one["shard"] for one in told.json["going"]] == ["right"]
+
+
+def test_one_shard_alone_forgets(enact, stopped):
+    """Of one that was restored from an old backup; the others keep what they have."""
+    words = ("shard", "forget", "number", "--cell", stopped, "--shard", "right")
+    assert "enact shard forget number --shard right --yes" in enact(*words).err
+    told = enact(*words, "--yes", "--json")
+    assert [one["shard"] for one in told.json["going"]] == ["right"]
+    left = enact("shard", "forget", "number", "--cell", stopped, "--dry-run", "--json").json
+    assert [one["shard"] for one in left["going"]] == ["left"]
+    assert "has no shard 'middle'" in enact(*words, "--shard", "middle").err
+
+
+@pytest.mark.slow
+def test_a_put_after_it_tells_the_version_that_it_made(enact, stopped, spawn, until):
+    """Which goes on above those that are gone; the other type is taken."""
+    assert enact("shard", "forget", "number", "--cell", stopped, "--yes").status == 0
+    for shard in ("left", "right"):
+        until(spawn("shard", "run", shard, "--cell", stopped), "ready: shard")
+    words = ("world", "put", "online", "part/new/number", '"three"', "--new", "--cell", stopped)
+    assert enact(*words).out == "online:part/new/number set, v3\n"
+    assert enact(*words).out == "online:part/new/number set, v4\n"
