@@ -79,6 +79,11 @@ def under_way(folders: Mapping[str, Path], *, forgets: bool = False) -> dict[str
                 f"the run that was cut off on {name} also {does} of {', '.join(lacking)}; name"
                 " their folders too, with --store NAME=PATH"
             )
+        if forgets and folders.keys() - set(mark.shards):  # they keep what they have
+            raise StoreError(
+                f"the run that was cut off on {name} was of {', '.join(mark.shards)} alone;"
+                f" {way_out(mark)} first"
+            )
     return marks
 
 

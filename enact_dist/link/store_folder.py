@@ -76,7 +76,8 @@ def way_out(mark: MovingMark) -> str:
     """Return what lets a run that was cut off come to its end."""
     command = "enact shard rebalance"
     if mark.aspects:
-        command = f"enact shard forget {' '.join(mark.aspects)} --yes"
+        only = " ".join(f"--shard {name}" for name in mark.shards)
+        command = f"enact shard forget {' '.join(mark.aspects)} {only} --yes"
     return f"let `{command}` come to its end"
 
 

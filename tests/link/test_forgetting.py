@@ -167,7 +167,9 @@ def test_killed_at_any_act_it_is_taken_up(tmp_path):
         if len({one == GONE for one in found.values()}) == 2:
             halves += 1
             for folder in cell.folders.values():
-                with pytest.raises(StoreError, match=r"forgetting pose with .* forget pose --yes"):
+                with pytest.raises(
+                    StoreError, match=r"forgetting pose .* pose --shard left --shard right --y"
+                ):
                     open_store(folder, unix_s=1)
         if was_killed:
             killed_at(cell, 1 + number % 7)
@@ -200,6 +202,22 @@ def test_what_came_since_stays_where_only_marks_were_left(tmp_path):
     with cell.opened() as cells:
         online = cells["left"].world("online")
         assert [v.version for v in online.history(entity, NEW_POSE)] == [version]
+
+
+def test_a_run_of_one_shard_is_taken_up_on_that_one_alone(tmp_path):
+    """The other never was to forget anything."""
+    cell = StoppedCell(tmp_path, TWO)
+    cell.fill(8, rounds=4)
+    whole = cell.folders
+    cell.where = placement("right", pins=[("**", "right")])
+    assert killed_at(cell, 4)
+    with pytest.raises(
+        StoreError, match=r"of right alone; let `enact shard forget pose --shard right -"
+    ):
+        forget(whole, ["pose"], now_ns=NOW_NS)
+    assert of_aspect(whole["left"])[0]
+    assert forget({"right": whole["right"]}, ["pose"], now_ns=NOW_NS).resumed
+    assert (of_aspect(whole["left"])[0], of_aspect(whole["right"])) == (True, GONE)
 
 
 # ---------------------------------------------------------------- what is refused
