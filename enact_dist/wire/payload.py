@@ -23,7 +23,15 @@ from enact_dist.wire.limits import (
 )
 from enact_dist.wire.shapes import shape_of
 from enact_dist.wire.tree_reader import TreeReader, build, untyped
-from enact_dist.wire.tree_writer import INT_MAX, INT_MIN, TREE, MisfitError, TreeWriter, reference
+from enact_dist.wire.tree_writer import (
+    INT_MAX,
+    INT_MIN,
+    TREE,
+    MisfitError,
+    TreeWriter,
+    reference,
+    too_large,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -143,10 +151,7 @@ def _write(writer: TreeWriter, value: object, datum_type: Any) -> bytes:
             )
         tree = msgpack.packb(reference(TREE, *writer.add(tree)))
     if writer.length > BODY_BYTES_MAX:
-        raise DatumTypeError(
-            f"{root}: it has {writer.length} bytes; at most {BODY_BYTES_MAX}; split it over several"
-            " entities or aspects"
-        )
+        raise DatumTypeError(too_large(writer.length).at(root))
     return _VERSION + tree
 
 

@@ -16,7 +16,13 @@ import msgpack
 import numpy as np
 
 from enact_dist.wire.arrays import DtypeError, describe, raw_bytes
-from enact_dist.wire.limits import DEPTH_MAX, DIMENSIONS_MAX, INLINE_BYTES_MAX, aligned
+from enact_dist.wire.limits import (
+    BODY_BYTES_MAX,
+    DEPTH_MAX,
+    DIMENSIONS_MAX,
+    INLINE_BYTES_MAX,
+    aligned,
+)
 from enact_dist.wire.shapes import (
     ArrayOf,
     CodecOf,
@@ -144,6 +150,10 @@ class TreeWriter:
         dtype: np.dtype[Any] = value.dtype
         if shape.dtype is not None and dtype.newbyteorder("=") != shape.dtype:
             raise MisfitError(f"asked {text_of(shape)}, found dtype {dtype}")
+        if value.size and not dtype.itemsize:
+            raise MisfitError(f"{value.size} items of dtype {dtype}, which has no size")
+        if value.nbytes > BODY_BYTES_MAX:  # before a copy of what only looks that large
+            raise too_large(value.nbytes)
         try:
             description = describe(dtype)
         except DtypeError as error:
@@ -281,6 +291,13 @@ def _as_float(value: int) -> float:
 def _unboxed(value: np.generic) -> object:
     """Return a numpy scalar as Python's own, which it equals; a long double is none."""
     return value if isinstance(value, np.longdouble | np.clongdouble) else value.item()
+
+
+def too_large(size: int) -> MisfitError:
+    """Return the error for a part, or a whole, of more bytes than a body may have."""
+    return MisfitError(
+        f"it has {size} bytes; at most {BODY_BYTES_MAX}; split it over several entities or aspects"
+    )
 
 
 def _misfit(asked: str, value: object) -> MisfitError:

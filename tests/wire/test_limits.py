@@ -95,6 +95,14 @@ def test_header_is_limited_on_both_sides():
         decode_frame(bytes([0x93, 1, 1]) + bytes(limits.HEADER_BYTES_MAX), b"")
 
 
+def test_array_that_only_looks_too_large_is_refused_without_a_copy():
+    """One line that stands for a terabyte: its copy would take the memory of the machine."""
+    broad = np.broadcast_to(np.uint8(0), (1 << 20, 1 << 20))
+
+    with pytest.raises(DatumTypeError, match=r"list\[0\]: it has 1099511627776 bytes; at most 10"):
+        encode_datum([broad], list)
+
+
 def test_body_is_limited_on_both_sides():
     """A datum over 1 GiB is refused before a byte of it is copied."""
     zeros = np.zeros(limits.BODY_BYTES_MAX + 1, np.uint8)  # pages that are never touched

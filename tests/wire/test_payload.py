@@ -360,6 +360,8 @@ def test_value_is_accepted_as(value, datum_type, kept):
         ({"\ud800": 1}, dict, "lone surrogate"),
         ([1.0], np.ndarray, r"ndarray: asked numpy.ndarray, found list \[1.0\]"),
         (np.array([None]), np.ndarray, "holds Python objects"),
+        (np.empty(3, "V0"), np.ndarray, r"ndarray: 3 items of dtype \|V0, which has no size"),
+        ([np.empty((), np.dtype([]))], list, r"list\[0\]: 1 items of dtype \[\], which has no size"),
         (np.ma.array([1]), np.ndarray, "found numpy.ma.MaskedArray"),
         (np.zeros(1, {"names": ["a"], "formats": ["i4"], "titles": [7]}), np.ndarray,
          "a title that is no text: 7"),
