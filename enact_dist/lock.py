@@ -237,6 +237,9 @@ class Lock:
         """
         self._readings.end(functools.partial(_refuse_released, self._requests))
         self._each.clear()
+        if self._lock is not None:
+            self._lock.states.clear()
+            self._lock.cut = None
 
     def _use(self) -> None:
         """Raise unless the block is running and the lock not known to be lost."""

@@ -373,6 +373,8 @@ class MultiLock:
     def _end(self, phase: Phase) -> None:
         """Rest in `phase`; whatever may still be held or awaited is given back."""
         self.phase = phase
+        if self._finishing is not None:
+            self._finishing.writes = {}  # they may be large, and whoever has the lock may keep it
         if phase not in (Phase.COMMITTED, Phase.UNKNOWN):
             touched = [part.shard for part in self.parts]
             touched += [shard for shard, _ in self.plan.views if shard not in touched]
