@@ -42,7 +42,7 @@ from enact_dist.together import Together
 from enact_dist.wire.limits import ITEMS_MAX
 from enact_dist.wire.payload import encode_parts
 from enact_dist.writable import WritableEach
-from enact_dist.writing import Writing, template
+from enact_dist.writing import Asked, Writing
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -376,7 +376,8 @@ class Lock:
 
         Args:
             request: A `Write` of this lock.
-            shape: Of the array; for a dataclass of arrays ``{field: shape}``.
+            shape: Of the array; for a dataclass of arrays ``{field: shape}``, whose own checks see
+                them filled with zeros.
             dtype: Of the array, or ``{field: dtype}``; as annotated, else float64, if left out.
             like: In place of both: a datum, its arrays of the shapes, dtypes and orders wanted.
             stamp_ns: As in `put`.
@@ -388,13 +389,8 @@ class Lock:
             NoRoomError: As `put`.
         """
         self._check_writable(request)
-        slot, asked = slot_of(request), request.aspect.datum_type
-        self._writing.refuse_second(slot, request)
-        try:
-            wanted = template(asked, like, shape, dtype)
-            value: T = self._writing.blank(slot, self._shard(slot), wanted, asked, stamp_ns)
-        except DatumTypeError as error:
-            raise misfit(slot, "is not set", error) from error.__cause__
+        asked = Asked(request.aspect.datum_type, like, shape, dtype, stamp_ns)
+        value: T = self._writing.new(slot_of(request), asked, self._shard)
         return value
 
     def __delitem__(self, request: Write[Any]) -> None:
@@ -427,7 +423,9 @@ class Lock:
     def _check_writable(self, request: LockRequest[Any]) -> None:
         self._check(request)
         if request.access is Access.WRITE_EACH:
-            raise MisuseError(f"set one entity at a time: lock[{request!r}][entity] = …")
+            raise MisuseError(
+                f"set one entity at a time: lock[{request!r}][entity] = …, or .new(entity, …) of it"
+            )
         if request.access is not Access.WRITE:
             raise ReadonlyError(
                 f"{request!r} does not allow writing; ask with Write(…) instead of"

@@ -7,16 +7,18 @@ One class in two parts with `Lock`, whose writes it fills.
 from __future__ import annotations
 
 from collections.abc import Iterator, MutableMapping
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, TypeVar, overload
 
 from enact_dist.core.datum import Slot
 from enact_dist.errors import MisuseError
 from enact_dist.reading import EachData, Readings
 from enact_dist.terms import Entity, pattern_matches
+from enact_dist.writing import Asked
 
 if TYPE_CHECKING:
     from enact_dist.lock import Lock
     from enact_dist.terms import LockRequest
+    from enact_dist.writing import DTypesLike, ShapesLike
 
 T = TypeVar("T")
 
@@ -77,6 +79,31 @@ class WritableEach(EachData[T], MutableMapping[Entity, T]):
         self._lock._put(slot, self._request.aspect, datum, stamp_ns=stamp_ns)
         self._note(entity, slot, null=False)
         self._followed = self._lock._writing.edits
+
+    @overload
+    def new(
+        self, entity: Entity, shape: ShapesLike, dtype: DTypesLike = None, *, stamp_ns: int = 0
+    ) -> T: ...
+    @overload
+    def new(self, entity: Entity, *, like: T, stamp_ns: int = 0) -> T: ...
+    def new(
+        self,
+        entity: Entity,
+        shape: ShapesLike | None = None,
+        dtype: DTypesLike = None,
+        *,
+        like: T | None = None,
+        stamp_ns: int = 0,
+    ) -> T:
+        """Return one entity's datum, whose arrays are to be filled in place; see `Lock.new`."""
+        self.follow()
+        slot = self._slot(entity)
+        self._lock._use()
+        asked = Asked(self._request.aspect.datum_type, like, shape, dtype, stamp_ns)
+        value: T = self._lock._writing.new(slot, asked, self._lock._shard)
+        self._note(entity, slot, null=False)
+        self._followed = self._lock._writing.edits
+        return value
 
     def __delitem__(self, entity: Entity) -> None:
         self.follow()

@@ -16,6 +16,7 @@ from enact_dist.core.datum import Datum, Slot
 from enact_dist.core.messages import WriteItem
 from enact_dist.errors import DatumTypeError, MisuseError
 from enact_dist.in_place import Shown, changeable
+from enact_dist.reading import misfit
 from enact_dist.wire.limits import BODY_BYTES_MAX, ITEMS_MAX, PAYLOAD_BYTES_MIN
 from enact_dist.wire.payload import decode_datum, decode_to_fill, encode_parts, joined
 from enact_dist.wire.shapes import ArrayOf, RecordOf, shape_of
@@ -40,6 +41,25 @@ class _Written(NamedTuple):
     datum: Datum
     draft: Draft | None
     arrays: tuple[NDArray[Any], ...] = ()
+
+
+class Asked(NamedTuple):
+    """What a datum that is to be filled shall look like.
+
+    Attributes:
+        datum_type: The aspect's type.
+        like: A datum that looks so, or None.
+        shape: In its place: of the array; of each array by field where the type is a dataclass.
+        dtype: Of the array, or of all, or of each by field; None takes what the type is annotated
+            with, float64 where it is not.
+        stamp_ns: When it was captured.
+    """
+
+    datum_type: Any
+    like: object
+    shape: ShapesLike | None
+    dtype: DTypesLike
+    stamp_ns: int
 
 
 class Writing:
@@ -132,27 +152,32 @@ class Writing:
             return _Written(encoded.datum(), None)
         return _Written(encoded.over(body, draft.file), draft)
 
-    def refuse_second(self, slot: Slot, request: object) -> None:
-        """Raise `MisuseError` if a datum of this slot was handed out to be filled, and stands."""
+    def new(self, slot: Slot, asked: Asked, shard_of: Callable[[Slot], str]) -> Any:
+        """Set a slot to a value whose arrays are to be filled, and return it.
+
+        Raises:
+            DatumTypeError: What was asked is not of the type, or has no array.
+            MisuseError: It is more than one lock may write, or there is one that stands.
+            NoRoomError: The shard's cap is reached.
+        """
         held = self._by_slot.get(slot)
         if held is not None and held.arrays:
             raise MisuseError(
-                f"new({request!r}) has handed out a datum in this block already, and a second one"
-                " would take its place with nothing in it: fill the first, or give it up with"
-                " `del lock[request]` before you ask for another"
+                f"new() has handed out a datum of {slot.entity}/{slot.aspect} in this block"
+                " already, and a second one would take its place with nothing in it: fill the"
+                " first, or give it up with `del lock[request]` (of a pattern"
+                " `del lock[request][entity]`) before you ask for another"
             )
+        try:
+            return self._blank(slot, asked, shard_of)
+        except DatumTypeError as error:
+            raise misfit(slot, "is not set", error) from error.__cause__
 
-    def blank(self, slot: Slot, shard: str, like: object, datum_type: Any, stamp_ns: int) -> Any:
-        """Set a slot to a value like `like`, whose arrays are to be filled, and return it.
-
-        Raises:
-            DatumTypeError: `like` is not of the type, or has no array.
-            MisuseError: It is more than one lock may write.
-            NoRoomError: The shard's cap is reached.
-        """
-        encoded = encode_parts(like, datum_type, stamp_ns=stamp_ns)
+    def _blank(self, slot: Slot, asked: Asked, shard_of: Callable[[Slot], str]) -> Any:
+        like, datum_type = template(asked), asked.datum_type
+        encoded = encode_parts(like, datum_type, stamp_ns=asked.stamp_ns)
         size = self._size_with(slot, encoded.size)
-        draft, memory, shown = self._memory(shard, encoded)
+        draft, memory, shown = self._memory(shard_of(slot), encoded)
         encoded.put_texts(memory)
         value, arrays = decode_to_fill(encoded.encoding, memory, datum_type)
         if not arrays:
@@ -231,24 +256,16 @@ def _plain(encoded: Encoded) -> memoryview:
     return memoryview(raw.data)[start : start + encoded.size]
 
 
-def template(
-    datum_type: object, like: object, shape: ShapesLike | None, dtype: DTypesLike
-) -> object:
+def template(asked: Asked) -> object:
     """Return what a datum that is to be filled looks like, without memory of its own.
-
-    Args:
-        datum_type: The aspect's type.
-        like: A datum that looks so, or None.
-        shape: In its place: of the array; of each array by field where the type is a dataclass.
-        dtype: Of the array, or of all, or of each by field; None takes what the type is annotated
-            with, float64 where it is not.
 
     Raises:
         MisuseError: Both ways to say it were taken, or none.
-        DatumTypeError: The type has other fields, or fields that are no arrays, or numpy knows no
-            such shape or dtype.
+        DatumTypeError: The type has other fields, or fields that are no arrays, or takes none of
+            these shapes, or numpy knows no such shape or dtype.
     """
-    if (like is None) == (shape is None):
+    datum_type, like, shape, dtype, _ = asked
+    if (like is None) == (shape is None) or (like is not None and dtype is not None):
         raise MisuseError("new() takes either shape and dtype, or like=…")
     if shape is None:
         return like
@@ -263,9 +280,21 @@ def template(
     if unknown:
         raise DatumTypeError(f"dtypes of {unknown} were given; the fields are {sorted(arrays)}")
     made = {
-        name: _empty(name, kind, shape[name], dtypes.get(name)) for name, kind in arrays.items()
+        name: _empty(name, kind, shape[name], dtypes.get(name), zeros=True)
+        for name, kind in arrays.items()
     }
-    return wanted.kind(**made)
+    return _record(wanted.kind, made)
+
+
+def _record(kind: type[Any], arrays: Mapping[str, NDArray[Any]]) -> object:
+    """Return a dataclass of arrays, which its own checks see filled with zeros."""
+    try:
+        return kind(**arrays)
+    except Exception as error:
+        raise DatumTypeError(
+            f"{kind.__qualname__} takes no arrays of these shapes, all zeros: {error!r:.200}; give"
+            " like=… a datum that looks like the new one"
+        ) from error
 
 
 def _arrays_of(
@@ -285,13 +314,15 @@ def _arrays_of(
     return fields
 
 
-def _empty(name: str, wanted: Shape, shape: ShapeLike, dtype: DTypesLike) -> NDArray[Any]:
+def _empty(
+    name: str, wanted: Shape, shape: ShapeLike, dtype: DTypesLike, *, zeros: bool = False
+) -> NDArray[Any]:
     import numpy as np
 
     if dtype is None and isinstance(wanted, ArrayOf):
         dtype = wanted.dtype
     try:
-        return np.empty(shape, cast("DTypeLike", dtype))
+        return (np.zeros if zeros else np.empty)(shape, cast("DTypeLike", dtype))
     except (TypeError, ValueError, OverflowError, MemoryError) as error:
         raise DatumTypeError(
             f"{name}: no array of shape {shape!r:.80} and dtype {dtype!r:.80}: {error}"

@@ -2,7 +2,7 @@
 
 import os
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -39,8 +39,25 @@ class Points:
     colors: np.ndarray
 
 
+@dataclass(frozen=True)
+class Colored:
+    colors: NDArray[np.float64]
+
+    def __post_init__(self):
+        if self.colors.shape[1] != 3 or not (self.colors <= 1.0).all():
+            raise ValueError("three columns, of at most 1")
+
+
+@dataclass(frozen=True)
+class Counted:
+    numbers: np.ndarray
+    total: np.ndarray = field(init=False)
+
+
 VIEW = Aspect("view", Points, Durability.VOLATILE)
 CLOUD = Aspect("cloud", np.ndarray, Durability.VOLATILE)
+COLORED = Aspect("colored", Colored, Durability.VOLATILE)
+COUNTED = Aspect("counted", Counted, Durability.VOLATILE)
 SURFACE = Aspect("surface", Surface, Durability.VOLATILE)
 TEXT = Aspect("text", str, Durability.VOLATILE)
 
@@ -126,8 +143,9 @@ def test_dataclass_of_arrays_is_filled_in_place(online):
 def test_wrong_fields_and_shapes_are_named(online):
     """Each wrong way to ask for a dataclass or an array says what was asked and what there is."""
     write, surface = Write(online, piece, VIEW), Write(online, piece, SURFACE)
-    cloud = Write(online, piece, CLOUD)
-    with Lock(write, surface, cloud) as lock:
+    cloud, colored = Write(online, piece, CLOUD), Write(online, piece, COLORED)
+    counted = Write(online, piece, COUNTED)
+    with Lock(write, surface, cloud, colored, counted) as lock:
         with pytest.raises(DatumTypeError, match=r"\['points_m'\] were given; the fields"):
             lock.new(write, {"points_m": (3, 3)})
         with pytest.raises(DatumTypeError, match=r"dtypes of \['normals'\]"):
@@ -140,6 +158,26 @@ def test_wrong_fields_and_shapes_are_named(online):
             lock.new(cloud, -1)
         with pytest.raises(DatumTypeError, match="no array of shape"):
             lock.new(cloud, (3,), "no dtype")
+        with pytest.raises(MisuseError, match="either shape and dtype, or like"):
+            lock.new(cloud, dtype=np.float32, like=np.zeros(3, np.uint8))
+        with pytest.raises(DatumTypeError, match=r"Colored takes no arrays.*three columns.*like="):
+            lock.new(colored, {"colors": (9, 2)})
+        with pytest.raises(DatumTypeError, match=r"Counted takes no arrays.*total.*give like="):
+            lock.new(counted, {"numbers": 9, "total": 1})
+
+
+@CARRIERS
+@pytest.mark.parametrize("rows", [4, 50_000])
+def test_checks_of_a_dataclass_see_zeros(online, rows):
+    """Not what the memory of the process happens to hold, which they might refuse or not."""
+    write = Write(online, piece, COLORED)
+    waste = [np.full(3 * rows, np.nan) for _ in range(8)]  # what a new array may then lie in
+    del waste
+    with Lock(write) as lock:
+        lock.new(write, {"colors": (rows, 3)}).colors[:] = 0.5
+
+    with Lock(Read(online, piece, COLORED)) as lock:
+        assert (lock[Read(online, piece, COLORED)].colors == 0.5).all()
 
 
 @CARRIERS
@@ -309,7 +347,7 @@ def test_second_new_of_a_block_is_refused(online, size):
     with Lock(write) as lock:
         first = lock.new(write, (size,), np.uint8)
         first[:] = 1
-        with pytest.raises(MisuseError, match=r"new\(Write\(.*work_piece.*`del lock\[request\]`"):
+        with pytest.raises(MisuseError, match=r"datum of work_piece/cloud.*`del lock\[request\]`"):
             lock.new(write, (size + 1,), np.uint8)
         first[:2] = 2
     with Lock(read) as lock:

@@ -61,6 +61,7 @@ def count_contacts() -> None:
                 lock[count] = lock.get(count, 0) + 1
             lock[count] += 1
             lock[all_counts][piece] = 3
+            assert_type(lock[all_counts].new(piece, like=3), int)
             del lock[count]
         view = View(online, bench, COUNT)
         snapshot = online.view(view)
