@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.epochs import is_kept, state_of
 from enact_dist.errors import ConfigError, EnactError, ShardUnreachableError
+from enact_dist.link.shared_folder import MEMORY, SHARED_FOLDER_VARIABLE
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Iterator
@@ -49,7 +50,6 @@ SKEW_ROUNDS: Final = 5
 """Of several round trips the shortest tells the skew best."""
 ROUND_TRIP_S_WARN: Final = 0.02
 
-SHM_FOLDER: Final = Path("/dev/shm")  # noqa: S108 (the kernel's folder, not a temporary file)
 SHM_BYTES_WARN: Final = 256_000_000
 DISK_BYTES_WARN: Final = 1_000_000_000
 DISK_BYTES_FAIL: Final = 50_000_000
@@ -90,7 +90,8 @@ def examine(target: str, *, timeout_s: float = 5.0) -> Iterator[Finding]:
     yield python_version(sys.version_info[:3])
     yield from _packages()
     yield from _open3d()
-    yield shared_memory(SHM_FOLDER)
+    named = os.environ.get(SHARED_FOLDER_VARIABLE)
+    yield shared_memory(Path(named) if named else MEMORY, named=bool(named))
     if not target:
         yield Finding(
             Level.WARN,
@@ -207,16 +208,24 @@ def _open3d_import() -> Finding:
     return Finding(Level.FAIL, "open3d", f"cannot be imported: {last}", remedy)
 
 
-def shared_memory(folder: Path) -> Finding:
-    """Check the folder in which processes of one host can share memory."""
+def shared_memory(folder: Path, *, named: bool = False) -> Finding:
+    """Check the folder in which processes of one host can share memory.
+
+    Args:
+        folder: Where it is, or will be made.
+        named: Whether somebody has chosen it, in `SHARED_FOLDER_VARIABLE`.
+    """
+    if named and not os.path.lexists(folder):
+        folder = next(parent for parent in folder.absolute().parents if parent.is_dir())
     if not folder.is_dir():
         return Finding(
-            Level.WARN, "shared memory", f"{folder} does not exist", f"mount a tmpfs at {folder}"
+            Level.WARN, "shared memory", f"{folder} is no folder", f"mount a tmpfs at {folder}"
         )
     if not os.access(folder, os.W_OK | os.X_OK):
-        return Finding(
-            Level.WARN, "shared memory", f"{folder} is not writable", f"sudo chmod 1777 {folder}"
-        )
+        remedy = f"sudo chmod 1777 {folder}"
+        if named:
+            remedy = f"let this user write there, or name another in {SHARED_FOLDER_VARIABLE}"
+        return Finding(Level.WARN, "shared memory", f"{folder} is not writable", remedy)
     usage = shutil.disk_usage(folder)
     text = f"{folder}: {usage.free / 1e6:.0f} MB free of {usage.total / 1e6:.0f} MB"
     if usage.free < SHM_BYTES_WARN:
@@ -338,6 +347,10 @@ def shared_data(shard: ShardInfo) -> Iterator[Finding]:
     used, most = counters.get("payload_bytes", 0), counters.get("payload_bytes_max", 0)
     subject = f"shared memory of {shard.name}"
     if not most:
+        if "payload_bytes_max" in counters:
+            found = "none: its large data travel, on its own host too"
+            remedy = "its log says why, unless shared_bytes_max = 0 asks for it"
+            yield Finding(Level.WARN, subject, found, remedy)
         return
     text = f"{counters.get('payload_files', 0)} files, {used} of {most} bytes"
     refused = counters.get("payloads_refused", 0)

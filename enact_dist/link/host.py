@@ -301,7 +301,8 @@ class ShardHost:
         if self._clock.monotonic_ns() >= until_ns:
             with self._mutex:
                 found = self._shard.biggest(3)
-            text = "; the largest: " + ", ".join(f"{name} {size}" for name, size in found)
+            names = ", ".join(f"{name} {size}" for name, size in found)
+            text = f"; the largest: {names}" if names else ""
             self._named_biggest = self._clock.monotonic_ns() + BIGGEST_NS, text
         return text
 

@@ -1,5 +1,6 @@
 """The doctor: each check, good and bad, with its remedy."""
 
+import os
 import socket
 import time
 from dataclasses import replace
@@ -41,6 +42,20 @@ def test_shared_memory_that_is_missing_is_a_warning(tmp_path):
 
     assert found.level is Level.WARN
     assert "mount a tmpfs" in found.remedy
+
+
+def test_doctor_looks_at_the_shared_folder_that_the_environment_names(enact, tmp_path, monkeypatch):
+    """Not at the default that nobody uses; where it will be made, if it is not there yet."""
+    monkeypatch.setenv("ENACT_SHARED_FOLDER", str(tmp_path / "not" / "yet"))
+    assert f"ok    shared memory: {tmp_path}: " in enact("doctor").out
+
+    (tmp_path / "file").write_text("", encoding="utf-8")
+    monkeypatch.setenv("ENACT_SHARED_FOLDER", str(tmp_path / "file"))
+    assert f"warn  shared memory: {tmp_path}/file is no folder" in enact("doctor").out
+
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    found = doctor.shared_memory(tmp_path, named=True)
+    assert "another in ENACT_SHARED_FOLDER" in found.remedy
 
 
 def test_data_folder_that_does_not_exist_yet_is_judged_by_its_parent(tmp_path):
@@ -255,6 +270,7 @@ def test_doctor_checks_the_machine_without_a_cell(enact):
     [
         ({}, None, ""),
         ({"payload_bytes_max": 100}, None, ""),
+        ({"payload_bytes_max": 0}, Level.WARN, "none: its large data travel, on its own host"),
         ({"payload_bytes": 80, "payload_files": 2}, Level.OK, "2 files, 80 of 100 bytes"),
         ({"payload_bytes": 80, "payloads_refused": 3}, Level.WARN, "3 writes were refused"),
         ({"payload_fallbacks": 4}, Level.WARN, "4 large data did not fit"),

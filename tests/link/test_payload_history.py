@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from enact_dist import Aspect, Durability, Entity, Lock, View, Write, connect
-from enact_dist.errors import ForgottenError
+from enact_dist.errors import ForgottenError, NoRoomError
 from enact_dist.link.memory import leftovers
 from enact_dist.link.shard_daemon import DaemonSettings, start_shard
 
@@ -47,6 +47,18 @@ def shown(world):
     """Return which array a world context shows."""
     request = View(world, TRAY, CLOUD)
     return int(world.view(request)[request][0])
+
+
+def test_refusal_names_the_largest_slots_where_there_are_any(cell):
+    """A shard that holds nothing lists nothing."""
+    source = cell.create_world("source")
+    request = Write(source, TRAY, CLOUD)
+
+    with (
+        pytest.raises(NoRoomError, match=r"; 0 of at most \d+ are in use; raise shared_bytes_max"),
+        Lock(request) as lock,
+    ):
+        lock[request] = np.zeros(2 * FILES_MAX * SIZE, np.uint8)
 
 
 def test_payload_of_a_fork_is_there_as_long_as_anything_that_names_it(cell):
