@@ -14,6 +14,7 @@ from enact_dist.bench.visit import Visit, anywhere
 from enact_dist.config_values import CARRIERS
 from enact_dist.connecting import connect, local
 from enact_dist.link.shared_folder import MEMORY, SHARED_FOLDER_VARIABLE
+from enact_dist.supervise import SUPERVISOR_VARIABLE
 from enact_dist.verify.daemons import LineProcess, free_port
 
 if TYPE_CHECKING:
@@ -140,7 +141,8 @@ class Place:
         for name in self.shard_names:
             lines += ["[[pins]]", f'entities = "{name}/**"', f'shard = "{name}"']
         file.write_text("\n".join(lines) + "\n")
-        with environment(**{CARRIER_VARIABLE: "auto"}):
+        # They end with us, however we end: nobody else would ever stop them.
+        with environment(**{CARRIER_VARIABLE: "auto", SUPERVISOR_VARIABLE: str(os.getpid())}):
             self._daemons = [
                 self._process(COMMAND, ("shard", "run", name, "--cell", str(file)))
                 for name in self.shard_names

@@ -159,8 +159,8 @@ class SessionClient:
         """Raise `MisuseError` if this client is closed or belongs to the parent process."""
         if self.forked:
             raise MisuseError(
-                "this cell was connected before a fork and belongs to the parent process;"
-                " connect anew in the child, or start it with the 'spawn' method"
+                "this cell was opened before a fork and belongs to the parent process; connect only"
+                " after the fork, or start the child with the 'spawn' method"
             )
         if self.closed:
             raise MisuseError("this cell is closed; connect again")

@@ -3,9 +3,11 @@
 import contextlib
 import json
 import os
+import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -442,6 +444,42 @@ def test_bench_that_is_told_to_leave_removes_its_files(tmp_path):
     finally:
         running.kill()
         running.wait()
+
+
+def processes_of(folder, word):
+    """Return the processes that have a word and, in another, a folder on their command lines."""
+    found = []
+    for process in Path("/proc").glob("[0-9]*/cmdline"):
+        with contextlib.suppress(OSError):
+            words = process.read_bytes().split(b"\0")
+            if word in words and any(str(folder).encode() in one for one in words):
+                found.append(int(process.parent.name))
+    return found
+
+
+@pytest.mark.slow
+def test_daemons_of_a_killed_bench_end(tmp_path):
+    """Nobody else would ever stop them: what they share would be used until the next boot."""
+    running = subprocess.Popen(
+        [sys.executable, "-m", "enact_dist.cli.main", "bench", "waiters", "--seconds", "3"],
+        env={**os.environ, "TMPDIR": str(tmp_path)},
+    )
+    try:
+        deadline_s = time.monotonic() + 60
+        while not processes_of(tmp_path, b"enact_dist.bench.worker"):  # its shard serves
+            assert time.monotonic() < deadline_s
+            time.sleep(0.01)
+        assert processes_of(tmp_path, b"shard")
+    finally:
+        running.kill()
+        running.wait()
+
+    while left := processes_of(tmp_path, b"shard"):
+        if time.monotonic() > deadline_s + 60:
+            for pid in left:
+                os.kill(pid, signal.SIGKILL)
+            pytest.fail(f"daemons {left} run still")
+        time.sleep(0.05)
 
 
 @pytest.mark.slow
