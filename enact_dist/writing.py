@@ -251,7 +251,7 @@ def _plain(encoded: Encoded) -> memoryview:
 
     from enact_dist.wire.limits import ALIGNMENT
 
-    raw = np.empty(encoded.size + ALIGNMENT, np.uint8)
+    raw = np.zeros(encoded.size + ALIGNMENT, np.uint8)  # what nobody fills is published, too
     start = -raw.ctypes.data % ALIGNMENT
     return memoryview(raw.data)[start : start + encoded.size]
 

@@ -181,6 +181,25 @@ def test_checks_of_a_dataclass_see_zeros(online, rows):
 
 
 @CARRIERS
+def test_part_that_nobody_fills_is_none_of_the_memory_of_the_writer(online, monkeypatch):
+    """What lies there by chance would be everybody's to read."""
+    write, empty = Write(online, piece, CLOUD), np.empty
+
+    def with_secrets(*arguments, **options):
+        array = empty(*arguments, **options)
+        array[...] = 0x5A
+        return array
+
+    with Lock(write) as lock:
+        monkeypatch.setattr(np, "empty", with_secrets)
+        lock.new(write, (1000,), np.uint8)[:10] = 1
+        monkeypatch.undo()
+
+    with Lock(Read(online, piece, CLOUD)) as lock:
+        assert lock[Read(online, piece, CLOUD)].sum() == 10
+
+
+@CARRIERS
 @ROWS
 def test_array_is_read_only_after_the_block(online, rows):
     """Its writer cannot change what was committed by accident."""
