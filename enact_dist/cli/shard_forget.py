@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 from enact_dist.cli.output import ProgressLine, print_json, print_table, shown_bytes
 from enact_dist.cli.verbs import DONE, FAILED, add_cell, add_verb, cell_config, pair, pairs
 from enact_dist.errors import ConfigError
-from enact_dist.session import unknown_aspect
 
 if TYPE_CHECKING:
     import argparse
@@ -174,6 +173,8 @@ class _Told:
         Raises:
             MisuseError: No shard here has ever known one of the aspects.
         """
+        from enact_dist.session import unknown_aspect
+
         self.line.end()
         for name in found.aspects:
             if name not in found.known:
