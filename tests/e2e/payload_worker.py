@@ -17,7 +17,7 @@ import enact_dist.core
 import enact_dist.link
 import enact_dist.wire
 from enact_dist import Aspect, Durability, Entity, Lock, Read, Write, connect
-from enact_dist.errors import NullDatumError
+from enact_dist.errors import LeaseLostError, NullDatumError
 
 ARRAY = Aspect("array", np.ndarray, Durability.VOLATILE)
 KEPT = Aspect("kept", np.ndarray, Durability.OS)
@@ -28,6 +28,15 @@ def say(*words):
     print(*words, flush=True)
 
 
+def certainly(act):
+    """Do it again as long as its lock was lost, by a machine that let it wait."""
+    while True:
+        try:
+            return act()
+        except LeaseLostError:
+            continue
+
+
 def request(kind, cell, name):
     return kind(cell.world("online"), Entity("piece"), ASPECTS[name])
 
@@ -35,12 +44,17 @@ def request(kind, cell, name):
 def fill(cell, way, size, value, name="array"):
     """Commit an array of `size` bytes full of `value`, by `put` or by `new`."""
     write = request(Write, cell, name)
-    with Lock(write) as lock:
-        if way == "put":
-            lock[write] = np.full(int(size), int(value), np.uint8)
-        else:
-            lock.new(write, (int(size),), np.uint8)[:] = int(value)
-    say("filled:", cell.statistics().get("payload_fallbacks", 0))
+
+    def commit():
+        before = cell.statistics().get("payload_fallbacks", 0)
+        with Lock(write, wait_s=60.0) as lock:
+            if way == "put":
+                lock[write] = np.full(int(size), int(value), np.uint8)
+            else:
+                lock.new(write, (int(size),), np.uint8)[:] = int(value)
+        return cell.statistics().get("payload_fallbacks", 0) - before
+
+    say("filled:", certainly(commit))
     sys.stdin.readline()
 
 
@@ -63,9 +77,13 @@ def fill_slowly(cell, way, size, value):
 def read(cell, name="array"):
     """Read the array whole; say its length and its values."""
     asked = request(Read, cell, name)
+
+    def look():
+        with Lock(asked, wait_s=60.0) as lock:
+            return lock[asked]
+
     try:
-        with Lock(asked) as lock:
-            array = lock[asked]
+        array = certainly(look)
     except NullDatumError as error:
         say("read: null", error.reason)
     else:

@@ -1,5 +1,6 @@
 """Commits over shards with real processes: all or nothing, whatever is killed when."""
 
+import contextlib
 import json
 import os
 import random
@@ -9,6 +10,7 @@ import pytest
 from accounts import COUNT, LEFT, RIGHT, open_accounts, two_shards
 
 from enact_dist import Lock, Write, connect
+from enact_dist.errors import LeaseLostError
 
 pytestmark = pytest.mark.slow
 TOTAL = 10_000
@@ -28,8 +30,25 @@ def total(cell):
     with connect(cell.file) as joined:
         world = joined.world("online")
         one, two = Write(world, LEFT, COUNT), Write(world, RIGHT, COUNT)
-        with Lock(one, two, wait_s=60.0) as lock:
-            return lock[one] + lock[two]
+        while True:  # what is found lost at the end is asked for again
+            with contextlib.suppress(LeaseLostError), Lock(one, two, wait_s=60.0) as lock:
+                lock[one] = lock[one]  # a commit over both since the last start of either
+                lock[two] = lock[two]
+                found = lock[one] + lock[two]
+            if lock.position is not None:
+                return found
+
+
+def finished(joined):
+    """Return how many commits shards heard of that another one had decided, since their start."""
+    return sum(shard.counters.get("commits_finished", 0) for shard in joined.shards())
+
+
+def until(question, found):
+    """Ask again until what comes back is true: others hear of an end after who has ended."""
+    deadline_s = time.monotonic() + 60.0
+    while not question():
+        assert time.monotonic() < deadline_s, found()
 
 
 @pytest.mark.carrier("socket", "zenoh")
@@ -38,27 +57,27 @@ def test_transfers_between_shards_keep_the_sum_when_shards_are_killed(cell):
     kills = int(os.environ.get("ENACT_KILLS", "8"))
     draw = random.Random(3)
     auditor = cell.worker("audit")
-    workers = [cell.worker("transfer", seed, 150) for seed in range(4)]
+    transfers = max(150, 10 * kills)  # a worker tells of every 20, and is asked for each 4th kill
+    workers = [cell.worker("transfer", seed, transfers) for seed in range(4)]
     for process in (auditor, *workers):
         process.expect("started")
     for number in range(kills):
-        workers[number % 4].expect("progress", 60)
+        workers[number % 4].expect("progress")
         time.sleep(draw.uniform(0.0, 0.1))  # the moment of the kill is what varies
         name = draw.choice(("s0", "s1"))
         cell.kill(name)
         cell.start(name)
     for worker in workers:
-        assert worker.expect("done", 120).startswith("150 ")
+        assert worker.expect("done", 400).startswith(f"{transfers} ")
+    auditor.expect("often")
     auditor.tell("")
-    seen = json.loads(auditor.expect("summary", 30))
+    seen = json.loads(auditor.expect("summary"))
 
     assert total(cell) == TOTAL
     assert seen["sums"] == [TOTAL], seen
-    assert seen["views"] > 50
     with connect(cell.file) as joined:
-        assert not joined.locks()
-        counters = [shard.counters for shard in joined.shards()]
-    assert sum(counter.get("commits_finished", 0) for counter in counters) > 0
+        until(lambda: not joined.locks(), joined.locks)
+        until(lambda: finished(joined), joined.shards)
 
 
 def test_lock_in_doubt_is_told_and_given_up_by_hand(cell):

@@ -37,7 +37,7 @@ def test_acknowledged_commits_survive_kill_at_random_moments(make_cell):
     pause = threading.Event()
     known_pair = known_swift = 0
     for _ in range(ROUNDS):
-        known_pair = max(known_pair, int(pairs.expect("acknowledged", 30)))
+        known_pair = max(known_pair, int(pairs.expect("acknowledged")))
         pause.wait(draw.uniform(0.0, 0.05))
         cell.kill()
         known_pair = max(known_pair, last_acknowledged(pairs))

@@ -22,6 +22,8 @@ from enact_dist.verify.checker import Checker, LockStory, Reading, State, Told
 
 pytestmark = pytest.mark.slow
 TTL_S = 1.0
+LONG_TTL_S = 20.0
+"""Where nobody loses a lock, however long a busy machine lets its holder wait."""
 
 
 @pytest.fixture
@@ -37,7 +39,8 @@ def joined(request):
         with local(worlds=["online"]) as cell:
             yield open_accounts(cell)
     else:
-        with connect(request.getfixturevalue("daemons").file) as cell:
+        made = two_trapped_shards(request.getfixturevalue("make_cell"), ttl_s=LONG_TTL_S)
+        with connect(made.file) as cell:
             yield open_accounts(cell)
 
 
@@ -78,7 +81,7 @@ class Skew:
         write, view = Write(world, mine, COUNT), View(world, other, COUNT)
         begun_ns, error, base = time.monotonic_ns(), None, 0
         try:
-            with Lock(write, view, wait_s=10.0) as lock:
+            with Lock(write, view, wait_s=60.0) as lock:
                 base = lock.version(view)
                 lock[write] = lock[view] + 1
                 if self.expects:
@@ -139,7 +142,7 @@ def test_two_locks_that_only_view_what_the_other_writes_both_commit(joined):
 
 def write_right(cell, value):
     right = Write(cell.world("online"), RIGHT, COUNT)
-    with Lock(right, wait_s=20.0) as lock:
+    with Lock(right, wait_s=60.0) as lock:
         lock[right] = value
 
 
@@ -174,7 +177,7 @@ def test_lock_whose_read_lease_expired_writes_nothing(daemons):
         client.signal(signal.SIGCONT)
         client.tell("")
 
-        assert "nothing was written" in client.expect("lost", 30)
+        assert "nothing was written" in client.expect("lost")
         assert seen(other, LEFT, RIGHT) == [0, 5]
 
 
@@ -260,7 +263,7 @@ def test_unknown_commit_can_be_asked_about_when_its_shard_is_back(
 
         start_trapped(daemons, "s0")
         for _ in range(5):  # later locks of the same client leave the outcome alone
-            with Lock(left, right, wait_s=20.0):
+            with Lock(left, right, wait_s=60.0):
                 pass
         found = [cell.outcome(caught.value.lock_id) for cell in (mine, other)]
 

@@ -55,7 +55,7 @@ def run(hosts, tmp_path, make_process):
 
 def told(process):
     """Return what a program said of its data, and how its calls travelled."""
-    way = process.expect("done:", timeout_s=90.0)
+    way = process.expect("done:", timeout_s=400.0)
     assert process.finish() == 0, process.story()
     return [line for line in process.seen if ": " in line and "done" not in line], way
 
@@ -76,7 +76,7 @@ def test_program_that_is_cut_off_in_mid_transfer_goes_on_when_the_network_is_bac
     calm, _ = told(run("far"))
     program = run("far", "pause")
     for kind in ("Stage", "Fetch"):
-        assert program.expect("midst:", timeout_s=60.0) == kind
+        assert program.expect("midst:", timeout_s=180.0) == kind
         hosts.cut("s0", "far")
         hosts.cut("far", "s0")
         program.tell("")

@@ -14,6 +14,8 @@ pytestmark = pytest.mark.slow
 COUNT = Aspect("count", int)
 counter = Entity("counter")
 TTL_S = 2.0
+LONG_S = 400.0
+"""What a busy machine may take for thousands of locks; it is no claim."""
 GIL_S = int(os.environ.get("ENACT_GIL_SECONDS", "13"))
 
 
@@ -34,7 +36,7 @@ def test_increments_of_four_processes_add_up(make_cell):
     cell = make_cell().start_all()
     workers = [cell.worker("increment", 1000) for _ in range(4)]
     for worker in workers:
-        assert worker.expect("done", 120).startswith("1000 ")
+        assert worker.expect("done", LONG_S).startswith("1000 ")
     assert counted(cell) == 4000
 
 
@@ -44,11 +46,11 @@ def test_increments_add_up_when_shard_is_killed_and_restarted(make_cell):
     cell = make_cell().start_all()
     workers = [cell.worker("increment", 1000) for _ in range(4)]
     for _ in range(2):
-        workers[0].expect("progress", 60)
+        workers[0].expect("progress")
         cell.kill()
         cell.start()
     for worker in workers:
-        assert worker.expect("done", 180).startswith("1000 ")
+        assert worker.expect("done", LONG_S).startswith("1000 ")
     assert counted(cell) == 4000
 
 
@@ -61,7 +63,7 @@ def test_stopped_holder_is_fenced_when_it_wakes(make_cell):
     holder.signal(signal.SIGSTOP)
     stopped_s = time.monotonic()
     other = cell.worker("write_once", 5)
-    other.expect("wrote", 30)
+    other.expect("wrote")
     assert time.monotonic() - stopped_s >= TTL_S / 2 * 0.9
     while time.monotonic() - stopped_s < 3 * TTL_S:  # the claim is about three TTLs
         other_value = counted(cell)
@@ -70,7 +72,7 @@ def test_stopped_holder_is_fenced_when_it_wakes(make_cell):
     holder.signal(signal.SIGCONT)
     holder.tell("")
 
-    assert "nothing was written" in holder.expect("lost", 30)
+    assert "nothing was written" in holder.expect("lost")
     assert counted(cell) == 5
 
 
@@ -82,8 +84,8 @@ def test_holder_of_the_interpreter_lock_keeps_its_lease(make_cell):
     holder = cell.worker("hold_gil", GIL_S)
     holder.expect("holding")
 
-    assert float(holder.expect("slept", GIL_S + 60)) >= 6 * TTL_S
-    holder.expect("committed", 60)
+    assert float(holder.expect("slept", GIL_S + LONG_S)) >= 6 * TTL_S
+    holder.expect("committed")
 
     assert counted(cell) == 222
     ticking.tell("stop")
@@ -100,7 +102,7 @@ def test_killed_holder_leaves_its_lock(make_cell):
     waiter.expect("asking")
 
     holder.signal(signal.SIGKILL)
-    waiter.expect("wrote", 20)
+    waiter.expect("wrote", 45)  # it would be a minute without that
 
     assert counted(cell) == 7
 
@@ -111,7 +113,7 @@ def test_opposite_order_locks_neither_deadlock_nor_starve(make_cell):
     seconds = float(os.environ.get("ENACT_OPPOSITE_SECONDS", "8"))
     cell = make_cell().start_all()
     workers = [cell.worker("opposite", seed, seconds, 4) for seed in range(8)]
-    results = [json.loads(worker.expect("done", seconds + 60)) for worker in workers]
+    results = [json.loads(worker.expect("done", seconds + LONG_S)) for worker in workers]
 
     assert all(result["done"] > 0 and result["timeouts"] == 0 for result in results), results
     total = sum(counted(cell, Entity(f"pair/{i}")) for i in range(4))
@@ -141,7 +143,7 @@ def next_word(worker):
     for start in ("created", "found"):
         if any(line.startswith(start) for line in worker.seen):
             return start
-    line = worker.lines.get(timeout=60)
+    line = worker.lines.get(timeout=LONG_S)
     assert line is not None, worker.story()
     worker.seen.append(line)
     return line.split()[0]
@@ -169,7 +171,7 @@ def test_long_reader_makes_writer_wait_visibly(make_cell):
     assert "write_once" in listed.stdout
     assert "read_long" in listed.stdout
     reader.tell("")
-    writer.expect("wrote", 30)
+    writer.expect("wrote")
 
 
 def test_lost_lock_names_its_cause():

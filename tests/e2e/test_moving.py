@@ -18,7 +18,7 @@ PARTS = tuple(Entity(f"part/{number}") for number in range(8))
 def put(world, entity, aspect, datum):
     """Commit one datum; return its version."""
     write = Write(world, entity, aspect)
-    with Lock(write, wait_s=30.0) as lock:
+    with Lock(write, wait_s=60.0) as lock:
         lock[write] = datum
     return world.history(entity, aspect)[-1].version
 
@@ -110,7 +110,7 @@ def _step_back(cell, online, entity):
         change = next(watch)
         assert (change.version, change.gap > 0) == (3, True)
         read = Read(online, entity, POSE)
-        with Lock(read, wait_s=30.0) as lock:
+        with Lock(read, wait_s=60.0) as lock:
             assert lock[read] == [1]
         assert put(online, entity, POSE, [5]) == 4
         assert next(watch).version == 4

@@ -9,7 +9,7 @@ import pytest
 from accounts import COUNT, LEFT, PINS, RIGHT, open_accounts
 
 from enact_dist import Position, View, connect
-from enact_dist.errors import ForgottenError, ShardUnreachableError
+from enact_dist.errors import ForgottenError, LockTimeoutError, ShardUnreachableError
 
 READS = int(os.environ.get("ENACT_PAST_READS", "5000"))
 READS_OVER_KILLS = min(READS, 3000)
@@ -50,8 +50,8 @@ class Traveller:
         balances = seen[left], seen[right]
         assert sum(balances) == BOTH, (moment, balances)
         assert self.seen.setdefault(moment, balances) == balances, moment
-        if len(self.seen) > SAMPLES:
-            del self.seen[moment]
+        if len(self.seen) > SAMPLES:  # those that stay are of all the time, not of its begin
+            del self.seen[self._draw.choice(list(self.seen))]
 
 
 @pytest.mark.slow
@@ -120,8 +120,8 @@ def test_sum_holds_while_shards_are_killed_and_little_is_retained(make_cell):
             except ForgottenError as error:
                 forgotten.append((moment.stamp_ns, error.oldest_ns))
                 traveller.seen.pop(moment, None)
-            except ShardUnreachableError:
-                continue  # a slow machine starts it later than a read waits
+            except (LockTimeoutError, ShardUnreachableError):
+                continue  # a slow machine starts it, or lets it decide, later than a read waits
             reads += 1
         killer.join()
 

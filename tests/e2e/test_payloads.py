@@ -14,7 +14,7 @@ import pytest
 
 from enact_dist import Entity, Lock, View, Write, connect
 from enact_dist.core.messages import Survey
-from enact_dist.errors import NoRoomError
+from enact_dist.errors import LeaseLostError, NoRoomError
 from enact_dist.terms import Aspect, Durability
 
 pytestmark = pytest.mark.slow
@@ -68,7 +68,7 @@ def used(root):
     return (system.f_blocks - system.f_bfree) * system.f_frsize
 
 
-def until(question, limit_s=15.0):
+def until(question, limit_s=120.0):
     deadline_s = time.monotonic() + limit_s
     while not question():
         assert time.monotonic() < deadline_s, "it never came true"
@@ -198,10 +198,17 @@ def test_memory_never_exceeds_the_cap(make_cell, root, monkeypatch):
         write = Write(online, piece, frames)
         begun_s = time.monotonic()
         number = 0
+
+        def put(number):
+            while True:  # a lock that was lost, by a machine that let it wait, has written nothing
+                with contextlib.suppress(LeaseLostError), Lock(write) as lock:
+                    lock.put(write, bytes(size), stamp_ns=number)
+                if lock.position is not None:
+                    return
+
         while time.monotonic() < begun_s + CAP_S:
             number += 1
-            with Lock(write) as lock:
-                lock.put(write, bytes(size), stamp_ns=number)
+            put(number)
             most = max(most, used(root))
             time.sleep(max(0.0, begun_s + number * period_s - time.monotonic()))
         (shard,) = joined.shards()

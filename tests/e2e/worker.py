@@ -36,6 +36,8 @@ COUNT = Aspect("count", int)
 FRAME = Aspect("frame", np.ndarray, Durability.VOLATILE)
 NAME = Aspect("name", str)
 counter = Entity("counter")
+OFTEN = 50
+"""So many views make an audit."""
 
 
 def say(*words):
@@ -55,6 +57,15 @@ def certainly(act, *arguments):
             continue
 
 
+def stands(cell, unknown):
+    """Ask for the outcome of a commit until its shard is back; say whether it stands."""
+    while True:
+        try:
+            return cell.outcome(unknown.lock_id) is not None
+        except (CommitUnknownError, ShardUnreachableError):
+            continue
+
+
 def increment(cell, count):
     """Add 1 to a counter `count` times; every add is certain when the process ends well."""
     request = Write(cell.world("online"), counter, COUNT)
@@ -64,11 +75,15 @@ def increment(cell, count):
         try:
             with Lock(request, wait_s=120.0) as lock:
                 lock[request] = lock.get(request, 0) + 1
-            done += 1
-            if done % 50 == 0:
-                say("progress", done)
-        except LeaseLostError:
-            lost += 1  # nothing was written: do it again
+            added = True
+        except (LeaseLostError, ShardUnreachableError):
+            added = False  # nothing was written: do it again
+        except CommitUnknownError as error:
+            added = stands(cell, error)  # its shard takes longer to start than a commit waits
+        done += added
+        lost += not added
+        if added and done % 50 == 0:
+            say("progress", done)
     say("done", done, "lost", lost)
 
 
@@ -287,7 +302,7 @@ def transfer(cell, seed, count):
 
 
 def audit(cell):
-    """View both accounts again and again; say how often, and each sum that was seen."""
+    """View both accounts again and again; say when it was often, and at the end each sum seen."""
     import threading
 
     world, stop, sums, views = cell.world("online"), threading.Event(), set(), 0
@@ -301,6 +316,8 @@ def audit(cell):
             continue  # it was killed, or both by turns for as long as a view has patience
         views += 1
         sums.add(sum(seen[request] for request in requests))
+        if views == OFTEN:
+            say("often")
     say("summary", json.dumps({"views": views, "sums": sorted(sums)}))
 
 
