@@ -27,7 +27,7 @@ from enact_dist.bench.raw_socket import RawSocket
 from enact_dist.bench.rows import FLOOR, Case
 from enact_dist.bench.timing import PAUSE_S, timed
 from enact_dist.errors import MisuseError
-from enact_dist.verify.daemons import LineProcess, free_port
+from enact_dist.verify.daemons import KeptPorts, LineProcess
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -143,7 +143,9 @@ class Floors:
     def _zenoh(self) -> RawZenoh:
         from enact_dist.bench.raw_zenoh import RawZenoh
 
-        port = free_port()
+        ports = KeptPorts()
+        self._stack.callback(ports.close)
+        port = ports.free()
         self._process("enact_dist.bench.raw_zenoh", str(port))
         return self._stack.enter_context(RawZenoh(port))
 

@@ -15,7 +15,7 @@ from enact_dist.config_values import CARRIERS
 from enact_dist.connecting import connect, local
 from enact_dist.link.shared_folder import MEMORY, SHARED_FOLDER_VARIABLE
 from enact_dist.supervise import SUPERVISOR_VARIABLE
-from enact_dist.verify.daemons import LineProcess, free_port
+from enact_dist.verify.daemons import KeptPorts, LineProcess
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -130,14 +130,15 @@ class Place:
         return self._target
 
     def _start_daemons(self) -> str:
-        file = self.folder / "cell.toml"
+        file, ports = self.folder / "cell.toml", KeptPorts()
+        self._stack.callback(ports.close)
         lines = [
             'name = "bench"',
             f'worlds = ["{WORLD}"]',
             f"data_folder = {json.dumps(str(self.folder / 'data'))}",
         ]
         for name in self.shard_names:
-            lines += [f"[shards.{name}]", f'listen = "tcp/127.0.0.1:{free_port()}"']
+            lines += [f"[shards.{name}]", f'listen = "tcp/127.0.0.1:{ports.free()}"']
         for name in self.shard_names:
             lines += ["[[pins]]", f'entities = "{name}/**"', f'shard = "{name}"']
         file.write_text("\n".join(lines) + "\n")

@@ -24,19 +24,37 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
-LINE_S: Final = 30.0
-"""How long a line may stay out before the process counts as hung."""
+LINE_S: Final = 90.0
+"""How long a line may stay out before the process counts as hung; many start at once."""
 LOG_BYTES: Final = 2000
 """So much of a log's end is looked at."""
 COMMAND: Final = "enact_dist.cli.main"
 
 
-def free_port() -> int:
-    """Return a TCP port of the loopback that nobody listens at."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
+class KeptPorts:
+    """TCP ports of the loopback that the system gives nobody else before `close`.
+
+    One that was only found free may be another's before the own daemon listens, or while that is
+    killed and started again.  A socket that is bound to it and never listens keeps it; a daemon
+    that says SO_REUSEADDR, as Zenoh does, listens there.
+    """
+
+    def __init__(self) -> None:
+        self._kept: list[socket.socket] = []
+
+    def free(self) -> int:
+        """Return a port that nobody listens at."""
+        kept = socket.socket()
+        self._kept.append(kept)
+        kept.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        kept.bind(("127.0.0.1", 0))
+        port: int = kept.getsockname()[1]
         return port
+
+    def close(self) -> None:
+        """Let the system give them away; twice is harmless."""
+        while self._kept:
+            self._kept.pop().close()
 
 
 def last_said(log: str) -> str:
@@ -195,6 +213,7 @@ class CellProcesses:
         self.file = folder / "cell.toml"
         self.shards: dict[str, LineProcess] = {}
         self._all: list[LineProcess] = []
+        self._ports = KeptPorts()
         lines = [
             'name = "verify"',
             'worlds = ["online"]',
@@ -203,7 +222,7 @@ class CellProcesses:
             f'carrier = "{carrier}"',
         ]
         for name in shards:
-            lines += [f"[shards.{name}]", f'listen = "tcp/127.0.0.1:{free_port()}"']
+            lines += [f"[shards.{name}]", f'listen = "tcp/127.0.0.1:{self._ports.free()}"']
         for pattern, shard in pins.items():
             lines += ["[[pins]]", f'entities = "{pattern}"', f'shard = "{shard}"']
         self.file.write_text("\n".join(lines) + "\n")
@@ -239,3 +258,4 @@ class CellProcesses:
     def __exit__(self, *_: object) -> None:
         for process in reversed(self._all):
             process.end()
+        self._ports.close()

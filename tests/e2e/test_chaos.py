@@ -4,6 +4,7 @@ The run is made once; what it recorded is then doctored in memory, to see that t
 have noticed.  A shard with a real fault is hit by one directed schedule.
 """
 
+import contextlib
 import json
 import os
 import signal
@@ -28,6 +29,9 @@ from enact_dist.verify.daemons import LineProcess
 pytestmark = pytest.mark.slow
 SECONDS = float(os.environ.get("ENACT_CHAOS_SECONDS", "55"))
 ATTEMPTS = 12
+RUNS = 3
+"""So many runs may be made until all has happened; a slow machine does less in its time."""
+END_S = 180.0
 
 
 @pytest.fixture(scope="module")
@@ -41,10 +45,13 @@ def _namespaces():
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory, _namespaces):
-    """The folder of one run of all kinds of faults."""
-    kept = tmp_path_factory.mktemp("chaos") / "kept"
-    minutes = str(SECONDS / 60)
-    status = main(["verify", "--chaos", "--minutes", minutes, "--keep", str(kept), "--json"])
+    """The folder of one run of all kinds of faults, the first in which all has happened."""
+    for _ in range(RUNS):
+        kept = tmp_path_factory.mktemp("chaos") / "kept"
+        minutes = str(SECONDS / 60)
+        status = main(["verify", "--chaos", "--minutes", minutes, "--keep", str(kept), "--json"])
+        if status or not lacking(evidence.load(kept)):
+            break
     return kept, status
 
 
@@ -52,6 +59,25 @@ def folder(tmp_path_factory, _namespaces):
 def found(folder):
     """The evidence of the run, for a test to doctor."""
     return evidence.load(folder[0])
+
+
+def lacking(found):
+    """Name what is to happen in a run, and has not, or too seldom."""
+    verdict = judge(found)
+    wanted = {
+        **{kind: verdict.faults.get(kind, 0) >= count for kind, count in faults.DECK.items()},
+        "a fenced commit": verdict.fenced > 0,
+        "a fenced commit, as the shards count": verdict.counters["fenced"] > 0,
+        "a decision that was asked for": verdict.counters["resolves_asked"] > 0,
+        "epochs": verdict.epoch_changes >= 5,
+        "commits": verdict.commits > 70,  # twenty times as many on an idle machine
+        "commits over shards": verdict.over_shards > 15,
+        "views": verdict.views_checked > 5,
+        "recoveries": verdict.recovery["serving to first grant"].n > 3,
+        "a commit with a part to leave out": part_to_leave_out(found) is not None,
+        "a reader to move": reader_to_move(found) is not None,
+    }
+    return [what for what, happened in wanted.items() if not happened]
 
 
 def rules(found):
@@ -65,17 +91,8 @@ def test_nothing_is_lost_doubled_or_half_done(folder):
 
     assert verdict.anomalies == []
     assert status == 0
-    hit = verdict.faults
-    assert all(hit.get(kind, 0) >= count for kind, count in faults.DECK.items()), hit
     assert not verdict.missing
-    assert verdict.fenced > 0
-    assert verdict.counters["fenced"] > 0
-    assert verdict.counters["resolves_asked"] > 0
-    assert verdict.epoch_changes >= 5
-    assert verdict.commits > 70  # twenty times as many on a machine that has nothing else to do
-    assert verdict.over_shards > 15
-    assert verdict.views_checked > 5
-    assert verdict.recovery["serving to first grant"].n > 3
+    assert lacking(evidence.load(kept)) == []
 
 
 def processes_of(folder):
@@ -112,13 +129,16 @@ def test_nobody_is_left_when_the_run_is_broken_off(tmp_path, number, status):
                 break
         working = processes_of(kept)
         assert len(working) > 5
-        stopped = next(pid for pid in working if pid != run.pid)
-        os.kill(stopped, signal.SIGSTOP)
+        for pid in working:
+            if pid != run.pid:
+                with contextlib.suppress(ProcessLookupError):  # the run has just killed it
+                    os.kill(pid, signal.SIGSTOP)
+                    break
 
         run.send_signal(number)
 
-        assert run.wait(30) == status
-    deadline_s = time.monotonic() + 10
+        assert run.wait(END_S) == status
+    deadline_s = time.monotonic() + END_S
     while processes_of(kept) and time.monotonic() < deadline_s:
         time.sleep(0.05)  # nothing tells when a process of somebody else has ended
     assert processes_of(kept) == []
@@ -136,9 +156,50 @@ def test_history_is_checked_again_from_its_folder(folder, capsys):
 # ---------------------------------------------------------------- doctored histories
 
 
+def final_look(found):
+    """Return the lock that read everything at the end."""
+    return next(
+        lock
+        for lock in found.locks.values()
+        if lock.client == evidence.FINAL and lock.told is Told.COMMITTED
+    )
+
+
+def part_to_leave_out(found):
+    """Return a commit over several slots, and one of them with versions above, or None."""
+    final = {slot: version for slot, version, _, _ in final_look(found).seen}
+    return next(
+        (
+            (record, written)
+            for record in found.locks.values()
+            if record.told is Told.COMMITTED and len(record.writes) > 1
+            for written in record.writes
+            if written[0].endswith("/kept") and 1 < written[1] < final[written[0]] - 3
+        ),
+        None,
+    )
+
+
+def reader_to_move(found):
+    """Return a lock that only read, and something that has changed since, or None."""
+    slot, newest = kept_slot(found)
+    return next(
+        (
+            lock
+            for lock in found.locks.values()
+            if lock.told is Told.COMMITTED
+            and not lock.writes
+            and any(
+                held and version < newest - 3 for at, version, _, held in lock.seen if at == slot
+            )
+        ),
+        None,
+    )
+
+
 def kept_slot(found):
     """Return a durable slot with many versions."""
-    final = found.locks["final.1"]
+    final = final_look(found)
     return max(
         ((slot, version) for slot, version, _, _ in final.seen if slot.endswith("/kept")),
         key=lambda seen: seen[1],
@@ -197,14 +258,7 @@ def test_dropped_commit_is_named(found):
 
 def test_half_of_a_commit_is_named(found):
     """A commit over shards of which one part never came: versions above it close the gap."""
-    final = {slot: version for slot, version, _, _ in found.locks["final.1"].seen}
-    record, (slot, version, _) = next(
-        (record, written)
-        for record in found.locks.values()
-        if record.told is Told.COMMITTED and len(record.writes) > 1
-        for written in record.writes
-        if written[0].endswith("/kept") and 1 < written[1] < final[written[0]] - 3
-    )
+    record, (slot, version, _) = part_to_leave_out(found)
 
     def change(at, seen, writer):
         if at != slot or seen < version or (seen == version and writer != record.id):
@@ -243,14 +297,7 @@ def test_told_not_but_visible_is_named(found):
 
 def test_reader_moved_in_time_is_named(found):
     """A reader that is said to have begun after all others had ended read what was old by then."""
-    slot, newest = kept_slot(found)
-    record = next(
-        lock
-        for lock in found.locks.values()
-        if lock.told is Told.COMMITTED
-        and not lock.writes
-        and any(held and version < newest - 3 for at, version, _, held in lock.seen if at == slot)
-    )
+    record = reader_to_move(found)
     late_ns = max(lock.ended_ns or 0 for lock in found.locks.values())
     record.begun_ns, record.ended_ns = late_ns + 1, late_ns + 2
 
@@ -301,6 +348,7 @@ def zombie_commits(folder, daemon_module):
         for process in started:
             process.end()
         cell.close()
+        hosts.close()
         log.close()
     return evidence.load(folder)
 

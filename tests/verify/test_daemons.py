@@ -1,8 +1,15 @@
 """The processes of a throw-away cell do what its file says."""
 
+import contextlib
+import socket
+
 import pytest
 
+from enact_dist.config import load_config
 from enact_dist.errors import LinkError
+from enact_dist.verify.chaos.hosts import Loopback
+from enact_dist.verify.chaos.watcher import Watcher
+from enact_dist.verify.checker import Told
 from enact_dist.verify.daemons import CellProcesses, LineProcess, last_said
 
 
@@ -29,6 +36,50 @@ def test_shard_whose_log_is_json_is_waited_for_as_any_other(tmp_path):
             assert daemon.expect("ready:").startswith("shard s0 of cell verify at tcp/127.0.0.1:")
         finally:
             daemon.end()
+
+
+@contextlib.contextmanager
+def cell_of_a_run(folder):
+    with CellProcesses(folder, ("s0",), pins={}, ttl_s=1.0) as cell:
+        (shard,) = load_config(cell.file).placement_map().shards
+        yield shard.endpoints[0]
+
+
+@contextlib.contextmanager
+def hosts_of_a_run(_folder):
+    hosts = Loopback(("s0",), why="none is wanted")
+    yield hosts.endpoint("s0")
+    hosts.close()
+
+
+@pytest.mark.parametrize("made", [cell_of_a_run, hosts_of_a_run])
+def test_port_of_a_shard_is_kept_for_it(tmp_path, made):
+    """Before it listens, and while it is killed and started again, nobody else gets its port."""
+    with made(tmp_path) as endpoint:
+        port = int(endpoint.rpartition(":")[2])
+        with socket.socket() as other, pytest.raises(OSError, match="in use"):
+            other.bind(("127.0.0.1", port))
+
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", port))
+
+
+def test_last_look_of_a_run_is_taken_again_where_its_lock_was_lost(tmp_path):
+    """A machine that lets the watcher wait for longer than a lease shows no fault of the cell."""
+
+    class Look:
+        told = iter((Told.NOT, Told.UNKNOWN, Told.COMMITTED))
+
+        def take_all(self):
+            return next(self.told)
+
+    class Cell:
+        _client = None
+
+    watcher = Watcher(Cell(), tmp_path, ttl_s=1.0, ahead_ns=0)
+    watcher._final = Look()
+
+    assert watcher.final() == Told.COMMITTED.value
 
 
 def test_process_that_fails_is_told_by_what_was_wrong(tmp_path):

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 WATCHER: Final = "watcher"
 CLIENT: Final = "enact_dist.verify.chaos.client"
 WATCHER_MODULE: Final = "enact_dist.verify.chaos.watcher"
-END_S: Final = 60.0
+END_S: Final = 120.0
 """How long a client may take to end: what it waits for, and what it sends again, is bounded."""
 
 

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Final, Protocol
 from enact_dist.errors import LinkError
 from enact_dist.verify.chaos import switch
 from enact_dist.verify.chaos.switch import Cable, Counts
-from enact_dist.verify.daemons import LineProcess, free_port
+from enact_dist.verify.daemons import KeptPorts, LineProcess
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -82,7 +82,8 @@ class Loopback:
             f"other monotonic clocks ({why})",
         )
         self.clock_ahead_ns = dict.fromkeys(hosts, 0)
-        self._ports = {host: free_port() for host in hosts}
+        self._kept = KeptPorts()
+        self._ports = {host: self._kept.free() for host in hosts}
 
     def before(self, host: str) -> tuple[str, ...]:
         """Return the command that runs what follows it on a host."""
@@ -105,7 +106,8 @@ class Loopback:
         self.cut(source, target)
 
     def close(self) -> None:
-        """Do nothing: processes end by themselves."""
+        """Give the ports back; processes end by themselves."""
+        self._kept.close()
 
 
 class Namespaces:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 TTL_S: Final = 1.0
 CLIENTS_PER_HOST: Final = 2
 WATCHER_HOST: Final = "watch"
-REST_S: Final = 10.0
+REST_S: Final = 30.0
 """How long locks may be left after the last client has gone; leases end after one TTL."""
 
 
