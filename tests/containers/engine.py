@@ -26,8 +26,8 @@ PREFIX = "enact-engine-"
 POOL = "base=198.18.64.0/18,size=24"
 """Addresses of networks: of the range for tests of devices, that nothing on the Internet has."""
 
-START_S = 60.0
-END_S = 60.0
+START_S = 180.0
+END_S = 120.0
 CALL_S = 900.0
 CGROUPS = Path("/sys/fs/cgroup")
 
@@ -98,7 +98,7 @@ class Engine:
             number = self.docker("inspect", "--format", "{{.State.Pid}}", network_of).stdout
             enter += ["nsenter", "--target", number.strip(), "--net"]
         return subprocess.run(
-            [*enter, *map(str, words)], capture_output=True, text=True, check=True, timeout=30
+            [*enter, *map(str, words)], capture_output=True, text=True, check=True, timeout=120
         )
 
     def end(self) -> None:
@@ -179,7 +179,7 @@ def wait_until_it_answers(engine: Engine, process: subprocess.Popen[bytes]) -> N
         NoEngineError: It ended, or never answered; with the end of its log.
     """
     until_s = time.monotonic() + START_S
-    while engine.docker("version", check=False, wait_s=30.0).returncode:
+    while engine.docker("version", check=False, wait_s=START_S).returncode:
         if process.poll() is not None or time.monotonic() > until_s:
             said = (engine.folder / "dockerd.log").read_text("utf-8").strip().splitlines()
             raise NoEngineError("\n".join(said[-3:]) or "dockerd said nothing")

@@ -18,7 +18,7 @@ HERE = Path(__file__).parent
 SHARDS = ("s0", "s1")
 CLIENTS = {"a0": "near", "a1": "far"}
 TTL_S = 2.0
-LONG_S = 60.0
+LONG_S = 180.0
 
 
 class Site:

@@ -71,7 +71,7 @@ class Counting(Actor):
         lock[self.count] = {part.name: area for part, area in lock[self.areas].items()}
 
 
-def found(cell, *, wait_s=60.0):
+def found(cell, *, wait_s=180.0):
     """Wait until all parts are counted; return the count and a checksum of each frame."""
     online = cell.world("online")
     count, frames = View(online, LINE, COUNT), ViewEach(online, PARTS, FRAME)
@@ -84,7 +84,7 @@ def found(cell, *, wait_s=60.0):
 
 
 def main():
-    with connect(sys.argv[1], actor="reader", timeout_s=30.0) as cell:
+    with connect(sys.argv[1], actor="reader", timeout_s=120.0) as cell:
         print("found", json.dumps(found(cell)), flush=True)
         print(
             "ways",
