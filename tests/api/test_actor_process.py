@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-PATIENCE_S = 30.0
+PATIENCE_S = 120.0
 NUMBER = Aspect("number", int, Durability.VOLATILE)
 PRODUCT = Aspect("product", int, Durability.VOLATILE)
 

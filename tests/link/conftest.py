@@ -184,7 +184,7 @@ def carry(request):
 def until():
     """Ask again until what comes back is true; return it."""
 
-    def ask(question, *, limit_s=30.0):
+    def ask(question, *, limit_s=120.0):
         deadline_s = time.monotonic() + limit_s
         while not (found := question()):
             assert time.monotonic() < deadline_s, "it never came true"

@@ -72,7 +72,7 @@ for name in os.listdir("/proc/self/fd"):
 @pytest.fixture
 def long_leases(monkeypatch):
     """What a lease alone frees, it frees after three times as long as the next one waits."""
-    monkeypatch.setenv("ENACT_SESSION_TTL_S", "60")
+    monkeypatch.setenv("ENACT_SESSION_TTL_S", "180")
 
 
 def wait_while(endpoint, happens):
@@ -83,7 +83,7 @@ def wait_while(endpoint, happens):
         granted = []
 
         def wait():
-            with Lock(request, wait_s=20.0):
+            with Lock(request, wait_s=60.0):
                 granted.append(request)
 
         waiting = threading.Thread(target=wait)

@@ -70,8 +70,8 @@ KILLED = """
 import sys
 from enact_dist.core.messages import Hello
 from enact_dist.link.zenoh_carrier import ZenohCarrier
-carrier = ZenohCarrier("cell", "victim", "tester", [sys.argv[1]], ttl_s=60.0)
-carrier.request("s0", Hello("victim", 0, 60_000_000_000, "victim", "h", 1, False), timeout_s=30)
+carrier = ZenohCarrier("cell", "victim", "tester", [sys.argv[1]], ttl_s=240.0)
+carrier.request("s0", Hello("victim", 0, 240_000_000_000, "victim", "h", 1, False), timeout_s=30)
 print("open", flush=True)
 sys.stdin.read()
 """
@@ -79,7 +79,7 @@ sys.stdin.read()
 
 @pytest.mark.slow
 def test_shard_sees_at_once_when_a_client_is_killed(daemon, carry, endpoint, program, until):
-    """The token of a process killed with -9 vanishes by itself, long before its lease of 60 s."""
+    """The token of a process killed with -9 vanishes by itself, long before its lease of 240 s."""
     daemon(endpoint)
     watcher = carry(endpoint)
     process = program(KILLED, endpoint)
@@ -92,4 +92,4 @@ def test_shard_sees_at_once_when_a_client_is_killed(daemon, carry, endpoint, pro
     until(present)
     process.kill()
 
-    until(lambda: not present(), limit_s=20.0)
+    until(lambda: not present(), limit_s=60.0)

@@ -11,8 +11,21 @@ import time
 import numpy as np
 
 from enact_dist import Aspect, Entity, Lock, Write, connect
+from enact_dist.errors import LeaseLostError
 
 NUMBER = Aspect("number", np.ndarray, retention=400)
+
+
+def commit(requests, number):
+    """Set all to a number; again where a slow machine has cost the lock, which writes nothing."""
+    while True:
+        try:
+            with Lock(*requests, wait_s=60.0) as lock:
+                for request in requests:
+                    lock[request] = np.full(20_000, number)
+        except LeaseLostError:
+            continue
+        return
 
 
 def main():
@@ -23,9 +36,7 @@ def main():
         number = 0
         while True:
             number += 1
-            with Lock(*requests) as lock:
-                for request in requests:
-                    lock[request] = np.full(20_000, number)
+            commit(requests, number)
             if number == 1:
                 print("committing", flush=True)
             time.sleep(pause_s)
