@@ -82,13 +82,18 @@ class _Ready:
 
 
 class _Child:
-    """One task with its process; used by the supervisor's thread only, but for `_read`."""
+    """One task with its process; used by the supervisor's thread only, but for `_read`.
+
+    Attributes:
+        pause_s: How long it pauses, or paused, between its last end and the start after that.
+    """
 
     def __init__(self, task: Task, say: Say, events: queue.SimpleQueue[_Ended | _Ready]) -> None:
         self.task = task
         self.ready = False
         self.over = False
         self.restart_at_s = 0.0
+        self.pause_s = 0.0
         self._say, self._events = say, events
         self._process: subprocess.Popen[bytes] | None = None
         self._pause_s = PAUSE_S_MIN
@@ -120,13 +125,8 @@ class _Child:
         self._process = None
         if time.monotonic() - self._started_s > GOOD_S:
             self._pause_s = PAUSE_S_MIN
-        self.restart_at_s = time.monotonic() + self._pause_s
+        self.restart_at_s, self.pause_s = time.monotonic() + self._pause_s, self._pause_s
         self._pause_s = min(2 * self._pause_s, PAUSE_S_MAX)
-
-    @property
-    def pause_s(self) -> float:
-        """How long the next restart is away."""
-        return max(0.0, self.restart_at_s - time.monotonic())
 
     def send(self, number: signal.Signals) -> None:
         if self._process is not None:

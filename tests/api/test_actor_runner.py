@@ -36,7 +36,7 @@ online = World("online")
 VIEWS = Entities("view/*")
 CLOUD, SURFACE, COUNT = Aspect("cloud", int), Aspect("surface", int), Aspect("count", int)
 A, B, SYSTEM = Entity("view/a"), Entity("view/b"), Entity("system")
-PATIENCE_S = 20.0
+PATIENCE_S = 60.0
 
 
 @pytest.fixture

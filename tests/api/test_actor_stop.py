@@ -10,7 +10,7 @@ from enact_dist.lock import Lock
 from enact_dist.terms import Aspect, Entity, World, Write
 
 COUNT, BENCH = Aspect("count", int), Entity("bench")
-STOP_S = 10.0
+STOP_S = 60.0
 """What a busy machine may take; the wait for the lock would be ten minutes."""
 
 

@@ -366,7 +366,7 @@ def test_forked_child_is_refused_every_use_and_may_open_its_own_cell():
         [sys.executable, "-W", "ignore", "-c", FORKED],
         capture_output=True,
         text=True,
-        timeout=30,
+        timeout=180,
         check=False,
     )
     assert done.stdout.split() == ["10", "7"], done.stderr
@@ -382,7 +382,7 @@ def test_interpreter_ends_when_a_cell_was_never_closed():
         "watch.start(); print('end')"
     )
     done = subprocess.run(
-        [sys.executable, "-c", text], capture_output=True, text=True, timeout=30, check=True
+        [sys.executable, "-c", text], capture_output=True, text=True, timeout=180, check=True
     )
     assert (done.stdout, done.stderr) == ("end\n", "")
 

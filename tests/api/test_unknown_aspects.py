@@ -106,7 +106,7 @@ def test_reader_of_an_aspect_to_come_sees_it_when_it_has_come(world):
         assert watch.next(0.0) is None
         other = type(world)(world.name, type(world.session)(world.session.client))
         other.init(robot, goal, 3)
-        change = watch.next(10.0)
+        change = watch.next(60.0)
 
     assert change is not None
     assert (change.aspect, change.version) == ("goal", 1)
@@ -160,7 +160,7 @@ def test_observer_registers_nothing(two_shards):
         assert len(seen.at(online.history(left, PLAN)[0].position).survey()) == 1
         assert seen.diff(seen, aspects=[PLAN]).rows == ()
         with seen.watch("**", PLAN, MISSPELT) as watch:
-            assert watch.next(10.0) is not None
+            assert watch.next(60.0) is not None
         with pytest.raises(DatumTypeError, match="'plan' is registered with datum type"):
             seen.view(View(seen, left, Aspect("plan", int)))
         with pytest.raises(MisuseError, match="only observes"):
@@ -179,7 +179,7 @@ def test_comparison_by_a_misspelt_name_is_refused(world, cell):
     with world.watch_diff(cell.world("training"), "**", MISSPELT) as watch:
         assert watch.next(0.0) is None
         world.init(robot, MISSPELT, [1.0])
-        found = watch.next(10.0)
+        found = watch.next(60.0)
     assert found is not None
     assert found.aspect == "plann"
 
@@ -195,7 +195,7 @@ def test_watch_begun_before_its_aspect_came_counts_right_over_a_restart(two_stor
     ):
         assert watch.next(0.0) is None
         online.init(left, goal, 1)
-        assert watch.next(10.0).version == 1
+        assert watch.next(60.0).version == 1
         client = looking.world("online").session.client
         assert "goal" not in client.aspect_entries()
         epoch = client.core.epoch("left")
@@ -205,7 +205,7 @@ def test_watch_begun_before_its_aspect_came_counts_right_over_a_restart(two_stor
         two_stored.start("left")
         with Lock(write) as lock:
             lock[write] = 2
-        change = watch.next(10.0)
+        change = watch.next(60.0)
         assert (change.version, change.gap) == (2, 0)
 
 

@@ -27,16 +27,21 @@ SERVE = (
 
 
 class Story:
-    """Lines of the log; `stop` is set when one contains the mark for the wanted time."""
+    """Lines of the log; `stop` is set when one contains the mark for the wanted time.
 
-    def __init__(self, mark, times=1):
+    Of those before a line that contains `after` none is counted.
+    """
+
+    def __init__(self, mark, times=1, after=""):
         self.lines = []
         self.stop = threading.Event()
-        self._mark, self._left = mark, times
+        self._mark, self._left, self._after = mark, times, after
 
     def __call__(self, name, line):
         self.lines.append(f"{name}: {line}")
-        if self._mark in self.lines[-1]:
+        if self._after in self.lines[-1]:
+            self._after = ""
+        if self._mark in self.lines[-1] and not self._after:
             self._left -= 1
             if self._left == 0:
                 self.stop.set()
@@ -97,6 +102,20 @@ def test_child_that_failed_is_started_again_with_growing_pauses():
     ]
 
 
+def test_pause_is_told_as_it_was_chosen():
+    """A supervisor that gets no time between the end of a child and its line says no other one."""
+    story = Story("exit status 5")
+
+    class Judged(Supervisor):
+        def _judge(self, child, status):
+            child.restart_at_s -= 0.15
+            super()._judge(child, status)
+
+    Judged([task("shard", "shard", "raise SystemExit(5)")], story).run(story.stop)
+
+    assert story.lines == ["shard: exit status 5; started again in 0.2 s"]
+
+
 def test_killed_child_is_started_again_by_name_of_the_signal():
     """A child that was killed from outside is reported as such."""
     story = Story("started again")
@@ -108,7 +127,7 @@ def test_killed_child_is_started_again_by_name_of_the_signal():
 
 def test_actor_that_is_done_is_not_started_again():
     """An actor that ends with status 0 has finished; the shards go on."""
-    story = Story("shard: beat", times=3)
+    story = Story("shard: beat", times=3, after="once: done")
     beat = "import time; print('ready:')\nwhile True: print('beat'); time.sleep(0.3)"
 
     story.run(task("shard", "shard", beat), task("once", "actor", "print('worked')"))
@@ -230,7 +249,7 @@ def run_in_time(supervisor, stop):
     ended = []
     thread = threading.Thread(target=lambda: ended.append(supervisor.run(stop)), daemon=True)
     thread.start()
-    thread.join(30)
+    thread.join(120)
     return ended[0] if ended else None
 
 

@@ -345,7 +345,7 @@ def test_process_says_goodbye_when_it_never_closed_its_cell(two, program):
     """A cell that nobody closed is closed at the interpreter's exit, over a living connection."""
     two.start("a")
     process = program(LEFT_OPEN, two.endpoints["a"])
-    assert process.communicate(timeout=20) == ("", "")
+    assert process.communicate(timeout=180) == ("", "")
     assert two.sessions("a") == []
 
 

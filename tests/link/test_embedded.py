@@ -43,17 +43,17 @@ def test_carrier_answers_all_requests_in_their_order(embedded, make_peer):
 
 def test_carrier_waits_for_a_parked_answer_from_another_thread(embedded, make_peer):
     """A request in one thread is answered when another thread releases what it waits for."""
-    call = lambda shard, message: embedded.request(shard, message, timeout_s=10)  # noqa: E731
+    call = lambda shard, message: embedded.request(shard, message, timeout_s=61)  # noqa: E731
     holder, waiter = make_peer(call), make_peer(call)
     holder.hello()
     waiter.hello()
     granted = holder.acquire("cup")
     answers = []
-    thread = threading.Thread(target=lambda: answers.append(waiter.acquire("cup", wait_s=9.0)))
+    thread = threading.Thread(target=lambda: answers.append(waiter.acquire("cup", wait_s=60.0)))
     thread.start()
 
     holder.commit(granted, "cup", b"1")
-    thread.join(10)
+    thread.join(90)
 
     assert [type(answer) for answer in answers] == [Granted]
 

@@ -226,7 +226,7 @@ def test_program_of_another_release_is_told_both_versions(daemon, endpoint, prog
 
     client = program(CLIENT, endpoint)
 
-    _, said = client.communicate(timeout=30)
+    _, said = client.communicate(timeout=180)
     assert client.returncode == 1
     assert "ProtocolError" in said
     assert f"version {FRAME_VERSION} came; this side speaks {FRAME_VERSION - 1}" in said

@@ -57,13 +57,13 @@ def test_carrier_keeps_many_calls_in_flight_at_once(daemon, carry, endpoint):
     """100 parked calls and one quick one are under way together; the quick one comes at once."""
     daemon(endpoint)
     carrier = carry(endpoint)
-    parked = [("s0", AwaitStamp(2**62, 900_000_000))] * 100  # 90 s one by one
+    parked = [("s0", AwaitStamp(2**62, 2_000_000_000))] * 100  # 200 s one by one
     started_s = time.monotonic()
 
-    answers = carrier.request_all([*parked, ("s0", ListLocks())], timeout_s=30)
+    answers = carrier.request_all([*parked, ("s0", ListLocks())], timeout_s=100)
 
     assert [type(answer) for answer in answers] == [*[Reached] * 100, Locks]
-    assert time.monotonic() - started_s < 20.0
+    assert time.monotonic() - started_s < 100.0
 
 
 @both

@@ -10,7 +10,7 @@ from enact_dist.core.messages import AwaitStamp
 from enact_dist.link.zenoh_carrier import ZenohCarrier
 carrier = ZenohCarrier("cell", "left-open", "tester", [sys.argv[1]], ttl_s=2.0)
 feed = carrier.subscribe()
-forever = lambda: carrier.request("s0", AwaitStamp(2**62, 60_000_000_000), timeout_s=60)
+forever = lambda: carrier.request("s0", AwaitStamp(2**62, 600_000_000_000), timeout_s=600)
 threading.Thread(target=forever, daemon=True).start()
 threading.Thread(target=lambda: feed.get(None), daemon=True).start()
 print("open", flush=True)
@@ -22,7 +22,7 @@ def test_carrier_left_open_never_holds_up_the_end_of_the_interpreter(daemon, end
     daemon(endpoint)
     process = program(LEFT_OPEN, endpoint)
 
-    _, errors = process.communicate(timeout=20)
+    _, errors = process.communicate(timeout=180)
 
     assert process.returncode == 0, errors
     assert errors == ""
@@ -58,7 +58,7 @@ def test_carrier_raises_in_a_forked_child_which_still_ends(daemon, endpoint, pro
     daemon(endpoint)
     process = program(FORKED, endpoint)
 
-    output, errors = process.communicate(timeout=30)
+    output, errors = process.communicate(timeout=180)
 
     assert "request: " in output, errors
     assert "was forked" in output
