@@ -59,27 +59,32 @@ def _writes(cell: Cell) -> list[Write[int]]:
     return [Write(world, entity, NUMBER) for entity in ENTITIES]
 
 
+def _lock_once(writes: list[Write[int]], *, said: str = "") -> None:
+    """Take a lock over all of it and give it back; says when it had it, if there is a word.
+
+    What is found lost at the end, or away at the beginning, is asked for again.
+    """
+    while True:
+        with contextlib.suppress(LeaseLostError, ShardUnreachableError):
+            with Lock(*writes, wait_s=WAIT_S):
+                if said:
+                    _say(said)
+            return
+
+
 def _stay(cell: Cell) -> None:
-    with Lock(*_writes(cell), wait_s=WAIT_S):
-        pass
+    _lock_once(_writes(cell))
     _say("staying")
     sys.stdin.read()
 
 
 def _ask(cell: Cell) -> None:
     writes = _writes(cell)
-    with Lock(*writes, wait_s=WAIT_S):
-        pass
+    _lock_once(writes)
     _say("ready")
     for _ in sys.stdin:
         _say("asking")
-        granted = False
-        while not granted:
-            # What is found lost at the end, or away at the beginning, is asked for again.
-            with contextlib.suppress(LeaseLostError, ShardUnreachableError):
-                with Lock(*writes, wait_s=WAIT_S):
-                    _say("granted")
-                granted = True
+        _lock_once(writes, said="granted")
         _say("done")
 
 

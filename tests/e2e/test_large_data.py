@@ -11,8 +11,8 @@ from enact_dist.verify.chaos.hosts import open_hosts
 pytestmark = [pytest.mark.slow, pytest.mark.carrier("auto")]
 """One program is on the host of a shard, the other far away: each takes what there is."""
 PROGRAM = str(Path(__file__).with_name("large_data_program.py"))
-TTL_S = 12.0
-CUT_S = 6.5
+TTL_S = 20.0
+CUT_S = 11.0
 """Longer than the lease of a link (TTL_S / 2); the lock outlives it and some seconds more."""
 
 
