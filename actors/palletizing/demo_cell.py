@@ -26,6 +26,8 @@ from enact_dist.config import load_config
 from enact_dist.errors import ConfigError, LinkError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from enact_dist import Cell
 
 TEMPLATE: Final = Path(__file__).with_name("cell.toml")
@@ -94,12 +96,16 @@ class RunningCell(DemoCell):
         self._log = out / "cell.log"
         super().__init__(out / "cell.toml", packages=packages, seed=seed, log=str(self._log))
         self._data = Path()
+        self._ports: list[socket.socket] = []
         self._process: subprocess.Popen[bytes] | None = None
 
     def __enter__(self) -> Self:
         self._data = Path(tempfile.mkdtemp(prefix="enact-palletizing-"))
+        template = TEMPLATE.read_text()
+        self._ports = kept_ports(len(tomllib.loads(template)["shards"]))
+        ports = [each.getsockname()[1] for each in self._ports]
         text = configured(
-            TEMPLATE.read_text(), packages=self.packages, seed=self.seed, data=self._data
+            template, packages=self.packages, seed=self.seed, data=self._data, ports=ports
         )
         write_whole({self.config: text.encode()})
         command = [sys.executable, "-m", "enact_dist.cli.main", "up", str(self.config)]
@@ -122,6 +128,8 @@ class RunningCell(DemoCell):
             except subprocess.TimeoutExpired:
                 self._process.kill()
                 self._process.wait()
+        for each in self._ports:
+            each.close()
         shutil.rmtree(self._data, ignore_errors=True)
 
     def check(self) -> None:
@@ -158,20 +166,19 @@ def watched_cell(config: Path) -> DemoCell:
     return DemoCell(config, packages=packages, seed=seed, log="the logs of its processes")
 
 
-def configured(template: str, *, packages: int, seed: int, data: Path) -> str:
-    """Return a `cell.toml` for one run: free ports, own data folder, packages and seed.
+def configured(template: str, *, packages: int, seed: int, data: Path, ports: Sequence[int]) -> str:
+    """Return a `cell.toml` for one run: its own ports, data folder, packages and seed.
 
     Args:
         template: The text of the `cell.toml` of the application.
         packages: How many packages come.
         seed: Seed of all simulated sensors.
         data: Parent of the shards' folders.
+        ports: One of this host for each shard.
     """
     config = tomllib.loads(template)
     config["data_folder"] = str(data)
-    for shard, port in zip(
-        config["shards"].values(), _free_ports(len(config["shards"])), strict=True
-    ):
+    for shard, port in zip(config["shards"].values(), ports, strict=True):
         shard["listen"] = f"tcp/127.0.0.1:{port}"
     overhead = f"{_SENSORS}:tray_sensor?packages={packages}&seed={seed}"
     actors = config["actors"]
@@ -184,14 +191,17 @@ def configured(template: str, *, packages: int, seed: int, data: Path) -> str:
     return _toml(config)
 
 
-def _free_ports(count: int) -> list[int]:
-    """Return ports of this host that nobody listens at; all are held until all are chosen."""
-    sockets = [socket.create_server(("127.0.0.1", 0)) for _ in range(count)]
-    try:
-        return [int(each.getsockname()[1]) for each in sockets]
-    finally:
-        for each in sockets:
-            each.close()
+def kept_ports(count: int) -> list[socket.socket]:
+    """Return sockets, each of which keeps a port of this host that nobody listens at.
+
+    The system gives it to nobody else, before a shard listens there or while it is started again;
+    who says SO_REUSEADDR, as Zenoh does, listens beside a socket that does not listen.
+    """
+    kept = [socket.socket() for _ in range(count)]
+    for each in kept:
+        each.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        each.bind(("127.0.0.1", 0))
+    return kept
 
 
 def _toml(config: dict[str, Any]) -> str:

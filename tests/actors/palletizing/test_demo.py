@@ -1,8 +1,11 @@
 """Claims about the demonstration around the cell: its configuration, its report, its run."""
 
 import json
+import socket
+import subprocess
 import tomllib
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +14,7 @@ pytest.importorskip("open3d", exc_type=ImportError)
 
 from actors.geometry.shapes import Surface
 from actors.palletizing.demo import SEED, run_demo
-from actors.palletizing.demo_cell import TEMPLATE, configured, watched_cell
+from actors.palletizing.demo_cell import TEMPLATE, RunningCell, configured, watched_cell
 from actors.palletizing.demo_pictures import model_picture, tray_picture
 from actors.palletizing.demo_report import report_bytes, rows_of, score_of
 from actors.palletizing.feedback import sentence
@@ -29,11 +32,14 @@ def test_cell_of_a_run_differs_only_in_what_a_run_chooses():
     """Ports, data folder, packages and seed are the run's; all else is the shipped cell."""
     shipped = tomllib.loads(TEMPLATE.read_text())
 
-    run = tomllib.loads(configured(TEMPLATE.read_text(), packages=5, seed=3, data=Path("/data")))
+    text = configured(
+        TEMPLATE.read_text(), packages=5, seed=3, data=Path("/data"), ports=(7001, 7002)
+    )
+    run = tomllib.loads(text)
 
     assert run["data_folder"] == "/data"
-    ports = {run["shards"][name].pop("listen") for name in ("left", "right")}
-    assert len(ports) == 2
+    ports = [run["shards"][name].pop("listen") for name in ("left", "right")]
+    assert ports == ["tcp/127.0.0.1:7001", "tcp/127.0.0.1:7002"]
     for name in ("left", "right"):
         shipped["shards"][name].pop("listen")
     assert run["actors"]["planning"]["options"]["packages"] == 5
@@ -43,6 +49,35 @@ def test_cell_of_a_run_differs_only_in_what_a_run_chooses():
         for actor in ("planning", "training-perception", "online-perception"):
             config["actors"][actor].pop("options")
     assert run == shipped
+
+
+def test_ports_of_a_run_are_kept_while_it_runs(tmp_path, monkeypatch):
+    """Nobody else gets them before its shards listen, or while one is started again."""
+    started = []
+
+    class Up:
+        send_signal = wait = poll = staticmethod(lambda *_: None)
+
+    monkeypatch.setattr(
+        "actors.palletizing.demo_cell.subprocess",
+        SimpleNamespace(
+            Popen=lambda *_, **__: started.append(1) or Up(),
+            STDOUT=subprocess.STDOUT,
+            DEVNULL=subprocess.DEVNULL,
+        ),
+    )
+
+    with RunningCell(tmp_path, packages=1, seed=1) as cell:
+        shards = tomllib.loads(cell.config.read_text())["shards"].values()
+        ports = [int(shard["listen"].rpartition(":")[2]) for shard in shards]
+        for port in ports:
+            with socket.socket() as other, pytest.raises(OSError, match="in use"):
+                other.bind(("127.0.0.1", port))
+    for port in ports:
+        with socket.socket() as other:
+            other.bind(("127.0.0.1", port))
+    assert len(ports) == 2
+    assert started == [1]
 
 
 def test_shipped_cell_fits_together():
@@ -117,7 +152,9 @@ def test_tray_picture_shows_the_region_in_red(tray):
 def test_a_watched_cell_says_what_comes(tmp_path):
     """Packages and seed of a cell that others run are those of its own sensor."""
     file = tmp_path / "cell.toml"
-    file.write_text(configured(TEMPLATE.read_text(), packages=5, seed=3, data=tmp_path))
+    file.write_text(
+        configured(TEMPLATE.read_text(), packages=5, seed=3, data=tmp_path, ports=(1, 2))
+    )
 
     watched = watched_cell(file)
 
