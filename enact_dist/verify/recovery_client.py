@@ -114,7 +114,7 @@ _ROLES: Final[dict[str, Callable[[Cell], None]]] = {
 def main(words: Sequence[str]) -> None:
     """Play one role until the parent ends this process."""
     file, role = words
-    with connect(file, actor=role, timeout_s=20.0) as cell:
+    with connect(file, actor=role, timeout_s=60.0) as cell:
         _ROLES[role](cell)
 
 

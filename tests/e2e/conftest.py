@@ -74,7 +74,7 @@ class Process:
     def signal(self, number):
         self.popen.send_signal(number)
 
-    def finish(self, timeout_s=60.0):
+    def finish(self, timeout_s=180.0):
         """Wait for the end and return the exit status."""
         return self.popen.wait(timeout=timeout_s)
 
@@ -133,7 +133,7 @@ class Cell:
             [sys.executable, "-m", "enact_dist.cli.main", *arguments],
             capture_output=True,
             text=True,
-            timeout=60,
+            timeout=180,
             env={**os.environ, "ENACT_CELL": str(self.file)},
             check=False,
         )

@@ -165,7 +165,7 @@ def opposite(cell, seed, seconds, count):
         one, two = Write(world, first, COUNT), Write(world, second, COUNT)
         started = time.monotonic()
         try:
-            with Lock(one, two, wait_s=20.0) as lock:
+            with Lock(one, two, wait_s=45.0) as lock:  # less than a lock may be held
                 longest_s = max(longest_s, time.monotonic() - started)
                 lock[one] = lock.get(one, 0) + 1
                 lock[two] = lock.get(two, 0) + 1
@@ -184,7 +184,7 @@ def perceive(cell, label):
     wait_line()
 
     def look():
-        with Lock(each) as lock:
+        with Lock(each, wait_s=60.0) as lock:
             packages = lock[each]
             if label in packages.values():
                 return "found"

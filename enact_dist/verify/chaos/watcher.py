@@ -117,7 +117,7 @@ def main() -> None:
         lines.put("end")
 
     threading.Thread(target=listen, daemon=True).start()
-    with connect(file, actor="watcher", timeout_s=20.0) as cell:
+    with connect(file, actor="watcher", timeout_s=60.0) as cell:
         watcher = Watcher(cell, Path(folder), ttl_s=float(ttl_s), ahead_ns=int(ahead_ns))
         print("started", flush=True)
         while True:
