@@ -51,8 +51,6 @@ SKEW_ROUNDS: Final = 5
 ROUND_TRIP_S_WARN: Final = 0.02
 
 SHM_BYTES_WARN: Final = 256_000_000
-DISK_BYTES_WARN: Final = 1_000_000_000
-DISK_BYTES_FAIL: Final = 50_000_000
 
 
 class Level(enum.Enum):
@@ -108,12 +106,11 @@ def examine(target: str, *, timeout_s: float = 5.0) -> Iterator[Finding]:
             yield Finding(Level.FAIL, "cell.toml", str(error), "correct the file")
             return
         yield Finding(Level.OK, "cell.toml", f"{target}: cell {config.name}, {_counts(config)}")
-        yield from _folders(config)
     kept = yield from _cell(target, config, timeout_s)
     if config is not None:
-        from enact_dist.doctor_cell import without_folder
+        from enact_dist.doctor_cell import folders
 
-        yield from without_folder(config, kept)
+        yield from folders(config, kept)
 
 
 def _config(target: str) -> CellConfig:
@@ -229,39 +226,10 @@ def shared_memory(folder: Path, *, named: bool = False) -> Finding:
     usage = shutil.disk_usage(folder)
     text = f"{folder}: {usage.free / 1e6:.0f} MB free of {usage.total / 1e6:.0f} MB"
     if usage.free < SHM_BYTES_WARN:
-        remedy = f"enlarge it: mount -o remount,size=1G {folder} (docker run --shm-size=1g)"
+        how = "of a container: the tmpfs volume" if named else "docker run --shm-size=1g"
+        remedy = f"enlarge it: mount -o remount,size=1G {folder} ({how})"
         return Finding(Level.WARN, "shared memory", text, remedy)
     return Finding(Level.OK, "shared memory", text)
-
-
-def _folders(config: CellConfig) -> Iterator[Finding]:
-    host = socket.gethostname()
-    for shard in config.shards:
-        if shard.folder is not None and shard.host in {"", host}:
-            yield data_folder(shard.name, shard.folder)
-
-
-def data_folder(shard: str, folder: Path) -> Finding:
-    """Check the disk on which a shard keeps, or will keep, its data."""
-    subject = f"disk of {shard}"
-    there = folder
-    while not there.exists() and there != there.parent:
-        there = there.parent
-    if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
-        user = os.environ.get("USER", str(os.getuid()))
-        return Finding(
-            Level.FAIL,
-            subject,
-            f"{there} cannot be written by {user}",
-            f"sudo install -d -o {user} {folder}",
-        )
-    free = shutil.disk_usage(there).free
-    text = f"{folder}: {free / 1e9:.1f} GB free"
-    if free < DISK_BYTES_FAIL:
-        return Finding(Level.FAIL, subject, text, "free some space: a full disk stops the shard")
-    if free < DISK_BYTES_WARN:
-        return Finding(Level.WARN, subject, text, "free some space: a full disk stops the shard")
-    return Finding(Level.OK, subject, text)
 
 
 # ---------------------------------------------------------------- the cell

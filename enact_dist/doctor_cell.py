@@ -6,18 +6,25 @@ another file than the rest does not.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import os
+import shutil
+import socket
+from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.epochs import is_kept
 from enact_dist.doctor import Finding, Level
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping
+    from pathlib import Path
 
     from enact_dist.cell_info import ShardInfo
     from enact_dist.config_types import CellConfig, ShardConfig
     from enact_dist.core.answers import Welcome
     from enact_dist.core.message_parts import PlacementMap
+
+DISK_BYTES_WARN: Final = 1_000_000_000
+DISK_BYTES_FAIL: Final = 50_000_000
 
 _RESTART = (
     "take the file that the shards were started with; or stop them all, move entities with"
@@ -57,16 +64,56 @@ def differences(
     yield from _catalogue(config, welcomes)
 
 
-def without_folder(config: CellConfig, kept: Collection[str]) -> Iterator[Finding]:
-    """Name the shards that keep nothing by the file; those of `kept` do so all the same."""
+def folders(config: CellConfig, kept: Collection[str]) -> Iterator[Finding]:
+    """Check the disks of the shards that run, or may run, on this host.
+
+    Args:
+        config: The file.
+        kept: The shards that run and keep data in a folder, wherever that is.
+    """
+    host = socket.gethostname()
     for shard in config.shards:
-        if shard.folder is None and shard.name not in kept:
-            yield Finding(
-                Level.WARN,
-                f"disk of {shard.name}",
-                "no folder: everything is lost when the shard stops",
-                f"write data_folder, or a folder in [shards.{shard.name}]",
-            )
+        folder, running = shard.folder, shard.name in kept
+        if folder is None:
+            if not running:
+                yield _without_folder(shard.name)
+        elif running and not os.access(folder, os.W_OK | os.X_OK):
+            text = f"{folder} is on another machine or another user's, where the shard runs"
+            yield Finding(Level.OK, f"disk of {shard.name}", text)
+        elif shard.host in {"", host}:
+            yield data_folder(shard.name, folder)
+
+
+def _without_folder(shard: str) -> Finding:
+    return Finding(
+        Level.WARN,
+        f"disk of {shard}",
+        "no folder: everything is lost when the shard stops",
+        f"write data_folder, or a folder in [shards.{shard}]",
+    )
+
+
+def data_folder(shard: str, folder: Path) -> Finding:
+    """Check the disk on which a shard keeps, or will keep, its data."""
+    subject = f"disk of {shard}"
+    there = folder
+    while not there.exists() and there != there.parent:
+        there = there.parent
+    if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
+        user = os.environ.get("USER", str(os.getuid()))
+        return Finding(
+            Level.FAIL,
+            subject,
+            f"{there} cannot be written by {user}",
+            f"if shard {shard} is to run here, as {user}: sudo install -d -o {user} {folder}",
+        )
+    free = shutil.disk_usage(there).free
+    text = f"{folder}: {free / 1e9:.1f} GB free"
+    if free < DISK_BYTES_FAIL:
+        return Finding(Level.FAIL, subject, text, "free some space: a full disk stops the shard")
+    if free < DISK_BYTES_WARN:
+        return Finding(Level.WARN, subject, text, "free some space: a full disk stops the shard")
+    return Finding(Level.OK, subject, text)
 
 
 def _placement(config: CellConfig, running: PlacementMap) -> Iterator[Finding]:

@@ -13,7 +13,7 @@ from enact_dist.config import load_config
 from enact_dist.core.epochs import unkept_epoch
 from enact_dist.core.messages import AspectEntry, Welcome
 from enact_dist.doctor import Level
-from enact_dist.doctor_cell import differences
+from enact_dist.doctor_cell import data_folder, differences
 
 
 def test_python_older_than_3_11_fails():
@@ -60,7 +60,7 @@ def test_doctor_looks_at_the_shared_folder_that_the_environment_names(enact, tmp
 
 def test_data_folder_that_does_not_exist_yet_is_judged_by_its_parent(tmp_path):
     """A shard makes its own folder; what counts is whether it can."""
-    found = doctor.data_folder("left", tmp_path / "data" / "left")
+    found = data_folder("left", tmp_path / "data" / "left")
 
     assert found.level is Level.OK
     assert "GB free" in found.text
@@ -70,7 +70,7 @@ def test_data_folder_behind_a_file_fails(tmp_path):
     """Where a file stands in the way, the remedy makes the folder."""
     (tmp_path / "data").write_text("", encoding="utf-8")
 
-    found = doctor.data_folder("left", tmp_path / "data" / "left")
+    found = data_folder("left", tmp_path / "data" / "left")
 
     assert found.level is Level.FAIL
     assert str(tmp_path / "data" / "left") in found.remedy
@@ -125,6 +125,22 @@ def test_doctor_reports_each_shard_of_a_running_cell(enact, cell_file):
         levels
     )
     assert levels["shard left"] in {"ok", "warn"}
+
+
+def test_disk_of_a_shard_that_runs_elsewhere_is_none_of_this_machine(
+    enact, cell_file, tmp_path, monkeypatch
+):
+    """A container of tools has no folder of the shards, and is not told to make one."""
+    (tmp_path / "file").write_text("", encoding="utf-8")
+    monkeypatch.setenv("ENACT_DATA_FOLDER", str(tmp_path / "file"))
+
+    result = enact("doctor", "--cell", cell_file, "--json")
+
+    ((level, text),) = told(result.json, "disk of left")
+    assert (result.status, level) == (0, "ok")
+    assert text == (
+        f"{tmp_path}/file/left is on another machine or another user's, where the shard runs"
+    )
 
 
 def told(findings, subject):
