@@ -42,6 +42,8 @@ FACES: Final = (
 )
 """One colour per planar patch, in turn; free form is clay."""
 
+LABEL_PX: Final = 17
+"""Height of a capital letter of a verdict; its plate is less than twice as high."""
 TRAY_HALF_M: Final = (0.447, 0.317)
 """What is drawn around the middle of the tray: all but its rim, where the floor shines through."""
 
@@ -68,9 +70,14 @@ def model_picture(name: str, surface: Surface) -> Picture:
         for azimuth in (-60.0, 120.0)
     ]
     faces = len(surface.patch_planes)
+    size_mm = 1000.0 * np.ptp(surface.vertices_m, axis=0)
+    size = " x ".join(f"{side:.0f}" for side in size_mm)
     return tiles(
         pictures,
-        [f"{name}: trained from depth views", f"{len(surface.triangles)} triangles, {faces} faces"],
+        [
+            f"{name}: trained from depth views",
+            f"{size} mm, {len(surface.triangles)} triangles, {faces} plane faces",
+        ],
     )
 
 
@@ -81,7 +88,7 @@ def tray_picture(
     *,
     size_px: tuple[int, int] = (1080, 780),
 ) -> Picture:
-    """Show a tray as the sensor saw it, with the deviating regions in red, each with its verdict.
+    """Show a tray as the sensor saw it, with the deviating regions in red, each under its verdict.
 
     Args:
         frame: The last image of the tray; its world is the tray frame.
@@ -106,12 +113,11 @@ def tray_picture(
     )
     picture = draw_bodies(_bodies(points_grid(depth_m, camera), points, colours, camera), view)
     for place, flag, region in regions:
-        centre = np.nanmean(points[region.ravel()], axis=0) + np.array([0.0, 0.0, 0.03])
-        at = _pixel(centre, view)
+        seen = _pixels(points[region.ravel()], view)
+        column, top = np.nanmean(seen[:, 0]), np.nanmin(seen[:, 1])
+        at = round(float(column)) - 80, round(float(top)) - 2 * LABEL_PX
         amount = f" {flag.deviation_mm:.0f} mm" if flag.verdict != "missing" else ""
-        picture = with_label(
-            picture, f"{place}: {flag.verdict}{amount}", (at[0] - 80, at[1] - 12), height_px=17
-        )
+        picture = with_label(picture, f"{place}: {flag.verdict}{amount}", at, height_px=LABEL_PX)
     return picture
 
 
@@ -142,10 +148,14 @@ def latest(frames: Mapping[int, DepthFrame], trays: Mapping[int, int]) -> dict[i
     return {trays[stop]: frames[stop] for stop in sorted(frames)}
 
 
-def _pixel(point_m: npt.NDArray[np.float64], view: Acquisition) -> tuple[int, int]:
-    """Return column and row of a point of the world in a picture."""
-    local = moved(point_m[None], inverse(view.world_from_camera))[0]
+def _pixels(points_m: npt.NDArray[np.float64], view: Acquisition) -> npt.NDArray[np.float64]:
+    """Return column and row of points of the world in a picture, NaN where a point has NaN."""
+    local = moved(points_m, inverse(view.world_from_camera))
     camera = view.camera
-    column = camera.fx_px * local[0] / local[2] + camera.cx_px
-    row = camera.fy_px * local[1] / local[2] + camera.cy_px
-    return round(float(column)), round(float(row))
+    return np.stack(
+        [
+            camera.fx_px * local[:, 0] / local[:, 2] + camera.cx_px,
+            camera.fy_px * local[:, 1] / local[:, 2] + camera.cy_px,
+        ],
+        axis=1,
+    )

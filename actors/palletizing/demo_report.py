@@ -69,7 +69,7 @@ def rows_of(
                 truth=str(package.truth),
                 verdict=flag.verdict,
                 correct=flag.verdict == VERDICT_OF_KIND[package.truth.kind],
-                deviation_mm=round(flag.deviation_mm, 2),
+                deviation_mm=round(flag.deviation_mm, 1),  # as the user's line says it
                 frame_to_feedback_ms=round(notices[place].latency_ms, 1),
             )
         )

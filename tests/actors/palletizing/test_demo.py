@@ -4,6 +4,7 @@ import json
 import socket
 import subprocess
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -147,6 +148,33 @@ def test_tray_picture_shows_the_region_in_red(tray):
 
     assert red(with_region) > 0.003
     assert red(without) == 0.0
+
+
+def test_verdict_hides_nothing_of_its_region(tray):
+    """Its plate stands above what is red, so that the shape of a dent can be seen."""
+    frame = tray.capture_empty()
+    region = np.zeros(frame.depth_mm.shape, bool)
+    region[180:290, 280:390] = True
+
+    picture = tray_picture(frame, frame.depth_mm, [("place/0", flag("missing"), region)])
+
+    red = (picture[..., 0] > 150) & (picture[..., 1] < 110)
+    assert red.mean() > 0.01
+    rows, columns = np.nonzero(red)
+    height, width = np.ptp(rows) + 1, np.ptp(columns) + 1
+    assert red.sum() > 0.9 * height * width
+
+
+def test_deviation_is_the_same_in_the_table_and_in_the_line_for_the_user():
+    """Rounded once: 5.746 mm is 5.7 mm everywhere, not 5.75 and then 5.8."""
+    found = replace(flag("deformed"), deviation_mm=5.746)
+
+    (row,) = rows_of(
+        package_sequence(1, seed=SEED), {"place/0": found}, {"place/0": Notice("", 7, 1.0)}
+    )
+
+    assert sentence("place/0", found).startswith("place/0: milk_carton is deformed by 5.7 mm")
+    assert f"{row.deviation_mm:.1f}" == "5.7"
 
 
 def test_a_watched_cell_says_what_comes(tmp_path):
