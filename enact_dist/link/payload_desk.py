@@ -57,6 +57,8 @@ DRAFT_BYTES_MAX: Final = 2 << 30
 """Bytes of drafts that wait in plain memory for their commits."""
 ROOM_S: Final = 1.0
 """How long a new draft waits for files that are on their way out."""
+SILENT_NS: Final = 60_000_000_000
+"""So long the log says nothing more of payloads that are no files; they are counted."""
 ROOM_TRIES: Final = 8
 """So often history lets go for a draft, each time of more, while others take the room before it."""
 
@@ -135,6 +137,7 @@ class PayloadDesk:
         self._over = UsedNames()
         self._bytes = self._gone = 0
         self._full = 0, 0
+        self._silent_until_ns = 0
 
     # ---------------------------------------------------------------- drafts
 
@@ -197,7 +200,7 @@ class PayloadDesk:
         if self._folder is not None and not shared and self._firm:
             return self._refused(session, total, self._bytes, self._bytes_max)
         if self._folder is not None and not shared:
-            self._count("payload_fallbacks")
+            self._travels(f"its cap of {self._bytes_max} bytes is reached")
         memory = self._in_folder(self._folder, file, total) if shared else None
         if memory is None:
             drafted = self._drafted()
@@ -269,9 +272,17 @@ class PayloadDesk:
             with self._mutex:
                 self._bytes -= total
                 self._files -= 1
-            self._count("payload_fallbacks")
-            _log.info("payload %s is no file: %s", file, error)
+            self._travels(str(error.strerror or error))
             return None
+
+    def _travels(self, why: str) -> None:
+        """Count a payload that is no file; say so, but of a full folder not for each."""
+        self._count("payload_fallbacks")
+        now_ns = self._clock.monotonic_ns()
+        if self._folder is not None and now_ns >= self._silent_until_ns:
+            self._silent_until_ns = now_ns + SILENT_NS
+            text = "large data travel over the network, for the shared folder %s takes none: %s"
+            _log.warning(text, self._folder.path, why)
 
     def _file_memory(self, folder: SharedFolder, file: str, total: int) -> Pages:
         flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC

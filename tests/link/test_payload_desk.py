@@ -434,6 +434,30 @@ def test_folder_that_takes_no_file_costs_no_commit(folder, monkeypatch, code):
     assert desk.figures()["payload_fallbacks"] == 1
 
 
+def test_full_folder_is_told_once_a_minute(folder, monkeypatch, caplog):
+    """A camera would fill the log with it; each payload is counted all the same."""
+
+    def refuse(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "posix_fallocate", refuse)
+    clock = ManualClock()
+    desk = PayloadDesk(folder, 10 * SIZE, clock=clock)
+    said = (
+        f"large data travel over the network, for the shared folder {folder.path} takes none:"
+        " No space left on device"
+    )
+
+    for number in (1, 2, 3):
+        stage(desk, f"a-{number}")
+    assert caplog.messages == [said]
+
+    clock.advance(61.0)
+    stage(desk, "a-4")
+    assert caplog.messages == [said, said]
+    assert desk.figures()["payload_fallbacks"] == 4
+
+
 def test_draft_whose_file_somebody_has_removed_is_no_payload(folder):
     """Its bytes come again with the commit; whoever serves all clients does not fail of it."""
     desk = PayloadDesk(folder, 10 * SIZE)
