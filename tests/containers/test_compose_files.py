@@ -1,5 +1,7 @@
 """Every compose file can be read, alone and with the others, as the page of deploy/ calls them."""
 
+import json
+
 import pytest
 
 pytestmark = pytest.mark.containers
@@ -32,3 +34,12 @@ def test_the_address_of_the_shards_has_to_be_named(engine):
 
     assert done.returncode
     assert "SHARD_ADDRESS" in done.stderr
+
+
+def test_a_cell_file_that_is_missing_is_told_by_its_name(engine):
+    """The engine refuses the mount; else it makes a folder, and every container reads that."""
+    told = engine.compose(*ONE, "--profile", "tools", "config", "--format", "json").stdout
+
+    for name, service in json.loads(told)["services"].items():
+        mounts = {mount["target"]: mount for mount in service["volumes"]}
+        assert name == "folder" or not mounts["/etc/enact/cell.toml"]["bind"]
