@@ -451,9 +451,16 @@ class Cell(Closing):
         """Let the keep-alives carry an actor's own statistics (msgpack of a map)."""
         self._client.set_report(report)
 
-    def aspects(self) -> dict[str, tuple[str, str]]:
-        """Return the registered aspects: name to (fingerprint of the type, durability)."""
-        self._client.greet()
+    def aspects(self, *, enough: str = "") -> dict[str, tuple[str, str]]:
+        """Return the registered aspects: name to (fingerprint of the type, durability).
+
+        Args:
+            enough: Once shards that answer know an aspect of this name, no other is waited for.
+
+        Raises:
+            ShardUnreachableError: A shard does not answer.
+        """
+        self._session.greet(enough=enough)
         entries = self._client.aspect_entries()
         return {name: (entry.fingerprint, entry.durability) for name, entry in entries.items()}
 

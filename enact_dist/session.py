@@ -97,6 +97,22 @@ class Session:
             self._looked_up.clear()
         return lapses
 
+    def greet(self, *, enough: str = "") -> None:
+        """Learn anew which aspects and world contexts the shards know.
+
+        With the name of an aspect that is `enough` it ends where those that answer at once know it.
+
+        Raises:
+            ShardUnreachableError: A shard does not answer.
+        """
+        client = self.client
+        if enough:
+            client.call_once([(shard, client.core.hello(shard)) for shard in client.shards()])
+            found = client.aspect_entries().get(enough)
+            if found is not None and found.fingerprint:
+                return
+        client.greet()
+
     def look_up(self, aspects: Iterable[Aspect[Any]], *, timeout_s: float | None = None) -> None:
         """Make sure that no shard knows one of these aspects, which are only read, otherwise.
 

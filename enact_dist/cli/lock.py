@@ -29,10 +29,13 @@ from enact_dist.link.signals import StopSignals
 from enact_dist.terms import Access, Entities, Entity, checked_name
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
     from enact_dist.cell import Cell
     from enact_dist.cell_info import LockInfo
     from enact_dist.cli.verbs import Verb
     from enact_dist.core.messages import Item
+    from enact_dist.link.client import CellClient
 
 POLL_S: Final = 0.05
 """How soon a lost lock or an ended command is noticed."""
@@ -238,7 +241,10 @@ def _hold(cell: Cell, arguments: argparse.Namespace, stop: StopSignals) -> int:
     items = [_item(cell, request, arguments.world) for request in arguments.requests]
     client = cell.world(items[0].context).session.client
     entries = client.aspect_entries()
-    client.register(aspects=[entries[item.aspect] for item in items])  # a pattern is on every shard
+    client.register(
+        aspects=[entries[item.aspect] for item in items],
+        needed=lambda: _shards_of(client, items),
+    )
     lock = client.acquire(items, wait_s=arguments.wait, hold_s=arguments.hold)
     name, by_itself = arguments.command[0], False
     try:
@@ -268,6 +274,12 @@ def _hold(cell: Cell, arguments: argparse.Namespace, stop: StopSignals) -> int:
     return running.status
 
 
+def _shards_of(client: CellClient, items: Iterable[Item]) -> Iterator[str]:
+    """Yield the shards on which these data lie: those of a pattern on any."""
+    for item in items:
+        yield from client.shards() if "*" in item.entity else (client.shard_of(item.entity),)
+
+
 def _command_name(arguments: argparse.Namespace) -> str:
     return f"hold:{os.path.basename(arguments.command[0])}"  # noqa: PTH119 (a word, not a file)
 
@@ -278,14 +290,16 @@ def _item(cell: Cell, request: tuple[str, str, str, str], default: str | None) -
     from enact_dist.session import unknown_aspect
 
     world, entity, aspect, access = request
-    worlds = cell.worlds()
-    world = world or default or (worlds[0] if len(worlds) == 1 else "")
+    world = world or default or ""
+    worlds = cell.worlds() if not world else ()
+    if len(worlds) == 1:
+        (world,) = worlds
     if not world:
         raise ConfigError(
             f"in which world context is {entity}/{aspect}? write WORLD:{entity}/{aspect}:{access}"
             f" or --world WORLD (known: {', '.join(worlds) or 'none'})"
         )
-    known = [name for name, entry in cell.aspects().items() if entry[0]]
+    known = [name for name, entry in cell.aspects(enough=aspect).items() if entry[0]]
     if aspect not in known:
         raise unknown_aspect(aspect, known)
     cell.world(world)  # refuses an unknown one by name

@@ -224,7 +224,9 @@ def put_datum(arguments: argparse.Namespace) -> int:
     entity, name = arguments.slot
     with open_cell(arguments, observer=False) as cell:
         world = cell.world(arguments.world)
-        datum_type = literals.type_to_put(name, cell.aspects(), arguments.value, new=arguments.new)
+        datum_type = literals.type_to_put(
+            name, cell.aspects(enough=name), arguments.value, new=arguments.new
+        )
         value = literals.read(arguments.value, datum_type)
         request = Write(world, Entity(entity), Aspect(name, datum_type))
         with Lock(request, wait_s=arguments.wait) as lock:
