@@ -1,6 +1,7 @@
 """From journals to a verdict: what a run of real processes recorded is told as a history."""
 
 import json
+from contextlib import closing
 
 import pytest
 
@@ -304,14 +305,13 @@ def test_folder_of_something_else_is_refused(tmp_path):
 def test_without_namespaces_what_is_left_out_is_named(monkeypatch):
     """On a system without the tools the cell runs on the loopback, and says what is missing."""
     monkeypatch.setenv("PATH", "")
-    found = hosts.open_hosts(("s0", "g0"))
-
-    assert isinstance(found, hosts.Loopback)
-    assert any(
-        "partitions (the program unshare is not installed)" in name for name in found.missing
-    )
-    with pytest.raises(LinkError, match="one host"):
-        found.cut("s0", "g0")
+    with closing(hosts.open_hosts(("s0", "g0"))) as found:
+        assert isinstance(found, hosts.Loopback)
+        assert any(
+            "partitions (the program unshare is not installed)" in name for name in found.missing
+        )
+        with pytest.raises(LinkError, match="one host"):
+            found.cut("s0", "g0")
     with pytest.raises(LinkError, match="not installed"):
         hosts.open_hosts(("s0", "g0"), required=True)
 

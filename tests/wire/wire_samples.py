@@ -25,16 +25,20 @@ def annotated(cls):
     return [(name, hints[name]) for name in names]
 
 
-def is_optional(kind):
-    return typing.get_origin(kind) in (types.UnionType, typing.Union)
+def alternatives(kind):
+    """Return what an annotation is one of, and whether that may be None; nothing for others."""
+    if typing.get_origin(kind) not in (types.UnionType, typing.Union):
+        return [], False
+    kinds = typing.get_args(kind)
+    return [one for one in kinds if one is not type(None)], type(None) in kinds
 
 
 @cache
 def messages(kind):
     """Return a strategy for values of an annotation of `core.messages`."""
-    if is_optional(kind):
-        inner = next(one for one in typing.get_args(kind) if one is not type(None))
-        return st.none() | messages(inner)
+    inner, may_be_none = alternatives(kind)
+    if inner:
+        return st.one_of(*[st.none()] * may_be_none, *map(messages, inner))
     if typing.get_origin(kind) is tuple:
         return st.lists(messages(typing.get_args(kind)[0]), max_size=3).map(tuple)
     if kind is Datum:
@@ -69,9 +73,10 @@ def messages(kind):
 
 def sample(kind, random):
     """Return a value of an annotation, of middle size, by a seeded generator."""
-    if is_optional(kind):
-        inner = next(one for one in typing.get_args(kind) if one is not type(None))
-        return sample(inner, random) if random.random() < 0.8 else None
+    inner, may_be_none = alternatives(kind)
+    if inner:
+        one = inner[0] if len(inner) == 1 else random.choice(inner)
+        return None if may_be_none and random.random() >= 0.8 else sample(one, random)
     if typing.get_origin(kind) is tuple:
         kinds = typing.get_args(kind)
         if kinds[1:] == (...,):
