@@ -102,7 +102,9 @@ class Actor:
         triggers: Declared reading requests; the actor must not write what triggers it.
         every_s: Period of a source in seconds; may be set per instance.
         only_entity: The one entity that an instance works on, of those that its patterns match; a
-            source needs it where it names a pattern.  `entity` in `cell.toml`, ``--entity``.
+            source needs it where it names a pattern.  `entity` in `cell.toml`, ``--entity``; of
+            what `__init__` sets, `enact actor check` knows nothing.  A `Together` names its
+            entities itself and cannot be narrowed.
         wait_s: How long one attempt waits for its lock.
         hold_s: How long an update may hold its lock; a longer one loses it and commits nothing.
         shared: Declared writes whose slots other actors write too, on purpose; any two other

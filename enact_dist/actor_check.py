@@ -11,11 +11,12 @@ error    unbound role         a role that no world context is bound to
 error    unknown role         a binding for a role that the actor does not have
 error    unknown world        a world context that the cell does not list
 error    unknown aspect       an aspect that the cell does not list
-error    no such entity       an actor without triggers whose pattern is given no `entity`, or one
-                              that does not match
+error    no such entity       the one `entity` of an actor does not match what it declares
 error    two types            one aspect name with two datum types
 error    own trigger          an actor that, as bound, writes what triggers it
 error    two writers          two actors that write one slot, not both declaring it as `shared`
+warning  entity unsaid        an actor without triggers names a pattern, and neither `cell.toml` nor
+                              its class says for which entity: its `__init__` has to
 warning  unwritten trigger    a trigger that no actor writes: only a write from outside runs it
 warning  unwritten read       a reading request for data that no actor writes
 warning  set not retained     an aspect of a `Together` has no history (retention = 1): a set is
@@ -72,6 +73,12 @@ class ActorDeclaration:
     actor_class: type[Actor]
     worlds: Mapping[str, str] | None = None
     entity: Entity | None = None
+
+    @property
+    def unsaid(self) -> bool:
+        """Whether it works on one entity, and which is not said."""
+        declaration = self.actor_class.declaration
+        return self.entity is None and declaration.per_entity and not declaration.triggers
 
     def world_of(self, role: str) -> str | None:
         """Return the world context that a role is bound to."""
@@ -172,7 +179,7 @@ def check_cell(config: CellConfig, *, initial: Collection[str] = ()) -> tuple[Fi
     for actor in config.actors:
         try:
             actor_class = load_class(actor.class_path)
-            only = Entity(actor.entity) if actor.entity else None
+            only = Entity(actor.entity) if actor.entity else actor_class.only_entity
             actors.append(ActorDeclaration(actor.name, actor_class, actor.worlds or None, only))
             read_options(actor_class, actor.options)
             if actor.every_s is not None:
@@ -288,11 +295,13 @@ def _roles(actors: Iterable[ActorDeclaration], worlds: Collection[str]) -> Itera
 
 def _entities(actors: Iterable[ActorDeclaration]) -> Iterator[Finding]:
     for actor in actors:
+        unsaid = actor.unsaid
         try:
             actor.actor_class.declaration.check_entity(actor.entity)
         except MisuseError as error:
+            kind = "entity unsaid" if unsaid else "no such entity"
             text = f"actor {actor.name}: {error}"
-            yield Finding("error", "no such entity", (actor.name,), text)
+            yield Finding("warning" if unsaid else "error", kind, (actor.name,), text)
 
 
 def _aspects(uses: Iterable[_Use], aspects: Collection[str]) -> Iterator[Finding]:
@@ -345,6 +354,8 @@ def _writers(uses: Sequence[_Use]) -> Iterator[Finding]:
     for index, one in enumerate(writes):
         for other in writes[index + 1 :]:
             if one.actor is other.actor or not one.meets(other) or (one.shared and other.shared):
+                continue
+            if one.actor.unsaid or other.actor.unsaid:  # which slots it writes nobody can say
                 continue
             yield Finding(
                 "error",

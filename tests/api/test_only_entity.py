@@ -174,7 +174,7 @@ def test_entity_that_does_not_fit_is_refused_before_it_runs(actor, entity, messa
 
 
 def test_check_tells_cameras_apart_by_their_entity():
-    """Two of one entity write one slot; one without any cannot run."""
+    """Two of one entity write one slot; what nobody says may be said by an `__init__`."""
     zero, one = Entity("camera/0"), Entity("camera/1")
 
     def found(*entities):
@@ -186,20 +186,18 @@ def test_check_tells_cameras_apart_by_their_entity():
 
     assert found(zero, one) == []
     assert found(zero, one, zero) == [("two writers", ("camera-0", "camera-2"))]
-    assert found(zero, None) == [
-        ("no such entity", ("camera-1",)),
-        ("two writers", ("camera-0", "camera-1")),
-    ]
+    assert found(zero, Entity("tray/1")) == [("no such entity", ("camera-1",))]
+    assert found(zero, None) == [("entity unsaid", ("camera-1",))]
 
 
 def test_actors_of_one_class_are_told_apart_by_their_names():
     """Where nobody names them."""
     with testing.worlds("online") as cell:
-        threads = [
+        names = [
             ActorThread(actor, cell).statistics().name
-            for actor in (Camera(), only(Camera(), "camera/1"))[1:]
+            for actor in (Worker(), only(Worker(), "camera/1"), only(Camera(), "camera/1"))
         ]
-    assert threads == ["Camera-camera-1"]
+    assert names == ["Worker", "Worker-camera-1", "Camera-camera-1"]
 
 
 def test_command_of_a_process_names_the_entity():

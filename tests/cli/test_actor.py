@@ -51,6 +51,10 @@ class Camera(Actor):
         lock[self.count] = lock.get(self.count, 0) + 1
 
 
+class Own(Camera):
+    only_entity = Entity("camera/1")
+
+
 class Broken(Actor):
     online = World("online")
     count = Write(online, Entity("broken"), COUNT)
@@ -185,11 +189,23 @@ def test_entity_that_is_missing_or_does_not_fit_is_refused(module, enact, write_
     assert (run.status, other.status) == (2, 2)
     assert "has no triggers and no only_entity" in run.err
     assert "which tray/1 does not match" in other.err
-    assert check.status == 1
-    assert "error: no such entity: actor lost: Camera.count is " in check.out
+    assert check.status == 0
+    assert "warning: entity unsaid: actor lost: Camera.count is " in check.out
     with pytest.raises(SystemExit) as ended:
         enact("actor", "run", "camera-0", "--entity", "camera/*", "--cell", file)
     assert ended.value.code == 2
+
+
+def test_check_goes_by_the_entity_that_a_class_says(module, enact, write_cell):
+    """It needs none in the file, and is told apart from the others."""
+    own = '\n[actors.own]\nclass = "my_actors:Own"\n'
+    alone = enact("actor", "check", "--cell", write_cell(own))
+    both = enact("actor", "check", "--cell", write_cell(CAMERAS + own), "--json")
+
+    assert (alone.status, alone.out) == (0, "ok: 1 actors of cell clitest fit together\n")
+    assert [(each["kind"], each["actors"]) for each in both.json] == [
+        ("two writers", ["camera-1", "own"])
+    ]
 
 
 def test_check_accepts_actors_that_fit(module, enact, write_cell):
