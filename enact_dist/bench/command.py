@@ -91,8 +91,13 @@ def names_of(arguments: argparse.Namespace) -> list[str]:
 
     Raises:
         MisuseError: One is named that needs several processes, and there is to be one; or daemons
-            of its own, and there are others.
+            of its own, and there are others; or a carrier where there is nothing to carry.
     """
+    if arguments.embedded and arguments.carrier != "auto":
+        raise MisuseError(
+            f"--embedded with --carrier {arguments.carrier}: within one process calls travel over"
+            " none; leave out one of both"
+        )
     asked = set(arguments.names or BENCHES)
     for option, given, cannot, why in (
         ("--embedded", arguments.embedded, BETWEEN_PROCESSES, "needs several processes"),

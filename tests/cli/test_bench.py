@@ -327,6 +327,7 @@ def test_wrong_usage_is_refused(enact, capsys, words, text):
     ("words", "status", "text"),
     [
         (("bench", "wakeup", "--embedded"), 1, "wakeup with --embedded: needs several processes"),
+        (("bench", "core", "--embedded", "--carrier", "zenoh"), 1, "--carrier zenoh: within one"),
         (("bench", "memory", "--connect", "x"), 1, "memory with --connect: needs daemons of its"),
         (("bench", "multi", "--connect", "no-such-file.toml", *SHORT), 2, "no-such-file.toml"),
     ],
