@@ -123,7 +123,7 @@ def _end(stores: Iterable[Recovered], aspect: str, now_ns: int) -> AspectForgott
     for stored in stores:
         before = [record for record in stored.forgotten if record.name == aspect]
         for record in before:
-            base = max(base, record.version_base, *(base for _, base in record.entity_bases))
+            base = max(base, record.version_base, *(base for _, base, _ in record.entity_bases))
             at_ns = max(at_ns, record.at_ns)
         base = max([base, *(state.version for state in _states(stored, aspect))])
         at_ns = max([at_ns, *(record.stamp_ns + 1 for record in stored.slots)])

@@ -63,6 +63,18 @@ class Move(NamedTuple):
     copied: bool
 
 
+class _Start(NamedTuple):
+    """Where slots start again whose context was dropped, or whose aspect was forgotten.
+
+    Attributes:
+        base: Above this version.
+        at_ns: Up to this stamp nothing is known of an aspect.
+    """
+
+    base: int
+    at_ns: int = 0
+
+
 @dataclass(slots=True)
 class Plan:
     """What a rebalance does.
@@ -216,21 +228,20 @@ class Shards:
         """Yield what each shard knows of each aspect that any one has forgotten."""
         all_gone = [gone for stored in self._stores.values() for gone in stored.forgotten]
         for name in sorted({gone.name for gone in all_gone}):
-            at_ns = max(gone.at_ns for gone in all_gone if gone.name == name)
             none = AspectForgotten(name, 0, 0)
-            found = {
+            yield {
                 shard: next((gone for gone in stored.forgotten if gone.name == name), none)
                 for shard, stored in self._stores.items()
             }
-            yield {shard: replace(gone, at_ns=at_ns) for shard, gone in found.items()}
 
     def _bases(
         self, by_name: Iterable[dict[str, Gone]], part: Literal["context", "aspect"]
     ) -> dict[str, list[Gone]]:
-        """Return above which versions what is gone starts when it is made again: alike everywhere.
+        """Return how what is gone starts when it is made again: alike everywhere.
 
-        What was made since began above the base of its own shard, and goes on so; who has it before
-        it moves is told as well, as a run that is cut off may leave it there.
+        What was made since began above the base of its own shard, and is known since that one
+        forgot the aspect, and goes on so; who has it before it moves is told as well, as a run that
+        is cut off may leave it there.
 
         Args:
             by_name: What each shard knows of what is gone.
@@ -239,18 +250,21 @@ class Shards:
         bases: dict[str, list[Gone]] = {entry.name: [] for entry in self._placement.shards}
         for by_shard in by_name:
             known = next(iter(by_shard.values()))
-            top = max(gone.version_base for gone in by_shard.values())
-            moved = {shard: dict(gone.entity_bases) for shard, gone in by_shard.items()}
-            own: dict[str, dict[str, int]] = {shard: {} for shard in bases}
+            starts = {shard: _start_of(gone) for shard, gone in by_shard.items()}
+            top = _Start(*map(max, zip(*starts.values(), strict=True)))
+            moved = {
+                shard: {entity: _Start(*start) for entity, *start in gone.entity_bases}
+                for shard, gone in by_shard.items()
+            }
+            own: dict[str, dict[str, _Start]] = {shard: {} for shard in bases}
             for entity, holders in self._states.items():
                 for shard, slots in holders.items():
-                    base = moved[shard].get(entity, by_shard[shard].version_base)
-                    if base < top and any(getattr(slot, part) == known.name for slot in slots):
+                    start = moved[shard].get(entity, starts[shard])
+                    if start != top and any(getattr(slot, part) == known.name for slot in slots):
                         for place in own.keys() & {shard, shard_of(entity, self._placement)}:
-                            own[place][entity] = base
+                            own[place][entity] = start
             for shard, found in bases.items():
-                entity_bases = tuple(sorted(own[shard].items()))
-                found.append(replace(known, version_base=top, entity_bases=entity_bases))
+                found.append(_with_starts(known, top, own[shard]))
         return bases
 
     # ---------------------------------------------------------------- records
@@ -298,6 +312,19 @@ def strangers(stored: Recovered, shard: str, placement: PlacementMap) -> list[tu
         entities.update((write.slot.entity, None) for write in promise.writes)
     found = ((entity, shard_of(entity, placement)) for entity in entities)
     return [(entity, owner) for entity, owner in found if owner != shard]
+
+
+def _start_of(gone: Gone) -> _Start:
+    return _Start(gone.version_base, gone.at_ns if isinstance(gone, AspectForgotten) else 0)
+
+
+def _with_starts(gone: Gone, top: _Start, own: Mapping[str, _Start]) -> Gone:
+    """Return what is gone with where its slots start, and those of some entities by themselves."""
+    entities = sorted(own.items())
+    if isinstance(gone, WorldDropped):
+        bases = tuple((name, start.base) for name, start in entities)
+        return WorldDropped(gone.name, top.base, bases)
+    return AspectForgotten(gone.name, *top, tuple((name, *start) for name, start in entities))
 
 
 def _versions(slots: Mapping[Slot, list[SlotRecord]]) -> set[tuple[Slot, int, int]]:

@@ -56,14 +56,15 @@ class AspectForgotten:
     """An aspect is registered no more, and all states of its slots are gone.
 
     If it is registered again, versions of its slots start above `version_base`: none is ever used
-    twice.  Those of `entity_bases` were moved here, as those of `WorldDropped`.  What they were up
-    to the stamp `at_ns` is not known.
+    twice.  What they were up to the stamp `at_ns` is not known.  For the entities of `entity_bases`
+    it is another version and another stamp: these are from a shard that forgot the aspect at
+    another time, or never.
     """
 
     name: str
     version_base: int
     at_ns: int
-    entity_bases: tuple[tuple[str, int], ...] = ()
+    entity_bases: tuple[tuple[str, int, int], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

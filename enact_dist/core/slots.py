@@ -12,7 +12,7 @@ import heapq
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from enact_dist.core.bases import Bases
+from enact_dist.core.bases import AspectBases, Bases
 from enact_dist.core.datum import Column, Datum, Slot
 from enact_dist.core.history import History
 from enact_dist.core.messages import Cause, Forgotten, SlotState, SlotVersion
@@ -79,7 +79,6 @@ class SlotMap:
         "_aspect_bases",
         "_columns",
         "_context_bases",
-        "_forgotten_ns",
         "_lost",
         "_payloads",
         "_since_ns",
@@ -99,8 +98,7 @@ class SlotMap:
         forgotten: Collection[AspectForgotten] = (),
     ) -> None:
         self._context_bases = Bases(dropped)
-        self._aspect_bases = Bases(forgotten)
-        self._forgotten_ns = {aspect.name: aspect.at_ns for aspect in forgotten}
+        self._aspect_bases = AspectBases(forgotten)
         self._answer_bytes_max = answer_bytes_max
         self._since_ns = since_ns
         self._columns: dict[Column, dict[str, Content]] = {}
@@ -197,7 +195,7 @@ class SlotMap:
         oldest = self._oldest(slot, newest)
         if oldest.version > self._first_version(slot):
             return oldest.stamp_ns
-        forgotten_ns = self._forgotten_ns.get(slot.aspect, 0)
+        forgotten_ns = self._aspect_bases.forgotten_ns(slot.aspect, slot.entity)
         return max(forgotten_ns, self._since_ns) if slot in self._lost else forgotten_ns
 
     def _oldest(self, slot: Slot, newest: Content) -> Content:
@@ -215,7 +213,8 @@ class SlotMap:
         """Return what is asked and not known any more as of a stamp, None if all is known."""
         latest, unknown = Forgotten(Slot("", "", ""), 0), False
         for item in items:
-            forgotten_ns = self._forgotten_ns.get(item.aspect, 0)
+            each = ACCESSES[item.access].each
+            forgotten_ns = self._aspect_bases.forgotten_ns(item.aspect) if each else 0
             if forgotten_ns > at_ns:  # whatever the slots were that a pattern asks for
                 slot = Slot(item.context, item.entity, item.aspect)
                 latest = max(latest, Forgotten(slot, forgotten_ns), key=lambda one: one.oldest_ns)

@@ -136,7 +136,7 @@ def forgotten_row(record: AspectForgotten) -> tuple[Key, bytes]:
 
 
 def _moved(record: WorldDropped | AspectForgotten) -> list[list[list[object]]]:
-    return [[list(base) for base in record.entity_bases]] if record.entity_bases else []
+    return [[list(entry) for entry in record.entity_bases]] if record.entity_bases else []
 
 
 def kept_row(record: KeptRecord) -> tuple[Key, bytes | None]:
@@ -240,23 +240,26 @@ def read_world(key: Key, body: bytes) -> WorldRecord:
 def read_dropped(key: Key, body: bytes) -> WorldDropped:
     """Read the row of a world context that there was."""
     name, fields = Fields(key.name).last(str), Fields(body)
-    return WorldDropped(name, fields.next(int), _bases_moved(fields))
+    base, moved = fields.next(int), _moved_here(fields)
+    return WorldDropped(name, base, tuple((one.next(str), one.last(int)) for one in moved))
 
 
 def read_forgotten(key: Key, body: bytes) -> AspectForgotten:
     """Read the row of an aspect that there was."""
     name, fields = Fields(key.name).last(str), Fields(body)
-    return AspectForgotten(name, fields.next(int), fields.next(int), _bases_moved(fields))
+    base, at_ns, moved = fields.next(int), fields.next(int), _moved_here(fields)
+    entity_bases = ((one.next(str), one.next(int), one.last(int)) for one in moved)
+    return AspectForgotten(name, base, at_ns, tuple(entity_bases))
 
 
-def _bases_moved(fields: Fields) -> tuple[tuple[str, int], ...]:
-    """Take the last field, if there is one: the bases of entities that were moved here."""
+def _moved_here(fields: Fields) -> list[Fields]:
+    """Take the last field, if there is one: where entities start that were moved here."""
     if fields.at_end:
-        return ()
-    bases = [Fields(entry) for entry in fields.last(list)]
-    if not bases:
+        return []
+    moved = [Fields(entry) for entry in fields.last(list)]
+    if not moved:
         raise DamagedRowError("bases of entities were expected, found none")
-    return tuple((base.next(str), base.last(int)) for base in bases)
+    return moved
 
 
 def read_aspect(key: Key, body: bytes) -> AspectEntry:

@@ -9,7 +9,7 @@ import pytest
 from rebalance_cells import ENTITIES, POSE, StoppedCell, placement
 from store_writer import persist, slot_record
 
-from enact_dist import Aspect, Lock, Position, View, Write, local
+from enact_dist import Aspect, Entities, Lock, Position, View, ViewEach, Write, local
 from enact_dist.core.datum import LockId, Slot, Token
 from enact_dist.core.messages import AspectEntry, Item, SlotVersion, WriteItem
 from enact_dist.core.placement import shard_of
@@ -21,7 +21,8 @@ from enact_dist.link.store import open_store, read_store
 from enact_dist.link.store_folder import moving_mark
 from enact_dist.terms import Access
 
-TWO = placement("left", "right")
+TWO_NAMES = ("left", "right")
+TWO = placement(*TWO_NAMES)
 NEW_POSE = Aspect("pose", str, POSE.durability, retention=POSE.retention)
 NOW_NS = time.time_ns()
 GONE = (False, 0, 0)
@@ -329,6 +330,50 @@ def test_versions_are_never_used_again_where_an_entity_moves(tmp_path):
         made = online.history(stays, NEW_POSE)[0].position.stamp_ns
         before = online.at(Position(made - 1, away))
         assert before.view(old := View(before, stays, NEW_POSE)).get(old) is None
+
+
+def past_of(cell, entity, versions):
+    """Return what a slot has been at the stamps of its versions, and what labels keep of it."""
+    online = cell.world("online")
+    found = []
+    for version in versions:
+        past = online.at(Position(version.position.stamp_ns, "local"))
+        found.append(past.view(view := View(past, entity, POSE))[view])
+    known = [(one.version, one.datum()) for one in online.history(entity, POSE)]
+    return found, known, [(one.version, one.datum()) for one in cell.kept()["best"]]
+
+
+@pytest.mark.parametrize("away", TWO_NAMES)
+@pytest.mark.parametrize("earlier", [False, True])
+def test_what_another_shard_forgot_is_known_where_it_was_not(tmp_path, earlier, away):
+    """The past and labels of who forgot nothing, or did before, stay readable in a rebalance."""
+    cell = StoppedCell(tmp_path, TWO)
+    mine, other = (next(e for e in ENTITIES if shard_of(e.name, TWO) == s) for s in TWO_NAMES)
+    with cell.opened() as cells:
+        for one in cells.values():
+            one.create_world("online")
+        for entity in (mine, other):
+            cell.put(cells, "online", entity, 2)
+    if earlier:
+        forget({"left": cell.folders["left"]}, ["pose"], now_ns=time.time_ns())
+    with cell.opened() as cells:
+        cell.put(cells, "online", mine, 3)
+        versions = cells["left"].world("online").history(mine, POSE)[-3:]
+        cells["left"].keep("best", versions[:1])
+        before = past_of(cells["left"], mine, versions)
+    forget({"right": cell.folders["right"]}, ["pose"], now_ns=time.time_ns())
+
+    for home in ("left", away, "left"):
+        cell.where = placement(*TWO_NAMES, pins=[(mine.name, home)])
+        rebalance(cell.folders, cell.where, unix_s=int(time.time()))
+        with cell.opened() as cells:
+            assert past_of(cells[home], mine, versions) == before
+            past = cells[home].world("online").at(Position(versions[-1].position.stamp_ns, "local"))
+            for asked in (View(past, other, POSE), ViewEach(past, Entities("part/*"), POSE)):
+                with pytest.raises(ForgottenError):  # it may have been on either shard
+                    past.view(asked)
+    with cell.opened() as cells:
+        assert cell.put(cells, "online", mine, 1) == versions[-1].version + 1
 
 
 def test_a_rebalance_and_a_forgetting_wait_for_each_other(tmp_path):

@@ -111,6 +111,7 @@ def prepared(draw):
 LOCKED = st.sampled_from(LOCKS)
 NAMES = st.sampled_from(("x", "y"))
 BASES = st.sampled_from(((), (("a", 3),), (("a", 0), ("b", 7))))
+STARTS = st.sampled_from(((), (("a", 3, 0),), (("a", 0, 5), ("b", 7, 1 << 62))))
 RECORDS = st.one_of(
     *(states() for _ in range(6)),
     *(forks() for _ in range(6)),
@@ -122,7 +123,7 @@ RECORDS = st.one_of(
     st.builds(WorldDropped, st.sampled_from(CONTEXTS), STAMPS),
     st.builds(AspectForgotten, st.sampled_from(ASPECTS), STAMPS, STAMPS),
     st.builds(BasesMoved, st.builds(WorldDropped, st.sampled_from(CONTEXTS), STAMPS, BASES)),
-    st.builds(BasesMoved, st.builds(AspectForgotten, NAMES, STAMPS, STAMPS, BASES)),
+    st.builds(BasesMoved, st.builds(AspectForgotten, NAMES, STAMPS, STAMPS, STARTS)),
     st.builds(EntitiesMoved, st.sampled_from((("a",), ("b",), ("a", "b"), ("c",)))),
     st.builds(SessionRecord, NAMES, STAMPS),
     st.builds(SessionEnded, NAMES, STAMPS),
