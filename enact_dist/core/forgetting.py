@@ -7,6 +7,8 @@ All that the shards have stored goes in, a plan comes out.  Rules that a change 
 - Versions are never used twice: on every shard those of an aspect start above all that any shard
   had, and stamps after all that it has.
 - A commit over shards that names the aspect and is not settled is not to be touched.
+- A run that was cut off goes on where its records are not: a shard that has one let the aspect go,
+  and may have served since; one that was restored from a backup has not, and has none.
 """
 
 from __future__ import annotations
@@ -53,34 +55,66 @@ class Plan:
     Attributes:
         known: All aspects that some shard has, or has had.
         going: What there is of those that go; nothing of it on a shard is left out.
-        records: What each shard stores; none where no shard has anything.
+        records: What each shard stores; none where there is nothing to be done.
+        names: The aspects that are let go.
+        at_ns: From which stamp on each one is, of which there is anything to be done.
+        done: Those of a run that was cut off which every shard has let go.
         obstacles: Why nothing may be done at all, for people; then the rest means nothing.
     """
 
     known: frozenset[str] = frozenset()
     going: list[Going] = field(default_factory=list)
     records: dict[str, tuple[Record, ...]] = field(default_factory=dict)
+    names: tuple[str, ...] = ()
+    at_ns: dict[str, int] = field(default_factory=dict)
+    done: tuple[str, ...] = ()
     obstacles: list[str] = field(default_factory=list)
 
 
-def planned(stores: Mapping[str, Recovered], aspects: Iterable[str], *, now_ns: int) -> Plan:
+def planned(
+    stores: Mapping[str, Recovered],
+    aspects: Iterable[str],
+    *,
+    now_ns: int,
+    begun: Mapping[str, int] | None = None,
+) -> Plan:
     """Return what is to be done to let aspects go.
 
     Args:
         stores: What each shard has stored.
         aspects: Their names.
         now_ns: The wall clock.
+        begun: Those of a run that was cut off, and from which stamp on it let them go.
     """
-    names = tuple(dict.fromkeys(aspects))
-    plan = Plan(frozenset(name for stored in stores.values() for name in _known(stored)))
+    begun = begun or {}
+    has = {
+        shard: {name for name, at_ns in begun.items() if _has_let_go(stored, name, at_ns)}
+        for shard, stored in stores.items()
+    }
+    done = tuple(name for name in begun if all(name in here for here in has.values()))
+    names = tuple(name for name in dict.fromkeys([*aspects, *begun]) if name not in done)
+    known = frozenset(name for stored in stores.values() for name in _known(stored))
+    plan = Plan(known, names=names, done=done)
+    left = {shard: [name for name in names if name not in has[shard]] for shard in stores}
     for shard, stored in stores.items():
-        plan.obstacles += _undecided(shard, stored, frozenset(names), stores.keys())
-        plan.going += [found for name in names if (found := _going(shard, stored, name))]
-    gone = {found.aspect for found in plan.going}
-    ends = [_end(stores.values(), name, now_ns) for name in names if name in gone]
-    for shard, stored in stores.items() if ends else ():
-        plan.records[shard] = (*ends, *_labels_without(stored, gone))
+        plan.obstacles += _undecided(shard, stored, frozenset(left[shard]), stores.keys())
+        plan.going += [found for name in left[shard] if (found := _going(shard, stored, name))]
+    gone = {found.aspect for found in plan.going} | (begun.keys() - set(done))
+    ends = {name: _end(stores.values(), name, now_ns) for name in names if name in gone}
+    plan.at_ns = {name: end.at_ns for name, end in ends.items()}
+    for shard, stored in stores.items():
+        here = [name for name in left[shard] if name in ends]
+        if here:
+            plan.records[shard] = (
+                *(ends[name] for name in here),
+                *_labels_without(stored, set(here)),
+            )
     return plan
+
+
+def _has_let_go(stored: Recovered, aspect: str, at_ns: int) -> bool:
+    """Whether a shard has a record by which it let an aspect go, at a stamp or later."""
+    return any(record.name == aspect and record.at_ns >= at_ns for record in stored.forgotten)
 
 
 def _known(stored: Recovered) -> Iterator[str]:
@@ -118,13 +152,13 @@ def _going(shard: str, stored: Recovered, aspect: str) -> Going | None:
 
 
 def _end(stores: Iterable[Recovered], aspect: str, now_ns: int) -> AspectForgotten:
-    """Return the record by which every shard lets an aspect go, the same on all."""
+    """Return the record by which every shard lets an aspect go: later than any before it."""
     base, at_ns = 0, now_ns
     for stored in stores:
         before = [record for record in stored.forgotten if record.name == aspect]
         for record in before:
             base = max(base, record.version_base, *(base for _, base, _ in record.entity_bases))
-            at_ns = max(at_ns, record.at_ns)
+            at_ns = max(at_ns, record.at_ns + 1)
         base = max([base, *(state.version for state in _states(stored, aspect))])
         at_ns = max([at_ns, *(record.stamp_ns + 1 for record in stored.slots)])
     return AspectForgotten(aspect, base, at_ns)

@@ -1,8 +1,8 @@
 """Marks on folders of a stopped cell that are changed together: no shard starts from one meanwhile.
 
 The marks are there before the first folder is changed and go after the last one, so a run that is
-cut off anywhere is taken up by the next one.  They come and go in the order of the shards' names:
-where the first of them has none, all is done but to take the others away.
+cut off anywhere is taken up by the next one.  They come and go in the order of the shards' names.
+What is done is not known by them: a folder that was restored meanwhile has none.
 """
 
 from __future__ import annotations
@@ -16,28 +16,30 @@ from enact_dist.link.folder_lock import replace_file, sync_folder
 from enact_dist.link.store_folder import FORGET, MOVING_FILE, REBALANCE, moving_mark, way_out
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Mapping
+    from collections.abc import Callable, Mapping
     from pathlib import Path
 
     from enact_dist.link.store_folder import MovingMark
 
 
 def mark(
-    folders: Mapping[str, Path], act: Callable[[str], None], aspects: Collection[str] = ()
+    folders: Mapping[str, Path],
+    act: Callable[[str], None],
+    aspects: Mapping[str, int] | None = None,
 ) -> None:
     """Mark all folders as of one change, new or taken up.
 
     Args:
         folders: The folder of each shard.
         act: Told before each one is marked.
-        aspects: Those that are forgotten; none where entities move.
+        aspects: Those that are forgotten, and from which stamp on; none where entities move.
     """
     found = [mark for folder in folders.values() if (mark := moving_mark(folder)) is not None]
     number = found[0].number if found else uuid.uuid4().hex
     content: dict[str, object] = {FORGET if aspects else REBALANCE: number}
     content["shards"] = sorted(folders)
     if aspects:
-        content["aspects"] = sorted(aspects)
+        content["aspects"] = dict(sorted(aspects.items()))
     for name, folder in sorted(folders.items()):
         act(f"mark {name}")
         replace_file(folder / MOVING_FILE, json.dumps(content).encode())
@@ -85,8 +87,3 @@ def under_way(folders: Mapping[str, Path], *, forgets: bool = False) -> dict[str
                 f" {way_out(mark)} first"
             )
     return marks
-
-
-def is_done(marks: Mapping[str, MovingMark]) -> bool:
-    """Whether a run was cut off when it took its marks away."""
-    return any(mark.shards[0] not in marks for mark in marks.values())

@@ -5,9 +5,10 @@
     all folders locked, opened, checked ─> marked ─> shard by shard: one batch ─> marks removed
 
 Each arrow is durable before the next act, so a run that is killed anywhere is taken up by the next
-one; while a folder is marked no shard starts from it.  What a shard has of an aspect goes in one
-batch, so it never has a part of it.  Nobody need wait for leases of before the stop: a lock that
-somebody believes in is refused at its commit, and a shard that starts grants none before.
+one; while a folder is marked no shard starts from it.  Cut off among the first or the last marks,
+some shards do start: with all that they had, or with none of it.  What a shard has of an aspect
+goes in one batch, so it never has a part of it.  Nobody need wait for leases of before the stop: a
+lock that somebody believes in is refused at its commit, and a shard that starts grants none before.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 from enact_dist.core.forgetting import planned
 from enact_dist.core.records import Persist
 from enact_dist.errors import MisuseError, StoreError
-from enact_dist.link.folder_marks import is_done, mark, under_way, unmark
+from enact_dist.link.folder_marks import mark, under_way, unmark
 from enact_dist.link.store import open_store, read_store
 from enact_dist.terms import Durability
 
@@ -58,9 +59,9 @@ class Forgotten(NamedTuple):
         aspects: The aspects, those of an earlier run that was cut off among them.
         known: All aspects that these shards have, or have had.
         going: What each shard has, or had, of each one.
-        resumed: Whether an earlier run was cut off.
-        done: The aspects of one that had only to let the shards start again: they are forgotten,
-            and whatever is there of them has come since.
+        resumed: Whether an earlier run was cut off; a shard that had let an aspect go has it no
+            more, and what is there of it has come since.
+        done: The aspects of one that every shard has let go already.
     """
 
     aspects: tuple[str, ...]
@@ -128,10 +129,10 @@ def forget(
         found, plan = _plan(folders, stored, aspects, now_ns=now_ns)
         progress.found(found)
         _refuse_unknown(found)
-        if found.done:
-            unmark(folders, progress.act)
-        if plan.records or (found.resumed and not found.done):
-            mark(folders, progress.act, found.aspects)
+        if plan.records:
+            begun = _begun(folders)
+            at_ns = {name: begun.get(name, at_ns) for name, at_ns in plan.at_ns.items()}
+            mark(folders, progress.act, at_ns)
         for name, records in plan.records.items():
             progress.act(f"forget on {name}")
             stores[name].write([Persist(0, records, Durability.DURABLE)])
@@ -153,15 +154,22 @@ def _plan(
     Raises:
         StoreError: Something is in the way.
     """
-    marks = under_way(folders, forgets=True)
-    begun = dict.fromkeys(name for each in marks.values() for name in each.aspects)
-    done = tuple(begun) if is_done(marks) else ()
-    names = tuple(name for name in dict.fromkeys([*aspects, *begun]) if name not in done)
-    plan = planned(stored, names, now_ns=now_ns)
+    begun = _begun(folders)
+    plan = planned(stored, aspects, now_ns=now_ns, begun=begun)
     if plan.obstacles:
         more = f"; and {len(plan.obstacles) - 3} more" if len(plan.obstacles) > 3 else ""
         raise StoreError(f"nothing was forgotten: {'; '.join(plan.obstacles[:3])}{more}")
-    return Forgotten(names, plan.known, plan.going, bool(marks), done), plan
+    return Forgotten(plan.names, plan.known, plan.going, bool(begun), plan.done), plan
+
+
+def _begun(folders: Mapping[str, Path]) -> dict[str, int]:
+    """Return the aspects of a run that was cut off, and from which stamp on it let each one go.
+
+    Raises:
+        StoreError: As `under_way`.
+    """
+    marks = under_way(folders, forgets=True)
+    return {name: at_ns for each in marks.values() for name, at_ns in each.aspects.items()}
 
 
 def _refuse_unknown(found: Forgotten) -> None:

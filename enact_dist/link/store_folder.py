@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import logging
 import shutil
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, NamedTuple, NoReturn
 
 from enact_dist.core.moving import NAMED_MAX, strangers
@@ -18,6 +19,7 @@ from enact_dist.link.store_mark import Mark, read_mark
 from enact_dist.link.wal_check import check_wal
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
 
     from enact_dist.core.messages import PlacementMap
@@ -59,12 +61,12 @@ class MovingMark(NamedTuple):
     Attributes:
         number: Tells one run from another.
         shards: All shards whose folders take part.
-        aspects: Those that are forgotten; none where entities move.
+        aspects: Those that are forgotten, and from which stamp on; none where entities move.
     """
 
     number: str
     shards: tuple[str, ...]
-    aspects: tuple[str, ...] = ()
+    aspects: Mapping[str, int] = MappingProxyType({})
 
     @property
     def what(self) -> str:
@@ -92,11 +94,12 @@ def moving_mark(folder: Path) -> MovingMark | None:
         found = json.loads(path.read_text(encoding="utf-8"))
         shards = tuple(map(str, found["shards"]))
         if FORGET in found:
-            return MovingMark(str(found[FORGET]), shards, tuple(map(str, found["aspects"])))
+            aspects = {str(name): int(at_ns) for name, at_ns in found["aspects"].items()}
+            return MovingMark(str(found[FORGET]), shards, aspects)
         return MovingMark(str(found[REBALANCE]), shards)
     except FileNotFoundError:
         return None
-    except (ValueError, TypeError, KeyError):
+    except (ValueError, TypeError, KeyError, AttributeError):
         refuse(path, "is damaged")
 
 

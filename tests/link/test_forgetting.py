@@ -140,12 +140,19 @@ class Killer:
             os.kill(os.getpid(), signal.SIGKILL)
 
 
-def killed_at(cell, number):
+ACTS = (
+    "open left", "open right", "mark left", "mark right", "forget on left", "unlink on left",
+    "forget on right", "unlink on right", "unmark left", "unmark right",
+)  # fmt: skip
+"""What is done, in this order."""
+
+
+def killed_at(cell, number, *, now_ns=NOW_NS):
     """Forget in a child process that is killed at an act; return whether it was."""
     child = os.fork()
     if not child:
         try:
-            forget(cell.folders, ["pose"], now_ns=NOW_NS, progress=Killer(number))
+            forget(cell.folders, ["pose"], now_ns=now_ns, progress=Killer(number))
         finally:
             os._exit(0)
     return os.WIFSIGNALED(os.waitpid(child, 0)[1])
@@ -190,7 +197,8 @@ def test_what_came_since_stays_where_only_marks_were_left(tmp_path):
     copy = StoppedCell(shutil.copytree(tmp_path, tmp_path.with_name("copy")), TWO)
     acts = Killer(0)
     forget(copy.folders, ["pose"], now_ns=NOW_NS, progress=acts)
-    assert killed_at(cell, acts.acts.index("unmark right") + 1)
+    assert tuple(acts.acts) == ACTS
+    assert killed_at(cell, ACTS.index("unmark right") + 1)
     with local(cell.folders["left"]) as left:
         entity = next(e for e in ENTITIES if shard_of(e.name, TWO) == "left")
         version = put({"left": left}, entity, NEW_POSE, "new")
@@ -203,6 +211,58 @@ def test_what_came_since_stays_where_only_marks_were_left(tmp_path):
     with cell.opened() as cells:
         online = cells["left"].world("online")
         assert [v.version for v in online.history(entity, NEW_POSE)] == [version]
+
+
+@pytest.mark.parametrize("behind_s", [0, 3600])
+@pytest.mark.parametrize("act", ["forget on right", "unmark left", "unmark right"])
+def test_a_shard_that_was_restored_in_between_forgets_as_well(tmp_path, act, behind_s):
+    """It has the aspect again and no mark; that it has forgotten it once before says nothing."""
+    cell = StoppedCell(tmp_path / "cell", TWO)
+    cell.fill(9, rounds=4)
+    clock_ns = NOW_NS - behind_s * 10**9
+    forget(cell.folders, ["pose"], now_ns=NOW_NS)
+    entity = next(e for e in ENTITIES if shard_of(e.name, TWO) == "left")
+    with cell.opened() as cells:
+        last = cell.put(cells, "online", entity, 5)
+    backup = shutil.copytree(cell.folders["left"], tmp_path / "backup")
+    assert killed_at(cell, ACTS.index(act) + 1, now_ns=clock_ns)
+    shutil.rmtree(cell.folders["left"])
+    shutil.copytree(backup, cell.folders["left"])
+    assert of_aspect(cell.folders["left"])[0]
+
+    found = forget(cell.folders, ["pose"], now_ns=clock_ns)
+
+    assert (found.aspects, found.resumed, found.done) == (("pose",), True, ())
+    assert [of_aspect(folder) for folder in cell.folders.values()] == [GONE, GONE]
+    assert [moving_mark(folder) for folder in cell.folders.values()] == [None, None]
+    with cell.opened() as cells:
+        assert put(cells, entity, NEW_POSE, "new") > last
+
+
+def test_a_restored_shard_takes_nothing_from_one_that_served_since(tmp_path):
+    """One was restored before its mark was off, one has data by the new type, one has its mark."""
+    cell = StoppedCell(
+        tmp_path / "cell", placement(*TWO_NAMES, "third", pins=[("part/9", "third")])
+    )
+    cell.fill(10, rounds=4)
+    backup = shutil.copytree(cell.folders["right"], tmp_path / "backup")
+    assert killed_at(
+        cell, 3 + 3 + 3 * 2 + 2
+    )  # three were opened, marked and let it go, one is free
+    assert [moving_mark(folder) is None for folder in cell.folders.values()] == [True, False, False]
+    with local(cell.folders["left"]) as left:
+        entity = next(e for e in ENTITIES if shard_of(e.name, cell.where) == "left")
+        version = put({"left": left}, entity, NEW_POSE, "new", where=cell.where)
+    shutil.rmtree(cell.folders["right"])
+    shutil.copytree(backup, cell.folders["right"])
+
+    found = forget(cell.folders, ["pose"], now_ns=NOW_NS)
+
+    assert {going.shard for going in found.going} == {"right"}
+    assert of_aspect(cell.folders["right"]) == of_aspect(cell.folders["third"]) == GONE
+    with local(cell.folders["left"]) as left:
+        (kept,) = left.world("online").history(entity, NEW_POSE)
+        assert (kept.version, kept.datum()) == (version, "new")
 
 
 def test_a_run_of_one_shard_is_taken_up_on_that_one_alone(tmp_path):
