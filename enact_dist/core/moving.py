@@ -200,18 +200,36 @@ class Shards:
     def _aspects(self, obstacles: list[str]) -> list[AspectEntry]:
         """Return the aspects of all shards, each with the largest retention."""
         aspects: dict[str, AspectEntry] = {}
+        first: dict[str, str] = {}
         for name, stored in self._stores.items():
             for entry in stored.aspects:
                 known = aspects.setdefault(entry.name, entry)
+                where = first.setdefault(entry.name, name)
                 if known[:3] != entry[:3]:
                     obstacles.append(
-                        f"the aspect {entry.name} is {known.fingerprint} {known.durability} on one"
-                        f" shard and {entry.fingerprint} {entry.durability} on {name}: start the"
-                        " cell as it was once, with the same cell.toml for all"
+                        f"the aspect {entry.name} is {known.fingerprint} {known.durability} on"
+                        f" {where} and {entry.fingerprint} {entry.durability} on {name}:"
+                        f" {self._one_type(entry.name, where, name)}"
                     )
                 elif not covers(known, entry):
                     aspects[entry.name] = with_larger(known, entry)
         return list(aspects.values())
+
+    def _one_type(self, aspect: str, one: str, other: str) -> str:
+        """Return what makes an aspect that differs on two shards the same on both."""
+        at_ns = {
+            shard: max(
+                (r.at_ns for r in self._stores[shard].forgotten if r.name == aspect), default=0
+            )
+            for shard in (one, other)
+        }
+        old, new = sorted(at_ns, key=lambda shard: at_ns[shard])
+        if at_ns[old] < at_ns[new]:
+            return (
+                f"{new} has forgotten it since, and {old} has it as it was, from a backup say; call"
+                f" `enact shard forget {aspect} --shard {old}`"
+            )
+        return "start the cell as it was once, with the same cell.toml for all"
 
     def _worlds_dropped(self) -> Iterator[dict[str, Gone]]:
         """Yield what each shard knows of each context that any one has dropped."""

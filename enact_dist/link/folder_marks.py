@@ -76,10 +76,16 @@ def under_way(folders: Mapping[str, Path], *, forgets: bool = False) -> dict[str
     for name, mark in marks.items():
         lacking = [shard for shard in mark.shards if shard not in folders]
         if lacking:
-            does = "forgets aspects" if forgets else "moves entities"
+            others = ", ".join(lacking)
+            if forgets:
+                raise StoreError(
+                    f"the run that was cut off on {name} also forgets aspects of {others}; leave"
+                    f" --shard out, or {way_out(mark)}, with --store NAME=PATH for a folder that is"
+                    " not where the cell.toml says"
+                )
             raise StoreError(
-                f"the run that was cut off on {name} also {does} of {', '.join(lacking)}; name"
-                " their folders too, with --store NAME=PATH"
+                f"the run that was cut off on {name} also moves entities of {others}; name their"
+                " folders too, with --store NAME=PATH"
             )
         if forgets and folders.keys() - set(mark.shards):  # they keep what they have
             raise StoreError(

@@ -167,7 +167,10 @@ def moment_name(stamp_ns: int) -> str:
 
 
 def forgotten(answer: Forgotten) -> ForgottenError:
-    """Return the error for a past state that its shard does not keep any more."""
+    """Return the error for a past state that its shard does not keep any more.
+
+    Which of the two reasons it has does not travel.
+    """
     # Rounded up: what is copied from here must not lie before it.
     known = (
         f"all that was asked is known from {moment_name(answer.oldest_ns + 999_999)} on (stamp"
@@ -176,8 +179,9 @@ def forgotten(answer: Forgotten) -> ForgottenError:
         else "nothing of it is known"
     )
     return ForgottenError(
-        f"the asked state of {answer.slot} is older than its retention; {known}; ask for a later"
-        " time, or let the aspect retain more: Aspect(…, retention=…) or cell.toml",
+        f"the asked state of {answer.slot} is older than its retention, or than the last `enact"
+        f" shard forget {answer.slot.aspect or '…'}`; {known}; ask for a later time; more is kept"
+        " from now on with a larger Aspect(…, retention=…), or in cell.toml",
         oldest_ns=answer.oldest_ns,
     )
 

@@ -436,11 +436,52 @@ def test_what_another_shard_forgot_is_known_where_it_was_not(tmp_path, earlier, 
         assert cell.put(cells, "online", mine, 1) == versions[-1].version + 1
 
 
+@pytest.mark.parametrize(("old", "new"), [TWO_NAMES, TWO_NAMES[::-1]])
+def test_two_types_after_a_restore_are_told_with_what_makes_them_one(tmp_path, old, new):
+    """Which shard has the old one is known by when each has forgotten it."""
+    other = AspectRecord(AspectEntry("aspect", "str", "durable", 0))
+    never = two_stores(tmp_path / "never", **{new: [other]})
+    with pytest.raises(
+        StoreError, match=r"is .* on left and .* on right: start the cell as it was"
+    ):
+        rebalance(never, TWO, unix_s=1)
+    folders = two_stores(tmp_path)
+    forget({new: folders[new]}, ["aspect"], now_ns=NOW_NS)
+    store, _ = open_store(folders[new], unix_s=1)
+    store.write([persist(other)])
+    store.close()
+    with pytest.raises(
+        StoreError, match=f"{new} has forgotten it since, .* forget aspect --shard {old}`"
+    ):
+        rebalance(folders, TWO, unix_s=1)
+    forget({old: folders[old]}, ["aspect"], now_ns=NOW_NS)
+    rebalance(folders, TWO, unix_s=1)
+
+
+def test_what_was_forgotten_is_not_said_to_be_a_matter_of_retention_alone(tmp_path):
+    """Whoever asks for the past is told of both reasons, and since when it is known."""
+    cell = StoppedCell(tmp_path, TWO)
+    cell.fill(11, rounds=4)
+    forget(cell.folders, ["pose"], now_ns=NOW_NS)
+    entity = next(e for e in ENTITIES if shard_of(e.name, TWO) == "left")
+    with cell.opened() as cells:
+        past = cells["left"].world("online").at(Position(NOW_NS - 1, "left"))
+        with pytest.raises(
+            ForgottenError, match="or than the last `enact shard forget pose`"
+        ) as said:
+            past.view(View(past, entity, NEW_POSE))
+    assert said.value.oldest_ns >= NOW_NS
+
+
 def test_a_rebalance_and_a_forgetting_wait_for_each_other(tmp_path):
     """Each names the one that was cut off, and what ends it."""
     cell = StoppedCell(tmp_path, TWO)
     cell.fill(7, rounds=4)
     assert killed_at(cell, 5)
+    with pytest.raises(
+        StoreError, match=r"of right; leave --shard out, or let .* --shard left --shard right --yes"
+    ):
+        forget({"left": cell.folders["left"]}, ["pose"], now_ns=NOW_NS)
     with pytest.raises(StoreError, match=r"midst of forgetting pose; let `enact shard forget pose"):
         rebalance(cell.folders, TWO, unix_s=1)
     (cell.folder / "left" / "moving").write_text('{"rebalance": "x", "shards": ["left", "right"]}')
