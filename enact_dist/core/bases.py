@@ -62,3 +62,7 @@ class AspectBases(Bases):
         """
         at_ns = self._at_ns.get(aspect, 0)
         return self._at_ns_by_entity[aspect].get(entity, at_ns) if at_ns else 0
+
+    def last(self) -> tuple[int, str]:
+        """Return the latest stamp up to which nothing is known of an aspect (0: all is), and it."""
+        return max(((at_ns, name) for name, at_ns in self._at_ns.items()), default=(0, ""))

@@ -226,6 +226,11 @@ class SlotMap:
                 unknown |= since_ns > at_ns and isinstance(self.as_of(slot, at_ns), int)
         return latest if unknown else None
 
+    def forgotten_aspect(self, context: str) -> Forgotten:
+        """Return the aspect that was forgotten last, and up to when its slots are not known."""
+        at_ns, aspect = self._aspect_bases.last()
+        return Forgotten(Slot(context, "**", aspect), at_ns)
+
     def captured(
         self, slot: Slot, newest: Content, captured_ns: int, *, nearest: bool = False
     ) -> Content:

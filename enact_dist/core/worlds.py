@@ -183,7 +183,8 @@ class WorldDesk:
         del self._waiting[message.world]
         made: list[tuple[Slot, Content]] = []
         records: list[Record] = [WorldRecord(message.world, message.source, message.at_ns)]
-        unknown, latest = False, Forgotten(Slot(message.source, "", ""), 0)
+        latest = slots.forgotten_aspect(message.source)
+        unknown = latest.oldest_ns > message.at_ns  # no slot is left that would tell
         fork = _Making(self._state, message)
         for source, newest in slots.of_context(message.source):
             is_newest = newest.version > 0 and newest.stamp_ns <= message.at_ns
