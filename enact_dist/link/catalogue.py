@@ -38,12 +38,19 @@ class KnownCatalogue:
         self._worlds: dict[str, dict[str, WorldEntry]] = {}
         self._settled: tuple[PlacementMap | None, set[AspectEntry]] = (None, set())
 
-    def learn(self, shard: str, answer: Welcome | Registered) -> None:
-        """Take the catalogue that an answer carries; not that of an epoch which is over."""
+    def learn(self, shard: str, answer: Welcome | Registered, *, sent_in: int = 0) -> None:
+        """Take the catalogue that an answer carries; not that of an epoch which is over.
+
+        Args:
+            shard: Who has answered.
+            answer: What it said.
+            sent_in: The epoch that it was asked in; whose the answer is only a welcome says.
+        """
+        epoch = answer.epoch if isinstance(answer, Welcome) else sent_in
+        if epoch < self._epochs.get(shard, 0):
+            return
         if isinstance(answer, Welcome):
-            if answer.epoch < self._epochs.get(shard, 0):
-                return
-            self._epochs[shard] = answer.epoch
+            self._epochs[shard] = epoch
         worlds = {name: WorldEntry(name) for name in answer.worlds}
         self._worlds[shard] = worlds | {entry.name: entry for entry in answer.forks}
         before = self._aspects.get(shard, {})

@@ -201,9 +201,10 @@ class SessionClient:
         while True:
             left = [index for index, answer in enumerate(answers) if answer is None]
             sent = [calls[index] for index in left]
-            for index, answer in zip(left, self._send(sent), strict=True):
+            epochs = [self.core.epoch(shard) for shard, _ in sent]
+            for index, answer, epoch in zip(left, self._send(sent), epochs, strict=True):
                 if answer is not None:
-                    self._take(*calls[index], answer)
+                    self._take(*calls[index], answer, epoch)
                     answers[index] = answer
             if None not in answers or self._now_ns() >= deadline_ns:
                 return answers
@@ -288,16 +289,16 @@ class SessionClient:
         patience_s = max((_patience_s(request) for _, request in calls), default=CALL_S)
         return self.carrier.request_all(calls, timeout_s=patience_s)
 
-    def _take(self, shard: str, request: Request, answer: Answer) -> None:
-        """Let the session learn from an answer."""
+    def _take(self, shard: str, request: Request, answer: Answer, sent_in: int = 0) -> None:
+        """Let the session learn from an answer, asked in that epoch of the shard."""
         with self._mutex:
-            self._learn(shard, answer)
+            self._learn(shard, answer, sent_in)
             self.core.answered(shard, request, answer, self._now_ns())
         self._further.follow(self.core.placement)  # outside the mutex
 
-    def _learn(self, shard: str, answer: Answer) -> None:
+    def _learn(self, shard: str, answer: Answer, sent_in: int = 0) -> None:
         if isinstance(answer, CATALOGUES):
-            self._catalogue.learn(shard, answer)
+            self._catalogue.learn(shard, answer, sent_in=sent_in)
         if isinstance(answer, _GREETINGS):
             if isinstance(answer, Welcome):
                 self.payloads.learn(answer)
@@ -405,7 +406,7 @@ class SessionClient:
                 if isinstance(answer, Refused):
                     raise error_of(answer)
             restarted = [shard for shard in missing if self.core.epoch(shard) != epochs[shard]]
-            if restarted:  # the answer may be of before
+            if restarted:  # the answer may be of before, and then was not looked at
                 self.greet(restarted, timeout_s=timeout_s)
 
     def subscribe(self, interest: Survey | None = None) -> NoticeFeed:

@@ -14,8 +14,10 @@ from enact_dist.core.messages import (
     Item,
     PlacementMap,
     Reached,
+    Register,
     Registered,
     ShardEntry,
+    Welcome,
     WorldEntry,
 )
 from enact_dist.core.phase import Phase
@@ -85,6 +87,45 @@ def test_catalogue_shows_a_fork_at_any_moment():
     catalogue.learn("s0", Registered(("online",), (), Interrupted((fork,), look)))
 
     assert [sorted(worlds) for worlds in seen] == [["online", "what_if"]]
+
+
+def welcome(epoch, *aspects):
+    return Welcome("s0", epoch, True, 10**9, 0, 0, ONE_SHARD, ("online",), aspects)
+
+
+def test_catalogue_of_an_epoch_that_is_over_is_not_taken():
+    """A late welcome, or the answer to what was registered before: the shard has forgotten since."""
+    catalogue = KnownCatalogue()
+    catalogue.learn("s0", welcome(1, COUNT))
+    catalogue.learn("s0", welcome(2))
+    assert (catalogue.aspects(), catalogue.lapses) == ({}, 1)
+
+    catalogue.learn("s0", welcome(1, COUNT))
+    catalogue.learn("s0", Registered(("online",), (COUNT,)), sent_in=1)
+
+    assert (catalogue.aspects(), catalogue.lapses) == ({}, 1)
+    catalogue.learn("s0", Registered(("online",), (COUNT,)), sent_in=2)
+    assert catalogue.aspects() == {"count": COUNT}
+
+
+@pytest.mark.parametrize("known", [(), (COUNT,)])
+def test_what_was_registered_over_a_restart_is_looked_up_again(known):
+    """Until then nobody takes the answer for what the shard knows now, whatever that is."""
+    seen = []
+
+    class Restarting(Carrier):
+        def request(self, shard, message, *, timeout_s):
+            if isinstance(message, Register):
+                client._take(shard, client.core.hello(shard), welcome(2))
+                return Registered(("online",), (COUNT,))
+            seen.append(client.aspect_entries())
+            return welcome(2, *known)
+
+    client = client_of(Restarting())
+    client._take("s0", client.core.hello("s0"), welcome(1))
+    client.register(aspects=(COUNT,))
+    assert seen == [{}]
+    assert tuple(client.aspect_entries().values()) == known
 
 
 # ---------------------------------------------------------------- further shards
