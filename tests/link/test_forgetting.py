@@ -351,6 +351,22 @@ def test_unknown_aspects_are_refused(tmp_path):
         forget(folders, ["aspect"], now_ns=NOW_NS)
 
 
+def test_an_aspect_that_was_only_registered_since_goes_on_above_its_first_data(tmp_path):
+    """Nothing but the record of the time before tells of them; each is later than the last one."""
+    folders = two_stores(tmp_path, left=[slot_record("part/1", 7)])
+    last_ns = 0
+    for number in range(3):
+        assert forget(folders, ["aspect"], now_ns=NOW_NS - number).going
+        for folder in folders.values():
+            with read_store(folder) as found:
+                (record,) = found.forgotten
+            assert (record.version_base, record.at_ns > last_ns) == (7, True)
+        last_ns = record.at_ns
+        store, _ = open_store(folders["right"], unix_s=1)
+        store.write([persist(AspectRecord(AspectEntry("aspect", "str", "durable", 0)))])
+        store.close()
+
+
 def test_a_shard_that_runs_is_named(tmp_path):
     """By its name, its process and what to do."""
     folders = two_stores(tmp_path, left=[HERE])
