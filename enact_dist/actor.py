@@ -251,7 +251,7 @@ def stands_for_trigger(request: Declared) -> bool:
 
 def narrowed(request: Declared, only: Entity | None) -> Declared:
     """Return what a request stands for in an actor that works on one entity only."""
-    if only is None or not stands_for_trigger(request):
+    if not isinstance(only, Entity) or not stands_for_trigger(request):
         return request
     return type(request)(request.world, only, request.aspect)
 

@@ -39,7 +39,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
-from enact_dist.actor import narrowed, same_data
+from enact_dist.actor import narrowed, same_data, stands_for_trigger
 from enact_dist.actor_load import check_every_s, load_class, read_options
 from enact_dist.config_table import suggestion
 from enact_dist.core.messages import AspectEntry
@@ -113,6 +113,11 @@ class _Use:
     name: str
     request: Declared
     world: str
+
+    @property
+    def unsaid(self) -> bool:
+        """Whether it is of one entity, and nobody says of which."""
+        return self.actor.unsaid and stands_for_trigger(self.request)
 
     @property
     def named(self) -> Declared:
@@ -355,7 +360,7 @@ def _writers(uses: Sequence[_Use]) -> Iterator[Finding]:
         for other in writes[index + 1 :]:
             if one.actor is other.actor or not one.meets(other) or (one.shared and other.shared):
                 continue
-            if one.actor.unsaid or other.actor.unsaid:  # which slots it writes nobody can say
+            if one.unsaid or other.unsaid:  # which slot it writes nobody can say
                 continue
             yield Finding(
                 "error",

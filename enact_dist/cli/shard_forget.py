@@ -183,7 +183,7 @@ class _Told:
             return
         if found.done:
             print(f"a run that had forgotten {', '.join(found.done)} was cut off at its end")
-        elif found.resumed:
+        if found.resumed and (found.aspects or not found.done):
             print("an earlier run was cut off; this is what it had left")
         if not found.aspects:
             return

@@ -159,7 +159,8 @@ def _plan(
     if plan.obstacles:
         more = f"; and {len(plan.obstacles) - 3} more" if len(plan.obstacles) > 3 else ""
         raise StoreError(f"nothing was forgotten: {'; '.join(plan.obstacles[:3])}{more}")
-    return Forgotten(plan.names, plan.known, plan.going, bool(begun), plan.done), plan
+    known = plan.known | begun.keys()  # a restore may have left nothing of what was begun
+    return Forgotten(plan.names, known, plan.going, bool(begun), plan.done), plan
 
 
 def _begun(folders: Mapping[str, Path]) -> dict[str, int]:

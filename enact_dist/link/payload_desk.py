@@ -260,7 +260,7 @@ class PayloadDesk:
             NO_ROOM,
             f"session {session[:8]} asked for a payload of {total} bytes; {used} of at most {most}"
             f" are in use{self._biggest()}; raise shared_bytes_max, keep fewer versions, or let go"
-            " of arrays and locks that hold old ones",
+            " of arrays, and end locks, that hold old ones",
         )
 
     def _in_folder(self, folder: SharedFolder | None, file: str, total: int) -> Pages | None:

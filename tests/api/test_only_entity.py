@@ -188,6 +188,28 @@ def test_check_tells_cameras_apart_by_their_entity():
     assert found(zero, one, zero) == [("two writers", ("camera-0", "camera-2"))]
     assert found(zero, Entity("tray/1")) == [("no such entity", ("camera-1",))]
     assert found(zero, None) == [("entity unsaid", ("camera-1",))]
+    assert found(zero, "camera/1") == [("no such entity", ("camera-1",)), TWO_WRITERS]
+
+
+TWO_WRITERS = ("two writers", ("camera-0", "camera-1"))
+
+
+class Flagging(Camera):
+    """Writes a slot of its own entity, and one that is the same for all."""
+
+    flag = Write(online, Entity("system"), MASK)
+
+
+def test_check_finds_two_writers_of_one_slot_though_an_entity_is_unsaid():
+    """What stands for the entity is open; what does not is known."""
+    actors = [
+        ActorDeclaration("camera-0", Flagging),
+        ActorDeclaration("camera-1", Flagging, None, Entity("camera/1")),
+    ]
+
+    found = [(finding.kind, finding.actors) for finding in check_actors(actors)]
+
+    assert found == [TWO_WRITERS, ("entity unsaid", ("camera-0",))]
 
 
 def test_actors_of_one_class_are_told_apart_by_their_names():

@@ -137,8 +137,7 @@ class DecisionRounds:
     def _commit(self, value, told):
         world = self._client.world("online")
         left, right = Write(world, LEFT, COUNT), Write(world, RIGHT, COUNT)
-        again = True
-        while again:
+        for _ in range(60):
             told.error, finish_s = None, time.monotonic()
             try:
                 with Lock(left, right, wait_s=WAIT_S) as lock:
@@ -149,7 +148,8 @@ class DecisionRounds:
             told.waited_s = time.monotonic() - finish_s
             # Lost before it came to the step, by a machine that let it wait: nothing was tried.
             soon = told.waited_s < FINISH_S_SHORT / 2 and not self._reached.is_set()
-            again = soon and isinstance(told.error, LeaseLostError)
+            if not (soon and isinstance(told.error, LeaseLostError)):
+                break
         told.outcome = type(told.error).__name__ if told.error else "committed"
 
     def _reach(self, name):

@@ -14,6 +14,7 @@ from enact_dist.errors import LeaseLostError
 
 pytestmark = pytest.mark.slow
 TOTAL = 10_000
+TRIES = 60
 
 
 @pytest.fixture
@@ -30,13 +31,14 @@ def total(cell):
     with connect(cell.file) as joined:
         world = joined.world("online")
         one, two = Write(world, LEFT, COUNT), Write(world, RIGHT, COUNT)
-        while True:  # what is found lost at the end is asked for again
+        for _ in range(TRIES):  # what is found lost at the end is asked for again
             with contextlib.suppress(LeaseLostError), Lock(one, two, wait_s=60.0) as lock:
                 lock[one] = lock[one]  # a commit over both since the last start of either
                 lock[two] = lock[two]
                 found = lock[one] + lock[two]
             if lock.position is not None:
                 return found
+    raise AssertionError(f"a lock over both was lost {TRIES} times")
 
 
 def finished(joined):

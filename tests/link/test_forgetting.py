@@ -25,6 +25,7 @@ from enact_dist.core.messages import AspectEntry, Item, SlotVersion, WriteItem
 from enact_dist.core.placement import shard_of
 from enact_dist.core.records import AspectRecord, DecisionRecord, PreparedRecord
 from enact_dist.errors import DatumTypeError, ForgottenError, MisuseError, StoreError
+from enact_dist.link.folder_marks import mark
 from enact_dist.link.forgetting import forget, look
 from enact_dist.link.store import open_store, read_store
 from enact_dist.link.store_folder import moving_mark
@@ -219,6 +220,17 @@ def test_a_run_of_one_shard_is_taken_up_on_that_one_alone(tmp_path):
     assert of_aspect(whole["left"])[0]
     assert forget({"right": whole["right"]}, ["pose"], now_ns=NOW_NS).resumed
     assert (of_aspect(whole["left"])[0], of_aspect(whole["right"])) == (True, GONE)
+
+
+def test_a_run_whose_aspect_no_folder_has_any_more_comes_to_its_end(tmp_path):
+    """The only shard that had it was restored from a backup of before: nothing is left to do."""
+    folders = two_stores(tmp_path)
+    mark(folders, lambda _: None, {"gone": NOW_NS})
+
+    found = forget(folders, ["gone"], now_ns=NOW_NS)
+
+    assert (found.resumed, found.going) == (True, [])
+    assert [moving_mark(folder) for folder in folders.values()] == [None, None]
 
 
 # ---------------------------------------------------------------- what is refused

@@ -70,13 +70,15 @@ def write_until_it_fails(endpoint):
     """Write one entity after the other; return how many were answered, and what then came."""
     with connect(endpoint) as joined:
         online = joined.world("online")
-        number = 0
+        number = lost = 0
         while number < 200:
             request = Write(online, Entity(f"e{number}"), KEPT)
             try:
                 with Lock(request, wait_s=30.0) as lock:
                     lock[request] = bytes([number]) * BODY_BYTES
             except LeaseLostError:
+                lost += 1
+                assert lost < 60, "lost again and again"
                 continue  # of a slow machine, and nothing was written: the disk has not failed yet
             except EnactError as failure:
                 return number, failure

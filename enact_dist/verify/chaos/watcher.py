@@ -94,6 +94,7 @@ class Watcher:
         while (told := self._final.take_all()) is not Told.COMMITTED:
             if time.monotonic() > again_s:
                 break
+            time.sleep(PERIOD_S)  # a failure that comes at once is not asked for again at once
         return told.value
 
     def rest(self, limit_s: float) -> int:
