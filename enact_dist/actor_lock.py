@@ -6,7 +6,7 @@ context instead of a role and the triggering entity instead of a pattern.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from enact_dist.lock import Lock
 from enact_dist.reading import slot_of
@@ -18,8 +18,9 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from enact_dist.core.messages import Item
+    from enact_dist.terms import LockRequestOne
 
-T = TypeVar("T")
+R = TypeVar("R", bound=LockRequest[Any])
 
 
 class ActorLock(Lock):
@@ -66,14 +67,15 @@ class ActorLock(Lock):
         """Return which data of the set were outside retention at the grant, by their index."""
         return [index for index, view in enumerate(self._in_set) if self._is_null(slot_of(view))]
 
-    def _own(self, request: Any) -> Any:
+    def _resolve(self, request: R) -> R:
+        """Return what a declared request stands for in this update."""
         if isinstance(request, LockRequest) and isinstance(request.world, World):
-            return self._bound.get(request, request)
+            return cast("R", self._bound.get(request, request))
         return request
 
     def granted_states(self, declared: LockRequest[Any]) -> dict[Entity, tuple[int, int]]:
         """Return version and commit stamp (ns) of what a declared request showed at the grant."""
-        request = self._own(declared)
+        request = self._resolve(declared)
         slots = self._readings.matching(request) if request.access.each else [slot_of(request)]
         states = {slot: self._readings.state(slot) for slot in slots}
         return {
@@ -87,33 +89,10 @@ class ActorLock(Lock):
             self._use()
             self._readings.fetch(slot_of(view) for view in self._in_set)  # all are asked for
             return tuple([super(ActorLock, self).__getitem__(view) for view in self._in_set])
-        return super().__getitem__(self._own(request))
+        return super().__getitem__(request)
 
-    def get(self, request: LockRequest[Any], default: Any = None) -> Any:
-        """`Lock.get` of a declared request."""
-        return super().get(self._own(request), default)
-
-    def put(self, request: LockRequest[T], datum: T, *, stamp_ns: int = 0) -> None:
-        """`Lock.put` of a declared request."""
-        super().put(self._own(request), datum, stamp_ns=stamp_ns)
-
-    def __delitem__(self, request: LockRequest[Any]) -> None:
-        super().__delitem__(self._own(request))
-
-    def expect(self, view: LockRequest[Any]) -> None:
-        """`Lock.expect` of a declared request."""
-        super().expect(self._own(view))
-
-    def is_null(self, request: LockRequest[Any]) -> bool:
-        """`Lock.is_null` of a declared request."""
-        return super().is_null(self._own(request))
-
-    def version(self, request: LockRequest[Any]) -> int:
-        """`Lock.version` of a declared request."""
-        return super().version(self._own(request))
-
-    def stamp_ns(self, request: LockRequest[Any] | Together[Any]) -> int:
+    def stamp_ns(self, request: LockRequestOne[Any] | Together[Any]) -> int:
         """`Lock.stamp_ns` of a declared request, or the capture stamp of the set."""
         if isinstance(request, Together) and request == self._together:
             return self._captured_ns
-        return super().stamp_ns(self._own(request))
+        return super().stamp_ns(request)

@@ -11,7 +11,6 @@ is the index (no order-coupled list), data are immutable values, and a lock is a
 
 from __future__ import annotations
 
-import functools
 import threading
 import time
 from typing import TYPE_CHECKING, Any, TypeVar, overload
@@ -45,7 +44,7 @@ from enact_dist.writable import WritableEach
 from enact_dist.writing import Asked, Writing
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Mapping
     from types import TracebackType
 
     from enact_dist.core.datum import Position, Slot
@@ -63,6 +62,7 @@ if TYPE_CHECKING:
     from enact_dist.writing import DTypesLike, ShapesLike
 
 T = TypeVar("T")
+R = TypeVar("R", bound="LockRequest[Any]")
 
 HOLD_S_MAX = 24 * 3600.0
 _thread = threading.local()
@@ -79,12 +79,6 @@ def refuse_inside_lock(what: str) -> None:
             f"{what} inside a lock would hold and wait; this thread holds {held!r};"
             " leave its block first"
         )
-
-
-def _refuse_released(requests: Iterable[LockRequest[Any]]) -> None:
-    raise LockReleasedError(
-        f"Lock({', '.join(map(repr, requests))}) is used outside its `with` block"
-    )
 
 
 class Lock:
@@ -235,7 +229,7 @@ class Lock:
         What refers to this lock would form a cycle with it, and data would pile up until the
         garbage collector looks: 70 images of 0.9 MB were seen to.
         """
-        self._readings.end(functools.partial(_refuse_released, self._requests))
+        self._readings.end()
         self._each.clear()
         if self._lock is not None:
             self._lock.states.clear()
@@ -267,7 +261,7 @@ class Lock:
             NotRequestedError: The lock did not ask for it.
             LeaseLostError: The lock is lost.
         """
-        self._check(request)
+        request = self._check(request)
         if request.access.each:
             return self._each_data(request)
         return self._value(slot_of(request), request)
@@ -298,7 +292,7 @@ class Lock:
     def get(self, request: LockRequestOne[T], default: T) -> T: ...
     def get(self, request: LockRequestOne[T], default: T | None = None) -> T | None:
         """Return the datum, or `default` where the world context does not know it."""
-        self._check(request)
+        request = self._check(request)
         slot = slot_of(request)
         if self._is_null(slot):
             return default
@@ -307,8 +301,7 @@ class Lock:
 
     def is_null(self, request: LockRequestOne[Any]) -> bool:
         """Whether the datum is null; fetches nothing."""
-        self._check(request)
-        return self._is_null(slot_of(request))
+        return self._is_null(slot_of(self._check(request)))
 
     def _is_null(self, slot: Slot) -> bool:
         if slot in self._writing.data:
@@ -340,7 +333,7 @@ class Lock:
             DatumTypeError: The datum is not of the aspect's type.
             NoRoomError: The shard's cap of shared memory is reached.
         """
-        self._check_writable(request)
+        request = self._check_writable(request)
         self._put(slot_of(request), request.aspect, datum, stamp_ns=stamp_ns)
 
     def _put(self, slot: Slot, aspect: Aspect[T], datum: T, *, stamp_ns: int = 0) -> None:
@@ -388,15 +381,14 @@ class Lock:
             MisuseError: This block has one of this slot already.
             NoRoomError: As `put`.
         """
-        self._check_writable(request)
+        request = self._check_writable(request)
         asked = Asked(request.aspect.datum_type, like, shape, dtype, stamp_ns)
         value: T = self._writing.new(slot_of(request), asked, self._shard)
         return value
 
     def __delitem__(self, request: Write[Any]) -> None:
         """Write null when the block ends cleanly."""
-        self._check_writable(request)
-        self._writing.delete(slot_of(request))
+        self._writing.delete(slot_of(self._check_writable(request)))
 
     def expect(self, view: View[Any]) -> None:
         """Let the commit fail with `ChangedError` if the viewed slot has moved on by then.
@@ -408,20 +400,25 @@ class Lock:
         Raises:
             MisuseError: Not a `View` of this lock.
         """
-        self._check(view)
-        assert self._lock is not None
+        view = self._check(view)
         if view.access is not Access.VIEW:
             raise MisuseError(f"{view!r} is held or a pattern; only a View can be expected")
         slot = slot_of(view)
         state = self._readings.state(slot)
         self._expects[slot] = SlotVersion(slot, state.version if state is not None else 0)
 
-    def _check(self, request: LockRequest[Any]) -> None:
-        self._use()
-        check_requested(request, self._requests, "lock")
+    def _resolve(self, request: R) -> R:
+        """Return which request of this lock is meant by `request`."""
+        return request
 
-    def _check_writable(self, request: LockRequest[Any]) -> None:
-        self._check(request)
+    def _check(self, request: R) -> R:
+        self._use()
+        request = self._resolve(request)
+        check_requested(request, self._requests, "lock")
+        return request
+
+    def _check_writable(self, request: R) -> R:
+        request = self._check(request)
         if request.access is Access.WRITE_EACH:
             raise MisuseError(
                 f"set one entity at a time: lock[{request!r}][entity] = …, or .new(entity, …) of it"
@@ -431,6 +428,7 @@ class Lock:
                 f"{request!r} does not allow writing; ask with Write(…) instead of"
                 f" {type(request).__name__}(…)"
             )
+        return request
 
     # ---------------------------------------------------------------- state
 
@@ -447,16 +445,14 @@ class Lock:
 
     def version(self, request: LockRequestOne[Any]) -> int:
         """Return the version of the datum as granted (0: never set)."""
-        self._check(request)
-        state = self._readings.state(slot_of(request))
+        state = self._readings.state(slot_of(self._check(request)))
         return state.version if state is not None else 0
 
     def stamp_ns(self, request: LockRequestOne[Any] | Together[Any]) -> int:
         """Return when the datum, or an actor's set, was captured, as its writer said (0: not)."""
         if isinstance(request, Together):
             raise MisuseError(f"{request!r} is no part of this lock; an actor's trigger can be")
-        self._check(request)
-        slot = slot_of(request)
+        slot = slot_of(self._check(request))
         return 0 if self._is_null(slot) else self._readings.datum(slot).stamp_ns
 
     def valid(self) -> bool:

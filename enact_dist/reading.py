@@ -13,7 +13,13 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 from enact_dist.config_table import suggestion
 from enact_dist.core.datum import Slot
 from enact_dist.core.messages import DatumRead
-from enact_dist.errors import DatumTypeError, MisuseError, NotRequestedError, NullDatumError
+from enact_dist.errors import (
+    DatumTypeError,
+    LockReleasedError,
+    MisuseError,
+    NotRequestedError,
+    NullDatumError,
+)
 from enact_dist.in_place import Shown, changeable
 from enact_dist.link.fetching import fetch_all
 from enact_dist.terms import Access, Aspect, Entity, LockRequest, NullReason, pattern_matches
@@ -75,9 +81,9 @@ class Readings:
         self.usable = usable
         self.decoded = 0
 
-    def end(self, usable: Callable[[], None]) -> None:
-        """Forget all data: the lock is over, which `usable` says from now on."""
-        self.usable = usable
+    def end(self) -> None:
+        """Forget all data: the lock is over, as every later look at them says."""
+        self.usable = partial(_refuse_released, self.asked)
         self._readings.clear()
         self.looked_at.clear()
         self.changeable.clear()
@@ -315,3 +321,9 @@ def check_requested(
     if request not in requests:
         asked = ", ".join(map(repr, requests)) or "nothing"
         raise NotRequestedError(f"{request!r} was not asked for; this {what} asked for {asked}")
+
+
+def _refuse_released(requests: Iterable[LockRequest[Any]]) -> None:
+    raise LockReleasedError(
+        f"Lock({', '.join(map(repr, requests))}) is used outside its `with` block"
+    )
