@@ -24,6 +24,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 from enact_dist.errors import MisuseError
+from enact_dist.patterns import patterns_overlap
 from enact_dist.terms import (
     Entities,
     Entity,
@@ -33,7 +34,6 @@ from enact_dist.terms import (
     View,
     ViewEach,
     World,
-    patterns_overlap,
     refuse_duplicates,
 )
 from enact_dist.together import Together

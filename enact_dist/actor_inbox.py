@@ -19,8 +19,8 @@ from enact_dist.actor_sets import PendingSets
 from enact_dist.actor_triggers import BackOff, PendingTriggers, Trigger
 from enact_dist.errors import LinkError
 from enact_dist.link.clock import monotonic_ns
+from enact_dist.patterns import pattern_matches
 from enact_dist.session import session_of
-from enact_dist.terms import pattern_matches
 from enact_dist.together import Captured, captured_versions
 
 if TYPE_CHECKING:

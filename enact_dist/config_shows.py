@@ -37,7 +37,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.errors import ConfigError
-from enact_dist.terms import Entities, pattern_matches
+from enact_dist.patterns import pattern_matches
+from enact_dist.terms import Entities
 
 if TYPE_CHECKING:
     from enact_dist.config_table import Table

@@ -15,7 +15,8 @@ import numpy as np
 
 from enact_dist.core.datum import Datum
 from enact_dist.errors import DatumTypeError, MisuseError
-from enact_dist.terms import Access, pattern_matches
+from enact_dist.patterns import pattern_matches
+from enact_dist.terms import Access
 from enact_dist.wire import codecs
 from enact_dist.wire.payload import decode_datum, encode_parts
 from enact_dist.wire.shapes import (

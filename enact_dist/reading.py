@@ -22,7 +22,8 @@ from enact_dist.errors import (
 )
 from enact_dist.in_place import Shown, changeable
 from enact_dist.link.fetching import fetch_all
-from enact_dist.terms import Access, Aspect, Entity, LockRequest, NullReason, pattern_matches
+from enact_dist.patterns import pattern_matches
+from enact_dist.terms import Access, Aspect, Entity, LockRequest, NullReason
 from enact_dist.wire.payload import decode_datum
 
 if TYPE_CHECKING:

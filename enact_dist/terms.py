@@ -23,6 +23,7 @@ import secrets
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, Self, TypeVar
 
+from enact_dist.patterns import checked_pattern, pattern_matches
 from enact_dist.retention import DEFAULT_RETENTION as DEFAULT_RETENTION  # noqa: PLC0414
 from enact_dist.retention import Retention as Retention  # noqa: PLC0414 - both are found here, too
 from enact_dist.retention import checked_retention
@@ -40,7 +41,6 @@ NAME_LENGTH_MAX: Final = 200
 """Longest name of an entity, aspect or world context; keeps every key of the wire below 1 kB."""
 
 _SEGMENT = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.\-]*\Z")
-_PATTERN_SEGMENT = re.compile(r"(?:\*\*|(?!.*\*\*)[A-Za-z0-9_*][A-Za-z0-9_.\-*]*)\Z")
 
 
 def checked_name(kind: str, name: object, *, slashes: bool) -> str:
@@ -101,25 +101,17 @@ class Entities:
     """A set of entities, written as a name pattern (the paper's E_a).
 
     ``*`` inside a segment matches any characters but the slash; a segment ``**`` matches any
-    number of whole segments, also none.
+    number of whole segments, also none.  A segment has at most 8 stars, a pattern at most 4 of
+    the segments ``**``.
 
     Raises:
-        ValueError: A segment holds a character that no entity name can have.
+        ValueError: A segment holds a character that no entity name can have, or too many stars.
     """
 
     pattern: str
 
     def __post_init__(self) -> None:
-        if not isinstance(self.pattern, str) or not self.pattern:
-            raise ValueError(f"a pattern of entities is a non-empty string, not {self.pattern!r}")
-        if len(self.pattern) > NAME_LENGTH_MAX:
-            raise ValueError(f"pattern {self.pattern[:40]!r}… is longer than {NAME_LENGTH_MAX}")
-        for segment in self.pattern.split("/"):
-            if not _PATTERN_SEGMENT.match(segment):
-                raise ValueError(
-                    f"{self.pattern!r} is no pattern of entities: segment {segment!r} must be"
-                    " letters, digits, '_', '.', '-', '*', or '**' alone"
-                )
+        checked_pattern(self.pattern)
 
     def matches(self, entity: Entity) -> bool:
         """Say whether the pattern covers `entity`."""
@@ -127,75 +119,6 @@ class Entities:
 
     def __str__(self) -> str:
         return self.pattern
-
-
-_compiled: dict[str, re.Pattern[str]] = {}
-_COMPILED_MAX = 4096
-
-
-def pattern_matches(pattern: str, name: str) -> bool:
-    """Say whether the entity pattern `pattern` covers the entity name `name`."""
-    found = _compiled.get(pattern)
-    if found is None:
-        if len(_compiled) >= _COMPILED_MAX:
-            _compiled.clear()
-        found = _compiled[pattern] = re.compile(_pattern_source(pattern))
-    return found.match(name) is not None
-
-
-def patterns_overlap(one: str, other: str) -> bool:
-    """Say whether two entity patterns could cover one name; never wrongly no.
-
-    Compares segment by segment: two segments with a star are taken to overlap when neither the
-    texts before the first star nor those after the last one contradict each other.
-    """
-    return _segments_overlap(one.split("/"), other.split("/"))
-
-
-def _segments_overlap(one: list[str], other: list[str]) -> bool:
-    if not one or not other:
-        return all(segment == "**" for segment in one + other)
-    if "**" in (one[0], other[0]):
-        deep, flat = (one, other) if one[0] == "**" else (other, one)
-        return _segments_overlap(deep[1:], flat) or _segments_overlap(deep, flat[1:])
-    return _segment_overlaps(one[0], other[0]) and _segments_overlap(one[1:], other[1:])
-
-
-def _segment_overlaps(one: str, other: str) -> bool:
-    if "*" not in one:
-        return pattern_matches(other, one) if "*" in other else one == other
-    if "*" not in other:
-        return pattern_matches(one, other)
-    heads = (one.split("*")[0], other.split("*")[0])
-    tails = (one.split("*")[-1], other.split("*")[-1])
-    shortest_head, shortest_tail = min(map(len, heads)), min(map(len, tails))
-    same_head = heads[0][:shortest_head] == heads[1][:shortest_head]
-    same_tail = not shortest_tail or tails[0][-shortest_tail:] == tails[1][-shortest_tail:]
-    return same_head and same_tail
-
-
-def _pattern_source(pattern: str) -> str:
-    segments = pattern.split("/")
-    # "**/**" stands for what "**" does.
-    segments = [
-        s
-        for s, before in zip(segments, ["", *segments], strict=False)
-        if (s, before) != ("**", "**")
-    ]
-    source = ""
-    for index, segment in enumerate(segments):
-        last = index == len(segments) - 1
-        if segment == "**":
-            source += r"(?:[^/]+(?:/[^/]+)*)?" if last else r"(?:[^/]+/)*"
-        else:
-            source += "[^/]*".join(re.escape(part) for part in segment.split("*"))
-            source += "" if last else "/"
-    # "a/**" also covers "a" itself: the separator before a final "**" is optional.
-    if len(segments) > 1 and segments[-1] == "**":
-        tail = r"(?:[^/]+(?:/[^/]+)*)?"
-        if source[-len(tail) - 1] == "/":
-            source = source[: -len(tail) - 1] + rf"(?:/{tail})?"
-    return source + r"\Z"
 
 
 class Durability(enum.Enum):

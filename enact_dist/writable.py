@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, TypeVar, overload
 
 from enact_dist.core.datum import Slot
 from enact_dist.errors import MisuseError
+from enact_dist.patterns import pattern_matches
 from enact_dist.reading import EachData, Readings
-from enact_dist.terms import Entity, pattern_matches
+from enact_dist.terms import Entity
 from enact_dist.writing import Asked
 
 if TYPE_CHECKING:

@@ -9,7 +9,17 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "enact_dist"
-LAYERS = ("errors", "comparing", "retention", "terms", "core", "wire", "link", "api")  # low to high
+LAYERS = (
+    "errors",
+    "comparing",
+    "retention",
+    "patterns",
+    "terms",
+    "core",
+    "wire",
+    "link",
+    "api",
+)  # low to high
 PURE = {
     "core": {
         "__future__", "array", "bisect", "collections", "dataclasses", "enum", "hashlib", "heapq",

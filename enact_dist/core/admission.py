@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final
 from enact_dist.core.message_parts import READS_MAX
 from enact_dist.core.messages import Commit, Refused
 from enact_dist.core.retaining import NO_LIMIT
+from enact_dist.patterns import checked_pattern
 from enact_dist.terms import Access, Durability, checked_name
 
 if TYPE_CHECKING:
@@ -25,12 +26,13 @@ NO_PAYLOAD: Final = "no_payload"
 """The code of a refusal that leaves the lock as it is: named bytes are not here, send them."""
 
 _ACCESSES: Final = frozenset(access.value for access in Access)
+_ACCESSES_EACH: Final = frozenset(access.value for access in Access if access.each)
 _ACCESSES_BY_STAMP: Final = (Access.VIEW, Access.READ)
 _DURABILITIES: Final = ("", *(durability.value for durability in Durability))
 
 
 def wrong_access(items: Iterable[Item]) -> Refused | None:
-    """Refuse an access that there is not, and a write or a pattern of what was captured when."""
+    """Refuse an access or a pattern that there is not, and a write of what was captured when."""
     for item in items:
         if item.captured_ns and item.access not in _ACCESSES_BY_STAMP:
             return _refused(f"{item.entity}/{item.aspect} was asked by stamp; only a View can be")
@@ -38,6 +40,20 @@ def wrong_access(items: Iterable[Item]) -> Refused | None:
             return _refused(f"{item.entity}/{item.aspect} was asked nearest to no stamp")
         if item.access not in _ACCESSES:
             return _refused(f"access {item.access} was asked; there are {sorted(_ACCESSES)}")
+        if item.access in _ACCESSES_EACH:
+            wrong = wrong_patterns((item.entity,))
+            if wrong is not None:
+                return wrong
+    return None
+
+
+def wrong_patterns(patterns: Iterable[str]) -> Refused | None:
+    """Refuse a pattern that no client makes; matching one must stay cheap."""
+    try:
+        for pattern in patterns:
+            checked_pattern(pattern)
+    except ValueError as error:
+        return _refused(str(error))
     return None
 
 

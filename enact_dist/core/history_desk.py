@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.core.admission import wrong_label
+from enact_dist.core.admission import wrong_label, wrong_patterns
 from enact_dist.core.messages import (
     EpochChanged,
     KeepVersions,
@@ -43,7 +43,8 @@ class HistoryDesk:
 
     def on_list_history(self, message: ListHistory, reply_to: int) -> Iterator[Effect]:
         """List the known versions of slots, oldest first, without their data."""
-        yield Reply(reply_to, bounded(self._state, self._listed(message)))
+        wrong = wrong_patterns(message.patterns)
+        yield Reply(reply_to, wrong or bounded(self._state, self._listed(message)))
 
     def _listed(self, message: ListHistory) -> Iterator[VersionEntry]:
         slots = self._state.slots

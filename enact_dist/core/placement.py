@@ -10,7 +10,7 @@ from __future__ import annotations
 from hashlib import blake2b
 from typing import TYPE_CHECKING
 
-from enact_dist.terms import pattern_matches
+from enact_dist.patterns import pattern_matches
 
 if TYPE_CHECKING:
     from enact_dist.core.messages import PlacementMap

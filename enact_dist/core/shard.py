@@ -17,6 +17,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from enact_dist.core import inspection
+from enact_dist.core.admission import wrong_patterns
 from enact_dist.core.forced import BROKEN, SETTLED
 from enact_dist.core.history_desk import HistoryDesk
 from enact_dist.core.lineage_desk import LineageDesk
@@ -312,7 +313,9 @@ class Shard:
     # ---------------------------------------------------------------- people
 
     def _on_survey(self, message: Survey, reply_to: int) -> Iterator[Effect]:
-        yield Reply(reply_to, inspection.surveyed(self.state, message, stamp_ns=self.state.stamp()))
+        wrong = wrong_patterns(message.patterns)
+        stamp_ns = self.state.stamp()
+        yield Reply(reply_to, wrong or inspection.surveyed(self.state, message, stamp_ns=stamp_ns))
 
     def _on_list_locks(self, _: ListLocks, reply_to: int) -> Iterator[Effect]:
         oldest_first = sorted(self.state.tenures.by_lock.values(), key=lambda t: t.claim.ticket)

@@ -17,7 +17,8 @@ from enact_dist.core.datum import Column, Datum, Slot
 from enact_dist.core.history import History
 from enact_dist.core.messages import Cause, Forgotten, SlotState, SlotVersion
 from enact_dist.core.payload_names import PayloadNames
-from enact_dist.terms import ACCESSES, NullReason, pattern_matches
+from enact_dist.patterns import pattern_matches
+from enact_dist.terms import ACCESSES, NullReason
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping

@@ -28,7 +28,8 @@ from enact_dist.core.lock_table import Claim, LockTable, Mode, Resource, join
 from enact_dist.core.messages import Acquire, Granted, Item, Waiting
 from enact_dist.core.records import Effect, Reply, Story
 from enact_dist.core.slots import SlotMap
-from enact_dist.terms import ACCESSES, Access, pattern_matches
+from enact_dist.patterns import pattern_matches
+from enact_dist.terms import ACCESSES, Access
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator

@@ -12,7 +12,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.datum import Slot
-from enact_dist.terms import Access, pattern_matches
+from enact_dist.patterns import pattern_matches
+from enact_dist.terms import Access
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -20,7 +20,8 @@ from enact_dist.core.admission import unknown_world
 from enact_dist.core.datum import Column, Slot
 from enact_dist.core.messages import EpochChanged, Forgotten, Refused, TakeView, Viewed
 from enact_dist.core.records import Reply
-from enact_dist.terms import ACCESSES, pattern_matches
+from enact_dist.patterns import pattern_matches
+from enact_dist.terms import ACCESSES
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 
 from enact_dist.core.messages import Notice
 from enact_dist.errors import EnactError
-from enact_dist.terms import pattern_matches
+from enact_dist.patterns import pattern_matches
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable

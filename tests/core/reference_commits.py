@@ -9,7 +9,7 @@ from reference_parts import DURABILITY, RETENTION, Decision, Lane, Life
 from reference_shard import EACH, MS, ReferenceSessions
 
 from enact_dist.core.messages import Finish, Resolve
-from enact_dist.terms import pattern_matches
+from enact_dist.patterns import pattern_matches
 
 if TYPE_CHECKING:
     from enact_dist.core.datum import LockId

@@ -14,7 +14,8 @@ from reference_table import ReferenceTable
 
 from enact_dist.core.datum import Slot
 from enact_dist.core.records import Persisted
-from enact_dist.terms import Access, pattern_matches
+from enact_dist.patterns import pattern_matches
+from enact_dist.terms import Access
 
 if TYPE_CHECKING:
     from enact_dist.core.datum import LockId

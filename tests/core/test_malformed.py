@@ -19,12 +19,14 @@ from enact_dist.core.messages import (
     Finished,
     Granted,
     Item,
+    ListHistory,
     Prepare,
     Prepared,
     Refused,
     Register,
     Release,
     Request,
+    Survey,
     TakeView,
     Validate,
     WriteItem,
@@ -63,6 +65,20 @@ def test_access_that_does_not_exist_is_refused(bench, access):
     wrong = Item(access, "online", "piece", "count")
     refused(bench.acquire(ANN, wrong), "access")
     refused(bench.ask(TakeView(ANN, 1, 1, 5, (wrong,), 0)), "access")
+
+    assert free(bench)
+
+
+@pytest.mark.parametrize("pattern", ["*a" * 9, "/".join(["**"] * 5), "a**b", "", "a//b", "a\0*"])
+def test_pattern_that_no_client_makes_is_refused(bench, pattern):
+    """Of a lock, of a view and of each listing: too many stars could stop everybody else."""
+    bench.write("bob", 1, "new", to=slot("a" * 150))
+    for access in (Access.READ_EACH, Access.WRITE_EACH):
+        refused(bench.acquire(ANN, item(access, pattern)), "pattern")
+    view = (item(Access.VIEW_EACH, pattern),)
+    refused(bench.ask(TakeView(ANN, 1, 1, 5, view, 0)), "pattern")
+    refused(bench.ask(Survey((), ("piece", pattern), ())), "pattern")
+    refused(bench.ask(ListHistory((), (pattern,), ())), "pattern")
 
     assert free(bench)
 

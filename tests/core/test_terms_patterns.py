@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from itertools import product
+from time import process_time
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from enact_dist.terms import Entities, Entity, pattern_matches, patterns_overlap
+from enact_dist.patterns import pattern_matches, patterns_overlap
+from enact_dist.terms import Entities, Entity
 
 NAME_SEGMENT = st.text("ab", min_size=1, max_size=3)
 NAME = st.lists(NAME_SEGMENT, min_size=1, max_size=3).map("/".join)
@@ -59,6 +61,24 @@ def test_overlap_is_never_wrongly_denied(one, other):
         assert patterns_overlap(one, other)
 
 
+DEEPER_NAMES = [
+    "/".join(segments)
+    for depth in (1, 2, 3, 4, 5, 6)
+    for segments in product(("a", "b", "ab"), repeat=depth)
+]
+SHORT_PATTERN = st.lists(
+    st.sampled_from(("**", "*", "a", "b", "a*", "*b")), min_size=1, max_size=3
+).map("/".join)
+
+
+@settings(max_examples=300, deadline=None)
+@given(SHORT_PATTERN, SHORT_PATTERN)
+def test_overlap_is_the_existence_of_a_common_name(one, other):
+    """Both ways: a name of six segments suffices for patterns of three, if there is one at all."""
+    common = [name for name in DEEPER_NAMES if pattern_matches(one, name)]
+    assert patterns_overlap(one, other) == any(pattern_matches(other, name) for name in common)
+
+
 @given(PATTERN, PATTERN)
 def test_overlap_is_mutual(one, other):
     """It does not matter which pattern is named first."""
@@ -106,6 +126,52 @@ def test_wrong_entity_name_is_refused(name):
     """Names that no key of the wire could carry are refused where they are made."""
     with pytest.raises(ValueError, match=r"name"):
         Entity(name)
+
+
+HARD_TO_MATCH = [
+    ("*a" * 30, "a" * 190 + "b"),
+    ("*" + "a*" * 90, "a" * 199),
+    ("/".join(["**/a"] * 8), "/".join(["a"] * 99 + ["b"])),
+    ("/".join(["**/*a*b"] * 8 + ["c"]), "/".join(["aab"] * 49 + ["b"])),
+    ("**/" + "*a" * 8 + "/**/" + "*a" * 8, "/".join(["a" * 20 + "b"] * 9)),
+]
+
+
+@pytest.mark.parametrize(("pattern", "name"), HARD_TO_MATCH)
+def test_many_stars_cost_little(pattern, name):
+    """Where the expression tried each place again, one match of these took longer than a life."""
+    begin_s = process_time()
+    pattern_matches(pattern, name)
+    assert process_time() - begin_s < 1
+
+
+def test_many_deep_segments_overlap_in_little_time():
+    """Each pair of segments is looked at once; tried in all ways, these took hours."""
+    begin_s = process_time()
+    assert not patterns_overlap("**/a/" * 25 + "b", "**/a/" * 25 + "c")
+    assert patterns_overlap("**/a/" * 25 + "**/b", "**/c/" * 25 + "**/b")
+    assert process_time() - begin_s < 1
+
+
+@pytest.mark.parametrize(
+    ("pattern", "says"),
+    [
+        ("a/" + "*x" * 9, "9 stars"),
+        ("*" + "a*" * 8 + "/b", "9 stars"),
+        ("/".join(["**"] * 5), "5 segments"),
+        ("/".join(["**/a"] * 5), "5 segments"),
+    ],
+)
+def test_pattern_with_too_many_stars_is_refused(pattern, says):
+    """The limits of a segment and of a whole pattern, with the pattern named."""
+    with pytest.raises(ValueError, match=rf"pattern .*{says}.*at most"):
+        Entities(pattern)
+
+
+def test_pattern_with_the_most_stars_is_allowed():
+    """Eight in each segment, and four times any number of segments."""
+    pattern = "/".join(["**", "*x" * 8] * 4)
+    assert Entities(pattern).matches(Entity("/".join(["x" * 8, "y"] + ["x" * 9] * 3)))
 
 
 @pytest.mark.parametrize("pattern", ["", "a//b", "a/**b", "a b", "x" * 201])

@@ -14,7 +14,8 @@ from __future__ import annotations
 from collections import defaultdict
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.terms import Access, pattern_matches
+from enact_dist.patterns import pattern_matches
+from enact_dist.terms import Access
 from enact_dist.verify.chaos.journal import UNSEEN
 from enact_dist.verify.chaos.workload import MADE, VOLATILE
 from enact_dist.verify.checker import NOTHING, Anomaly, Checker, LockStory, Reading, State, Told

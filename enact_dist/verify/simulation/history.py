@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 from enact_dist.core.datum import Slot
 from enact_dist.core.phase import Phase
-from enact_dist.terms import Access, pattern_matches, patterns_overlap
+from enact_dist.patterns import pattern_matches, patterns_overlap
+from enact_dist.terms import Access
 
 if TYPE_CHECKING:
     from enact_dist.core.datum import LockId

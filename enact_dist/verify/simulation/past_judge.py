@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 
 from enact_dist.core.datum import Slot
 from enact_dist.core.messages import KeepVersions, Kept, ListHistory, SlotVersion, TakeView, Viewed
-from enact_dist.terms import Access, NullReason, pattern_matches
+from enact_dist.patterns import pattern_matches
+from enact_dist.terms import Access, NullReason
 from enact_dist.verify.simulation.cells import CONTEXTS
 from enact_dist.verify.simulation.picture import NEVER_SET, State
 from enact_dist.verify.simulation.reader_judge import stamp_of

@@ -10,7 +10,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.messages import Granted, Survey, Viewed
-from enact_dist.terms import Access, NullReason, pattern_matches
+from enact_dist.patterns import pattern_matches
+from enact_dist.terms import Access, NullReason
 from enact_dist.verify.simulation.picture import State
 
 if TYPE_CHECKING:
