@@ -1,14 +1,12 @@
-"""`enact world ls|tree|get|put|create|watch`; about time, comparing and exports see beside."""
+"""`enact world ls|tree|get|put|create`; about watching, time, comparing and exports see beside."""
 
 from __future__ import annotations
 
-import sys
-import time
 from typing import TYPE_CHECKING, Any
 
-from enact_dist.cli import world_aspects, world_diff, world_export, world_time
+from enact_dist.cli import world_aspects, world_diff, world_export, world_time, world_watch
 from enact_dist.cli.missing import named_if_missing
-from enact_dist.cli.output import print_json, print_json_line, print_table, shown_bytes
+from enact_dist.cli.output import print_json, print_table, shown_bytes
 from enact_dist.cli.slots import print_datum, print_slots
 from enact_dist.cli.verbs import (
     DONE,
@@ -21,23 +19,14 @@ from enact_dist.cli.verbs import (
     seconds,
     slot_name,
     verbs_of,
-    whole,
     world_name,
 )
-from enact_dist.config_table import suggestion
-from enact_dist.link.signals import StopSignals
 from enact_dist.terms import Entities, Entity
 
 if TYPE_CHECKING:
     import argparse
-    from collections.abc import Iterable
 
-    from enact_dist.cell import Cell
     from enact_dist.cli.verbs import Verb
-    from enact_dist.watch import Change
-
-WATCH_SLICE_S = 0.2
-"""How soon a watch notices a signal."""
 
 
 def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
@@ -55,7 +44,7 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
     _add_get(verbs)
     _add_put(verbs)
     _add_create(verbs)
-    _add_watch(verbs)
+    world_watch.add_watch(verbs)
     world_time.add_verbs(verbs)
     world_diff.add_diff(verbs)
     world_export.add_export(verbs)
@@ -126,23 +115,6 @@ def _add_create(verbs: argparse._SubParsersAction[Verb]) -> None:
     )  # fmt: skip
     create.add_argument("world", metavar="NAME", type=world_name, help="of the world context")
     add_reader(create)
-
-
-def _add_watch(verbs: argparse._SubParsersAction[Verb]) -> None:
-    watch = add_verb(
-        verbs, "watch", "print what is there and then every change, until Ctrl-C", run=watch_world,
-        example="enact world watch online 'tray/**' --aspect surface",
-    )  # fmt: skip
-    add_world(watch)
-    _add_pattern(watch)
-    watch.add_argument(
-        "--aspect",
-        action="append",
-        metavar="NAME",
-        help="only these, as soon as a shard knows them",
-    )
-    watch.add_argument("--count", type=whole, metavar="N", help="leave after N changes")
-    add_reader(watch)
 
 
 # ---------------------------------------------------------------- ls, tree
@@ -256,60 +228,3 @@ def create_world(arguments: argparse.Namespace) -> int:
     else:
         print(f"{arguments.world} {'is made' if is_new else 'was there'}")
     return DONE
-
-
-# ---------------------------------------------------------------- watch
-
-
-def watch_world(arguments: argparse.Namespace) -> int:
-    """Print changes as they come until a signal, or until there were enough."""
-    with StopSignals() as stop, open_cell(arguments) as cell:
-        world = cell.world(arguments.world)
-        _tell_unknown(arguments.aspect or (), cell)
-        shown = 0
-        with world.watch(Entities(arguments.pattern)) as watch:
-            while not stop.event.is_set() and shown != arguments.count:
-                change = watch.next(WATCH_SLICE_S)
-                if change is None or (arguments.aspect and change.aspect not in arguments.aspect):
-                    continue
-                _print_change(world.name, change, as_json=arguments.json)
-                shown += 1
-    return DONE
-
-
-def _tell_unknown(wanted: Iterable[str], cell: Cell) -> None:
-    """Say which aspects no shard knows so far: what comes of them may never come."""
-    known = cell.aspects()
-    for name in dict.fromkeys(wanted):
-        if name not in known:
-            close = suggestion(name, known)
-            print(
-                f"enact: no shard knows an aspect {name!r} yet{close}; waiting for its first datum",
-                file=sys.stderr,
-                flush=True,
-            )
-
-
-def _print_change(world: str, change: Change, *, as_json: bool) -> None:
-    if as_json:
-        facts = {
-            "world": world,
-            "entity": change.entity.name,
-            "aspect": change.aspect,
-            "version": change.version,
-            "stamp_ns": change.position.stamp_ns,
-            "shard": change.position.shard,
-            "gap": change.gap,
-            "null": change.null,
-        }
-        print_json_line(facts)
-        return
-    stamp_s, nanoseconds = divmod(change.position.stamp_ns, 1_000_000_000)
-    clock = time.strftime("%H:%M:%S", time.localtime(stamp_s))
-    null = "  NULL" if change.null else ""
-    gap = f"  ({change.gap} versions not seen)" if change.gap else ""
-    print(
-        f"{clock}.{nanoseconds // 1_000_000:03d}  {world}:{change.entity}/{change.aspect}"
-        f"  v{change.version}{null}{gap}",
-        flush=True,
-    )

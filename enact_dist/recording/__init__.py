@@ -28,7 +28,6 @@ module          what it does
 `pictures`      a datum as messages of Foxglove's schemas (`geometry`: of arrays) or as JSON
 `file`          the MCAP file, chunk by chunk; `disk` is the thread that writes it
 `reading`       a file back, as far as it is whole
-`fetching`      the data of given versions from their shards
 `recorder`      follows a cell and records it
 `replaying`     commits a recording again
 `exporting`     one world context as of one moment, into a file

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Final
 from enact_dist.config_shows import GUESSED
 from enact_dist.core.messages import Item
 from enact_dist.recording.exact import Recorded
-from enact_dist.recording.fetching import viewed
 from enact_dist.recording.file import RecordingFile
 from enact_dist.terms import Access
+from enact_dist.version_data import viewed
 
 if TYPE_CHECKING:
     import os

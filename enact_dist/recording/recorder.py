@@ -23,10 +23,10 @@ from enact_dist.core.datum import Slot
 from enact_dist.errors import ConfigError, LinkError, LockTimeoutError, UnknownWorldError
 from enact_dist.recording.disk import QUEUE_BYTES_MAX, DiskThread
 from enact_dist.recording.exact import Recorded
-from enact_dist.recording.fetching import Found, Wanted, between, explained, found_of
 from enact_dist.recording.file import CHUNK_BYTES, CHUNK_S, RecordingFile
 from enact_dist.recording.settling import END_S, Settling
 from enact_dist.terms import Entities, NullReason
+from enact_dist.version_data import Found, Wanted, between, explained, found_of
 from enact_dist.watch import Watch
 
 if TYPE_CHECKING:

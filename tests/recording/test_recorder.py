@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from enact_dist import Aspect, Durability, Entity, Lock, Write
+from enact_dist import Aspect, Durability, Entity, Lock, Write, version_data
 from enact_dist.core import history
 from enact_dist.errors import ConfigError, StoreError, UnknownWorldError
 from enact_dist.link import notices
-from enact_dist.recording import Recorder, Replay, Shows, export_world, fetching, recorder
+from enact_dist.recording import Recorder, Replay, Shows, export_world, recorder
 from enact_dist.recording.exporting import world_as_of
 from enact_dist.recording.file import RecordingFile
 from enact_dist.recording.reading import Recording
@@ -408,10 +408,11 @@ def test_versions_are_explained_in_parts_where_one_answer_is_too_short(cell, onl
     versions = online.history(piece, COUNT)
     monkeypatch.setattr("enact_dist.core.version_list.NAMED_MAX", 4)
     wanted = [
-        fetching.Wanted(v.position.stamp_ns, v.slot, v.version, v.position.shard) for v in versions
+        version_data.Wanted(v.position.stamp_ns, v.slot, v.version, v.position.shard)
+        for v in versions
     ]
 
-    found = fetching.explained(online.session, wanted)
+    found = version_data.explained(online.session, wanted)
 
     assert [found[one].cause for one in wanted] == [version.cause for version in versions]
 
