@@ -286,10 +286,11 @@ def _together_of(
 ) -> Together[Any] | None:
     """Return the set that triggers an actor, checked."""
     declared = [one for one in _attributes(actor_class).values() if isinstance(one, Together)]
-    if not declared and not any(isinstance(one, Together) for one in actor_class.triggers):
+    triggers = _listed(actor_class, "triggers")
+    if not declared and not any(isinstance(one, Together) for one in triggers):
         return None
     name = actor_class.__name__
-    if len(declared) != 1 or list(actor_class.triggers) != declared:
+    if len(declared) != 1 or list(triggers) != declared:
         raise MisuseError(
             f"{name} declares {declared or 'no Together'} and triggers {actor_class.triggers!r};"
             " a Together is a class attribute of its actor and its only trigger"
@@ -324,12 +325,7 @@ def _requests_of(actor_class: type[Actor]) -> dict[str, Declared]:
 def _chosen(
     actor_class: type[Actor], attribute: str, requests: Mapping[str, Declared]
 ) -> tuple[Declared, ...]:
-    chosen = getattr(actor_class, attribute)
-    if not isinstance(chosen, Sequence) or isinstance(chosen, str):
-        raise MisuseError(
-            f"{actor_class.__name__}.{attribute} is {chosen!r}; write the requests in a list or"
-            " tuple"
-        )
+    chosen = _listed(actor_class, attribute)
     triggering = attribute == "triggers"
     for index, request in enumerate(chosen):
         where = f"{actor_class.__name__}.{attribute}[{index}]"
@@ -342,6 +338,21 @@ def _chosen(
             wanted = f"{_READING} can trigger" if triggering else "Write or WriteEach is shared"
             raise MisuseError(f"{where} is {request!r}; only a {wanted}")
     return tuple(chosen)
+
+
+def _listed(actor_class: type[Actor], attribute: str) -> Sequence[Any]:
+    """Return `triggers` or `shared`, which must be a list, also of one."""
+    chosen: object = getattr(actor_class, attribute)
+    if isinstance(chosen, Sequence) and not isinstance(chosen, str):
+        return chosen
+    attributes = _attributes(actor_class)
+    name = next((n for n, value in attributes.items() if value is chosen and n != attribute), "")
+    which = name or "NAME" + (", …" if isinstance(chosen, set | frozenset) else "")
+    raise MisuseError(
+        f"{actor_class.__name__}.{attribute} is {chosen!r}, which is no list or tuple; write"
+        f" {attribute} = [{which}], a list even of one"
+        + ("" if name else ", of requests that are attributes of the class")
+    )
 
 
 def _check_schedule(actor_class: type[Actor], declaration: Declaration) -> None:

@@ -263,18 +263,16 @@ def list_actors(arguments: argparse.Namespace) -> int:
 
 
 def _losses(report: ActorStatistics) -> Iterator[str]:
-    """Yield what an actor has lost and the table does not show."""
-    if report.incomplete or report.late or report.unstamped:
-        last = f", the newest a {report.last_incomplete}" if report.last_incomplete else ""
-        yield (
-            f"{report.incomplete} incomplete sets{last}; {report.late} data too late for their"
-            f" set, {report.unstamped} without a stamp"
-        )
-    if report.missed or report.unknown:
-        yield (
-            f"{report.missed} ticks missed; {report.unknown} commits never answered, which may"
-            " stand (see its log)"
-        )
+    """Yield what an actor has lost and the table does not show; nothing where it lost nothing."""
+    last = f", the newest a {report.last_incomplete}" if report.last_incomplete else ""
+    lost = (
+        (report.incomplete, f"incomplete sets{last}"),
+        (report.late, "data too late for their set"),
+        (report.unstamped, "data without a capture stamp, which no set can have"),
+        (report.missed, "ticks missed"),
+        (report.unknown, "commits never answered, which may stand (see its log)"),
+    )
+    yield from (f"{count} {what}" for count, what in lost if count)
 
 
 def _reports(info: ActorInfo) -> tuple[ActorStatistics, ...]:

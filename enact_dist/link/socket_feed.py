@@ -123,7 +123,7 @@ class SocketFeed:
                     self._read_from(shard, line, connection)
                     came = True
         except Exception as error:  # noqa: BLE001 - Zenoh goes on, and the socket is tried again
-            _log.info("notices of shard %s stay with Zenoh: %s", shard, error)
+            _log.debug("notices of shard %s stay with Zenoh: %s", shard, error)
         finally:
             with self._mutex:
                 self._coming.pop(shard, None)
@@ -140,7 +140,7 @@ class SocketFeed:
         try:
             connection.exchange(Kind.WATCH, self._watch)
         except (LinkError, ProtocolError, EOFError, OSError) as error:
-            _log.info("no notices over the socket to shard %s: %s", line.shard, error)
+            _log.debug("no notices over the socket to shard %s: %s", line.shard, error)
             line.drop(connection)
             return None
         wait_at_most(connection.socket, socket.SO_RCVTIMEO, 0.0)
@@ -158,7 +158,7 @@ class SocketFeed:
         self, shard: str, line: SocketLine, connection: Connection, error: Exception
     ) -> None:
         if not self._closed:
-            _log.info("notices of shard %s end: %s", shard, error)
+            _log.debug("notices of shard %s end: %s", shard, error)
         line.drop(connection)
         with self._mutex:
             self._pumps.pop(shard, None)

@@ -236,7 +236,7 @@ class SocketLine:
                 self._retry_at_s = time.monotonic() + self._retry_s
                 self._retry_s = min(2 * self._retry_s, RETRY_S_MAX)
             if self.problem != before:  # not at each further attempt
-                _log.info("no socket to shard %s: %s", self.shard, self.problem)
+                _log.debug("no socket to shard %s: %s", self.shard, self.problem)
             return None
         self.problem, self._retry_s = "", RETRY_S_MIN
         with self._mutex:

@@ -18,10 +18,16 @@ from enact_dist.terms import (
     Write,
     WriteEach,
 )
+from enact_dist.together import Together
 
 training, online = World("training"), World("online")
 PRODUCTS, SYSTEM = Entities("product/*"), Entity("system")
 SURFACE, FLAGS, COUNT = Aspect("surface", str), Aspect("flags", dict), Aspect("count", int)
+
+
+CLOUD = View(online, SYSTEM, SURFACE)
+FLAG = Write(online, SYSTEM, FLAGS)
+PAIR = Together([CLOUD, View(online, Entity("other"), SURFACE)], by="stamp")
 
 
 def declared(**attributes: object) -> Declaration:
@@ -101,6 +107,26 @@ def test_declaration_covers_an_entity_only_when_every_pattern_without_each_match
             {"cloud": View(online, SYSTEM, SURFACE), "triggers": "cloud"},
             r"Sample\.triggers is 'cloud'",
             id="text for triggers",
+        ),
+        pytest.param(
+            {"cloud": CLOUD, "triggers": CLOUD},
+            r"Sample\.triggers is View\(.*write triggers = \[cloud\], a list even of one",
+            id="one request for triggers",
+        ),
+        pytest.param(
+            {"triggers": CLOUD},
+            r"write triggers = \[NAME\], .* of requests that are attributes of the class",
+            id="undeclared request for triggers",
+        ),
+        pytest.param(
+            {"both": PAIR, "triggers": PAIR},
+            r"Sample\.triggers is Together\(.*write triggers = \[both\]",
+            id="one set for triggers",
+        ),
+        pytest.param(
+            {"flags": FLAG, "shared": FLAG},
+            r"Sample\.shared is Write\(.*write shared = \[flags\]",
+            id="one request for shared",
         ),
         pytest.param(
             {

@@ -66,6 +66,6 @@ def test_ls_counts_incomplete_sets_and_names_what_was_missing(summing, cell_file
     assert (report["incomplete"], report["late"], report["unstamped"]) == (1, 0, 1)
     assert report["last_incomplete"] == "set of stamp 2: without online:set/r/set_depth"
     assert (
-        "sum: 1 incomplete sets, the newest a set of stamp 2: without online:set/r/set_depth;"
-        " 0 data too late for their set, 1 without a stamp\n"
+        "sum: 1 incomplete sets, the newest a set of stamp 2: without online:set/r/set_depth\n"
+        "sum: 1 data without a capture stamp, which no set can have\n"
     ) in table

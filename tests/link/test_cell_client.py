@@ -84,6 +84,21 @@ def test_client_locks_on_a_living_shard_when_another_is_away(two):
         add_one(online, there)
 
 
+@pytest.mark.carrier("socket", "zenoh", "auto")
+def test_a_shard_that_was_started_again_is_no_line_in_a_client_s_log(kept, caplog):
+    """Its connections ended and came again, as they should: nobody has to do anything."""
+    kept.start("a")
+    kept.start("b")
+    caplog.set_level("INFO", logger="enact")
+    with kept.connect() as cell, cell.world("online").watch("**") as watch:
+        add_one(cell.world("online"), there, KEPT)
+        kept.restart("b")
+        add_one(cell.world("online"), there, KEPT)
+        assert [watch.next(30.0).version for _ in range(2)] == [1, 2]
+
+    assert [line.getMessage() for line in caplog.records if line.name == "enact.link"] == []
+
+
 def test_silent_shard_is_waited_for_once_while_all_are_listed(two, monkeypatch):
     """It is greeted and asked at once; one that is known already is only asked."""
     two.start("a")
