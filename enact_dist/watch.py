@@ -21,6 +21,7 @@ from enact_dist.closing import Following
 from enact_dist.core.datum import Position, Slot
 from enact_dist.core.epochs import is_kept
 from enact_dist.core.messages import Notice, Survey, Surveyed
+from enact_dist.core.stamps import STAMP_NS_MAX
 from enact_dist.errors import ShardUnreachableError
 from enact_dist.link.notices import Interest, Skipped
 from enact_dist.terms import Durability, Entities, Entity
@@ -168,7 +169,8 @@ class Watch(Following[Change]):
         same_epoch = notice.epoch == following.epoch
         if notice.epoch < following.epoch or (same_epoch and notice.number <= following.number):
             return
-        if not same_epoch or notice.number > following.number + 1:
+        no_stamps = any(not 0 < change.stamp_ns <= STAMP_NS_MAX for change in notice.changes)
+        if not same_epoch or notice.number > following.number + 1 or no_stamps:
             self._try_list_again(notice.shard)
             return
         following.number = notice.number
@@ -219,6 +221,7 @@ class Watch(Following[Change]):
                 continue
             self._note(shard, state.slot, known, null=null, captured=state.captured_ns)
         self._note_vanished(shard, answer.epoch, {state.slot for state in states})
+        self._feed.not_beyond(shard, answer.epoch, answer.notice_number)
         self._following[shard] = _Following(answer.epoch, answer.notice_number, listed=True)
 
     def _note_vanished(self, shard: str, epoch: int, listed: set[Slot]) -> None:

@@ -18,9 +18,9 @@ from enact_dist.terms import Access, Durability, checked_name
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable
 
-    from enact_dist.core.datum import Slot
+    from enact_dist.core.datum import LockId, Position, Slot
     from enact_dist.core.messages import AspectEntry, Finish, Item, Prepare, WriteItem
-    from enact_dist.core.records import PreparedRecord
+    from enact_dist.core.stamps import Stamps
 
 NO_PAYLOAD: Final = "no_payload"
 """The code of a refusal that leaves the lock as it is: named bytes are not here, send them."""
@@ -145,13 +145,36 @@ def wrong_parties(message: Commit | Prepare, *, peers: Collection[str]) -> Refus
     return None
 
 
-def wrong_finish(message: Finish, record: PreparedRecord) -> Refused | None:
+def wrong_finish(message: Finish, primary: str) -> Refused | None:
     """Refuse the word of a shard that is not the primary."""
-    if message.position.shard == record.primary:
+    if message.position.shard == primary:
         return None
     return _refused(
         f"shard {message.position.shard!r} is said to have committed {message.lock}, which was"
-        f" prepared for shard {record.primary!r}"
+        f" prepared for shard {primary!r}"
+    )
+
+
+def wrong_decision(
+    lock: LockId, position: Position, stamps: Stamps, *, wall_ns: int
+) -> Refused | None:
+    """Refuse the stamp of a decision that no shard with a right clock gives.
+
+    It would become the time of this shard for good, since stamps only grow.  The decision may be
+    said again: it is taken once the clocks agree.
+    """
+    if position.stamp_ns <= 0:
+        return _refused(
+            f"{lock} is said to be committed at stamp {position.stamp_ns}, which is none"
+        )
+    if not stamps.too_far_ahead(position.stamp_ns, wall_ns=wall_ns):
+        return None
+    ahead_s = (position.stamp_ns - wall_ns) / 1e9
+    return Refused(
+        "clock_skew",
+        f"shard {position.shard} has committed {lock} with a stamp {ahead_s:.1f} s ahead of the"
+        " clock of this shard; at most 1 s is accepted; set the clocks of both hosts, then the"
+        " commit is finished here, too",
     )
 
 

@@ -31,6 +31,7 @@ from enact_dist.core.messages import (
 from enact_dist.core.multilock import MultiLock
 from enact_dist.core.phase import Phase
 from enact_dist.core.placement import shard_of
+from enact_dist.core.stamps import STAMP_NS_MAX
 from enact_dist.core.unsettled import Unsettled
 from enact_dist.terms import ACCESSES, Access
 
@@ -181,8 +182,12 @@ class Client:
         self.placement = placement
 
     def saw_stamp(self, stamp_ns: int) -> None:
-        """Remember the largest stamp seen: later commits come after it everywhere."""
-        self.seen_stamp_ns = max(self.seen_stamp_ns, stamp_ns)
+        """Remember the largest stamp seen: later commits come after it everywhere.
+
+        One that no clock gives is passed over: every shard would refuse what comes after it.
+        """
+        if stamp_ns <= STAMP_NS_MAX:
+            self.seen_stamp_ns = max(self.seen_stamp_ns, stamp_ns)
 
     def committed(self, votes: Mapping[str, Prepared], stamp_ns: int) -> None:
         """Note on which slots the shards that have voted may not show a commit of ours yet."""

@@ -101,6 +101,10 @@ class ForcedAborts:
     def __contains__(self, lock: LockId) -> bool:
         return lock in self._records
 
+    def get(self, lock: LockId) -> ForcedRecord | None:
+        """Return what is kept of a lock that was aborted by hand."""
+        return self._records.get(lock)
+
     def add(self, record: ForcedRecord) -> None:
         """A lock was aborted by hand, and that is durable."""
         self._records[record.lock] = record

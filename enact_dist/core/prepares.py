@@ -22,9 +22,9 @@ Rules a change must keep
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, cast
 
-from enact_dist.core.admission import wrong_finish
+from enact_dist.core.admission import wrong_decision, wrong_finish
 from enact_dist.core.causes import cause_of, decided_cause
 from enact_dist.core.datum import LockId, Position
 from enact_dist.core.forced import FORCED, ForcedAborts
@@ -39,6 +39,7 @@ from enact_dist.core.messages import (
     Holder,
     Prepare,
     Prepared,
+    Refused,
     Resolve,
     Resolved,
     SlotVersion,
@@ -59,7 +60,7 @@ from enact_dist.core.records import (
 from enact_dist.terms import Durability
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Generator, Iterable, Iterator
 
     from enact_dist.core.records import ShardReturned
     from enact_dist.core.shard_state import ShardState
@@ -102,6 +103,7 @@ class PrepareDesk:
         self._state = state
         self._at_store: dict[int, _AtStore] = {}
         self._ask_ns: dict[LockId, int] = {}
+        self._refused: set[LockId] = set()
         self._forced = ForcedAborts(state, forced)
         for record in recovered:
             # Versions of volatile slots have started again.
@@ -201,18 +203,35 @@ class PrepareDesk:
     def on_finish(self, message: Finish, reply_to: int) -> Iterator[Effect]:
         """The primary says: committed."""
         tenure = self._state.tenures.by_lock.get(message.lock)
-        if message.lock in self._forced:
-            yield from self._forced.committed(message.lock, message.position, [reply_to])
-            return
-        if tenure is None or tenure.prepared is None:
+        forced = self._forced.get(message.lock)
+        prepared = tenure.prepared if tenure is not None else None
+        if forced is None and prepared is None:
             self._state.count("finishes_repeated")
             yield Reply(reply_to, Finished(message.lock))
             return
-        wrong = wrong_finish(message, tenure.prepared)
+        wrong = wrong_finish(message, (forced or cast("PreparedRecord", prepared)).primary)
         if wrong is not None:
             yield Reply(reply_to, wrong)
             return
-        yield from self._finish(tenure, message.position, [reply_to])
+        wrong = yield from self._wrong_decision(message.lock, message.position)
+        if wrong is not None:
+            yield Reply(reply_to, wrong)
+        elif forced is not None:
+            yield from self._forced.committed(message.lock, message.position, [reply_to])
+        elif tenure is not None:
+            yield from self._finish(tenure, message.position, [reply_to])
+
+    def _wrong_decision(
+        self, lock: LockId, position: Position
+    ) -> Generator[Effect, None, Refused | None]:
+        """Return why a decision is not taken with this stamp, and tell people once a lock."""
+        wrong = wrong_decision(lock, position, self._state.stamps, wall_ns=self._state.wall_ns)
+        if wrong is not None:
+            self._state.count("decisions_refused")
+            if lock not in self._refused:
+                self._refused.add(lock)
+                yield Story("lock.in_doubt", wrong.text, grave=True)
+        return wrong
 
     def _finish(self, tenure: Tenure, position: Position, replies: list[int]) -> Iterator[Effect]:
         record = tenure.prepared
@@ -234,6 +253,7 @@ class PrepareDesk:
     def _end(self, tenure: Tenure) -> Iterator[Effect]:
         tenure.prepared = None
         self._ask_ns.pop(tenure.lock, None)
+        self._refused.discard(tenure.lock)
         yield from self._state.tenures.remove(tenure, now_ns=self._state.now_ns)
 
     def on_called(self, message: Called, _: int) -> Iterator[Effect]:
@@ -243,6 +263,10 @@ class PrepareDesk:
             yield from self._state.decisions.finished(request.lock, message.shard)
         if not (isinstance(request, Resolve) and isinstance(answer, Resolved)):
             return
+        if answer.kind == RESOLVED_COMMITTED:
+            wrong = yield from self._wrong_decision(request.lock, answer.position)
+            if wrong is not None:
+                return
         if request.lock in self._forced:
             yield from self._forced.resolved(answer)
             return

@@ -24,7 +24,7 @@ from enact_dist.core.messages import (
 )
 from enact_dist.core.sessions import Session, SessionTable
 from enact_dist.core.slots import SlotMap
-from enact_dist.core.stamps import Stamps
+from enact_dist.core.stamps import Stamps, newest_stamp
 from enact_dist.core.tenures import Tenure, Tenures
 
 if TYPE_CHECKING:
@@ -111,15 +111,7 @@ class ShardState:
                 *map(WorldEntry, dict.fromkeys(r.slot.context for r in recovered.slots)),
             ),
         )
-        stamps = [record.stamp_ns for record in recovered.slots]
-        # A fork without slots here was made as of then, too: nothing may be committed before.
-        stamps += [record.at_ns for record in recovered.worlds]
-        # Nor before what was forgotten with its aspect.
-        stamps += [record.at_ns for record in recovered.forgotten]
-        stamps += [record.position.stamp_ns for record in recovered.outcomes]
-        stamps += [record.position.stamp_ns for record in recovered.decisions]
-        stamps += [record.stamp_ns for record in recovered.prepared]
-        self.stamps = Stamps(max(stamps, default=0))
+        self.stamps = Stamps(newest_stamp(recovered)[0])
         self.slots = SlotMap(
             recovered.slots,
             policies=self.catalogue.policies,

@@ -7,10 +7,30 @@ effect over all shards without synchronised clocks.
 
 from __future__ import annotations
 
-from typing import Final
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from enact_dist.core.records import Recovered
 
 AHEAD_NS_MAX: Final = 1_000_000_000
-"""A client's stamp may lie this far ahead of our wall clock; more is a wrong clock somewhere."""
+"""A stamp from elsewhere may lie this far ahead of our wall clock; more is a wrong clock."""
+STAMP_NS_MAX: Final = 1 << 62
+"""No stamp lies beyond this, the year 2116: from there on, clocks could not count for long."""
+
+
+def newest_stamp(recovered: Recovered) -> tuple[int, str]:
+    """Return the largest stamp of what a store has kept, and what has it; 0 where nothing is."""
+    stamps = [(record.stamp_ns, f"slot {record.slot}") for record in recovered.slots]
+    # A fork without slots here was made as of then, too: nothing may be committed before.
+    stamps += [(record.at_ns, f"world context {record.name}") for record in recovered.worlds]
+    # Nor before what was forgotten with its aspect.
+    stamps += [(record.at_ns, f"forgotten aspect {record.name}") for record in recovered.forgotten]
+    stamps += [(one.position.stamp_ns, f"commit {one.lock}") for one in recovered.outcomes]
+    stamps += [
+        (record.position.stamp_ns, f"commit {record.lock}") for record in recovered.decisions
+    ]
+    stamps += [(record.stamp_ns, f"prepared lock {record.lock}") for record in recovered.prepared]
+    return max(stamps, default=(0, "nothing"))
 
 
 class Stamps:
@@ -22,8 +42,11 @@ class Stamps:
         self.last_ns = last_ns
 
     def too_far_ahead(self, seen_ns: int, *, wall_ns: int) -> bool:
-        """Whether a stamp from elsewhere would drag this clock away from the wall clock."""
-        return seen_ns > max(wall_ns, self.last_ns) + AHEAD_NS_MAX
+        """Whether a stamp from elsewhere would drag this clock away from the wall clock.
+
+        What this clock has said itself is never too far: the wall clock may have been set back.
+        """
+        return seen_ns > max(wall_ns + AHEAD_NS_MAX, self.last_ns)
 
     def next(self, *, seen_ns: int, wall_ns: int) -> int:
         """Return the stamp of a new commit by a client that has seen stamps up to `seen_ns`."""

@@ -58,6 +58,11 @@ class ViewDesk:
         if refusal is not None or session is None:
             yield Reply(reply_to, refusal or EpochChanged(state.epoch))
             return
+        if message.at_ns < 0:
+            yield Reply(
+                reply_to, Refused("protocol", f"stamp {message.at_ns} was asked, which is none")
+            )
+            return
         if message.strict and state.stamps.too_far_ahead(message.at_ns, wall_ns=state.wall_ns):
             yield Reply(reply_to, self._in_the_future(message.at_ns))
             return

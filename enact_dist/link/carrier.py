@@ -91,6 +91,9 @@ class NoticeFeed(Protocol):
     def get_here(self) -> Notice | Skipped | None:
         """Return the next of those that are here already, None if there is none; never waits."""
 
+    def not_beyond(self, shard: str, epoch: int, number: int) -> None:
+        """Let notices after this number come: the shard says that it has sent no later one."""
+
     def close(self) -> None:
         """End the feed and wake whoever waits in `get`; twice is harmless."""
 

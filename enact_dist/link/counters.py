@@ -86,6 +86,10 @@ OF_A_SHARD: Final[dict[str, Counter]] = {
     ),
     "resolved_committed": Counter("commits in doubt that turned out as committed"),
     "resolved_aborted": Counter("commits in doubt that turned out as aborted"),
+    "decisions_refused": Counter(
+        "decisions of other shards with a stamp that is far ahead of the clock here",
+        "set the clocks of both hosts: enact doctor",
+    ),
     "prepared_forced": Counter("commits in doubt aborted by hand (enact lock resolve)"),
     "forced_confirmed": Counter("such that had not been committed elsewhere: all is well"),
     "forced_but_committed": Counter(

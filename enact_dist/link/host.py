@@ -110,12 +110,13 @@ def open_host(
         store, recovered = None, Recovered(epoch=unkept_epoch(wall_ns))
     else:
         from enact_dist.link.store import open_store
-        from enact_dist.link.store_folder import refuse_strangers
+        from enact_dist.link.store_folder import refuse_far_stamps, refuse_strangers
 
         store, recovered = open_store(folder, unix_s=wall_ns // 1_000_000_000)
         with ExitStack() as undo:
             undo.callback(store.close)
             refuse_strangers(folder, recovered, settings.name, settings.placement)
+            refuse_far_stamps(folder, recovered, wall_ns=wall_ns)
             undo.pop_all()
     shard = Shard(settings, recovered, now_ns=clock.monotonic_ns(), wall_ns=wall_ns)
     return ShardHost(

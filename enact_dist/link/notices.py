@@ -182,6 +182,15 @@ class NoticeQueue:
         self._notices.append(notice)
         self._wake()
 
+    def not_beyond(self, shard: str, epoch: int, number: int) -> None:
+        """Let notices after this number come: the shard itself says that it has sent no later one.
+
+        One with a later number was no notice of the shard's, and must not hide those that follow.
+        """
+        with self._mutex:
+            if self._newest.get(shard, (0, 0)) > (epoch, number):
+                self._newest[shard] = (epoch, number)
+
     def _wake(self) -> None:
         """Wake whoever waits in `get`.  The mutex is held."""
         self._changed.notify_all()

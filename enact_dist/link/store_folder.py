@@ -13,6 +13,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, NamedTuple, NoReturn
 
 from enact_dist.core.moving import NAMED_MAX, strangers
+from enact_dist.core.stamps import AHEAD_NS_MAX, STAMP_NS_MAX, newest_stamp
 from enact_dist.errors import StoreError
 from enact_dist.link.folder_lock import FORMAT_FILE
 from enact_dist.link.store_mark import Mark, read_mark
@@ -133,6 +134,32 @@ def refuse_strangers(folder: Path, stored: Recovered, shard: str, placement: Pla
             f"holds entities that by the cell.toml do not live on {shard}: {named}{more}",
             "move them with `enact shard rebalance` while the cell is stopped, or let the cell have"
             " the shards and pins that it had",
+        )
+
+
+def refuse_far_stamps(folder: Path, stored: Recovered, *, wall_ns: int) -> None:
+    """Refuse a folder whose clock could not go on, and warn of one that is ahead of its host.
+
+    Raises:
+        StoreError: A stamp lies beyond all that clocks give.
+    """
+    stamp_ns, holder = newest_stamp(stored)
+    if stamp_ns > STAMP_NS_MAX:
+        refuse(
+            folder,
+            f"holds {holder} with stamp {stamp_ns}, beyond the year 2116: no later commit could be"
+            " stamped",
+            "restore a backup from before that commit with `enact shard restore … --replace`, or"
+            " give the shard an empty folder and start without its data",
+        )
+    if stamp_ns > wall_ns + AHEAD_NS_MAX:
+        _log.warning(
+            "%s holds %s with a stamp %.1f s ahead of the clock of this host: until its clock gets"
+            " there, other shards refuse commits together with this one; set the clock, or restore"
+            " a backup from before that commit",
+            folder,
+            holder,
+            (stamp_ns - wall_ns) / 1e9,
         )
 
 

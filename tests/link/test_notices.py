@@ -288,3 +288,16 @@ def test_feed_in_a_forked_child_waits_for_no_thread_of_its_parent():
 
     assert os.waitpid(child, 0) == (child, 0)
     assert queue.get(0.0).number == 1
+
+
+def test_number_that_the_shard_has_not_given_hides_nothing():
+    """A forged notice takes the numbers up to it; once the shard has spoken, true ones come."""
+    queue = NoticeQueue()
+    queue.put(Notice("s0", 1, 1 << 62, ()))
+    queue.put(Notice("s0", 1, 6, ()))
+    queue.not_beyond("s0", 1, 6)
+    for number in (6, 7, 8):
+        queue.put(Notice("s0", 1, number, ()))
+
+    assert [queue.get(0.0).number for _ in range(3)] == [1 << 62, 7, 8]
+    assert queue.get(0.0) is None
