@@ -19,6 +19,7 @@ from enact_dist.cell_info import (
     ShardInfo,
     actor_infos,
     lock_info,
+    shard_info,
 )
 from enact_dist.closing import Closing
 from enact_dist.core.datum import Position
@@ -33,10 +34,9 @@ from enact_dist.core.messages import (
     ListSessions,
     Locks,
     Reached,
-    Sessions,
     Welcome,
 )
-from enact_dist.errors import EnactError, LinkError, MisuseError
+from enact_dist.errors import EnactError, MisuseError
 from enact_dist.forking import drop_world
 from enact_dist.history import keep_versions, kept_versions, let_go
 from enact_dist.lineage import causes_of, effects_of
@@ -60,8 +60,12 @@ _open: set[Cell] = set()
 class Cell(Closing):
     """A connection to a cell.  Use as a context manager, or `close` it.
 
-    A cell left open does not hang the interpreter's exit.  After a fork the child must connect
-    anew.
+    A cell left open does not hang the interpreter's exit.
+
+    A process that has connected over a network cannot hand that on to a child that it forks: there
+    the cell and every `connect` raise `MisuseError`, also where the cell was closed before.
+    Connect for the first time after the fork, or start the child with
+    ``multiprocessing.get_context("spawn")``.  `local` works in both.
     """
 
     def __init__(self, name: str, client: CellClient, *, host: Any = None) -> None:
@@ -370,46 +374,7 @@ class Cell(Closing):
 
     def shards(self) -> tuple[ShardInfo, ...]:
         """Return every shard of the cell, unreachable ones too, with why where that is known."""
-        return tuple(self._shard_or_problem(shard) for shard in self._client.shards())
-
-    def _shard_or_problem(self, shard: str) -> ShardInfo:
-        """Return what is known of a shard: what is wrong with one says nothing of the others."""
-        try:
-            return self._shard_info(shard)
-        except LinkError as error:
-            endpoint = self._client.carrier.endpoint_of(shard)
-            return ShardInfo(shard, endpoint, reachable=False, problem=str(error))
-
-    def _shard_info(self, shard: str) -> ShardInfo:
-        client, question = self._client, (shard, ListSessions())
-        endpoint = client.carrier.endpoint_of(shard)
-        if client.core.needs_hello(shard):
-            # How calls travel is known from its welcome on.  Who is silent is waited for once.
-            hello = (shard, client.core.hello(shard))
-            if client.call_once([hello, question])[1] is None:
-                return ShardInfo(shard, endpoint, reachable=False)
-        started_s = time.monotonic()
-        answer = client.call_once([question])[0]
-        round_trip_s = time.monotonic() - started_s
-        if not isinstance(answer, Sessions):
-            return ShardInfo(shard, endpoint, reachable=False)
-        ahead_ns = answer.wall_ns - time.time_ns() + round_trip_s * 1e9 / 2
-        return ShardInfo(
-            shard,
-            endpoint,
-            reachable=True,
-            epoch=answer.epoch,
-            open=answer.open,
-            uptime_s=answer.uptime_ns / 1e9,
-            slots=answer.slots,
-            size_bytes=answer.bytes,
-            sessions=len(answer.sessions),
-            locks=sum(session.locks for session in answer.sessions),
-            clock_ahead_s=ahead_ns / 1e9,
-            round_trip_s=round_trip_s,
-            carrier=client.carrier.way_to(shard),
-            counters={counter.name: counter.value for counter in answer.counters},
-        )
+        return tuple(shard_info(self._client, shard) for shard in self._client.shards())
 
     def welcomes(self) -> dict[str, Welcome]:
         """Return what each shard that answers at once says of the cell: its placement, contexts."""

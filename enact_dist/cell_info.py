@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Final
 
 from enact_dist.core.datum import Position
-from enact_dist.core.messages import Sessions
+from enact_dist.core.messages import ListSessions, Sessions
+from enact_dist.errors import LinkError
 from enact_dist.terms import Entity, NullReason
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
     from enact_dist.core.messages import Answer, Holder, SlotState
+    from enact_dist.link.client import CellClient
 
 
 RUNNING: Final = ("starting", "running")
@@ -221,4 +224,45 @@ def lock_info(shard: str, holder: Holder) -> LockInfo:
         holder.hold_left_ns / 1e9,
         holder.slots,
         holder.waits_for,
+    )
+
+
+def shard_info(client: CellClient, shard: str) -> ShardInfo:
+    """Return what is known of a shard: what is wrong with one says nothing of the others."""
+    try:
+        return _asked_info(client, shard)
+    except LinkError as error:
+        endpoint = client.carrier.endpoint_of(shard)
+        return ShardInfo(shard, endpoint, reachable=False, problem=str(error))
+
+
+def _asked_info(client: CellClient, shard: str) -> ShardInfo:
+    question = (shard, ListSessions())
+    endpoint = client.carrier.endpoint_of(shard)
+    if client.core.needs_hello(shard):
+        # How calls travel is known from its welcome on.  Who is silent is waited for once.
+        hello = (shard, client.core.hello(shard))
+        if client.call_once([hello, question])[1] is None:
+            return ShardInfo(shard, endpoint, reachable=False)
+    started_s = time.monotonic()
+    answer = client.call_once([question])[0]
+    round_trip_s = time.monotonic() - started_s
+    if not isinstance(answer, Sessions):
+        return ShardInfo(shard, endpoint, reachable=False)
+    ahead_ns = answer.wall_ns - time.time_ns() + round_trip_s * 1e9 / 2
+    return ShardInfo(
+        shard,
+        endpoint,
+        reachable=True,
+        epoch=answer.epoch,
+        open=answer.open,
+        uptime_s=answer.uptime_ns / 1e9,
+        slots=answer.slots,
+        size_bytes=answer.bytes,
+        sessions=len(answer.sessions),
+        locks=sum(session.locks for session in answer.sessions),
+        clock_ahead_s=ahead_ns / 1e9,
+        round_trip_s=round_trip_s,
+        carrier=client.carrier.way_to(shard),
+        counters={counter.name: counter.value for counter in answer.counters},
     )

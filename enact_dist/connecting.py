@@ -51,7 +51,8 @@ def connect(
     Raises:
         ShardUnreachableError: No shard answered in time; the message names shards and endpoints.
         ConfigError: The `cell.toml` cannot be used, or `target` is neither file nor endpoint.
-        MisuseError: A time is negative or not a number.
+        MisuseError: A time is negative or not a number, or this process was forked from one that
+            has been connected (see `Cell`).
     """
     from enact_dist.config_environment import carrier_of
     from enact_dist.link.joining import join

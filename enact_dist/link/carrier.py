@@ -27,6 +27,13 @@ if TYPE_CHECKING:
 _ANSWERS: Final = frozenset(get_args(Answer))
 
 
+FORKED_REMEDY: Final = (
+    "connect for the first time after the fork, or start the child with the 'spawn' method"
+    " (multiprocessing.get_context('spawn'))"
+)
+"""What somebody does who wants to use a cell in a child process."""
+
+
 def check_usable(pid: int, *, closed: bool) -> None:
     """Raise unless a carrier is open and belongs to this process.
 
@@ -40,7 +47,7 @@ def check_usable(pid: int, *, closed: bool) -> None:
     if pid != os.getpid():
         raise MisuseError(
             f"this connection belongs to process {pid}, from which this one"
-            f" ({os.getpid()}) was forked; start it with the 'spawn' method"
+            f" ({os.getpid()}) was forked; {FORKED_REMEDY}"
         )
     if closed:
         raise MisuseError("the connection to this cell is closed; connect again")

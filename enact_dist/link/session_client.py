@@ -35,6 +35,7 @@ from enact_dist.core.messages import (
 )
 from enact_dist.core.placement import shard_of
 from enact_dist.errors import EnactError, MisuseError
+from enact_dist.link.carrier import FORKED_REMEDY
 from enact_dist.link.catalogue import CATALOGUES, KnownCatalogue
 from enact_dist.link.clock import boottime_ns
 from enact_dist.link.further_shards import FurtherShards
@@ -159,8 +160,8 @@ class SessionClient:
         """Raise `MisuseError` if this client is closed or belongs to the parent process."""
         if self.forked:
             raise MisuseError(
-                "this cell was opened before a fork and belongs to the parent process; connect only"
-                " after the fork, or start the child with the 'spawn' method"
+                "this cell was opened before a fork and belongs to the parent process;"
+                f" {FORKED_REMEDY}"
             )
         if self.closed:
             raise MisuseError("this cell is closed; connect again")

@@ -32,6 +32,7 @@ from typing import TYPE_CHECKING, Final
 import zenoh
 
 from enact_dist.errors import ConfigError, LinkError, MisuseError
+from enact_dist.link.carrier import FORKED_REMEDY
 from enact_dist.link.zenoh_links import LinkWatch
 from enact_dist.wire.limits import BODY_BYTES_MAX, HEADER_BYTES_MAX
 
@@ -123,14 +124,11 @@ def open_session(
     Raises:
         ConfigError: An endpoint cannot be read.
         LinkError: An endpoint to listen at is in use, or not of this host.
-        MisuseError: This process was forked from one that had a session open.
+        MisuseError: This process was forked from one that has had a session.
     """
-    if any(pid != os.getpid() for pid, _ in _open_sessions):
-        raise MisuseError(
-            "this process was forked from one that is connected, where Zenoh cannot work; start it"
-            " with the 'spawn' method, or connect only after the fork"
-        )
+    check_not_forked()
     config = session_config(listen=listen, connect=connect, lease_s=lease_s, open_s=open_s)
+    _used_in.add(os.getpid())
     try:
         session = zenoh.open(config)
     except zenoh.ZError as error:
@@ -144,6 +142,22 @@ def open_session(
         raise
     keep_after_fork(watch)
     return session
+
+
+def check_not_forked() -> None:
+    """Raise unless Zenoh can be used in this process.
+
+    Its threads are made once and are not in a forked child: `zenoh.open` would wait there for ever,
+    also when every session of the parent was closed before the fork.
+
+    Raises:
+        MisuseError: This process was forked from one that has had a session.
+    """
+    if _used_in - {os.getpid()}:
+        raise MisuseError(
+            f"this process was forked from process {min(_used_in - {os.getpid()})}, which had"
+            f" connected to a cell, and Zenoh's threads do not survive that; {FORKED_REMEDY}"
+        )
 
 
 def _open_error(error: zenoh.ZError, listen: Sequence[str]) -> LinkError:
@@ -164,6 +178,8 @@ def _reason(error: zenoh.ZError) -> str:
     return str(error).split(" at /")[0].replace("[", "").strip()
 
 
+_used_in: set[int] = set()
+"""The processes that have opened sessions: this one, or one that it was forked from."""
 _open_sessions: list[tuple[int, zenoh.Session]] = []
 _owners: weakref.WeakSet[object] = weakref.WeakSet()
 _watches: dict[zenoh.Session, LinkWatch] = {}

@@ -66,6 +66,40 @@ def test_carrier_raises_in_a_forked_child_which_still_ends(daemon, endpoint, pro
     assert "child 3 parent Locks" in output
 
 
+FORKED_AFTER_CLOSE = """
+import multiprocessing, os, sys
+from enact_dist import connect
+from enact_dist.errors import MisuseError
+
+def child():
+    try:
+        connect(sys.argv[1], timeout_s=1.0)
+    except MisuseError as error:
+        print("child:", error, flush=True)
+
+connect(sys.argv[1], timeout_s=30.0).close()
+process = multiprocessing.get_context("fork").Process(target=child)
+process.start()
+process.join()
+connect(sys.argv[1], timeout_s=30.0).close()
+print("child", process.exitcode, "of", os.getpid(), flush=True)
+"""
+
+
+def test_connect_is_refused_in_a_forked_child_though_its_parent_has_closed(
+    daemon, endpoint, program
+):
+    """The child says at once what to do, and the parent connects again."""
+    daemon(endpoint)
+    process = program(FORKED_AFTER_CLOSE, endpoint)
+
+    output, errors = process.communicate(timeout=60)
+
+    assert f"forked from process {process.pid}, which had connected" in output, errors
+    assert "'spawn'" in output
+    assert f"child 0 of {process.pid}" in output
+
+
 KILLED = """
 import sys
 from enact_dist.core.messages import Hello
