@@ -9,7 +9,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-from enact_dist.actor import Actor, Declared, check_update, same_data, stands_for_trigger
+from enact_dist.actor import (
+    Actor,
+    Declared,
+    check_update,
+    narrowed,
+    same_data,
+    stands_for_trigger,
+)
 from enact_dist.actor_lock import ActorLock
 from enact_dist.actor_sets import PendingSets
 from enact_dist.errors import MisuseError
@@ -116,6 +123,16 @@ class BoundActor:
             stop=stop,
             together=self.declaration.together,
             captured_ns=captured_ns,
+        )
+
+    def writes(self) -> tuple[str, ...]:
+        """Return what the actor may write, as ``world:entities/aspect``."""
+        requests = [one for one in self.declaration.requests.values() if one.access.writes]
+        contexts = [self.contexts[one.world.name].name for one in requests]
+        named = [narrowed(one, self.only) for one in requests]
+        return tuple(
+            f"{context}:{one.entity}/{one.aspect.name}"
+            for context, one in zip(contexts, named, strict=True)
         )
 
     def check_usable(self) -> None:

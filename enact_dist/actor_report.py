@@ -31,6 +31,8 @@ STAMPS_MAX: Final = 512
 WAITS_MAX: Final = 512
 ERROR_LENGTH_MAX: Final = 500
 """Longest error text in a report; the whole one is in the actor's log."""
+WRITES_MAX: Final = 64
+"""Declared writes in a report."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +60,7 @@ class ActorStatistics:
         last_incomplete: The newest of these: its stamp and what was missing.
         late: Data whose set was over when they came.
         unstamped: Data that could be in no set, because their writer gave no stamp.
+        writes: What it declares to write, as ``world:entities/aspect``; at most `WRITES_MAX`.
     """
 
     name: str = ""
@@ -78,6 +81,7 @@ class ActorStatistics:
     last_incomplete: str = ""
     late: int = 0
     unstamped: int = 0
+    writes: tuple[str, ...] = ()
 
 
 _NAMES: Final = [field.name for field in dataclasses.fields(ActorStatistics)]

@@ -37,6 +37,7 @@ from enact_dist.actor_inbox import Inbox, SetInbox, watching
 from enact_dist.actor_log import Repeated, kind_of
 from enact_dist.actor_report import (
     ERROR_LENGTH_MAX,
+    WRITES_MAX,
     ActorRecord,
     ActorStatistics,
     encode_reports,
@@ -153,7 +154,9 @@ class ActorRun:
     def statistics(self) -> ActorStatistics:
         """Return what the actor has done so far."""
         self._record.skipped = self._inbox.skipped
-        statistics = self._record.snapshot(monotonic_ns())
+        statistics = dataclasses.replace(
+            self._record.snapshot(monotonic_ns()), writes=self._bound.writes()[:WRITES_MAX]
+        )
         if self._sets is None:
             return statistics
         sets = self._sets.sets

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.cli.output import ProgressLine, print_json, shown_bytes, shown_s
@@ -84,7 +85,8 @@ def _add_replay(nouns: argparse._SubParsersAction[Verb]) -> None:
         "commit a recording into a cell again, at its pace",
         run=run_replay,
         example="enact replay run.mcap --speed 0.5 --into cell.toml --world online=replayed\n"
-        "enact replay run.mcap --speed 0 --from 10 --to 20",
+        "enact replay run.mcap --speed 0 --from 10 --to 20\n"
+        "enact replay run.mcap --world online --entities 'camera/*' --aspect image",
     )
     replay.add_argument("file", metavar="FILE", help="a recording")
     replay.add_argument(
@@ -99,10 +101,15 @@ def _add_replay(nouns: argparse._SubParsersAction[Verb]) -> None:
     replay.add_argument(
         "--world",
         action="append",
-        type=pair,
-        metavar="OLD=NEW",
-        help="write what was recorded of context OLD into NEW",
+        type=world_choice,
+        metavar="NAME|OLD=NEW",
+        help="only this context (where a NAME is given, only the contexts that are named); OLD=NEW"
+        " writes what was recorded of OLD into NEW",
     )
+    replay.add_argument(
+        "--entities", metavar="PATTERN", type=entities, default="**", help="only these entities"
+    )
+    replay.add_argument("--aspect", action="append", metavar="NAME", help="only these aspects")
     replay.add_argument(
         "--from",
         dest="begin",
@@ -116,6 +123,11 @@ def _add_replay(nouns: argparse._SubParsersAction[Verb]) -> None:
         "--overwrite", action="store_true", help="also write into contexts that have data"
     )
     _add_json(replay)
+
+
+def world_choice(text: str) -> tuple[str, str]:
+    """Read ``NAME`` or ``OLD=NEW``, the name twice where it stays; an `argparse` type."""
+    return pair(text) if "=" in text else (text, text)
 
 
 def _add_cell(parser: Verb) -> None:
@@ -202,15 +214,23 @@ def _recorded_line(summary: RecordingSummary) -> str:
 
 
 def run_replay(arguments: argparse.Namespace) -> int:
-    """Commit a recording again until its end or a signal."""
+    """Commit a recording again until its end or a signal; fail where nothing in it was chosen."""
     from enact_dist.recording import Replay
 
+    def warn(text: str) -> None:
+        line.end()
+        print(f"enact: {text}", file=sys.stderr, flush=True)
+
     line = ProgressLine()
+    worlds = pairs(arguments.world, "--world")
     with StopSignals() as stop, open_cell(arguments, observer=False, actor="replay") as cell:
         replay = Replay(
             cell,
             arguments.file,
-            worlds=pairs(arguments.world, "--world"),
+            worlds=worlds,
+            only_worlds=worlds if any(old == new for old, new in worlds.items()) else (),
+            entities=arguments.entities,
+            aspects=arguments.aspect or (),
             speed=arguments.speed,
             overwrite=arguments.overwrite,
         )
@@ -220,12 +240,18 @@ def run_replay(arguments: argparse.Namespace) -> int:
             stop.event,
             loop=arguments.loop,
             tell=lambda so_far: line.show(_replayed_line(so_far)),
+            warn=warn,
         )
     line.end()
     if arguments.json:
         print_json(summary)
     else:
         print(_replayed_line(summary))
+        for slot, who in summary.other_writers.items():
+            print(f"  {slot}: {who} writes it, too")
+    if summary.rounds and not summary.versions:
+        print("enact: nothing in the recording is as asked, so nothing was set", file=sys.stderr)
+        return FAILED
     return DONE
 
 

@@ -8,20 +8,23 @@ from __future__ import annotations
 
 import threading
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
+from enact_dist.config_table import suggestion
 from enact_dist.core.messages import AspectEntry, Item
 from enact_dist.errors import ConfigError, DatumTypeError, MisuseError
+from enact_dist.patterns import pattern_matches
+from enact_dist.recording.other_writers import OtherWriters
 from enact_dist.recording.reading import Commit, Recording
-from enact_dist.terms import Access, checked_name
+from enact_dist.terms import Access, Entities, checked_name
 from enact_dist.wire.limits import BODY_BYTES_MAX, ITEMS_MAX
 from enact_dist.wire.payload import Encoded
 from enact_dist.writing import Writing
 
 if TYPE_CHECKING:
     import os
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
     from enact_dist.cell import Cell
     from enact_dist.core.datum import Datum, Slot
@@ -51,6 +54,7 @@ class ReplaySummary:
         missing_bytes: What follows its last whole chunk; 0 where it was ended whole.
         gaps: Versions that the recording itself does not have, where it was ended whole.
         whole: Whether it was ended whole.
+        other_writers: Who else writes a slot that was replayed, by its name.
     """
 
     path: str
@@ -63,6 +67,7 @@ class ReplaySummary:
     missing_bytes: int = 0
     gaps: int = 0
     whole: bool = False
+    other_writers: dict[str, str] = field(default_factory=dict)
 
 
 class Replay:
@@ -73,12 +78,16 @@ class Replay:
         path: The recording.
         worlds: Names of world contexts of the recording, and what each is called in the cell;
             what is not named keeps its name.
+        only_worlds: Replay only these world contexts of the recording; none means all.
+        entities: Replay only data of these entities.
+        aspects: Replay only these aspects, by name; none means all.
         speed: How much faster than it was recorded; 0: as fast as possible.
         overwrite: Also write into world contexts that have data.
 
     Raises:
-        ConfigError: The file is no recording, `speed` makes no sense, or `worlds` names what the
-            recording does not have, what cannot be a name, or one name for two.
+        ConfigError: The file is no recording, `speed` makes no sense, `worlds` or `only_worlds`
+            names what the recording does not have, or `worlds` what cannot be a name, or one name
+            for two.
     """
 
     def __init__(
@@ -87,6 +96,9 @@ class Replay:
         path: str | os.PathLike[str],
         *,
         worlds: Mapping[str, str] | None = None,
+        only_worlds: Iterable[str] = (),
+        entities: Entities | str = "**",
+        aspects: Iterable[str] = (),
         speed: float = 1.0,
         overwrite: bool = False,
     ) -> None:
@@ -95,26 +107,35 @@ class Replay:
         self._cell = cell
         self.recording = Recording(path)
         self._worlds = dict(worlds or {})
+        self._only = frozenset(only_worlds)
+        self._entities, self._aspects = str(Entities(str(entities))), frozenset(aspects)
         self._speed = speed
         self._from_ns = self._to_ns = 0
         self._overwrite = overwrite
         self._sessions: dict[str, Session] = {}
         self._registered: set[str] = set()
+        self._others = OtherWriters()
         self.summary = ReplaySummary(str(path))
-        known = self.recording.facts.get("worlds", "").split()
-        for name, new in self._worlds.items():
+        self._check_names(self.recording.facts.get("worlds", "").split())
+
+    def _check_names(self, known: Sequence[str]) -> None:
+        """Refuse names that the recording does not have, and those that cannot be taken."""
+        path = self.recording.path
+        for name in (*self._worlds, *sorted(self._only)):
             if name not in known:
                 raise ConfigError(
                     f"{path} has no world context {name!r}; it has {', '.join(known) or 'none'}"
                 )
+        for new in self._worlds.values():
             try:
                 checked_name("world context", new, slashes=False)
             except ValueError as error:
                 raise ConfigError(str(error)) from None
-        called = [self._worlds.get(name, name) for name in known]
+        chosen = [name for name in known if name in self._only or not self._only]
+        called = [self._worlds.get(name, name) for name in chosen]
         twice = next((new for new in called if called.count(new) > 1), None)
         if twice is not None:
-            both = ", ".join(name for name, new in zip(known, called, strict=True) if new == twice)
+            both = ", ".join(name for name, new in zip(chosen, called, strict=True) if new == twice)
             raise ConfigError(f"{both} of {path} would all be written into {twice!r}; name others")
 
     def between(self, from_ns: int, to_ns: int = 0) -> None:
@@ -138,15 +159,19 @@ class Replay:
         *,
         loop: bool = False,
         tell: Callable[[ReplaySummary], None] = lambda _: None,
+        warn: Callable[[str], None] | None = None,
     ) -> ReplaySummary:
-        """Commit all of it, or until `stop` is set; a commit is made whole or not at all.
+        """Commit all that was chosen, or until `stop` is set; a commit is made whole or not at all.
 
         Args:
             stop: Ends the replay.
             loop: Begin anew at the end.
             tell: Called after each commit.
+            warn: Called with a sentence for each slot that somebody else writes, too; None: a
+                warning of the log.
 
         Raises:
+            ConfigError: The recording has no such aspect.
             MisuseError: A world context has data, and `overwrite` was not asked; none is made.
             ProtocolError: The recording holds what this version cannot read.
             LockTimeoutError: Somebody else holds the data.
@@ -154,6 +179,9 @@ class Replay:
         """
         stop = stop or threading.Event()
         self._check()
+        self._others = OtherWriters(warn) if warn is not None else OtherWriters()
+        self._others.look_at_actors(self._cell, self._slots)
+        self.summary.other_writers = self._others.found
         begun_s = time.monotonic()
         while not stop.is_set():
             self._once(stop, tell)
@@ -192,7 +220,7 @@ class Replay:
     def _chosen(self) -> Iterator[Commit]:
         """Yield what is to be committed; first the state as of the begin, where one is named."""
         before: dict[Slot, Recorded] = {}
-        for commit in self.recording.commits():
+        for commit in self._wanted():
             if commit.log_ns < self._from_ns:
                 before.update((recorded.slot, recorded) for recorded in commit.versions)
                 continue
@@ -204,6 +232,25 @@ class Replay:
             yield commit
         if before:
             yield Commit(0, self._from_ns, tuple(before.values()))
+
+    def _wanted(self) -> Iterator[Commit]:
+        """Yield the commits with those of their data that were chosen, if any."""
+        for commit in self.recording.commits():
+            versions = tuple(one for one in commit.versions if self._wants(one.slot))
+            if versions:
+                yield commit._replace(versions=versions)
+
+    def _wants(self, slot: Slot) -> bool:
+        return (
+            (not self._only or slot.context in self._only)
+            and (not self._aspects or slot.aspect in self._aspects)
+            and pattern_matches(self._entities, slot.entity)
+        )
+
+    def _slots(self) -> set[Slot]:
+        """Return every slot that will be written; reads the recording through."""
+        slots = {one.slot for commit in self._chosen() for one in commit.versions}
+        return {s._replace(context=self._worlds.get(s.context, s.context)) for s in slots}
 
     # ---------------------------------------------------------------- one commit
 
@@ -217,6 +264,7 @@ class Replay:
         items = [Item(int(Access.WRITE), *slot) for slot in slots]
         writing = Writing(client.payloads)
         lock = client.acquire(items, wait_s=WAIT_S, hold_s=HOLD_S)
+        self._others.look_at(session, lock)
         committed = False
         try:
             if client.lapses != prepared:  # a shard has restarted and forgotten an aspect
@@ -229,6 +277,7 @@ class Replay:
                     writing.put(slot, _encoded(recorded.datum), lock.shard_of)
             client.finish(lock, writing.by_shard(lock.shard_of))
             committed = True
+            self._others.committed(lock)
         finally:
             client.release(lock)
             writing.end(committed=committed)
@@ -251,12 +300,22 @@ class Replay:
     def _check(self) -> None:
         """Refuse what cannot be replayed while the cell is as it was."""
         names = self.recording.look_through()
+        aspects = self.recording.aspects
+        for name in sorted(self._aspects - aspects.keys()):
+            raise ConfigError(
+                f"{self.recording.path} has no aspect {name!r}{suggestion(name, aspects)}; it has"
+                f" {', '.join(sorted(aspects)) or 'none'}"
+            )
+        if self._only:
+            names = names & self._only
         there = self._cell.worlds()
         for name in sorted(self._worlds.get(name, name) for name in names):
             if name in there and name not in self._sessions:  # a second run has data of the first
                 self._refuse_data(self._cell.world(name))
         types = self._cell.aspects()
-        for name, facts in self.recording.aspects.items():
+        for name, facts in aspects.items():
+            if self._aspects and name not in self._aspects:
+                continue
             if name in types and types[name][0] != facts.fingerprint:
                 raise DatumTypeError(
                     f"aspect {name!r} is {facts.fingerprint} in {self.recording.path} and"

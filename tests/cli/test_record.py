@@ -205,3 +205,53 @@ def test_record_refuses_a_pattern_that_is_none(enact, cell_file, tmp_path, capsy
         enact("record", cell_file, "--out", tmp_path / "run.mcap", "--entities", "[")
     assert end.value.code == 2
     assert "'[' is no pattern of entities" in capsys.readouterr().err
+
+
+def test_a_replay_of_what_is_chosen(enact, cell_file, put, tmp_path):
+    """By the names that choose what is recorded; a context that is called otherwise, too."""
+    put("chosen", a=1, b=2)
+    put("left_out", a=3)
+    out = tmp_path / "run.mcap"
+    worlds = ("--world", "chosen", "--world", "left_out")
+    enact("record", cell_file, "--out", out, *worlds, "--seconds", "0.1")
+    words = ("replay", out, "--into", cell_file, "--world", "left_out=left", "--world")
+
+    done = enact(*words, "chosen", "--entities", "b", "--overwrite", "--json")
+    nothing = enact(*words, "chosen=other", "--entities", "c")
+
+    assert (done.status, done.json["versions"], done.json["other_writers"]) == (0, 1, {})
+    assert nothing.status == 1
+    assert "nothing in the recording is as asked" in nothing.err
+    assert "'left'" in enact("world", "tree", "left", "--cell", cell_file).err  # nothing came to it
+
+
+MODULE = """\
+from enact_dist import Actor, Aspect, Entity, World, Write
+
+
+class Writer(Actor):
+    count = Write(World("both"), Entity("a"), Aspect("count", int))
+    every_s = 3600.0
+
+    def update(self, lock):
+        pass
+"""
+
+
+def test_an_actor_that_writes_the_same_is_named(enact, spawn, until, cell_file, put, tmp_path):
+    """On standard error before anything is set, and in the summary."""
+    (tmp_path / "writers.py").write_text(MODULE)
+    put("both", a=1)
+    out = tmp_path / "run.mcap"
+    enact("record", cell_file, "--out", out, "--world", "both", "--seconds", "0.1")
+    actor = spawn("actor", "run", "writers:Writer", "--cell", cell_file, "--name", "scale")
+    until(actor, "ready: actor scale")
+    while "both:a/count" not in enact("actor", "ls", "--cell", cell_file, "--json").out:
+        assert actor.poll() is None
+
+    done = enact("replay", out, "--into", cell_file, "--overwrite")
+
+    assert done.status == 0
+    assert f"enact: actor scale (process {actor.pid} on " in done.err
+    assert "writes both:a/count, too" in done.err
+    assert f"  both:a/count: actor scale (process {actor.pid} on " in done.out
