@@ -24,11 +24,13 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
         "enact verify --minutes 10 --json\n"
         "enact verify --seed 17\n"
         "enact verify --recovery\n"
-        "enact verify --chaos --minutes 5",
+        "enact verify --chaos --minutes 5\n"
+        "enact verify --floods --json",
     )
     add_simulation(verify)
     add_recovery(verify)
     add_chaos(verify)
+    add_floods(verify)
     verify.add_argument("--json", action="store_true", help="print one JSON object")
 
 
@@ -103,6 +105,28 @@ def add_chaos(verify: Verb) -> None:
     )
 
 
+def add_floods(verify: Verb) -> None:
+    """Add the options of the floods."""
+    floods = verify.add_argument_group("one client against the others")
+    floods.add_argument(
+        "--floods",
+        action="store_true",
+        help="flood the shards of a throw-away cell with questions, sessions, registrations, forged"
+        " messages and so on, each beside the updates of an honest client",
+    )
+    floods.add_argument(
+        "--flood", action="append", metavar="NAME", help="only this one (more than once: these)"
+    )
+    floods.add_argument(
+        "--updates", type=whole, default=3000, metavar="N", help="per flood (default: 3000)"
+    )
+    floods.add_argument(
+        "--carrier",
+        choices=("socket", "zenoh"),
+        help="how the honest client's calls travel (default: once over each)",
+    )
+
+
 def minutes(text: str) -> float:
     """Read a positive number of minutes as seconds; an `argparse` type."""
     return seconds(text) * 60.0
@@ -114,6 +138,10 @@ def run_verify(arguments: argparse.Namespace) -> int:
         from enact_dist.verify.chaos import command as chaos
 
         return chaos.run(arguments)
+    if arguments.floods or arguments.flood:
+        from enact_dist.verify.floods import command as floods
+
+        return floods.run(arguments)
     if arguments.recovery:
         from enact_dist.verify import recovery
 
