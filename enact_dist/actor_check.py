@@ -32,12 +32,8 @@ pattern says.
 
 from __future__ import annotations
 
-import os
-import sysconfig
-import traceback
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Final, Literal
+from typing import TYPE_CHECKING, Literal
 
 from enact_dist.actor import narrowed, same_data, stands_for_trigger
 from enact_dist.actor_load import check_every_s, load_class, read_options
@@ -47,6 +43,7 @@ from enact_dist.core.retaining import limits_of, said, with_larger
 from enact_dist.errors import ConfigError, MisuseError
 from enact_dist.retention import checked_retention
 from enact_dist.terms import Entity
+from enact_dist.user_code import raised
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -55,10 +52,6 @@ if TYPE_CHECKING:
     from enact_dist.config_types import CellConfig
 
 Level = Literal["error", "warning"]
-
-_BASE: Final = ("<", f"{Path(__file__).parent}{os.sep}", sysconfig.get_path("stdlib") + os.sep)
-"""How names of files begin that import a user's code, or that it calls."""
-_LIBRARIES: Final = (*_BASE, sysconfig.get_path("purelib") + os.sep)
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,11 +182,12 @@ def check_cell(config: CellConfig, *, initial: Collection[str] = ()) -> tuple[Fi
             read_options(actor_class, actor.options)
             if actor.every_s is not None:
                 check_every_s(actor_class, actor.every_s)
-        except ConfigError as error:
-            text = f"actor {actor.name}: {error}"
-            findings.append(Finding("error", "no such actor", (actor.name,), text))
-        except Exception as error:  # noqa: BLE001 (importing a module can raise anything)
-            text = f"actor {actor.name} ({actor.class_path}): {_raised(error)}"
+        except MisuseError as error:
+            if type(error) is ConfigError:
+                text = f"actor {actor.name}: {error}"
+                findings.append(Finding("error", "no such actor", (actor.name,), text))
+                continue
+            text = f"actor {actor.name} ({actor.class_path}): {raised(error.__cause__ or error)}"
             findings.append(Finding("error", "broken module", (actor.name,), text))
     findings += check_actors(actors, worlds=config.worlds, initial=initial)
     findings += _sets(actors, {entry.name: entry for entry in config.aspect_entries()})
@@ -214,24 +208,6 @@ def check_cell(config: CellConfig, *, initial: Collection[str] = ()) -> tuple[Fi
                 )
             )
     return _ordered(findings)
-
-
-def _raised(error: Exception) -> str:
-    """Return what an error is and where the user's code raised it."""
-    kind = type(error).__name__
-    if isinstance(error, SyntaxError) and error.filename:
-        return f"{kind} at {_shown(error.filename)}:{error.lineno}: {error.msg}"
-    lines = [(frame.filename, frame.lineno) for frame in traceback.extract_tb(error.__traceback__)]
-    for others in (_LIBRARIES, _BASE):
-        if own := [line for line in lines if not line[0].startswith(others)]:
-            break
-    file, number = (own or lines)[-1]
-    return f"{kind} at {_shown(file)}:{number}: {error}"
-
-
-def _shown(file: str) -> str:
-    here = f"{Path.cwd()}{os.sep}"
-    return file.removeprefix(here)
 
 
 def _sets(

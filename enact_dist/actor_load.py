@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.actor import Actor, check_period, check_update
 from enact_dist.config_table import suggestion
-from enact_dist.errors import ConfigError, MisuseError
+from enact_dist.errors import ConfigError, EnactError, MisuseError
 from enact_dist.terms import Entity
+from enact_dist.user_code import own_lines, place_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -35,6 +36,10 @@ _WANTED: Final[Mapping[object, str]] = {
     str: "a text",
     Path: "a path",
 }
+
+
+class BrokenModuleError(ConfigError):
+    """A module raised at its import; its `__cause__` says what, its notes the user's own lines."""
 
 
 def load_class(target: str) -> type[Actor]:
@@ -56,6 +61,8 @@ def load_class(target: str) -> type[Actor]:
         )
     try:
         module = importlib.import_module(module_name)
+    except EnactError:
+        raise  # what it declares is wrong: the error names the class and the attribute
     except ModuleNotFoundError as error:
         if error.name is None or not f"{module_name}.".startswith(f"{error.name}."):
             raise ConfigError(
@@ -67,6 +74,8 @@ def load_class(target: str) -> type[Actor]:
             f"no module {error.name} for actor {target!r}; run from the folder that holds it, or"
             " install its package"
         ) from error
+    except (Exception, SystemExit) as error:
+        raise _broken(target, module_name, error) from error
     found = getattr(module, class_name, None)
     if not isinstance(found, type) or not issubclass(found, Actor):
         actors = [
@@ -84,6 +93,17 @@ def load_class(target: str) -> type[Actor]:
     except MisuseError as error:
         raise ConfigError(str(error)) from None
     return found
+
+
+def _broken(target: str, module_name: str, error: BaseException) -> BrokenModuleError:
+    """Return the error for a module that raises at its import, with the user's own lines of it."""
+    text = f"{type(error).__name__}: {error}"
+    if isinstance(error, SystemExit):
+        text = f"it called sys.exit({error.code!r}) at {place_of(error)}"
+    broken = BrokenModuleError(f"{module_name} of actor {target!r} cannot be imported: {text}")
+    for line in own_lines(error):
+        broken.add_note(line)
+    return broken
 
 
 def load_actor(target: str, options: Mapping[str, object] | None = None) -> Actor:
@@ -145,6 +165,11 @@ def make_actor(actor_class: type[Actor], options: Mapping[str, object]) -> Actor
     except ValueError as error:
         name = actor_class.__name__
         raise ConfigError(f"actor {name} refuses its options {dict(options)}: {error}") from error
+    except SystemExit as error:
+        raise ConfigError(
+            f"{name}.__init__ called sys.exit({error.code!r}) at {place_of(error)}; it has to"
+            " return, or to raise what is wrong"
+        ) from error
 
 
 def read_options(actor_class: type[Actor], options: Mapping[str, object]) -> dict[str, Option]:

@@ -41,7 +41,8 @@ class ActorStatistics:
 
     Attributes:
         name: Name of the running actor.
-        state: "starting", "running", "done" (a once-actor that finished) or "stopped".
+        state: "starting", "running", "stuck" (its update runs on after its lock was lost), "done"
+            (a once-actor that finished) or "stopped".
         updates: Updates that committed.
         skipped: States of trigger data that no update saw because a newer one came first.
         failures: Updates that ended with an exception of their own.
@@ -61,6 +62,8 @@ class ActorStatistics:
         late: Data whose set was over when they came.
         unstamped: Data that could be in no set, because their writer gave no stamp.
         writes: What it declares to write, as ``world:entities/aspect``; at most `WRITES_MAX`.
+        updating_s: How long the update that runs has taken so far; 0 between updates.
+        lock_lost: Whether that update has lost its lock, so that it can commit nothing.
     """
 
     name: str = ""
@@ -82,6 +85,8 @@ class ActorStatistics:
     late: int = 0
     unstamped: int = 0
     writes: tuple[str, ...] = ()
+    updating_s: float = 0.0
+    lock_lost: bool = False
 
 
 _NAMES: Final = [field.name for field in dataclasses.fields(ActorStatistics)]

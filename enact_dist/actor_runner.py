@@ -33,6 +33,7 @@ from weakref import WeakKeyDictionary
 
 from enact_dist.actor import Actor, check_period, name_of
 from enact_dist.actor_binding import BoundActor
+from enact_dist.actor_doing import Doing
 from enact_dist.actor_inbox import Inbox, SetInbox, watching
 from enact_dist.actor_log import Repeated, kind_of
 from enact_dist.actor_report import (
@@ -76,6 +77,9 @@ STOP_LOOK_S: Final = 0.1
 """An idle actor looks at `stop` this often; an `Event` and a `Condition` cannot be awaited both."""
 
 REPORT_EVERY_NS: Final = 1_000_000_000
+LOOK_OUT_S: Final = 1.0
+NOTHING: Final = "nothing of it was written"
+"""What remains of an update that is cut off: its lock ends with its process."""
 
 log = logging.getLogger("enact.actor")
 
@@ -118,7 +122,12 @@ def run_actor(
 
 
 class ActorRun:
-    """One run of one actor.  `statistics` may be asked from any thread."""
+    """One run of one actor.  `statistics` may be asked from any thread.
+
+    Attributes:
+        name: Name in logs and reports.
+        doing: Which method of the actor runs.
+    """
 
     def __init__(
         self,
@@ -145,6 +154,8 @@ class ActorRun:
         self.name = name or name_of(actor)
         self._record = ActorRecord(self.name, now_ns=monotonic_ns())
         self._board = ReportBoard.of(cell)
+        self._ended = threading.Event()
+        self.doing = Doing(type(actor).__name__)
         self._reported_ns = 0
         if self._every_s is not None:
             check_period(self.name, self._every_s)
@@ -157,6 +168,12 @@ class ActorRun:
         statistics = dataclasses.replace(
             self._record.snapshot(monotonic_ns()), writes=self._bound.writes()[:WRITES_MAX]
         )
+        if (call := self.doing.call) is not None and call.method == "update":
+            lasted_s, lost = (monotonic_ns() - call.since_ns) / 1e9, call.lock_lost
+            state = "stuck" if lost else statistics.state
+            statistics = dataclasses.replace(
+                statistics, state=state, updating_s=round(lasted_s, 3), lock_lost=lost
+            )
         if self._sets is None:
             return statistics
         sets = self._sets.sets
@@ -180,7 +197,10 @@ class ActorRun:
             self._record.state = "stopped"
             self._report(now=True)
             return self.statistics()
-        self._actor.start()
+        with self.doing.inside("start"):
+            self._actor.start()
+        lookout = threading.Thread(target=self._look_out, name=f"{self.name} lookout", daemon=True)
+        lookout.start()
         try:
             if on_ready is not None:
                 on_ready()
@@ -197,10 +217,20 @@ class ActorRun:
         finally:
             if self._record.state == "running":
                 self._record.state = "stopped"
+            self._ended.set()
+            lookout.join()
             self._report(now=True)
             self._tell_left()
-            self._actor.stop()
+            with self.doing.inside("stop"):
+                self._actor.stop()
         return self.statistics()
+
+    def _look_out(self) -> None:
+        """Report for an update that takes long, as it cannot report itself."""
+        while not self._ended.wait(LOOK_OUT_S):
+            call = self.doing.call
+            if call is not None and monotonic_ns() - call.since_ns >= REPORT_EVERY_NS:
+                self._report()
 
     def _accepted(self) -> bool:
         """Let the shards accept the actor's requests, waiting for them; False: stopped first."""
@@ -287,7 +317,9 @@ class ActorRun:
                 missing = lock.missing()
                 seen = self._seen(lock)
                 if not missing:
-                    self._actor.update(lock)
+                    about = _about(entity)
+                    with self.doing.inside("update", about=about, lock=lock, remains=NOTHING):
+                        self._actor.update(lock)
         except REFUSALS as error:
             if isinstance(error, LockTimeoutError) and self._stop.is_set():
                 return error  # told to stop while it waited: nothing was refused

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from enact_dist.link.client import CellClient
 
 
-RUNNING: Final = ("starting", "running")
+RUNNING: Final = ("starting", "running", "stuck")
 """States of an actor's report that are none of an end."""
 
 

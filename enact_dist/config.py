@@ -79,6 +79,7 @@ shared_bytes_max       none           cap of each shard's large data in the memo
   entity               all            the one entity that it works on, of those that the patterns
                                       of its class match: one class for several cameras
   host                 this machine   host name of the machine that runs it
+  drain_s              8              how long its update may still take after SIGTERM, seconds
 =====================  =============  =====================================================
 
 Relative folders are relative to the file.  An unknown key, a wrong type or a name that does not
@@ -279,9 +280,13 @@ def _shard(name: str, table: Table, file: Path, data_folder: Path | None) -> Sha
                 " that names the host",
             )
     folder = _folder(table, "folder", file) or (data_folder and data_folder / name)
+    drain_s = _drain_s(table)
+    return ShardConfig(name, listen, advertise, folder, _host(table), _metrics(table), drain_s)
+
+
+def _drain_s(table: Table) -> float | None:
     drain_s = table.take_float("drain_s", 0.0, low=0.0, high=DRAIN_S_MAX)
-    told_s = drain_s if "drain_s" in table.values else None
-    return ShardConfig(name, listen, advertise, folder, _host(table), _metrics(table), told_s)
+    return drain_s if "drain_s" in table.values else None
 
 
 def _metrics(table: Table) -> tuple[str, int] | None:
@@ -365,7 +370,7 @@ def _retention(table: Table) -> Retention | None:
 
 
 def _actor(name: str, table: Table, worlds: tuple[str, ...]) -> ActorConfig:
-    table.refuse_unknown("class", "worlds", "options", "every_s", "entity", "host")
+    table.refuse_unknown("class", "worlds", "options", "every_s", "entity", "host", "drain_s")
     _check_title(name, "actor", table)
     class_path = table.take_str("class")
     if not _DOTTED_NAME.match(class_path):
@@ -381,6 +386,7 @@ def _actor(name: str, table: Table, worlds: tuple[str, ...]) -> ActorConfig:
         every_s=every_s,
         entity=_entity(table),
         host=_host(table),
+        drain_s=_drain_s(table),
     )
 
 

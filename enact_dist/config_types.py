@@ -90,6 +90,8 @@ class ActorConfig:
         every_s: Period in seconds that replaces the one of a source, or ``None``.
         entity: The one entity that it works on, of those that its patterns match; empty: all.
         host: Host name of the machine it runs on; empty: wherever `enact up` is called.
+        drain_s: How long its update may still take after a signal, seconds; ``None`` leaves it to
+            the actor's process.
     """
 
     name: str
@@ -99,6 +101,7 @@ class ActorConfig:
     every_s: float | None = None
     entity: str = ""
     host: str = ""
+    drain_s: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from enact_dist.actor_drain import DRAIN_S, Drain
 from enact_dist.actor_life import StopWithPulse
 from enact_dist.cli.output import print_json, print_table, shown_s
 from enact_dist.cli.verbs import (
@@ -21,6 +22,7 @@ from enact_dist.cli.verbs import (
     add_timeout,
     add_verb,
     cell_config,
+    duration,
     one_entity,
     open_cell,
     pair,
@@ -118,6 +120,14 @@ def _add_run(verbs: argparse._SubParsersAction[Verb]) -> None:
         help="the one entity that it works on, of those that its patterns match",
     )
     run.add_argument("--every", type=seconds, metavar="S", help="period of a source, seconds")
+    run.add_argument(
+        "--drain",
+        dest="drain_s",
+        type=duration,
+        metavar="S",
+        help="seconds that an update may still take after SIGTERM, before it is cut off (default:"
+        " `drain_s` of the actor in cell.toml, else 8)",
+    )
 
 
 def run_actor(arguments: argparse.Namespace) -> int:
@@ -127,20 +137,24 @@ def run_actor(arguments: argparse.Namespace) -> int:
     json_lines = JsonLines(process=f"actor {arguments.name or arguments.target}")
     formatter = json_lines if arguments.log == "json" else logging.Formatter(TEXT)
     _log_to_stderr(formatter)
+    actor, name, worlds, drain_s = _made(arguments)  # a signal ends an import at once
     with StopSignals() as signals:
-        actor, name, worlds = _made(arguments)
         stop = StopWithPulse(manager.alive)
         with open_cell(arguments, observer=False, actor=name) as cell:
             json_lines.cell, json_lines.process = cell.name, f"actor {name}"
-            signals.call(lambda _: manager.stopping())
-            signals.call(lambda _: stop.set())
+            run = _bound(actor, cell, worlds, stop, name)
+            drain = Drain(name, run.doing, drain_s)
+            for act in (lambda _: manager.stopping(), lambda _: stop.set(), drain.begin):
+                signals.call(act)
+            signals.call_again(drain.hurry)
 
             def ready() -> None:
                 say(formatter, "actor.ready", f"{READY} actor {name} in cell {cell.name}")
                 manager.ready()
                 _warn_of_namesakes(cell, name)
 
-            statistics = _bound(actor, cell, worlds, stop, name).run(on_ready=ready)
+            statistics = run.run(on_ready=ready)
+        drain.over()
     counted = {key: getattr(statistics, key) for key in ("state", "updates", "failures", "refused")}
     say(formatter, "actor.end", _farewell(name, statistics), **counted)
     return DONE
@@ -193,13 +207,14 @@ def _log_to_stderr(formatter: logging.Formatter) -> None:
     logging.basicConfig(level=logging.INFO, handlers=[handler])
 
 
-def _made(arguments: argparse.Namespace) -> tuple[Actor, str, dict[str, str] | None]:
-    """Return the actor that the command names, its name and its roles' world contexts."""
+def _made(arguments: argparse.Namespace) -> tuple[Actor, str, dict[str, str] | None, float]:
+    """Return the actor that the command names, its name, its roles' world contexts, its drain."""
     from enact_dist.actor import name_of
     from enact_dist.actor_load import check_every_s, configured_actor, load_actor
 
     worlds = pairs(arguments.world, "--world") or None
     options = pairs(arguments.option, "--option")
+    drain_s = arguments.drain_s
     if ":" in arguments.target:
         actor = load_actor(arguments.target, options)
         name = ""
@@ -218,6 +233,7 @@ def _made(arguments: argparse.Namespace) -> tuple[Actor, str, dict[str, str] | N
             raise ConfigError(f"the options of {entry.name} stand in {config.path}; leave --option")
         actor = configured_actor(entry)
         name = entry.name
+        drain_s = entry.drain_s if drain_s is None else drain_s
         worlds = worlds or dict(entry.worlds) or None
     if arguments.every is not None:
         check_every_s(type(actor), arguments.every)
@@ -228,7 +244,8 @@ def _made(arguments: argparse.Namespace) -> tuple[Actor, str, dict[str, str] | N
         actor.declaration.check_entity(actor.only_entity)
     except MisuseError as error:
         raise ConfigError(str(error)) from None
-    return actor, arguments.name or name or name_of(actor), worlds
+    name = arguments.name or name or name_of(actor)
+    return actor, name, worlds, DRAIN_S if drain_s is None else drain_s
 
 
 def _farewell(name: str, statistics: ActorStatistics) -> str:
@@ -293,13 +310,20 @@ def _rows(info: ActorInfo) -> Iterator[tuple[object, ...]]:
         ago_s = time.time() - report.last_update_unix_s
         last = f"{shown_s(max(0.0, ago_s))} ago" if report.last_update_unix_s else "never"
         yield (
-            report.name, *here, _state(info, report.state), report.updates,
+            report.name, *here, _state(info, _doing(report)), report.updates,
             "-" if info.silent else f"{report.rate_hz:.1f}/s",
             report.failures, report.refused, report.incomplete,
             f"{report.lock_wait_p99_ms:.1f} ms", last, *left, report.last_error or "-",
         )  # fmt: skip
     if not reports:
         yield (info.actor, *here, _state(info, "connected"), *["-"] * 7, *left, "-")
+
+
+def _doing(report: ActorStatistics) -> str:
+    """Return an actor's state, of an update that does not return for how long."""
+    if report.state != "stuck":
+        return report.state
+    return f"stuck for {shown_s(report.updating_s)} in update (lock lost)"
 
 
 def _state(info: ActorInfo, reported: str) -> str:

@@ -118,7 +118,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     Raises:
         SystemExit: The command line cannot be read (status 2), or `--help` was asked (0).
     """
-    words = list(sys.argv[1:] if argv is None else argv)
+    try:
+        return _main(list(sys.argv[1:] if argv is None else argv))
+    except KeyboardInterrupt:  # while modules of ours are loaded, too
+        return INTERRUPTED
+
+
+def _main(words: list[str]) -> int:
     words, command = _split_command(words)
     parser = build_parser(next(iter(words), ""))
     arguments = parser.parse_args(words)
@@ -156,8 +162,6 @@ def _run(arguments: argparse.Namespace) -> int:
         sys.stdout.flush()
     except EnactError as error:
         return _report(error, arguments)
-    except KeyboardInterrupt:
-        return INTERRUPTED
     except BrokenPipeError:
         # Whoever read our output has seen enough; what is left must not fail again at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -171,6 +175,8 @@ def _report(error: Exception, arguments: argparse.Namespace) -> int:
     if arguments.debug:
         raise error
     text = " ".join((str(error) or type(error).__name__).split())
+    for line in getattr(error, "__notes__", ()):
+        print(line, file=sys.stderr)
     as_json = getattr(arguments, "log", "text") == "json"
     print(_refusal(arguments, text) if as_json else f"enact: {text}", file=sys.stderr)
     if isinstance(error, ConfigError):

@@ -71,7 +71,7 @@ def run_up(arguments: argparse.Namespace) -> int:
         _refuse_second(config, shard)
     tasks = [
         *(_task(config, "shard", shard.name, arguments.log, shard.drain_s) for shard in shards),
-        *(_task(config, "actor", actor.name, arguments.log) for actor in actors),
+        *(_task(config, "actor", actor.name, arguments.log, actor.drain_s) for actor in actors),
     ]
     say: Say = _Log([task.name for task in tasks])
     if arguments.log == "json":
