@@ -1,61 +1,92 @@
-"""The hostile client of a flood: `attacker CELL ATTACK VICTIM_SESSION`.
-
-It says ``begun`` once its first round is over, or has gone on for `BEGUN_S`; goes on until a line
-comes; and says ``told {json}`` with what its messages came to.
-"""
+"""A client that keeps no rule: one session of its own, and ways to send anything at once."""
 
 from __future__ import annotations
 
-import json
-import os
-import sys
-import threading
+import socket
 from collections import Counter
-from pathlib import Path
-from typing import Final
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
 
-from enact_dist.config import load_config
-from enact_dist.errors import LinkError
-from enact_dist.verify.floods.attacks import ATTACKS, FIRST, Attack, Attacker
-from enact_dist.verify.floods.raw import RawZenoh, fresh_session
+from enact_dist.core.datum import LockId
+from enact_dist.core.messages import (
+    Acquire,
+    AwaitStamp,
+    Item,
+    TakeView,
+)
+from enact_dist.terms import Access
+from enact_dist.verify.floods.raw import WINDOW, RawSocket, RawZenoh, fresh_session, hello
+from enact_dist.verify.floods.victim import HELD, KEPT, WORLD
 
-BEGUN_S: Final = 3.0
+if TYPE_CHECKING:
+    from collections.abc import Iterable
 
+    from enact_dist.config_types import CellConfig
+    from enact_dist.core.messages import Request, Welcome
 
-def _attack(attack: Attack, attacker: Attacker, stop: threading.Event) -> None:
-    """Repeat rounds until told to stop; what a round finds closed, the next one opens again."""
-    while not stop.is_set():
-        try:
-            attack.round(attacker)
-        except (LinkError, OSError) as error:
-            attacker.tally[type(error).__name__] += 1
-        _begun.set()
-        attacker.tally["rounds"] += 1
-
-
-_begun = threading.Event()
-
-
-def main(file: str, name: str, victim: str) -> None:
-    """Attack until a line comes on the standard input, or its end."""
-    (attack,) = (attack for attack in ATTACKS if attack.name == name)
-    config = load_config(Path(file))
-    stop = threading.Event()
-    with RawZenoh(config, mode=attack.mode) as zenoh:
-        session = fresh_session()
-        attacker = Attacker(
-            config, zenoh, zenoh.welcome(FIRST, session), session, victim, zenoh.tally
-        )
-        rounds = threading.Thread(target=_attack, args=(attack, attacker, stop), daemon=True)
-        rounds.start()
-        _begun.wait(BEGUN_S)
-        print("begun", flush=True)
-        sys.stdin.readline()
-        stop.set()
-        told = {"tally": Counter(zenoh.tally), "heard": Counter(attacker.heard)}
-        print("told", json.dumps(told), flush=True)
-        os._exit(0)  # what still waits for a shard must not keep anybody
+FIRST: Final = "left"
+"""The shard on which everything of the honest client lies."""
+SECOND: Final = "right"
+HOLD_NS: Final = 60_000_000_000
 
 
-if __name__ == "__main__":
-    main(*sys.argv[1:])
+@dataclass(slots=True)
+class Attacker:
+    """A hostile client with one session of its own, to begin with.
+
+    Attributes:
+        config: The cell.
+        zenoh: Its way to all shards.
+        welcome: What the first shard said to its hello.
+        session: Its own.
+        victim: The honest client's session.
+        tally: What its messages came to.
+        heard: What it heard and should not have.
+        open: Sockets that it keeps open.
+    """
+
+    config: CellConfig
+    zenoh: RawZenoh
+    welcome: Welcome
+    session: str
+    victim: str
+    tally: Counter[str]
+    heard: Counter[str] = field(default_factory=Counter)
+    open: list[socket.socket | RawSocket] = field(default_factory=list)
+    number: int = 0
+
+    def next_lock(self, *, lane: int = 0) -> LockId:
+        """Return a lock of its own session that was not asked for yet."""
+        self.number += 1
+        return LockId(self.session, lane, self.number)
+
+    def acquire(self, items: tuple[Item, ...], lock: LockId, *, wait_ns: int = 0) -> Acquire:
+        """Return a request for a lock of its own session."""
+        version = self.welcome.placement.version
+        return Acquire(lock, self.welcome.epoch, version, 0, items, wait_ns, HOLD_NS, 0)
+
+    def view(self, lock: LockId, *, seen_ns: int = 0, at_ns: int = 0) -> TakeView:
+        """Return a request for a view of the datum that the victim holds."""
+        item = Item(int(Access.VIEW), WORLD, HELD.name, KEPT.name)
+        epoch, version = self.welcome.epoch, self.welcome.placement.version
+        return TakeView(lock, epoch, version, 0, (item,), seen_ns, at_ns)
+
+    def post(self, *messages: Request) -> None:
+        """Send messages to the first shard, some under way at once."""
+        for message in messages:
+            self.zenoh.post(FIRST, message)
+
+    def park(self, messages: Iterable[Request]) -> None:
+        """Send what is answered late, no more at once than the shard takes in."""
+        for number, message in enumerate(messages):
+            self.zenoh.post(FIRST, message, parked=True)
+            if number % WINDOW == 0:
+                self.zenoh.ask(FIRST, AwaitStamp(0, 0))
+
+
+def line_of(attacker: Attacker) -> RawSocket:
+    """Return a connection to the first shard that is open for a session of its own."""
+    session = fresh_session()
+    line = RawSocket(attacker.welcome, attacker.tally, session)
+    line.ask(hello(session))
+    return line

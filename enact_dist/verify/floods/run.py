@@ -15,7 +15,7 @@ from enact_dist.errors import EnactError, LinkError
 from enact_dist.lock import Lock
 from enact_dist.terms import View
 from enact_dist.verify.daemons import CellProcesses
-from enact_dist.verify.floods.attacks import FIRST, SECOND
+from enact_dist.verify.floods.attacker import FIRST, SECOND
 from enact_dist.verify.floods.victim import HELD, KEPT, WORLD
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ UPDATES_S: Final = 90.0
 """How long the honest client may take for all updates before it counts as stopped."""
 STOP_S: Final = 30.0
 VICTIM: Final = "enact_dist.verify.floods.victim"
-ATTACKER: Final = "enact_dist.verify.floods.attacker"
+ATTACKER: Final = "enact_dist.verify.floods.attacking"
 
 
 @dataclass(slots=True)
