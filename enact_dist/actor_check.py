@@ -38,6 +38,7 @@ from typing import TYPE_CHECKING, Literal
 from enact_dist.actor import narrowed, same_data, stands_for_trigger
 from enact_dist.actor_load import check_every_s, load_class, read_options
 from enact_dist.config_table import suggestion
+from enact_dist.core.datum_types import newest, type_conflict
 from enact_dist.core.messages import AspectEntry
 from enact_dist.core.retaining import limits_of, said, with_larger
 from enact_dist.errors import ConfigError, MisuseError
@@ -298,20 +299,29 @@ def _aspects(uses: Iterable[_Use], aspects: Collection[str]) -> Iterator[Finding
             )
 
 
-def _types(uses: Iterable[_Use]) -> Iterator[Finding]:
+def _types(uses: Sequence[_Use]) -> Iterator[Finding]:
+    """Yield the uses of an aspect with a type that does not go with the newest one written."""
     from enact_dist.wire.fingerprint import fingerprint
 
-    first: dict[str, tuple[_Use, str]] = {}
+    known: dict[str, tuple[_Use, AspectEntry]] = {}
+    entries: list[tuple[_Use, AspectEntry]] = []
     for use in uses:
-        aspect = use.request.aspect
-        found = fingerprint(aspect.datum_type)
-        other, wanted = first.setdefault(aspect.name, (use, found))
-        if found != wanted:
+        aspect, reads = use.request.aspect, not use.request.access.writes
+        entry = AspectEntry(aspect.name, fingerprint(aspect.datum_type), "", reads=reads)
+        entries.append((use, entry))
+    for use, entry in sorted(entries, key=lambda each: each[1].reads):  # first those that write
+        _, before = known.setdefault(entry.name, (use, entry))
+        if not entry.reads and newest(before, entry) == entry:
+            known[entry.name] = (use, entry)
+    for use, entry in entries:
+        other, registered = known[entry.name]
+        if use is not other and type_conflict(registered, entry):
             yield Finding(
                 "error",
                 "two types",
                 (other.actor.name, use.actor.name),
-                f"aspect {aspect.name} is {wanted} for {other}, but {found} for {use}",
+                f"aspect {entry.name} is {registered.fingerprint} for {other}, but"
+                f" {entry.fingerprint} for {use}",
             )
 
 

@@ -22,6 +22,7 @@ class AspectInfo:
     Attributes:
         aspect: Its name.
         type: The fingerprint of its type; "" where no type is registered, though there are slots.
+            A ``=`` marks fields that have a default.
         durability: What its data survive, "" as well.
         versions: So many of each slot are retained, the newest one included; None: without limit.
         age_s: For so long after they were replaced; None likewise.
@@ -30,6 +31,7 @@ class AspectInfo:
         slots: How many there are on these shards, null ones too.
         data: How many of these are not null.
         size_bytes: Of the newest data, each counted as in `SlotInfo`.
+        older_types: The fingerprints of the types that this one has succeeded, the oldest first.
     """
 
     aspect: str
@@ -42,6 +44,7 @@ class AspectInfo:
     slots: int = 0
     data: int = 0
     size_bytes: int = 0
+    older_types: tuple[str, ...] = ()
 
 
 def aspect_infos(session: Session, world: str = "") -> tuple[AspectInfo, ...]:
@@ -99,4 +102,13 @@ def _of_shard(answer: Answer, survey: Answer) -> list[AspectInfo]:
 def _info(entry: AspectEntry) -> AspectInfo:
     versions, age_ns, size = (None if one == NO_LIMIT else one for one in limits_of(entry))
     age_s = None if age_ns is None else age_ns / 1e9
-    return AspectInfo(entry.name, entry.fingerprint, entry.durability, versions, age_s, size, ())
+    return AspectInfo(
+        entry.name,
+        entry.fingerprint,
+        entry.durability,
+        versions,
+        age_s,
+        size,
+        (),
+        older_types=entry.older,
+    )

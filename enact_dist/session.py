@@ -6,7 +6,7 @@ import time
 from typing import TYPE_CHECKING, Any, Final
 
 from enact_dist.config_table import suggestion
-from enact_dist.core.catalogue import other_type
+from enact_dist.core.datum_types import type_conflict
 from enact_dist.core.messages import AspectEntry, AwaitStamp, Item, Reached
 from enact_dist.core.placement import shard_of
 from enact_dist.core.retaining import said
@@ -48,7 +48,7 @@ class Session:
     def __init__(self, client: CellClient) -> None:
         self.client = client
         self.cache = DatumCache()
-        self._entries: dict[int, tuple[Aspect[Any], AspectEntry]] = {}
+        self._entries: dict[int, tuple[Aspect[Any], AspectEntry, AspectEntry]] = {}
         self._looked_up: dict[AspectEntry, float] = {}
         self._lapses = 0
         self._unknown: set[AspectEntry] = set()
@@ -69,15 +69,17 @@ class Session:
             ShardUnreachableError: A shard that is asked does not answer.
         """
         prepared = self._see_lapses()
+        written = {request.aspect.name for request in requests if request.access.writes}
         aspects = {request.aspect.name: request.aspect for request in requests}
-        entries = [self._entry(aspect) for aspect in aspects.values()]
+        entries = [
+            self._entry(aspect, reads=name not in written) for name, aspect in aspects.items()
+        ]
         if self.client.knows(entries):
             return prepared
         patience_s = self.client.patience_s
         timeout_s = patience_s if wait_s is None else min(patience_s, max(wait_s, CALL_S))
-        writing = [request for request in requests if request.access.writes]
-        written = {request.aspect.name for request in writing}
         if written:
+            writing = [request for request in requests if request.access.writes]
             self.client.register(
                 aspects=[entry for entry in entries if entry.name in written],
                 needed=lambda: self.shards_of(writing),
@@ -125,7 +127,7 @@ class Session:
             ShardUnreachableError: A shard that is asked does not answer.
         """
         self._see_lapses()
-        entries = [self._entry(aspect) for aspect in aspects]
+        entries = [self._entry(aspect, reads=True) for aspect in aspects]
         if not self.client.knows(entries):
             self._look_up(entries, self.client.shards, timeout_s)
 
@@ -149,12 +151,14 @@ class Session:
         client.greet(lacking, timeout_s=timeout_s)
         known = client.aspect_entries()
         for entry in due:
-            wrong = other_type(known[entry.name], entry) if entry.name in known else ""
+            wrong = type_conflict(known[entry.name], entry) if entry.name in known else ""
             if wrong:
                 raise DatumTypeError(wrong)
         used = [entry for entry in due if entry.name in known]
         if used and not client.core.observer:
-            client.register(aspects=used, needed=needed, timeout_s=timeout_s)
+            # A shard to which an aspect is new gets the type that the others have.
+            as_known = [one._replace(fingerprint=known[one.name].fingerprint) for one in used]
+            client.register(aspects=as_known, needed=needed, timeout_s=timeout_s)
         if len(self._looked_up) >= ENTRIES_MAX:
             self._looked_up.clear()
             self._unknown.clear()
@@ -186,7 +190,9 @@ class Session:
             return  # the usual case
         shown = [one.state.slot for one in readings if not one.state.null_reason]
         names = {slot.aspect for slot in shown}
-        wanted = {self._entry(one.aspect) for one in requests if one.aspect.name in names}
+        wanted = {
+            self._entry(one.aspect, reads=True) for one in requests if one.aspect.name in names
+        }
         entries = [entry for entry in wanted if entry in self._unknown]
         for entry in entries:
             self._looked_up.pop(entry, None)
@@ -206,8 +212,8 @@ class Session:
             shards.add(shard_of(str(request.entity), self.client.core.placement))
         return shards
 
-    def _entry(self, aspect: Aspect[Any]) -> AspectEntry:
-        """Return the aspect's catalogue entry; computed once per aspect object."""
+    def _entry(self, aspect: Aspect[Any], *, reads: bool = False) -> AspectEntry:
+        """Return the entry with which a client registers; computed once per aspect object."""
         known = self._entries.get(id(aspect))
         if known is None or known[0] is not aspect:
             if len(self._entries) >= ENTRIES_MAX:
@@ -219,13 +225,15 @@ class Session:
                 durability,
                 *said(checked_retention(aspect.retention)),
             )
-            known = self._entries[id(aspect)] = (aspect, entry)
-        return known[1]
+            known = (aspect, entry, entry._replace(reads=True))
+            self._entries[id(aspect)] = known
+        _, writing, reading = known
+        return reading if reads else writing
 
     def aspect_used(self, name: str) -> Aspect[Any] | None:
         """Return the aspect of that name that this process used last here, if it used one."""
         entries = list(self._entries.values())  # other threads add to them
-        return next((aspect for aspect, _ in reversed(entries) if aspect.name == name), None)
+        return next((aspect for aspect, *_ in reversed(entries) if aspect.name == name), None)
 
     def shard_of(self, slot: Slot) -> str:
         """Return the name of the shard that owns the slot."""

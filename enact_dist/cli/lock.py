@@ -242,7 +242,7 @@ def _hold(cell: Cell, arguments: argparse.Namespace, stop: StopSignals) -> int:
     client = cell.world(items[0].context).session.client
     entries = client.aspect_entries()
     client.register(
-        aspects=[entries[item.aspect] for item in items],
+        aspects=[entries[item.aspect]._replace(reads=True) for item in items],
         needed=lambda: _shards_of(client, items),
     )
     lock = client.acquire(items, wait_s=arguments.wait, hold_s=arguments.hold)
@@ -359,12 +359,8 @@ def list_audit(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print_json(entries)
         return status
-    rows = [
-        (_local_time(one.stamp_s), one.shard, one.kind, one.identity or "-", one.text)
-        for one in entries
-    ]
-    columns = ("when", "shard", "what", "by", "details")
-    print_table(columns, rows, empty="no lock was ended by hand")
+    rows = [(_local_time(entry.stamp_s), entry.shard, entry.kind, entry.text) for entry in entries]
+    print_table(("when", "shard", "what", "details"), rows, empty="no lock was ended by hand")
     return status
 
 

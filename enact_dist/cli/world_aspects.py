@@ -60,7 +60,7 @@ def _row(info: AspectInfo) -> tuple[object, ...]:
         info.durability or "-",
         _retained(info) if info.type else "-",
         ", ".join(info.shards),
-        info.type or "-",
+        (info.type or "-") + (f" (older: {len(info.older_types)})" if info.older_types else ""),
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
+from enact_dist.core.datum_types import successions, type_conflict, with_type_of
 from enact_dist.core.history import Policy
 from enact_dist.core.retaining import covers, limits_of, with_larger
 from enact_dist.terms import Durability
@@ -19,9 +20,10 @@ class Catalogue:
 
     Attributes:
         policies: How much of its history each aspect retains.
+        successions: How often the type of some aspect has been succeeded by a newer one.
     """
 
-    __slots__ = ("_configured", "aspects", "policies", "worlds")
+    __slots__ = ("_configured", "aspects", "policies", "successions", "worlds")
 
     def __init__(
         self,
@@ -34,6 +36,7 @@ class Catalogue:
         self.aspects: dict[str, AspectEntry] = {}
         self.policies: dict[str, Policy] = {}
         self.worlds: dict[str, WorldEntry] = {}
+        self.successions = 0
         for world in worlds:
             # That it is a fork is known of a context which is also named elsewhere.
             if world.source or world.name not in self.worlds:
@@ -42,6 +45,8 @@ class Catalogue:
             self._set(self._with_configured(entry))
 
     def _set(self, entry: AspectEntry) -> None:
+        before = self.aspects.get(entry.name)
+        self.successions += len(entry.older) - (len(before.older) if before is not None else 0)
         self.aspects[entry.name] = entry
         stored = entry.durability != Durability.VOLATILE.value
         self.policies[entry.name] = Policy(limits_of(entry), stored)
@@ -59,9 +64,10 @@ class Catalogue:
         wanted = self._with_configured(entry)
         known = self.aspects.get(entry.name)
         if known is None:
+            wanted = wanted._replace(older=(), reads=False)
             self._set(wanted)
             return wanted, True
-        wrong = other_type(known, wanted)
+        wrong = type_conflict(known, wanted)
         if wrong:
             return wrong
         if entry.durability and known.durability != wanted.durability:
@@ -69,11 +75,13 @@ class Catalogue:
                 f"aspect {entry.name!r} is registered as {known.durability}, and was now asked as"
                 f" {wanted.durability}; state one durability in cell.toml or in Aspect(…)"
             )
-        if covers(known, wanted):
+        now = with_type_of(known, wanted)
+        if not covers(known, wanted):
+            now = with_larger(now, wanted)
+        if now == known:
             return known, False
-        larger = with_larger(known, wanted)
-        self._set(larger)
-        return larger, True
+        self._set(now)
+        return now, True
 
     def put_back(self, aspects: Mapping[str, AspectEntry]) -> None:
         """Undo registrations that came to nothing."""
@@ -81,6 +89,19 @@ class Catalogue:
             del self.aspects[name], self.policies[name]
         for entry in aspects.values():
             self._set(entry)
+        self.successions = successions(self.aspects.values())
+
+    def newer_type(self, aspect: str, known_successions: int) -> AspectEntry | None:
+        """Return the entry of an aspect that a client may know with an older type.
+
+        Args:
+            aspect: Name of the aspect.
+            known_successions: How many successions of types, of all aspects, the client knows.
+        """
+        if known_successions == self.successions:
+            return None
+        entry = self.aspects.get(aspect)
+        return entry if entry is not None and entry.older else None
 
     def forks(self) -> tuple[WorldEntry, ...]:
         """Return the world contexts that are forks."""
@@ -89,17 +110,6 @@ class Catalogue:
     def durability(self, aspect: str) -> Durability:
         """Return what a commit of this (registered) aspect survives."""
         return _DURABILITIES[self.aspects[aspect].durability]
-
-
-def other_type(known: AspectEntry, wanted: AspectEntry) -> str:
-    """Return that an aspect is of another type than is `wanted`; nothing where it is of that."""
-    if known.fingerprint == wanted.fingerprint:
-        return ""
-    return (
-        f"aspect {known.name!r} is registered with datum type {known.fingerprint}, and was"
-        f" now asked with {wanted.fingerprint}; use the registered type or another name, or give up"
-        f" its data for the new type: stop the cell and call `enact shard forget {known.name}`"
-    )
 
 
 _DURABILITIES: Final = {durability.value: durability for durability in Durability}

@@ -50,11 +50,13 @@ PLANS_MAX: Final = 256
 class Peer:
     """What this client knows of one shard.
 
-    `acknowledged` is the epoch that a `Hello` has confirmed to the shard.
+    `acknowledged` is the epoch that a `Hello` has confirmed to the shard; `successions` is how
+    many successions of datum types its newest known catalogue has.
     """
 
     epoch: int = 0
     acknowledged: int = -1
+    successions: int = 0
 
 
 class Client:
@@ -113,6 +115,15 @@ class Client:
         """Return the epoch that the shard was last known in (0: none)."""
         peer = self._peers.get(shard)
         return peer.epoch if peer is not None else 0
+
+    def successions(self, shard: str) -> int:
+        """Return how many successions of datum types are known of the shard's catalogue."""
+        peer = self._peers.get(shard)
+        return peer.successions if peer is not None else 0
+
+    def knows_types(self, shard: str, successions: int) -> None:
+        """Note how many successions of datum types the newest known catalogue of a shard has."""
+        self._peer(shard).successions = successions
 
     def needs_hello(self, shard: str) -> bool:
         """Whether the shard does not know yet that we are in its epoch."""

@@ -34,6 +34,8 @@ ITEMS_MAX: Final = 4096
 """Requests in one lock or view."""
 WAITERS_MAX: Final = 100_000
 """Locks, granted or waiting, at one shard."""
+NEWER_TYPE: Final = "newer_type"
+"""The code of a refusal until the client has looked at the types of the shard's aspects again."""
 DAMAGED: Final = "damaged"
 """The code of a refusal because the stored bytes of a datum are not what was stored."""
 
@@ -60,6 +62,11 @@ class LockDesk:
         session.renewed_ns = max(session.renewed_ns, state.now_ns)
         session.count_seen = max(session.count_seen, message.count)
         tenure = state.tenures.by_lock.get(lock)
+        missed = self._missed_type(message) if tenure is None else None
+        if missed is not None:
+            state.count("newer_types_missed")
+            yield Reply(reply_to, missed)
+            return
         if tenure is None:
             lane = session.lanes.get(lock.lane)
             if lane is None and len(session.lanes) >= LANES_MAX:
@@ -85,6 +92,19 @@ class LockDesk:
             yield from state.tenures.park(
                 tenure, reply_to=reply_to, wait_ns=message.wait_ns, now_ns=state.now_ns
             )
+
+    def _missed_type(self, message: Acquire) -> Refused | None:
+        """Refuse to let a client write an aspect whose type it has perhaps not compared yet."""
+        catalogue = self._state.catalogue
+        if message.successions == catalogue.successions:
+            return None  # the usual case
+        for item in message.items:
+            if ACCESSES[item.access].writes:
+                entry = catalogue.newer_type(item.aspect, message.successions)
+                if entry is not None:
+                    text = f"aspect {item.aspect!r} has the datum type {entry.fingerprint} now"
+                    return Refused(NEWER_TYPE, text)
+        return None
 
     def _supersede(self, lock: LockId) -> Iterator[Effect]:
         """A newer lock of a lane ends the older ones: their release was lost."""

@@ -167,6 +167,10 @@ class GrantLeft(NamedTuple):
 class AspectEntry(NamedTuple):
     """An aspect of the catalogue: its type's fingerprint and its durability ("" = unsaid).
 
+    `older` are the fingerprints of the types that this one has succeeded, the oldest first
+    (`core.datum_types`).  `reads` says in a registration that its client only reads: no type comes
+    to hold by it where there is one.
+
     The rest says how much of each slot's history stays: `retention` versions, the newest one
     included, replaced at most `age_ns` ago, of `size` bytes of replaced data.  0 is unsaid: where
     nothing is said of all three, `terms.Retention()` holds, else what is unsaid has no limit.  Of
@@ -179,6 +183,8 @@ class AspectEntry(NamedTuple):
     retention: int = 0
     age_ns: int = 0
     size: int = 0
+    older: tuple[str, ...] = ()
+    reads: bool = False
 
 
 class ShardEntry(NamedTuple):
@@ -220,15 +226,11 @@ class SessionInfo(NamedTuple):
 
 
 class AuditEntry(NamedTuple):
-    """An operator's act at a shard, or what came of one; `kind` is one of `core.forced`.
-
-    `identity` is who asked for it ("": the shard itself, or a release before this one kept it).
-    """
+    """An operator's act at a shard, or what came of one; `kind` is one of `core.forced`."""
 
     wall_ns: int
     kind: str
     text: str
-    identity: str = ""
 
 
 class Counter(NamedTuple):

@@ -16,6 +16,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
+from enact_dist.core.datum_types import newest
 from enact_dist.core.messages import SlotVersion
 from enact_dist.core.placement import shard_of
 from enact_dist.core.records import (
@@ -198,21 +199,25 @@ class Shards:
         return had_source and all(record.name != world.name for record in stored.worlds)
 
     def _aspects(self, obstacles: list[str]) -> list[AspectEntry]:
-        """Return the aspects of all shards, each with the largest retention."""
+        """Return the aspects of all shards, each with its newest type and largest retention."""
         aspects: dict[str, AspectEntry] = {}
         first: dict[str, str] = {}
         for name, stored in self._stores.items():
             for entry in stored.aspects:
                 known = aspects.setdefault(entry.name, entry)
                 where = first.setdefault(entry.name, name)
-                if known[:3] != entry[:3]:
+                newer = newest(known, entry)
+                if newer is None or known.durability != entry.durability:
                     obstacles.append(
                         f"the aspect {entry.name} is {known.fingerprint} {known.durability} on"
                         f" {where} and {entry.fingerprint} {entry.durability} on {name}:"
                         f" {self._one_type(entry.name, where, name)}"
                     )
-                elif not covers(known, entry):
-                    aspects[entry.name] = with_larger(known, entry)
+                else:
+                    aspects[entry.name] = newer
+                    for one in (known, entry):
+                        if not covers(newer, one):
+                            aspects[entry.name] = with_larger(aspects[entry.name], one)
         return list(aspects.values())
 
     def _one_type(self, aspect: str, one: str, other: str) -> str:

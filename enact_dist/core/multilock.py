@@ -166,6 +166,7 @@ class MultiLock:
             hold_ns,
             self.client.seen_stamp_ns,
             alone=len(self.parts) == 1 and not self.plan.views,
+            successions=self.client.successions(part.shard),
         )
 
     def _view(self, shard: str, cut: Cut, now_ns: int) -> Request:

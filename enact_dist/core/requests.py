@@ -53,6 +53,8 @@ class Acquire:
     the lock may take.  `count` is the session's message counter (see `KeepAlive`).
     `seen_stamp_ns` is the largest commit stamp the client has seen.  `alone` says that the whole
     lock, its views included, lies on this shard, so that its commit decides in one step.
+    `successions` says how many successions of datum types the client knows of at this shard: if it
+    has missed one of an aspect that it would write, the shard refuses it with ``newer_type``.
     """
 
     lock: LockId
@@ -64,6 +66,7 @@ class Acquire:
     hold_ns: int
     seen_stamp_ns: int
     alone: bool = False
+    successions: int = 0
 
 
 @dataclass(frozen=True, slots=True)

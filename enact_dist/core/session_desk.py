@@ -67,11 +67,7 @@ class SessionDesk:
             return
         ttl_ns = max(TTL_NS_MIN, min(message.ttl_ns, self._state.settings.ttl_ns_max))
         session, unrecorded = self._state.sessions.hello(
-            message,
-            identity=self._state.asker,
-            epoch=self._state.epoch,
-            ttl_ns=ttl_ns,
-            now_ns=self._state.now_ns,
+            message, epoch=self._state.epoch, ttl_ns=ttl_ns, now_ns=self._state.now_ns
         )
         self._state.shortest_ttl_ns = min(self._state.shortest_ttl_ns, session.ttl_ns)
         self._state.sessions.end_grace_if_all_acknowledged(self._state.now_ns)
@@ -92,7 +88,7 @@ class SessionDesk:
         if unrecorded and session.session not in self._recording:
             # A session that a restart would not know could lose its grants without the grace, so
             # it may do nothing before its record is durable.
-            record = SessionRecord(session.session, session.ttl_ns, session.identity)
+            record = SessionRecord(session.session, session.ttl_ns)
             yield from self.answer_when_durable(reply_to, welcome, (record,))
             self._recording[session.session] = self._ticket
         else:
@@ -149,6 +145,17 @@ class SessionDesk:
                 return
             if registered[1]:
                 records.append(AspectRecord(registered[0]))
+        succeeded = [
+            record.entry
+            for record in records
+            if isinstance(record, AspectRecord)
+            and record.entry.name in before
+            and record.entry.older != before[record.entry.name].older
+        ]
+        for entry in succeeded:
+            self._state.count("types_succeeded")
+            told = f"aspect {entry.name!r} has the datum type {entry.fingerprint} from now on"
+            yield Story("aspect.type", f"{told}, which succeeds {entry.older[-1]}")
         catalogue.worlds.update((name, WorldEntry(name)) for name in missing)
         answer = Registered(
             tuple(catalogue.worlds), tuple(catalogue.aspects.values()), catalogue.forks()
@@ -226,13 +233,8 @@ class SessionDesk:
 
     def on_session_seen(self, message: SessionSeen, _: int) -> Iterator[Effect]:
         """Note that a liveliness token appeared or vanished."""
-        mine = self._state.sessions.token_seen(
-            message.session,
-            message.present,
-            identity=message.identity,
-            now_ns=self._state.now_ns,
-        )
-        if mine and not message.present:
+        self._state.sessions.token_seen(message.session, message.present, now_ns=self._state.now_ns)
+        if not message.present:
             # Its waiters lose their place: a lock must not be granted to a dead process while
             # living ones wait.  A client that was only cut off asks again with the same id.
             for tenure in self._state.tenures.of_session(message.session):

@@ -2,19 +2,20 @@
 
 A shard that keeps nothing on disk forgets its catalogue when it restarts; `forget` then makes the
 client register anew what it needs there.  One with a folder may have forgotten an aspect as well,
-or know it with another type since (`enact shard forget`): `lapses` tells that this has happened.
+or know it with another type since (`enact shard forget`), and any may have let a newer type succeed
+the one that it had: `lapses` tells that this has happened.
 """
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.core.catalogue import other_type
+from enact_dist.core.datum_types import newest, same_type, successions, type_conflict
 from enact_dist.core.messages import AspectEntry, Registered, Welcome, WorldEntry
 from enact_dist.core.retaining import covers
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Container, Iterable
 
     from enact_dist.core.messages import PlacementMap
 
@@ -34,7 +35,9 @@ class KnownCatalogue:
     def __init__(self) -> None:
         self.lapses = 0
         self._epochs: dict[str, int] = {}
+        self._successions: dict[str, int] = {}
         self._aspects: dict[str, dict[str, AspectEntry]] = {}
+        self._wanted: dict[str, AspectEntry] = {}
         self._worlds: dict[str, dict[str, WorldEntry]] = {}
         self._settled: tuple[PlacementMap | None, set[AspectEntry]] = (None, set())
 
@@ -47,8 +50,11 @@ class KnownCatalogue:
             sent_in: The epoch that it was asked in; whose the answer is only a welcome says.
         """
         epoch = answer.epoch if isinstance(answer, Welcome) else sent_in
-        if epoch < self._epochs.get(shard, 0):
-            return
+        known = self._epochs.get(shard, 0)
+        changes = successions(answer.aspects)
+        if epoch < known or (epoch == known and changes < self._successions.get(shard, 0)):
+            return  # it was sent before what is known
+        self._successions[shard] = changes
         if isinstance(answer, Welcome):
             self._epochs[shard] = epoch
         worlds = {name: WorldEntry(name) for name in answer.worlds}
@@ -56,8 +62,26 @@ class KnownCatalogue:
         before = self._aspects.get(shard, {})
         now = self._aspects[shard] = {entry.name: entry for entry in answer.aspects}
         self._settled = (None, set())  # after it: nobody settles by what was known before
-        if any(name not in now or other_type(now[name], before[name]) for name in before):
+        if not all(
+            name in now and same_type(now[name].fingerprint, entry.fingerprint)
+            for name, entry in before.items()
+        ):
             self.lapses += 1
+
+    def wants(self, aspects: Iterable[AspectEntry]) -> None:
+        """Note the aspects that this client registers: as it writes them, if it does."""
+        for entry in aspects:
+            if not entry.reads or entry.name not in self._wanted:
+                self._wanted[entry.name] = entry
+
+    def wanted(self, names: Container[str]) -> list[AspectEntry]:
+        """Return what this client has registered, to be registered anew where it is forgotten."""
+        wanted = list(self._wanted.values())  # other threads add to them
+        return [entry for entry in wanted if entry.name in names]
+
+    def successions(self, shard: str) -> int:
+        """Return how many successions of datum types the newest catalogue of a shard has."""
+        return self._successions.get(shard, 0)
 
     def forget(self, shard: str) -> None:
         """Forget the aspects of a shard, which does not know what it was said to know."""
@@ -93,10 +117,11 @@ class KnownCatalogue:
         return {shard: worlds[name] for shard, worlds in known if name in worlds}
 
     def aspects(self) -> dict[str, AspectEntry]:
-        """Return the registered aspects of all greeted shards by name."""
+        """Return the registered aspects of all greeted shards by name, with the newest types."""
         merged: dict[str, AspectEntry] = {}
         for aspects in list(self._aspects.values()):
-            merged.update(aspects)
+            for name, entry in aspects.items():
+                merged[name] = newest(merged.get(name, entry), entry) or entry
         return merged
 
     def lacks(self, shard: str, worlds: Iterable[str], aspects: Iterable[AspectEntry]) -> bool:
@@ -108,9 +133,10 @@ class KnownCatalogue:
 
 
 def _agrees(known: AspectEntry | None, wanted: AspectEntry) -> bool:
+    if known is None or type_conflict(known, wanted):
+        return False
     return (
-        known is not None
-        and known.fingerprint == wanted.fingerprint
+        (wanted.reads or same_type(known.fingerprint, wanted.fingerprint))
         and wanted.durability in ("", known.durability)
         and covers(known, wanted)
     )

@@ -14,6 +14,7 @@ import itertools
 import logging
 from typing import TYPE_CHECKING, Final
 
+from enact_dist.core.lock_desk import NEWER_TYPE
 from enact_dist.core.messages import (
     OUTCOME_COMMITTED,
     OUTCOME_PENDING,
@@ -29,7 +30,7 @@ from enact_dist.core.multilock import MultiLock
 from enact_dist.core.phase import Phase
 from enact_dist.errors import CommitUnknownError, EnactError, MisuseError
 from enact_dist.link.lock_names import name_of, read_name
-from enact_dist.link.refusals import error_of, not_committed, not_granted
+from enact_dist.link.refusals import not_committed, not_granted
 from enact_dist.link.session_client import (
     BYTES_PER_S_MIN,
     CALL_S,
@@ -148,17 +149,18 @@ class CellClient(SessionClient):
             if attempt >= RESTARTS_AT_ONCE:
                 self._pause(min(0.02 * 2 ** min(attempt, 8), RESTART_S_MAX))
             return True
-        refusal = lock.refusal
-        unknown = isinstance(refusal, Refused) and refusal.code == "unknown_aspect"
-        if not unknown or attempt >= REGISTRATIONS_MAX:
+        code = lock.refusal.code if isinstance(lock.refusal, Refused) else ""
+        if code not in ("unknown_aspect", NEWER_TYPE) or attempt >= REGISTRATIONS_MAX:
             return False
-        # A shard that keeps nothing restarted since: its catalogue is empty again.
         shards = {shard for shard, _ in (*lock.plan.locks, *lock.plan.views)}
+        if code == NEWER_TYPE:
+            self.greet(shards)  # who asked sees the lapse, and compares the types once more
+            return True
+        # A shard that keeps nothing restarted since: its catalogue is empty again.
         named = {i.aspect for _, its in (*lock.plan.locks, *lock.plan.views) for i in its}
         for shard in shards:
             self._catalogue.forget(shard)
-        registered = list(self._registered.items())  # other threads add to them
-        aspects = [entry for name, entry in registered if name in named]
+        aspects = self._catalogue.wanted(named)
         self.register(aspects=aspects, needed=lambda: shards)
         return bool(aspects)
 
@@ -293,7 +295,7 @@ class CellClient(SessionClient):
             raise MisuseError(f"{name!r} names shard {shard}; there are {', '.join(self.shards())}")
         deadline_ns = self._now_ns() + int(timeout_s * 1e9)
         # A copy of the commit that is still under way finds nothing to commit after this.
-        released = self.call(shard, Release(lock), timeout_s=timeout_s)
+        self.call(shard, Release(lock), timeout_s=timeout_s)
         while True:
             left_s = max(0.0, (deadline_ns - self._now_ns()) / 1e9)
             answer = self.call(shard, Outcome(lock), timeout_s=left_s)
@@ -301,8 +303,6 @@ class CellClient(SessionClient):
             if isinstance(answer, OutcomeIs) and kind == OUTCOME_COMMITTED:
                 return answer.position
             if kind == OUTCOME_UNSEEN:
-                if isinstance(released, Refused):  # its session lives, so it may still be sent
-                    raise error_of(released)
                 return None
             if kind != OUTCOME_PENDING or self._now_ns() >= deadline_ns:
                 why = "still works on it" if kind == OUTCOME_PENDING else "knows it no more"

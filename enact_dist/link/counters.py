@@ -70,6 +70,11 @@ OF_A_SHARD: Final[dict[str, Counter]] = {
     ),
     "fenced": Counter("commits refused because their lock was lost", _DYING),
     "epoch_refusals": Counter("requests of clients from before this start, or of ended sessions"),
+    "newer_types_missed": Counter(
+        "locks asked with an aspect's older type: the client was to compare types first",
+        "bring programs up to date that only read now: enact actor ls, and their log",
+    ),
+    "types_succeeded": Counter("aspects whose type a newer one has succeeded, with more fields"),
     "wrong_shard": Counter(
         "requests made with another shard list", "start all shards with the same cell.toml"
     ),
@@ -104,10 +109,6 @@ OF_A_SHARD: Final[dict[str, Counter]] = {
         "move the shard's folder to another disk; see its log for when",
     ),
     "overloads": Counter("requests refused because too many wait", "find who asks: enact lock ls"),
-    "requests_refused": Counter(
-        "requests in the name of another's session or of another shard, or that name no epoch",
-        "see the error at who sent them; the same session or process may be copied",
-    ),
     "frames_refused": Counter(
         "messages that could not be read", "run the same release everywhere; see the shard's log"
     ),

@@ -118,7 +118,6 @@ class SessionClient:
             self.count,
             inside=carrier.inside,
         )
-        self._registered: dict[str, AspectEntry] = {}
         self._further = FurtherShards(carrier, client.placement, now_ns, self.count)
         self._renewer: threading.Thread | None = None
         if keep_alive:
@@ -300,6 +299,7 @@ class SessionClient:
     def _learn(self, shard: str, answer: Answer, sent_in: int = 0) -> None:
         if isinstance(answer, CATALOGUES):
             self._catalogue.learn(shard, answer, sent_in=sent_in)
+            self.core.knows_types(shard, self._catalogue.successions(shard))
         if isinstance(answer, _GREETINGS):
             if isinstance(answer, Welcome):
                 self.payloads.learn(answer)
@@ -392,7 +392,7 @@ class SessionClient:
                 "this session only observes: it cannot lock, and makes no world contexts and"
                 " aspects; connect without observer=True"
             )
-        self._registered.update((entry.name, entry) for entry in aspects)
+        self._catalogue.wants(aspects)
         missing = [
             shard for shard in self.shards() if self._catalogue.lacks(shard, worlds, aspects)
         ]

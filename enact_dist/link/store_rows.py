@@ -106,7 +106,7 @@ def epoch_body(epoch: int) -> bytes:
 
 def session_row(record: SessionRecord) -> tuple[Key, bytes]:
     """Return the row of a session."""
-    return key_of(Kind.SESSION, record.session), pack([record.ttl_ns, record.identity])
+    return key_of(Kind.SESSION, record.session), pack([record.ttl_ns])
 
 
 def ended_row(record: SessionEnded) -> tuple[Key, bytes]:
@@ -126,7 +126,10 @@ def dropped_row(record: WorldDropped) -> tuple[Key, bytes]:
 
 def aspect_row(entry: AspectEntry) -> tuple[Key, bytes]:
     """Return the row of an aspect."""
-    return key_of(Kind.ASPECT, entry.name), pack(list(entry[1:]))
+    older = [list(entry.older)] if entry.older else []
+    figures = [entry.retention, entry.age_ns, entry.size]
+    row = [entry.fingerprint, entry.durability, *figures, *older]
+    return key_of(Kind.ASPECT, entry.name), pack(row)
 
 
 def forgotten_row(record: AspectForgotten) -> tuple[Key, bytes]:
@@ -159,9 +162,7 @@ def outcome_key(session: str, lane: int) -> Key:
 
 def audit_row(record: AuditRecord, order: Order) -> tuple[Key, bytes]:
     """Return the row of an operator's act; `order` keeps acts apart."""
-    return key_of(Kind.AUDIT, *order), pack(
-        [record.wall_ns, record.text, record.kind, record.identity]
-    )
+    return key_of(Kind.AUDIT, *order), pack([record.wall_ns, record.text, record.kind])
 
 
 def slot_key(slot: Slot, order: Order) -> Key:
@@ -225,14 +226,7 @@ def read_epoch(body: bytes) -> int:
 
 def read_session(key: Key, body: bytes) -> SessionRecord:
     """Read the row of a session."""
-    fields = Fields(body)
-    ttl_ns = fields.next(int)
-    return SessionRecord(Fields(key.name).last(str), ttl_ns, _identity(fields))
-
-
-def _identity(fields: Fields) -> str:
-    """Take the last field, whose it is, which format 3 has not."""
-    return "" if fields.at_end else fields.last(str)
+    return SessionRecord(Fields(key.name).last(str), Fields(body).last(int))
 
 
 def read_ended(key: Key, body: bytes) -> SessionEnded:
@@ -274,14 +268,20 @@ def _moved_here(fields: Fields) -> list[Fields]:
 def read_aspect(key: Key, body: bytes) -> AspectEntry:
     """Read the row of an aspect."""
     fields = Fields(body)
-    return AspectEntry(
+    entry = AspectEntry(
         Fields(key.name).last(str),
         fields.next(str),
         fields.next(str),
         fields.next(int),
         fields.next(int),
-        fields.last(int),
+        fields.next(int),
     )
+    if fields.at_end:
+        return entry
+    older = fields.last(list)
+    if not older or not all(isinstance(one, str) for one in older):
+        raise DamagedRowError(f"older types of aspect {entry.name} were expected, found {older}")
+    return entry._replace(older=tuple(older))
 
 
 def read_kept(key: Key, body: bytes) -> KeptRecord:
@@ -305,8 +305,7 @@ def read_outcome(key: Key, body: bytes) -> OutcomeRecord:
 def read_audit(body: bytes) -> AuditRecord:
     """Read the row of an operator's act."""
     fields = Fields(body)
-    wall_ns, text, kind = fields.next(int), fields.next(str), fields.next(str)
-    return AuditRecord(wall_ns, text, kind, _identity(fields))
+    return AuditRecord(fields.next(int), fields.next(str), fields.last(str))
 
 
 def read_slot_key(key: Key) -> tuple[Slot, Order]:

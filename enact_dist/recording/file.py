@@ -86,6 +86,7 @@ class RecordingFile:
         self._chunk_bytes, self._chunk_s = chunk_bytes, chunk_s
         self._schemas: dict[tuple[str, bytes], int] = {}
         self._channels: dict[str, int] = {}
+        self._exact_facts: dict[str, dict[str, str]] = {}
         self._shown = 0
         self._held_bytes = 0
         self._held_since_s = 0.0
@@ -172,12 +173,23 @@ class RecordingFile:
         context, _, aspect = recorded.slot
         topic = f"{EXACT_TOPIC}{context}/{aspect}"
         if topic not in self._channels:
-            entry = self._aspects(aspect)
-            facts = {"world": context, "aspect": aspect, "exact": str(FORMAT)}
-            if entry is not None:
-                facts |= {"type": entry.fingerprint, "durability": entry.durability}
+            self._exact_facts[topic] = facts = self._facts_of(context, aspect)
             self._channels[topic] = self._writer.register_channel(topic, "msgpack", 0, facts)
         return self._channels[topic]
+
+    def _facts_of(self, context: str, aspect: str) -> dict[str, str]:
+        entry = self._aspects(aspect)
+        facts = {"world": context, "aspect": aspect, "exact": str(FORMAT)}
+        if entry is not None:
+            facts |= {"type": entry.fingerprint, "durability": entry.durability}
+        return facts
+
+    def _note_newer_types(self) -> None:
+        """Say once more of which type an aspect is, where a newer one has succeeded the first."""
+        for topic, facts in self._exact_facts.items():
+            now = self._facts_of(facts["world"], facts["aspect"])
+            if now != facts:
+                self._writer.register_channel(topic, "msgpack", 0, now)
 
     def _shown_channel(self, recorded: Recorded, picture: Picture) -> int | None:
         context, entity, aspect = recorded.slot
@@ -238,6 +250,7 @@ class RecordingFile:
         if self._stream.closed:
             return
         try:
+            self._note_newer_types()
             self.end_chunk()
             self._writer.add_metadata(END_RECORD, dict(facts))
             self._writer.finish()  # type: ignore[no-untyped-call]

@@ -442,7 +442,10 @@ class Recorder:
         for wanted in self._pending:
             self._miss_one(wanted, DISK_SLOW if not self._disk.has_room else UNREACHABLE)
         self._pending.clear()
-        self._meet_aspects()
+        with contextlib.suppress(LinkError):  # of a shard that is away
+            self._session.client.greet()
+        known = self._session.client.aspect_entries()
+        self._aspects.update((name, known[name]) for name in self._aspects if name in known)
 
 
 def _stamp(wanted: Wanted) -> int:

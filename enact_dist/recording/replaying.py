@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.config_table import suggestion
+from enact_dist.core.datum_types import succeeds, type_conflict
 from enact_dist.core.messages import AspectEntry, Item
 from enact_dist.errors import ConfigError, DatumTypeError, MisuseError
 from enact_dist.patterns import pattern_matches
@@ -314,9 +315,11 @@ class Replay:
                 self._refuse_data(self._cell.world(name))
         types = self._cell.aspects()
         for name, facts in aspects.items():
-            if self._aspects and name not in self._aspects:
+            if name not in types or (self._aspects and name not in self._aspects):
                 continue
-            if name in types and types[name][0] != facts.fingerprint:
+            # Data of an older type are read with the defaults, whatever was written before.
+            wanted = AspectEntry(name, facts.fingerprint, "", reads=True)
+            if type_conflict(AspectEntry(name, *types[name]), wanted):
                 raise DatumTypeError(
                     f"aspect {name!r} is {facts.fingerprint} in {self.recording.path} and"
                     f" {types[name][0]} in cell {self._cell.name!r}: nobody there could read what"
@@ -348,10 +351,19 @@ class Replay:
         if entries:
             session.client.greet()
             known = session.client.aspect_entries()
-            # What the cell says of durability holds here; the type must be the same.
-            entries = [e._replace(durability="") if e.name in known else e for e in entries]
-            session.client.register(aspects=entries)
+            session.client.register(aspects=[_as_known(e, known.get(e.name)) for e in entries])
         self._registered |= names
+
+
+def _as_known(entry: AspectEntry, known: AspectEntry | None) -> AspectEntry:
+    """Return the entry to register for recorded data where the cell knows the aspect so.
+
+    What the cell says of durability holds; a newer type of the cell stays what it is.
+    """
+    if known is None:
+        return entry
+    older = succeeds(known.fingerprint, entry.fingerprint)
+    return entry._replace(durability="", reads=older)
 
 
 def _encoded(datum: Datum) -> Encoded:

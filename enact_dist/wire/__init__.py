@@ -26,7 +26,9 @@ ext   content                                      means
 1     ``[dtype, shape, order, offset, length]``    array in the body; order ``"C"`` or ``"F"``
 2     ``[offset, length]``                         bytes in the body (more than 256)
 3     ``[offset, length]``                         UTF-8 text in the body (more than 256 bytes)
-4     ``[name, [field names], [nodes]]``           dataclass; nil is allowed for a field
+4     ``[name, [field names], [nodes]]``           dataclass; nil is allowed for a field; readers
+                                                   of an older type leave fields out, those of a
+                                                   newer type fill in defaults
 5     ``[codec name, node]``                       what a registered codec made of a value
 6     ``[node, node, …]``                          tuple
 7     ``[offset, length]``                         the tree itself, in the body (more than 4 KiB)
@@ -46,7 +48,8 @@ module           what it decides
 ===============  =================================================================================
 `frames`         message ↔ header and payload (`message_parts`: field by field; `bodies`: layout)
 `payload`        value ↔ datum (`tree_writer`, `tree_reader`: the tree; `arrays`: numpy)
-`shapes`         what a Python type means as a datum; `fingerprint` is its text
+`shapes`         what a Python type means as a datum; `fingerprint` is its text, by which
+                 `core.datum_types` decides which types go together
 `codecs`         types that are no plain data
 `keys`           names of shards, sessions and requests on Zenoh
 `limits`         the longest of everything

@@ -20,6 +20,7 @@ import dataclasses
 import types
 import typing
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -76,10 +77,11 @@ class OptionalOf:
 
 @dataclass(frozen=True, slots=True)
 class RecordOf:
-    """A frozen dataclass with its fields in order."""
+    """A frozen dataclass with its fields in order; `defaults` names those that have one."""
 
     kind: type
     fields: tuple[tuple[str, Shape], ...]
+    defaults: frozenset[str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,7 +179,13 @@ def _record(kind: type[Any], where: str, around: tuple[type[Any], ...]) -> Recor
             (field.name, _shape(hints[field.name], f"{where}.{field.name}", around))
             for field in dataclasses.fields(kind)
         ),
+        frozenset(field.name for field in dataclasses.fields(kind) if _has_default(field)),
     )
+
+
+def _has_default(field: dataclasses.Field[Any]) -> bool:
+    missing = dataclasses.MISSING
+    return field.default is not missing or field.default_factory is not missing
 
 
 def _dtype_of(arguments: tuple[Any, ...]) -> np.dtype[Any] | None:
@@ -208,23 +216,28 @@ def _name(hint: Any) -> str:
     return getattr(hint, "__qualname__", None) or repr(hint)
 
 
-def text_of(shape: Shape) -> str:
-    """Return the structure as text, for example ``Surface{vertices_m:ndarray,colour:str?}``."""
+def text_of(shape: Shape, *, mark: str = "") -> str:
+    """Return the structure as text, for example ``Surface{vertices_m:ndarray,colour:str?}``.
+
+    `mark` stands after each field that has a default.
+    """
+    part_of = partial(text_of, mark=mark)
     match shape:
         case Plain(kind):
             return "any" if kind is object else kind.__name__
         case ArrayOf(dtype):
             return "ndarray" if dtype is None else f"ndarray[{dtype.name}]"
         case ListOf(each):
-            return f"list[{text_of(each)}]"
+            return f"list[{part_of(each)}]"
         case DictOf(key, each):
-            return f"dict[{key.__name__},{text_of(each)}]"
+            return f"dict[{key.__name__},{part_of(each)}]"
         case TupleOf(parts, repeated):
-            return f"tuple[{','.join(map(text_of, parts))}{',...' if repeated else ''}]"
+            return f"tuple[{','.join(map(part_of, parts))}{',...' if repeated else ''}]"
         case OptionalOf(inner):
-            return f"{text_of(inner)}?"
-        case RecordOf(kind, fields):
-            inside = ",".join(f"{name}:{text_of(part)}" for name, part in fields)
+            return f"{part_of(inner)}?"
+        case RecordOf(kind, fields, defaults):
+            marks = {name: mark if name in defaults else "" for name, _ in fields}
+            inside = ",".join(f"{name}:{part_of(part)}{marks[name]}" for name, part in fields)
             return f"{kind.__name__}{{{inside}}}"
         case CodecOf(codec):
             return f"<{codec.name}>"

@@ -7,6 +7,7 @@ Rules to keep: bytes that no writer makes raise `ProtocolError`, whole trees of 
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, ClassVar, Final, NamedTuple, NoReturn
 
@@ -288,17 +289,61 @@ def _build_optional(node: Any, shape: OptionalOf, where: str, depth: int) -> Any
 
 def _build_record(node: Any, shape: RecordOf, where: str, depth: int) -> Any:
     names = tuple(name for name, _ in shape.fields)
-    if type(node) is not RecordNode or node.name != shape.kind.__name__ or node.fields != names:
-        found = (
-            f"{node.name:.80}({', '.join(node.fields):.200})" if type(node) is RecordNode else ""
-        )
-        _refuse(where, f"{shape.kind.__name__}({', '.join(names)})", node, found)
+    if type(node) is not RecordNode or node.name != shape.kind.__name__:
+        _refuse_record(where, names, shape, node)
     _check_depth(depth)
+    if node.fields != names:
+        return _build_other_record(node, shape, where, depth)
     made: Any = object.__new__(shape.kind)
     for (name, each), part in zip(shape.fields, node.nodes, strict=True):
         # As the value was: the checks of its own class ran when it was made.
         object.__setattr__(made, name, build(part, each, f"{where}.{name}", depth + 1))
     return made
+
+
+def _build_other_record(node: RecordNode, shape: RecordOf, where: str, depth: int) -> Any:
+    """Return the value for a node of an older or of a newer type (`core.datum_types`).
+
+    An older type lacks fields, which get their defaults; fields that a newer one has are left out.
+    """
+    names = tuple(name for name, _ in shape.fields)
+    found = dict(zip(node.fields, node.nodes, strict=True))
+    lacking = set(names) - found.keys()
+    shared = tuple(name for name in names if name in found)
+    in_order = shared == tuple(name for name in node.fields if name in names)
+    if not (in_order and lacking <= shape.defaults and (not lacking or shared == node.fields)):
+        _refuse_record(where, names, shape, node)
+    made: Any = object.__new__(shape.kind)
+    for name, each in shape.fields:
+        if name in found:
+            value = build(found[name], each, f"{where}.{name}", depth + 1)
+        else:
+            value = _default(shape.kind, name, where)
+        object.__setattr__(made, name, value)
+    return made
+
+
+def _default(kind: type, name: str, where: str) -> Any:
+    """Return the default of a field, an array read-only as any that arrives."""
+    field: dataclasses.Field[Any] = kind.__dataclass_fields__[name]  # type: ignore[attr-defined]
+    value = field.default
+    if field.default_factory is not dataclasses.MISSING:
+        try:
+            value = field.default_factory()
+        except (ValueError, TypeError, LookupError, ArithmeticError, AttributeError) as error:
+            raise DatumTypeError(
+                f"{where}.{name}: the datum is of an older type without this field, and the"
+                f" field's default cannot be made: {error!r}"
+            ) from error
+    if type(value) is np.ndarray:
+        value = value.view()
+        value.flags.writeable = False
+    return value
+
+
+def _refuse_record(where: str, names: tuple[str, ...], shape: RecordOf, node: Any) -> NoReturn:
+    found = f"{node.name:.80}({', '.join(node.fields):.200})" if type(node) is RecordNode else ""
+    _refuse(where, f"{shape.kind.__name__}({', '.join(names)})", node, found)
 
 
 def _build_coded(node: Any, shape: CodecOf, where: str, depth: int) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import pytest
@@ -177,6 +178,44 @@ def test_check_finds_two_types_when_one_aspect_name_has_two():
     assert (found.level, found.kind) == ("error", "two types")
     assert "str" in found.text
     assert "int" in found.text
+
+
+@dataclass(frozen=True)
+class Spot:
+    x_mm: float
+
+
+LongerSpot = dataclass(frozen=True)(
+    type("Spot", (), {"__annotations__": {"x_mm": float, "name": str}, "name": "spot"})
+)
+
+
+@pytest.mark.parametrize(
+    ("written", "read", "found"),
+    [
+        ([Spot], [LongerSpot], 0),
+        ([LongerSpot], [Spot], 0),
+        ([Spot, LongerSpot], [], 1),
+        ([LongerSpot, Spot], [], 1),
+        ([LongerSpot], [Spot, LongerSpot, Spot], 0),
+    ],
+)
+def test_check_lets_a_reader_have_an_older_or_newer_type(written, read, found):
+    """A type that gained fields with defaults is read by both; all that write have the newest."""
+    actors = []
+    for number, kind in enumerate([*written, *read]):
+        access = Write if number < len(written) else View
+        spot = access(online, Entity(f"spot/{number}"), Aspect("spot", kind))
+        body = {"spot": spot, "triggers": (spot,) if access is View else (), "update": idle}
+        if access is Write:
+            body = {"every_s": 1.0, **body}
+            del body["triggers"]
+        actors.append(type(f"Actor{number}", (Actor,), body))
+
+    two_types = [one for one in check(*actors) if one.kind == "two types"]
+
+    assert len(two_types) == found
+    assert all("name:str=" in one.text for one in two_types)
 
 
 CELL = """

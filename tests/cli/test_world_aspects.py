@@ -39,6 +39,7 @@ def test_each_aspect_is_listed_with_what_there_is_of_it(enact, cell, cell_file):
         "slots": 7,
         "data": 6,
         "size_bytes": 5 * 800 + 80,
+        "older_types": [],
     }
     assert rows["plan"]["shards"] == [cell.world("training").survey(aspects=("plan",))[0].shard]
     words = ("world", "aspects", "training", "--cell", cell_file)

@@ -71,13 +71,13 @@ class Unresolved:
         (NDArray[np.float32], "ndarray[float32]"),
         (NDArray[Any], "ndarray"),
         (list[int], "list[int]"),
-        (Point, "Point{xyz_m:ndarray[float64],label:str?}"),
-        (Path, ("Path{points:list[Point{xyz_m:ndarray[float64],label:str?}],"
+        (Point, "Point{xyz_m:ndarray[float64],label:str?=}"),
+        (Path, ("Path{points:list[Point{xyz_m:ndarray[float64],label:str?=}],"
                 "by_name:dict[str,tuple[int,...]],box:tuple[float,bool],extra:dict}")),
     ],
 )  # fmt: skip
 def test_fingerprint_is_the_structure(datum_type, text):
-    """Catalogues store these texts: they stay as they are."""
+    """Catalogues store these texts: they stay as they are; "=" marks a default."""
     assert fingerprint(datum_type) == text
 
 
