@@ -177,6 +177,7 @@ class Shard:
         if gap_ns > 0:
             state.now_ns = now_ns
         state.wall_ns = wall_ns
+        state.stamps.passes(now_ns=state.now_ns, wall_ns=wall_ns)
 
     def next_deadline_ns(self) -> int:
         """Return the monotonic time at which a `Tick` is due at the latest."""

@@ -36,17 +36,30 @@ def newest_stamp(recovered: Recovered) -> tuple[int, str]:
 class Stamps:
     """The clock of one shard.  Strictly increasing."""
 
-    __slots__ = ("last_ns",)
+    __slots__ = ("_wall_ahead_ns", "_wall_ns_max", "last_ns")
 
     def __init__(self, last_ns: int) -> None:
         self.last_ns = last_ns
+        self._wall_ahead_ns: int | None = None
+        self._wall_ns_max = 0
+
+    def passes(self, *, now_ns: int, wall_ns: int) -> None:
+        """Note the time: where the wall clock would be now if it had never been set back.
+
+        Other shards of this host have stamped by the clock as it was: until their stamps are past
+        again, what they have decided must not count as far ahead here.
+        """
+        ahead_ns = wall_ns - now_ns
+        if self._wall_ahead_ns is None or ahead_ns > self._wall_ahead_ns:
+            self._wall_ahead_ns = ahead_ns
+        self._wall_ns_max = now_ns + self._wall_ahead_ns
 
     def too_far_ahead(self, seen_ns: int, *, wall_ns: int) -> bool:
         """Whether a stamp from elsewhere would drag this clock away from the wall clock.
 
-        What this clock has said itself is never too far: the wall clock may have been set back.
+        What this clock has said itself is never too far, nor what the wall clock has shown.
         """
-        return seen_ns > max(wall_ns + AHEAD_NS_MAX, self.last_ns)
+        return seen_ns > max(max(wall_ns, self._wall_ns_max) + AHEAD_NS_MAX, self.last_ns)
 
     def next(self, *, seen_ns: int, wall_ns: int) -> int:
         """Return the stamp of a new commit by a client that has seen stamps up to `seen_ns`."""

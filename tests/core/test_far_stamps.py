@@ -153,6 +153,21 @@ def test_own_clock_may_be_ahead_of_the_wall(bench):
     assert answer.position.stamp_ns > seen_ns
 
 
+def test_stamps_of_others_from_before_the_wall_clock_was_set_back_are_taken(bench):
+    """The clock of the host went back an hour: its other shards have stamped by it as it was."""
+    bench.write("bob", 1, "1")
+    elsewhere_ns = bench.shard.state.stamps.last_ns + S // 2
+    bench.wall_ns -= 3600 * S
+    grant = bench.granted(ANN, item(W))
+
+    committed = bench.ask(Commit(ANN, grant.token, (), elsewhere_ns))
+    refused = bench.ask(TakeView(lock_id("bob", 2), 1, 1, 9, (item(Access.VIEW),), 0, BIG, True))
+
+    assert isinstance(committed, Committed)
+    assert committed.position.stamp_ns > elsewhere_ns
+    assert isinstance(refused, Refused)
+
+
 def test_client_passes_over_a_stamp_that_no_clock_gives():
     """All its later commits would be refused, by every shard."""
     client = Client("ann", ttl_ns=TTL_NS)
