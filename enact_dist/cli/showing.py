@@ -43,6 +43,17 @@ def lines(datum: object, name: str = "", indent: str = "") -> Iterator[str]:
         yield head + summary(datum)
 
 
+def one_line(datum: object) -> str:
+    """Return a datum as one line, as YAML writes it: ``Part {x_mm: 1.5, y_mm: 2.0}``."""
+    if isinstance(datum, dict):
+        named = {key: value for key, value in datum.items() if key != "__type__"}
+        fields = ", ".join(f"{key}: {one_line(value)}" for key, value in named.items())
+        return f"{datum.get('__type__', '')} {{{fields}}}".lstrip()
+    if isinstance(datum, list | tuple) and any(_is_long(each) for each in datum):
+        return f"[{', '.join(map(one_line, datum))}]"
+    return summary(datum)
+
+
 def _is_long(value: object) -> bool:
     return isinstance(value, dict | list | tuple | np.ndarray)
 

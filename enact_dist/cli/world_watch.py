@@ -45,6 +45,10 @@ WATCH_SLICE_S: Final = 0.2
 TOGETHER_MAX: Final = 256
 """So many changes that have come are shown together: their data and sizes are asked for at once."""
 
+LINES_IN_ONE_MAX: Final = 8
+ONE_LINE_MAX: Final = 80
+"""A datum of so few lines and characters stands behind its change, any other one below it."""
+
 
 def add_watch(verbs: argparse._SubParsersAction[Verb]) -> None:
     """Add the verb to the noun `world`."""
@@ -235,7 +239,7 @@ class _Lines:
         return {"datum": None if change.null else plain(datum)}
 
     def _print(self, change: Change, datum: object) -> None:
-        from enact_dist.cli.showing import lines
+        from enact_dist.cli.showing import lines, one_line
 
         head = _line(change)
         if not self._with_data or change.null:
@@ -243,10 +247,12 @@ class _Lines:
         elif isinstance(datum, _Absent):
             print(f"{head}  ({datum.reason})", flush=True)
         else:
-            shown = list(lines(datum))
-            alone = len(shown) == 1 and "\n" not in shown[0]
-            rest = [f"  {shown[0]}"] if alone else [f"\n    {line}" for line in shown]
-            print(head + "".join(rest), flush=True)
+            below = [line for each in lines(datum) for line in each.splitlines() or [""]]
+            alone = one_line(datum) if len(below) <= LINES_IN_ONE_MAX else ""
+            if len(below) > 1 and (not alone or "\n" in alone or len(alone) > ONE_LINE_MAX):
+                print(head, *below, sep="\n    ", flush=True)
+            else:
+                print(f"{head}  {alone}", flush=True)
 
     def end(self, seconds: float) -> None:
         if not self._as_json:

@@ -50,16 +50,26 @@ def test_data_of_one_line_stand_behind_their_change(watch, commit):
 
 
 def test_large_arrays_are_abbreviated_and_nested_data_indented(watch, commit):
-    """An image is its shape and range; a dict is one field a line."""
+    """An image is its shape and range; what would be a long line is one field a line."""
     commit("camera/1", IMAGE, np.arange(600, dtype=np.uint16).reshape(20, 30))
-    commit("tool", Aspect("state", dict), {"gripper": {"open": True}, "force_n": 2.5})
+    commit("tool", Aspect("state", dict), {"gripper": {"open": True}, "by": "x" * 80})
+    commit("tcp", Aspect("at", dict), {"gripper": {"open": True}, "mm": [1, [2.5]]})
 
     picture = watch("camera/*", "--data", "--count", "1").out
     state = watch("tool", "--data", "--count", "1").out.splitlines()
+    short = watch("tcp", "--data", "--count", "1").out
 
     assert "v1  array 20 x 30 uint16, 0 to 599\n" in picture
     assert state[0].endswith("watched:tool/state  v1")
-    assert state[1:] == ["    gripper:", "      open: True", "    force_n: 2.5"]
+    assert state[1:] == ["    gripper:", "      open: True", f"    by: {'x' * 80}"]
+    assert short.endswith("watched:tcp/at  v1  {gripper: {open: True}, mm: [1, [2.5]]}\n")
+
+
+def test_a_text_of_several_lines_is_indented(watch, commit):
+    """Its lines are not taken for changes."""
+    commit("note", Aspect("text", str), "one\ntwo")
+
+    assert watch("note", "--data", "--count", "1").out.splitlines()[1:] == ["    one", "    two"]
 
 
 def test_data_as_json(watch, commit):
