@@ -68,7 +68,7 @@ def load_class(target: str) -> type[Actor]:
             raise ConfigError(
                 f"{module_name} of actor {target!r} cannot be imported: it needs the module"
                 f" {error.name}, which is not installed; the actors of this repository need"
-                " pip install 'enact-dist[actors]'"
+                " pip install -e '.[actors]' in the clone of enact-dist"
             ) from error
         raise ConfigError(
             f"no module {error.name} for actor {target!r}; run from the folder that holds it, or"

@@ -10,6 +10,7 @@ error                                     the run
 `ChangedError` expected view moved on     trigger must not be lost
 `LinkError` shard away
 `CommitUnknownError` may stand            the same: the new update reads what stands (`unknown`)
+`PermissionDeniedError`                   ends the run
 any other exception                       counted, logged (one like before as a count), kept as last
                                           error; run again when the entity changes
 ========================================  =====================================================
@@ -51,6 +52,7 @@ from enact_dist.errors import (
     LinkError,
     LockTimeoutError,
     MisuseError,
+    PermissionDeniedError,
 )
 from enact_dist.link.clock import monotonic_ns, wall_ns
 from enact_dist.session import session_of
@@ -320,6 +322,9 @@ class ActorRun:
                     about = _about(entity)
                     with self.doing.inside("update", about=about, lock=lock, remains=NOTHING):
                         self._actor.update(lock)
+        except PermissionDeniedError as error:
+            self._record.failed(error)
+            raise  # nothing changes by asking again
         except REFUSALS as error:
             if isinstance(error, LockTimeoutError) and self._stop.is_set():
                 return error  # told to stop while it waited: nothing was refused

@@ -219,6 +219,8 @@ class Cell(Closing):
         Raises:
             CommitUnknownError: The shard cannot tell (any more): 64 later commits of the process
                 have ended in this error, too, or the process has been gone for a day.
+            PermissionDeniedError: Another process made the commit and lives; nothing was written
+                yet, and only that process can be told that nothing will be.
             ShardUnreachableError: The shard does not answer.
             LockHeldError: This thread holds a lock.
             MisuseError: `lock_id` is none of this cell.
@@ -333,7 +335,7 @@ class Cell(Closing):
         shards = self._client.shards() if shards is None else tuple(shards)
         answers = self._client.call_all([(shard, ListAudit("")) for shard in shards])
         found = [
-            AuditInfo(shard, entry.wall_ns / 1e9, entry.kind, entry.text)
+            AuditInfo(shard, entry.wall_ns / 1e9, entry.kind, entry.text, entry.identity)
             for shard, answer in zip(shards, answers, strict=True)
             if isinstance(answer, Audited)
             for entry in answer.entries

@@ -122,12 +122,14 @@ class AuditInfo:
         kind: "broken" or "forced" (what was done), "confirmed" or "alarm" (what a lost shard said
             when it was back), "settled" (somebody has seen to all alarms before).
         text: Who or what, and the reason that was given.
+        identity: Who asked for it, as actor@host:pid; empty for what the shard found by itself.
     """
 
     shard: str
     stamp_s: float
     kind: str
     text: str
+    identity: str = ""
 
 
 @dataclass(frozen=True, slots=True)

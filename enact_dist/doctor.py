@@ -164,7 +164,7 @@ def _open3d() -> Iterator[Finding]:
             Level.WARN,
             "open3d",
             "not installed; the core does without, the demo does not",
-            "pip install 'enact-dist[actors]'",
+            "pip install -e '.[actors]' in the clone of enact-dist",
         )
         return
     missing = missing_libraries(LIBRARIES)

@@ -11,6 +11,7 @@
     │  ├─ DatumTypeError       a datum that is not of its aspect's type
     │  ├─ UnknownWorldError    a world context that the cell does not have     .known
     │  └─ ConfigError          a cell.toml, folder or option that cannot be used   .line
+    ├─ PermissionDeniedError   who asks may not: another's session, a shard's own word
     ├─ NullDatumError          the world context does not know this datum      .reason
     ├─ ForgottenError          a past state that has left its retention        .oldest_ns
     ├─ ChangedError            an expected view moved on; nothing written
@@ -80,6 +81,13 @@ class ConfigError(MisuseError):
         super().__init__(message)
         self.path = path
         self.line = line
+
+
+class PermissionDeniedError(EnactError):
+    """Who asks may not do that; the message names who asked and whose it is.
+
+    Asking again does not help, so an actor ends on it at once.
+    """
 
 
 class NullDatumError(EnactError):

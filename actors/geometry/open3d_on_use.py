@@ -32,7 +32,7 @@ def open3d() -> Any:  # its stubs contradict its behaviour, so the module is han
     except ImportError as error:
         missing = re.search(r"(lib[\w.+-]+\.so[.\d]*)", str(error))
         if missing is None:
-            remedy = "install the actors extra: pip install 'enact-dist[actors]'"
+            remedy = "install it: pip install -e '.[actors]' in the clone of enact-dist"
         else:
             package = DEBIAN_PACKAGES.get(missing[1], f"the package that holds {missing[1]}")
             remedy = f"sudo apt-get install -y {package}"

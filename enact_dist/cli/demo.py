@@ -104,5 +104,5 @@ def _missing(error: ImportError) -> ConfigError:
         )
     return ConfigError(
         f"the demo needs {error.name}, which is not installed; install the actors extra:"
-        " pip install 'enact-dist[actors]'"
+        " pip install -e '.[actors]' in the clone of enact-dist"
     )

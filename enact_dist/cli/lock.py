@@ -359,8 +359,12 @@ def list_audit(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print_json(entries)
         return status
-    rows = [(_local_time(entry.stamp_s), entry.shard, entry.kind, entry.text) for entry in entries]
-    print_table(("when", "shard", "what", "details"), rows, empty="no lock was ended by hand")
+    rows = [
+        (_local_time(one.stamp_s), one.shard, one.kind, one.identity or "-", one.text)
+        for one in entries
+    ]
+    columns = ("when", "shard", "what", "by", "details")
+    print_table(columns, rows, empty="no lock was ended by hand")
     return status
 
 

@@ -76,7 +76,7 @@ class Audit:
     def entries(self) -> tuple[AuditEntry, ...]:
         """Return the newest records, for people."""
         return tuple(
-            AuditEntry(record.wall_ns, record.kind, record.text)
+            AuditEntry(record.wall_ns, record.kind, record.text, record.identity)
             for record in self._records[-ENTRIES_MAX:]
         )
 

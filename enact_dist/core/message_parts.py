@@ -226,11 +226,15 @@ class SessionInfo(NamedTuple):
 
 
 class AuditEntry(NamedTuple):
-    """An operator's act at a shard, or what came of one; `kind` is one of `core.forced`."""
+    """An operator's act at a shard, or what came of one; `kind` is one of `core.forced`.
+
+    `identity` is who asked for it ("": the shard itself, or a release before this one kept it).
+    """
 
     wall_ns: int
     kind: str
     text: str
+    identity: str = ""
 
 
 class Counter(NamedTuple):

@@ -372,7 +372,7 @@ class PrepareDesk:
         forced = ForcedRecord(tenure.lock, record.primary, record.primary_token, slots)
         work = _AtStore(tenure, record, forced=forced, holder=holder, asked=message)
         work.operators.append(reply_to)
-        audit = state.audit.keep(AuditRecord(state.wall_ns, text, FORCED))
+        audit = state.audit.keep(AuditRecord(state.wall_ns, text, FORCED, state.asker))
         yield Story("lock.forced", text, grave=True)
         yield self._persist(work, (audit, forced, PreparedEnded(tenure.lock)))
 

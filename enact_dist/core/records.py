@@ -15,10 +15,14 @@ from enact_dist.terms import Durability
 
 @dataclass(frozen=True, slots=True)
 class SessionRecord:
-    """A session that may hold locks: after a restart the grace waits for it."""
+    """A session that may hold locks: after a restart the grace waits for it.
+
+    `identity` is whose it is ("" where a release that noted none has kept it).
+    """
 
     session: str
     ttl_ns: int
+    identity: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,11 +183,15 @@ class DecisionDone:
 
 @dataclass(frozen=True, slots=True)
 class AuditRecord:
-    """An operator's act or what came of it, kept for good; `kind` is one of `core.forced`."""
+    """An operator's act or what came of it, kept for good; `kind` is one of `core.forced`.
+
+    `identity` is who asked for it; "" for what the shard found by itself.
+    """
 
     wall_ns: int
     text: str
     kind: str = "broken"
+    identity: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -327,10 +335,11 @@ class ShardReturned:
 
 @dataclass(frozen=True, slots=True)
 class SessionSeen:
-    """A session's liveliness token appeared or vanished."""
+    """A session's liveliness token, declared under this identity, appeared or vanished."""
 
     session: str
     present: bool
+    identity: str = ""
 
 
 @dataclass(frozen=True, slots=True)

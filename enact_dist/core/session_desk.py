@@ -67,7 +67,11 @@ class SessionDesk:
             return
         ttl_ns = max(TTL_NS_MIN, min(message.ttl_ns, self._state.settings.ttl_ns_max))
         session, unrecorded = self._state.sessions.hello(
-            message, epoch=self._state.epoch, ttl_ns=ttl_ns, now_ns=self._state.now_ns
+            message,
+            identity=self._state.asker,
+            epoch=self._state.epoch,
+            ttl_ns=ttl_ns,
+            now_ns=self._state.now_ns,
         )
         self._state.shortest_ttl_ns = min(self._state.shortest_ttl_ns, session.ttl_ns)
         self._state.sessions.end_grace_if_all_acknowledged(self._state.now_ns)
@@ -88,7 +92,7 @@ class SessionDesk:
         if unrecorded and session.session not in self._recording:
             # A session that a restart would not know could lose its grants without the grace, so
             # it may do nothing before its record is durable.
-            record = SessionRecord(session.session, session.ttl_ns)
+            record = SessionRecord(session.session, session.ttl_ns, session.identity)
             yield from self.answer_when_durable(reply_to, welcome, (record,))
             self._recording[session.session] = self._ticket
         else:
@@ -233,8 +237,13 @@ class SessionDesk:
 
     def on_session_seen(self, message: SessionSeen, _: int) -> Iterator[Effect]:
         """Note that a liveliness token appeared or vanished."""
-        self._state.sessions.token_seen(message.session, message.present, now_ns=self._state.now_ns)
-        if not message.present:
+        mine = self._state.sessions.token_seen(
+            message.session,
+            message.present,
+            identity=message.identity,
+            now_ns=self._state.now_ns,
+        )
+        if mine and not message.present:
             # Its waiters lose their place: a lock must not be granted to a dead process while
             # living ones wait.  A client that was only cut off asks again with the same id.
             for tenure in self._state.tenures.of_session(message.session):

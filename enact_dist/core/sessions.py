@@ -51,6 +51,15 @@ class Lane:
 
 
 @dataclass(slots=True)
+class _Retired:
+    """What stays known of a session that has ended, for late questions and late copies."""
+
+    identity: str = ""
+    lanes: dict[int, Lane] = field(default_factory=dict)
+    act: tuple[int, Answer | None] = (0, None)
+
+
+@dataclass(slots=True)
 class Session:
     """One client process as a shard sees it.
 
@@ -58,6 +67,7 @@ class Session:
     session has, or their leases must have run out, a restarted shard grants nothing.
     `present` says that it has said hello in this epoch.  `act` is the count of the newest
     `Fork`, `DropWorld` or `KeepVersions` that it has asked for, and its answer once there is one.
+    `identity` is whose it is, see `core.owners`.
     """
 
     session: str
@@ -76,6 +86,7 @@ class Session:
     token_seen_ns: int | None = None
     lanes: dict[int, Lane] = field(default_factory=dict)
     act: tuple[int, Answer | None] = (0, None)
+    identity: str = ""
 
     def lease_end_ns(self, now_ns: int) -> int:
         """Return when the lease ends if no further sign of life comes."""
@@ -96,7 +107,7 @@ class Session:
 class SessionTable:
     """All sessions of one shard, and the grace after a restart."""
 
-    __slots__ = ("_retired", "_retired_acts", "_tokens", "by_id", "grace_end_ns")
+    __slots__ = ("_retired", "_tokens", "by_id", "grace_end_ns")
 
     def __init__(
         self,
@@ -106,19 +117,22 @@ class SessionTable:
         now_ns: int,
     ) -> None:
         self.by_id: dict[str, Session] = {}
-        self._tokens: dict[str, bool] = {}
-        self._retired_acts: dict[str, tuple[int, Answer | None]] = {}
-        self._retired: dict[str, dict[int, Lane]] = {}
+        self._tokens: dict[tuple[str, str], None] = {}
+        self._retired: dict[str, _Retired] = {}
         for record in recovered:
             self.by_id[record.session] = Session(
-                record.session, record.ttl_ns, renewed_ns=now_ns, durable=True
+                record.session,
+                record.ttl_ns,
+                renewed_ns=now_ns,
+                durable=True,
+                identity=record.identity,
             )
         for outcome in outcomes:
             session = self.by_id.get(outcome.lock.session)
             lanes = (
                 session.lanes
                 if session is not None
-                else self._retired.setdefault(outcome.lock.session, {})
+                else self._retired.setdefault(outcome.lock.session, _Retired()).lanes
             )
             lanes[outcome.lock.lane] = Lane(top=outcome.lock.seq, outcome=outcome)
         longest_ns = max((session.ttl_ns for session in self.by_id.values()), default=0)
@@ -138,8 +152,13 @@ class SessionTable:
         ):
             self.grace_end_ns = now_ns
 
+    def owner(self, session: str) -> str | None:
+        """Return whose a session is, also one that ended; None for one that is not known."""
+        found = self.by_id.get(session) or self._retired.get(session)
+        return found.identity if found is not None else None
+
     def hello(
-        self, message: Hello, *, epoch: int, ttl_ns: int, now_ns: int
+        self, message: Hello, *, identity: str, epoch: int, ttl_ns: int, now_ns: int
     ) -> tuple[Session, bool]:
         """Open or refresh a session; say also whether it needs a durable record first.
 
@@ -148,35 +167,49 @@ class SessionTable:
         session = self.by_id.get(message.session)
         if session is None:
             session = Session(message.session, ttl_ns, renewed_ns=now_ns, acknowledged=True)
-            session.lanes = self._retired.pop(message.session, {})
-            session.act = self._retired_acts.pop(message.session, session.act)
+            retired = self._retired.pop(message.session, None)
+            if retired is not None:
+                session.lanes, session.act = retired.lanes, retired.act
             self.by_id[message.session] = session
-            if message.session in self._tokens:
-                session.token_present = self._tokens.pop(message.session)
-                session.token_seen_ns = now_ns
+        bound = bool(identity) and not session.identity
+        session.identity = session.identity or identity
+        if (message.session, identity) in self._tokens:
+            del self._tokens[message.session, identity]
+            session.token_present = True
+            session.token_seen_ns = now_ns
         session.renewed_ns = max(session.renewed_ns, now_ns)
         session.actor, session.host, session.pid = message.actor, message.host, message.pid
         session.observer = message.observer
         if message.known_epoch == epoch:
             session.acknowledged = True
-        return session, not message.observer and not session.durable
+        return session, not message.observer and (bound or not session.durable)
 
     def known(self, session: str) -> Session | None:
         """Return the session if it has said hello in this epoch."""
         found = self.by_id.get(session)
         return found if found is not None and found.present else None
 
-    def token_seen(self, session: str, present: bool, *, now_ns: int) -> None:
-        """Note that a session's liveliness token appeared or vanished."""
+    def token_seen(self, session: str, present: bool, *, identity: str, now_ns: int) -> bool:
+        """Note that a liveliness token appeared or vanished; whether the session is live and its.
+
+        The token of another identity than the session's stands for nothing.
+        """
         found = self.by_id.get(session)
-        if found is None:
-            self._tokens.pop(session, None)
-            if present and len(self._tokens) < SESSIONS_MAX:
-                self._tokens[session] = True
-            return
+        if found is None or found.identity != identity:
+            self._tokens.pop((session, identity), None)
+            if present:
+                self._expect(session, identity)
+            return False
         if present or found.token_present:
             found.token_seen_ns = now_ns
         found.token_present = present
+        return True
+
+    def _expect(self, session: str, identity: str) -> None:
+        """Note a token whose session has not said hello; the oldest ones make room."""
+        self._tokens[session, identity] = None
+        while len(self._tokens) > SESSIONS_MAX:
+            del self._tokens[next(iter(self._tokens))]
 
     def stalled(self, gap_ns: int) -> None:
         """Move every deadline by the time that the shard itself stood still."""
@@ -199,20 +232,19 @@ class SessionTable:
     def lanes_of(self, session: str) -> dict[int, Lane] | None:
         """Return the lanes of a session, also of one that ended a while ago."""
         found = self.by_id.get(session)
-        return found.lanes if found is not None else self._retired.get(session)
+        if found is not None:
+            return found.lanes
+        retired = self._retired.get(session)
+        return retired.lanes if retired is not None else None
 
     def forget(self, session: str) -> None:
         """Drop a session; what it did last stays known, for late questions and late copies."""
         found = self.by_id.pop(session, None)
         if found is None:
             return
-        if found.token_present and len(self._tokens) < SESSIONS_MAX:
-            self._tokens[session] = True
-        if found.lanes:
-            self._retired[session] = found.lanes
+        if found.token_present:
+            self._expect(session, found.identity)
+        if found.lanes or found.act[0]:
+            self._retired[session] = _Retired(found.identity, found.lanes, found.act)
             while len(self._retired) > SESSIONS_MAX:
                 del self._retired[next(iter(self._retired))]
-        if found.act[0]:
-            self._retired_acts[session] = found.act
-            while len(self._retired_acts) > SESSIONS_MAX:
-                del self._retired_acts[next(iter(self._retired_acts))]

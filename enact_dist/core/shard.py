@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from enact_dist.core import inspection
+from enact_dist.core import inspection, owners
 from enact_dist.core.admission import wrong_patterns
 from enact_dist.core.forced import BROKEN, SETTLED
 from enact_dist.core.history_desk import HistoryDesk
@@ -30,6 +30,7 @@ from enact_dist.core.messages import (
     Broken,
     Commit,
     DropWorld,
+    EpochChanged,
     Explain,
     Fetch,
     FindEffects,
@@ -146,18 +147,37 @@ class Shard:
     # ---------------------------------------------------------------- the one mutator
 
     def handle(
-        self, message: Request | Event, *, reply_to: int = 0, now_ns: int, wall_ns: int
+        self,
+        message: Request | Event,
+        *,
+        reply_to: int = 0,
+        identity: str = "",
+        now_ns: int,
+        wall_ns: int,
     ) -> list[Effect]:
         """Take one message and return what is to be done about it, in order.
 
         Args:
             message: A request of a client, or an event of this host.
             reply_to: Handle under which the request's answer will be asked to be sent.
+            identity: Who asks, as the transport knows it; see `core.owners`.
             now_ns: This host's monotonic clock.
             wall_ns: This host's wall clock, since 1970; used for stamps only.
         """
         self._advance(now_ns, wall_ns)
-        effects = list(self._handlers[type(message)](message, reply_to))
+        state = self.state
+        state.asker = identity
+        refusal = (
+            owners.refusal(message, identity, state.sessions, state.epoch) if identity else None
+        )
+        if refusal is None:
+            effects = list(self._handlers[type(message)](message, reply_to))
+        else:
+            effects = [Reply(reply_to, refusal)]
+            if type(refusal) is EpochChanged:
+                state.count("epoch_refusals")
+            else:
+                state.count("requests_refused")
         if self._views.waits:
             effects += self._views.answer_parked()
         if self._worlds.waits:
@@ -334,11 +354,15 @@ class Shard:
             yield from tell(reply_to, self.state.told_by_hand(message), ())
             return
         holder = self.state.describe(found, self.state.now_ns)
-        cause = f"broken by an operator: {message.reason or 'no reason given'}"
+        cause = (
+            f"broken by {self.state.asker or 'an operator'}: {message.reason or 'no reason given'}"
+        )
         yield from self.state.tenures.take_away(found, cause, now_ns=self.state.now_ns)
         self.state.count("locks_broken")
         text = f"lock {message.number} of {holder.actor}@{holder.host} {cause}"
-        kept = self.state.audit.keep(AuditRecord(self.state.wall_ns, text, BROKEN))
+        kept = self.state.audit.keep(
+            AuditRecord(self.state.wall_ns, text, BROKEN, self.state.asker)
+        )
         broken = Broken(True, holder)
         self.state.by_hand[Break] = message, broken
         # It holds at once; who did it, and why, is kept before anybody is told.
@@ -351,7 +375,11 @@ class Shard:
         audit = self.state.audit
         records: tuple[Record, ...] = ()
         if message.settle and audit.may_settle(message.seen_ns):
-            records = (audit.keep(AuditRecord(self.state.wall_ns, message.settle, SETTLED)),)
+            records = (
+                audit.keep(
+                    AuditRecord(self.state.wall_ns, message.settle, SETTLED, self.state.asker)
+                ),
+            )
         answer = Audited(audit.alarms, audit.entries())
         yield from self._sessions.answer_when_durable(reply_to, answer, records, Durability.OS)
 

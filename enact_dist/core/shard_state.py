@@ -79,6 +79,7 @@ class ShardState:
 
     Attributes:
         now_ns: Monotonic time of the message being handled.
+        asker: The identity under which it came; "" for what this process itself says.
         wall_ns: Wall clock at that moment; for stamps only.
         peers: The other shards of the cell.
         pins: Data that a view without a lock keeps fetchable.
@@ -94,6 +95,7 @@ class ShardState:
         self.settings = settings
         self.epoch = recovered.epoch
         self.now_ns, self.wall_ns, self.born_ns = now_ns, wall_ns, now_ns
+        self.asker = ""
         self.draining = False
         self.counters: dict[str, int] = {}
         self.pins: dict[LockId, dict[tuple[Slot, int], Datum]] = {}

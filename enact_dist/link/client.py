@@ -30,7 +30,7 @@ from enact_dist.core.multilock import MultiLock
 from enact_dist.core.phase import Phase
 from enact_dist.errors import CommitUnknownError, EnactError, MisuseError
 from enact_dist.link.lock_names import name_of, read_name
-from enact_dist.link.refusals import not_committed, not_granted
+from enact_dist.link.refusals import error_of, not_committed, not_granted
 from enact_dist.link.session_client import (
     BYTES_PER_S_MIN,
     CALL_S,
@@ -295,7 +295,7 @@ class CellClient(SessionClient):
             raise MisuseError(f"{name!r} names shard {shard}; there are {', '.join(self.shards())}")
         deadline_ns = self._now_ns() + int(timeout_s * 1e9)
         # A copy of the commit that is still under way finds nothing to commit after this.
-        self.call(shard, Release(lock), timeout_s=timeout_s)
+        released = self.call(shard, Release(lock), timeout_s=timeout_s)
         while True:
             left_s = max(0.0, (deadline_ns - self._now_ns()) / 1e9)
             answer = self.call(shard, Outcome(lock), timeout_s=left_s)
@@ -303,6 +303,8 @@ class CellClient(SessionClient):
             if isinstance(answer, OutcomeIs) and kind == OUTCOME_COMMITTED:
                 return answer.position
             if kind == OUTCOME_UNSEEN:
+                if isinstance(released, Refused):  # its session lives, so it may still be sent
+                    raise error_of(released)
                 return None
             if kind != OUTCOME_PENDING or self._now_ns() >= deadline_ns:
                 why = "still works on it" if kind == OUTCOME_PENDING else "knows it no more"

@@ -109,6 +109,10 @@ OF_A_SHARD: Final[dict[str, Counter]] = {
         "move the shard's folder to another disk; see its log for when",
     ),
     "overloads": Counter("requests refused because too many wait", "find who asks: enact lock ls"),
+    "requests_refused": Counter(
+        "requests in the name of another's session or of another shard, or that name no epoch",
+        "see the error at who sent them; the same session or process may be copied",
+    ),
     "frames_refused": Counter(
         "messages that could not be read", "run the same release everywhere; see the shard's log"
     ),

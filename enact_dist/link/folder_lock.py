@@ -21,12 +21,16 @@ if TYPE_CHECKING:
 
 LOCK_FILE: Final = "lock"
 FORMAT_FILE: Final = "format"
-FORMAT: Final = 3
+FORMAT_READ_MIN: Final = 3
+"""The oldest format that this program reads."""
+FORMAT: Final = 4
 """Version of everything below a data folder; goes up when an older program could misread it.
 
 2: commits over shards are stored (prepared locks, decisions), and the mark is there first.
 3: slots have a row per stored state, with its cause.  A folder of 2 is refused as well: to take a
 row in either form would weaken the check that it is exactly what was written.
+4: a session's row and an operator's act end with whose they are; a folder of 3 is read and marked
+as one of 4, which an older program leaves alone.
 """
 
 _FORMAT_WORDS: Final = "enact-dist store"
@@ -129,7 +133,7 @@ def replace_file(path: Path, content: bytes, *, mode: int = 0o644) -> None:
 
 
 def check_format(folder: Path, *, is_new: bool) -> None:
-    """Refuse a folder of another format; mark a new one with ours.
+    """Refuse a folder of another format; mark with ours a new one, and one that ours contains.
 
     Args:
         folder: The data folder, locked.
@@ -143,7 +147,7 @@ def check_format(folder: Path, *, is_new: bool) -> None:
     text = None
     with contextlib.suppress(FileNotFoundError):
         text = path.read_text(encoding="ascii", errors="replace").strip()
-    if text is None and is_new:
+    if (text is None and is_new) or text == f"{_FORMAT_WORDS} {FORMAT_READ_MIN}":
         replace_file(path, f"{_FORMAT_WORDS} {FORMAT}\n".encode())
         return
     words, _, version = (text or "").rpartition(" ")

@@ -28,9 +28,8 @@ from collections import deque
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Final, cast
 
+from enact_dist.core import owners
 from enact_dist.core.epochs import state_of, unkept_epoch
-from enact_dist.core.inspection import counted
-from enact_dist.core.latencies import Latencies
 from enact_dist.core.messages import (
     Acquire,
     AwaitStamp,
@@ -57,6 +56,7 @@ from enact_dist.core.records import (
 from enact_dist.core.shard import Shard
 from enact_dist.errors import StoreError
 from enact_dist.link.clock import Clock, SystemClock
+from enact_dist.link.host_figures import figures_of, latencies_of
 from enact_dist.link.payload_desk import PayloadDesk, half_of
 from enact_dist.link.stalls import Stalls
 from enact_dist.link.uninterrupted import Uninterrupted
@@ -65,6 +65,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
+    from enact_dist.core.latencies import Latencies
     from enact_dist.core.messages import Answer, Notice, Request
     from enact_dist.core.records import Effect, Event
     from enact_dist.core.shard_state import ShardSettings
@@ -211,35 +212,17 @@ class ShardHost:
         return state_of(grants=state.grants, draining=state.draining)
 
     def figures(self) -> dict[str, float]:
-        """Return the counters and what there is now, by name; see `link.metrics`.
-
-        Taken without the mutex, so that who looks never delays the shard: one figure may be a
-        moment older than the next.
-        """
-        state, payloads = self._shard.state, self._payloads.figures()
-        tenures = list(state.tenures.by_lock.values())
-        held = sum(tenure.token is not None for tenure in tenures)
-        return {
-            **counted(state),
-            **payloads,
-            "ready": state.grants,
-            "epoch": self.epoch,
-            "uptime_seconds": (self._clock.monotonic_ns() - state.born_ns) / 1e9,
-            "sessions": len(state.sessions.by_id),
-            "slots": state.slots.count,
-            "slot_bytes": state.slots.bytes,
-            "locks_held": held,
-            "locks_waiting": len(tenures) - held,
-            "requests_parked": len(self._replies),
-        }
+        """Return the counters and what there is now, by name; see `link.host_figures`."""
+        return figures_of(
+            self._shard.state,
+            self._payloads,
+            parked=len(self._replies),
+            now_ns=self._clock.monotonic_ns(),
+        )
 
     def latencies(self) -> dict[str, Latencies]:
-        """Return how long things took, by name; taken as `figures` are."""
-        written = self._store_thread.latencies if self._store_thread is not None else Latencies()
-        return {
-            "store_write_seconds": written,
-            "lock_wait_seconds": self._shard.state.tenures.waited,
-        }
+        """Return how long things took, by name; see `link.host_figures`."""
+        return latencies_of(self._shard.state, self._store_thread)
 
     @property
     def ended(self) -> bool:
@@ -251,16 +234,17 @@ class ShardHost:
         """What killed the host, or None while it lives."""
         return self._failure
 
-    def submit(self, message: Request, reply: Callable[[Answer], None]) -> None:
+    def submit(self, message: Request, reply: Callable[[Answer], None], identity: str = "") -> None:
         """Hand a request to the shard; `reply` is called once, now or later, from any thread.
 
         It is never called when the host ends or fails first: no answer means *unknown*.
+        `identity` is who asks, as the transport knows it ("": this process).
         """
         kind = type(message)
         if kind is Commit or kind is Prepare:
             message = self._payloads.with_bodies(cast("Commit", message))
         elif kind is Stage:
-            self._stage(cast("Stage", message), reply)
+            self._stage(cast("Stage", message), reply, identity)
             return
         elif kind is ListSessions:
             self._shard.counters.update(self._payloads.figures())
@@ -273,13 +257,17 @@ class ShardHost:
                 return
             self._handles += 1
             self._replies[self._handles] = reply
-            self._handle(message, self._handles)
+            self._handle(message, self._handles, identity)
             self._look_at_clock_for(message)
 
-    def _stage(self, message: Stage, reply: Callable[[Answer], None]) -> None:
+    def _stage(self, message: Stage, reply: Callable[[Answer], None], identity: str) -> None:
         if self._ended:
             return
-        if message.total and message.session not in self._shard.state.sessions.by_id:
+        sessions = self._shard.state.sessions
+        refusal = owners.refusal(message, identity, sessions, self.epoch) if identity else None
+        if refusal is not None:
+            reply(refusal)
+        elif message.total and message.session not in sessions.by_id:
             reply(EpochChanged(self.epoch))
         else:
             reply(self._payloads.stage(message))
@@ -339,11 +327,11 @@ class ShardHost:
 
     # ---------------------------------------------------------------- messages in, effects out
 
-    def _handle(self, message: Request | Event, handle: int) -> None:
+    def _handle(self, message: Request | Event, handle: int, identity: str = "") -> None:
         """Let the shard decide and do what it says.  The mutex is held."""
         with self._uninterrupted:
             try:
-                self._perform(self._decide(message, handle))
+                self._perform(self._decide(message, handle, identity))
                 while self._kept_at_once:
                     self._perform(self._decide(Persisted(self._kept_at_once.popleft()), 0))
                 if self._draining and self._shard.idle:
@@ -355,10 +343,14 @@ class ShardHost:
                 if not isinstance(failure, Exception):
                     raise
 
-    def _decide(self, message: Request | Event, handle: int) -> list[Effect]:
+    def _decide(self, message: Request | Event, handle: int, identity: str = "") -> list[Effect]:
         clock = self._clock
         return self._shard.handle(
-            message, reply_to=handle, now_ns=clock.monotonic_ns(), wall_ns=clock.wall_ns()
+            message,
+            reply_to=handle,
+            identity=identity,
+            now_ns=clock.monotonic_ns(),
+            wall_ns=clock.wall_ns(),
         )
 
     def _perform(self, effects: list[Effect]) -> None:

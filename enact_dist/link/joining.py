@@ -12,6 +12,7 @@ from enact_dist.link.socket_carrier import SocketCarrier
 from enact_dist.link.zenoh_carrier import POLL_S, ZenohCarrier
 from enact_dist.link.zenoh_config import OPEN_S
 from enact_dist.link.zenoh_discovery import discover
+from enact_dist.wire.keys import identity_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -56,10 +57,11 @@ def join(
     # The link's lease follows the session's, which the shard may have shortened.
     client.ttl_ns = min(client.ttl_ns, welcome.ttl_ns)
     reachable = [e for entry in welcome.placement.shards for e in entry.endpoints]
+    identity = identity_of(client.actor, client.host, client.pid)
     zenoh = ZenohCarrier(
         found,
         client.session,
-        client.actor,
+        identity,
         tuple(dict.fromkeys((*endpoints, *reachable))),
         ttl_s=client.ttl_ns / 1e9,
         open_s=open_s,
@@ -67,7 +69,9 @@ def join(
     way: Carrier = zenoh
     try:
         if carrier != "zenoh":
-            way = sockets = SocketCarrier(zenoh, client.session, forced=carrier == "socket")
+            way = sockets = SocketCarrier(
+                zenoh, client.session, identity, forced=carrier == "socket"
+            )
             welcome = _first_usable(sockets, client, welcome, timeout_s)
         way.add_endpoints(welcome.placement.shards)
     except BaseException:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from enact_dist.core.messages import Forgotten
 from enact_dist.core.multilock import MultiLock
+from enact_dist.core.owners import PERMISSION
 from enact_dist.core.phase import Phase
 from enact_dist.core.tenures import HELD_TOO_LONG
 from enact_dist.errors import (
@@ -25,6 +26,7 @@ from enact_dist.errors import (
     LockTimeoutError,
     MisuseError,
     NoRoomError,
+    PermissionDeniedError,
     ProtocolError,
     ShardUnreachableError,
     StoreError,
@@ -205,6 +207,7 @@ def error_of(refused: Refused | Forgotten) -> EnactError:
         "protocol": ProtocolError,
         "overload": LinkError,
         "no_room": NoRoomError,
+        PERMISSION: PermissionDeniedError,
         "damaged": StoreError,
     }
     return classes.get(refused.code, LinkError)(refused.text)

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Final, cast, get_args
 import zenoh
 
 from enact_dist.core.messages import Answer, Request
+from enact_dist.core.owners import shard_identity
 from enact_dist.errors import ProtocolError
 from enact_dist.link.zenoh_config import close_session, keep_after_fork, open_session
 from enact_dist.link.zenoh_presence import ShardPresence
@@ -44,7 +45,7 @@ class ShardCalls:
 
     Args:
         cell: The cell's name.
-        name: The calling shard; stands in the keys where clients have their actor's name.
+        name: The calling shard; its identity stands in the keys.
         shards: All shards of the cell with their endpoints.
         lease_s: A connection counts as lost after so long without a sign of life.
         answered: Called with shard, request and answer, from the thread of that shard.
@@ -92,7 +93,9 @@ class ShardCalls:
         try:
             line = _Line(
                 shard,
-                lambda request: request_key(self._cell, shard, verb_of(request), self._name),
+                lambda request: request_key(
+                    self._cell, shard, verb_of(request), shard_identity(self._name)
+                ),
                 self._endpoints[shard],
                 self._lease_s,
                 lambda request, answer: self._answered(shard, request, answer),

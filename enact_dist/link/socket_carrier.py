@@ -24,6 +24,7 @@ from enact_dist.errors import LinkError
 from enact_dist.link.carrier import check_usable
 from enact_dist.link.notices import NoticeQueue
 from enact_dist.link.socket_feed import SocketFeed
+from enact_dist.link.socket_frames import greeting_of
 from enact_dist.link.socket_line import Connection, SocketLine
 
 if TYPE_CHECKING:
@@ -51,7 +52,8 @@ class SocketCarrier:
 
     Args:
         behind: Reaches every shard; closed with this carrier.
-        session: For whom the connections speak.
+        session: For which session the connections speak.
+        identity: Whose it is.
         forced: Whether a socket that cannot be used is an error.
 
     Attributes:
@@ -59,11 +61,13 @@ class SocketCarrier:
         calls: How many calls went over sockets, and how many over Zenoh.
     """
 
-    def __init__(self, behind: ZenohCarrier, session: str, *, forced: bool = False) -> None:
+    def __init__(
+        self, behind: ZenohCarrier, session: str, identity: str, *, forced: bool = False
+    ) -> None:
         self.inside = False
         self.calls = {"socket": 0, "zenoh": 0}
         self._behind = behind
-        self._session = session
+        self._greeting = greeting_of(session, identity)
         self._forced = forced
         self._pid = os.getpid()
         self._closed = False
@@ -207,7 +211,7 @@ class SocketCarrier:
                 old = self._lines.pop(shard, None)
                 line = None
                 if welcome.shared:
-                    line = SocketLine(shard, welcome.shared, welcome.shared_nonce, self._session)
+                    line = SocketLine(shard, welcome.shared, welcome.shared_nonce, self._greeting)
                     self._lines[shard] = line
         if old is not None:
             old.close()

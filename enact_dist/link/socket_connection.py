@@ -10,9 +10,10 @@ from __future__ import annotations
 import logging
 import socket
 import threading
-from typing import TYPE_CHECKING, Final, cast, get_args
+from typing import TYPE_CHECKING, Final, cast
 
-from enact_dist.core.messages import Answer, Refused, Request, Survey
+from enact_dist.core.messages import Answer, Outcome, Refused, Request, Survey
+from enact_dist.core.owners import SESSION_OF, named_session, not_yours
 from enact_dist.errors import LinkError, ProtocolError
 from enact_dist.link.notices import Interest
 from enact_dist.link.senders import size_of
@@ -21,12 +22,12 @@ from enact_dist.link.socket_frames import (
     Kind,
     Stream,
     prefixed,
+    read_greeting,
     send_frame,
     wait_at_most,
 )
 from enact_dist.link.socket_watcher import SocketWatcher
 from enact_dist.wire.frames import decode_frame, encode_frame, encode_parts
-from enact_dist.wire.limits import NAME_CHARACTERS_MAX
 
 if TYPE_CHECKING:
     from enact_dist.link.socket_service import SocketService
@@ -36,7 +37,6 @@ OPEN_S: Final = 1.0
 SEND_S: Final = 5.0
 """How long a client may read nothing of an answer before its connection is given up."""
 
-_REQUESTS: Final = frozenset(get_args(Request))
 _log = logging.getLogger("enact.link")
 
 
@@ -52,7 +52,8 @@ class SocketConnection:
     """One connection and its thread: a request, its answer, the next request.
 
     Attributes:
-        session: For whom it speaks; empty until the service has admitted it.
+        session: For which session it speaks; empty until the service has admitted it.
+        identity: Whose that is.
         step: 3n while it waits for its n-th request, 3n + 1 once it has read that, 3n + 2 once the
             host has it, too.
         ended: Set once the thread is through.
@@ -60,7 +61,7 @@ class SocketConnection:
 
     __slots__ = (
         "_answer", "_answered", "_late", "_rest", "_service", "_stream", "_thread", "connected",
-        "ended", "session", "step",
+        "ended", "identity", "session", "step",
     )  # fmt: skip
 
     def __init__(self, service: SocketService, connected: socket.socket) -> None:
@@ -72,7 +73,7 @@ class SocketConnection:
         self._late: Answer | None = None
         self._rest: memoryview | None = None
         self.connected = connected
-        self.session = ""
+        self.session = self.identity = ""
         self.step = 2
         self.ended = threading.Event()
 
@@ -104,13 +105,13 @@ class SocketConnection:
             kind, header, payload = self._stream.receive()
         except BlockingIOError:
             return False
-        if kind != Kind.OPEN or payload or not 0 < len(header) <= NAME_CHARACTERS_MAX:
-            raise ProtocolError("a connection did not say for whom it speaks")
+        if kind != Kind.OPEN or payload:
+            raise ProtocolError(f"a frame of kind {kind} came in place of a greeting")
+        session, self.identity = read_greeting(header)
         try:
-            session = header.decode("ascii")
             self._service.admit(self, session)
             self.session = session
-        except (LinkError, UnicodeDecodeError) as error:
+        except LinkError as error:
             self._refuse(error)
             return False
         wait_at_most(self.connected, socket.SO_RCVTIMEO, 0.0)
@@ -140,14 +141,19 @@ class SocketConnection:
                 raise ProtocolError(f"a frame of kind {kind} came in place of a request")
             try:
                 message = decode_frame(header, payload)
-                if type(message) not in _REQUESTS:
+                if type(message) not in SESSION_OF:
                     raise ProtocolError(f"{type(message).__name__} is no request")
             except ProtocolError as error:
                 host.count("frames_refused")
                 self.step = step = step + 1
                 self._send(Refused("protocol", str(error)))
                 continue
-            host.submit(cast("Request", message), self._take)
+            session = named_session(message)
+            if session and session != self.session and type(message) is not Outcome:
+                self.step = step = step + 1
+                self._send(not_yours(session, "another connection", self.identity))
+                continue
+            host.submit(cast("Request", message), self._take, self.identity)
             self.step = step = step + 1
             self._send_answer()
 

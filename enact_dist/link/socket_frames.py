@@ -25,7 +25,8 @@ from collections.abc import Sequence
 from typing import Final
 
 from enact_dist.errors import ProtocolError
-from enact_dist.wire.limits import HEADER_BYTES_MAX, PAYLOAD_BYTES_MAX
+from enact_dist.wire.keys import quoted_identity
+from enact_dist.wire.limits import HEADER_BYTES_MAX, NAME_CHARACTERS_MAX, PAYLOAD_BYTES_MAX
 
 Buffer = bytes | memoryview
 
@@ -47,7 +48,7 @@ class Kind(enum.IntEnum):
     """What a frame is."""
 
     OPEN = 1
-    """Client: I speak for this session (the header is its name)."""
+    """Client: I speak for this session (the header is `greeting_of` it)."""
     OPENED = 2
     """Shard: go on (the header is the shard's name)."""
     REFUSED = 3
@@ -66,6 +67,24 @@ _KINDS: Final = frozenset(int(kind) for kind in Kind)
 
 
 _SKIPPED: Final = struct.Struct("<QQQ")
+
+
+def greeting_of(session: str, identity: str) -> bytes:
+    """Return how a connection says for which session it speaks, and whose that is."""
+    return f"{session} {quoted_identity(identity)}".encode()
+
+
+def read_greeting(header: bytes) -> tuple[str, str]:
+    """Return the session and the identity for which a connection speaks.
+
+    Raises:
+        ProtocolError: The header says neither.
+    """
+    session, _, identity = header.decode("ascii", "replace").partition(" ")
+    fits = 0 < len(session) <= NAME_CHARACTERS_MAX and identity
+    if not fits or quoted_identity(identity) != identity:
+        raise ProtocolError("a connection did not say for whom it speaks")
+    return session, identity
 
 
 def skipped_frame(epoch: int, after: int, number: int) -> bytes:

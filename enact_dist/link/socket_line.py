@@ -170,19 +170,19 @@ class SocketLine:
         shard: The shard's name.
         name: Name of its shared folder, from its WELCOME.
         nonce: What has to stand in there.
-        session: For whom the connections speak.
+        greeting: For whom the connections speak, from `socket_frames.greeting_of`.
 
     Attributes:
         name: As given.
         problem: Why the last attempt to connect failed; empty while all is well.
     """
 
-    def __init__(self, shard: str, name: str, nonce: bytes, session: str) -> None:
+    def __init__(self, shard: str, name: str, nonce: bytes, greeting: bytes) -> None:
         self.shard = shard
         self.name = name
         self.problem = ""
         self._nonce = nonce
-        self._session = session
+        self._greeting = greeting
         self._idle: list[Connection] = []
         # Weak: Ctrl-C may come between any two steps of who holds one, and takes it out of use.
         self._open: weakref.WeakSet[Connection] = weakref.WeakSet()
@@ -259,7 +259,7 @@ class SocketLine:
             connected.connect(folder.address(SOCKET_NAME))
             check_peer(connected, users=frozenset((folder.owner, os.geteuid())), group=None)
             connection = Connection(self.shard, connected)
-            connection.exchange(Kind.OPEN, self._session.encode())
+            connection.exchange(Kind.OPEN, self._greeting)
             wait_at_most(connected, socket.SO_SNDTIMEO, SEND_S)
         except BaseException:
             connected.close()

@@ -106,7 +106,7 @@ def epoch_body(epoch: int) -> bytes:
 
 def session_row(record: SessionRecord) -> tuple[Key, bytes]:
     """Return the row of a session."""
-    return key_of(Kind.SESSION, record.session), pack([record.ttl_ns])
+    return key_of(Kind.SESSION, record.session), pack([record.ttl_ns, record.identity])
 
 
 def ended_row(record: SessionEnded) -> tuple[Key, bytes]:
@@ -162,7 +162,9 @@ def outcome_key(session: str, lane: int) -> Key:
 
 def audit_row(record: AuditRecord, order: Order) -> tuple[Key, bytes]:
     """Return the row of an operator's act; `order` keeps acts apart."""
-    return key_of(Kind.AUDIT, *order), pack([record.wall_ns, record.text, record.kind])
+    return key_of(Kind.AUDIT, *order), pack(
+        [record.wall_ns, record.text, record.kind, record.identity]
+    )
 
 
 def slot_key(slot: Slot, order: Order) -> Key:
@@ -226,7 +228,14 @@ def read_epoch(body: bytes) -> int:
 
 def read_session(key: Key, body: bytes) -> SessionRecord:
     """Read the row of a session."""
-    return SessionRecord(Fields(key.name).last(str), Fields(body).last(int))
+    fields = Fields(body)
+    ttl_ns = fields.next(int)
+    return SessionRecord(Fields(key.name).last(str), ttl_ns, _identity(fields))
+
+
+def _identity(fields: Fields) -> str:
+    """Take the last field, whose it is, which format 3 has not."""
+    return "" if fields.at_end else fields.last(str)
 
 
 def read_ended(key: Key, body: bytes) -> SessionEnded:
@@ -305,7 +314,8 @@ def read_outcome(key: Key, body: bytes) -> OutcomeRecord:
 def read_audit(body: bytes) -> AuditRecord:
     """Read the row of an operator's act."""
     fields = Fields(body)
-    return AuditRecord(fields.next(int), fields.next(str), fields.last(str))
+    wall_ns, text, kind = fields.next(int), fields.next(str), fields.next(str)
+    return AuditRecord(wall_ns, text, kind, _identity(fields))
 
 
 def read_slot_key(key: Key) -> tuple[Slot, Order]:

@@ -66,8 +66,6 @@ shard is up, so the first look is the last one; and no channel of Zenoh's Python
 would tell of a later connection, can be waited on for a limited time."""
 REACH_S: Final = 0.3
 """How long a shard has to show that it is already in reach."""
-NAMELESS: Final = "client"
-"""Stands in the keys of a client that gave no name."""
 JOIN_S: Final = 1.0
 """How long an ending carrier or feed waits for each of its threads."""
 UNCHECKED_MAX: Final = 256
@@ -112,7 +110,7 @@ class ZenohCarrier:
     Args:
         cell: The cell's name.
         session: Whose liveliness token is held for the life of the carrier.
-        actor: Stands in the key of every request.
+        identity: Who asks: stands in the key of every request and of the token.
         endpoints: Where to connect first; one that answers is enough.
         ttl_s: The session's lease; a link counts as lost after half of it.
         connect_s: How long to wait for the first connection.
@@ -128,7 +126,7 @@ class ZenohCarrier:
         self,
         cell: str,
         session: str,
-        actor: str,
+        identity: str,
         endpoints: Sequence[str],
         *,
         ttl_s: float,
@@ -139,7 +137,7 @@ class ZenohCarrier:
         self.fetch_bytes = FETCH_BYTES
         self._cell = cell
         self._session = session
-        self._actor = actor or NAMELESS
+        self._identity = identity
         self._lease_s = ttl_s / 2
         self._open_s = open_s
         self._pid = os.getpid()
@@ -245,7 +243,7 @@ class ZenohCarrier:
         known = (shard, type(message))
         key = self._keys.get(known)
         if key is None:
-            key = request_key(self._cell, shard, verb_of(message), self._actor)
+            key = request_key(self._cell, shard, verb_of(message), self._identity)
             self._keys[known] = key
         return key
 
@@ -324,7 +322,9 @@ class ZenohCarrier:
 
     def _open_link(self, endpoints: tuple[str, ...]) -> _Link:
         session = open_session(connect=endpoints, lease_s=self._lease_s, open_s=self._open_s)
-        token = session.liveliness().declare_token(token_key(self._cell, self._session))
+        token = session.liveliness().declare_token(
+            token_key(self._cell, self._identity, self._session)
+        )
         link = _Link(session, endpoints, token, BulkWay(endpoints, self._lease_s, self._open_s))
         with self._mutex:
             late = self._closed  # by another thread, while this one was opened

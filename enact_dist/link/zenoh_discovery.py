@@ -12,13 +12,14 @@ from typing import TYPE_CHECKING, Final
 
 import zenoh
 
-from enact_dist.core.messages import Welcome
+from enact_dist.core.messages import Refused, Welcome
 from enact_dist.errors import ProtocolError, ShardUnreachableError
 from enact_dist.link.endpoints import unknown_hosts
-from enact_dist.link.zenoh_carrier import NAMELESS, POLL_S, QUESTION, answer_in, wait_connected
+from enact_dist.link.refusals import error_of
+from enact_dist.link.zenoh_carrier import POLL_S, QUESTION, answer_in, wait_connected
 from enact_dist.link.zenoh_config import close_session, open_session
 from enact_dist.wire.frames import encode_frame
-from enact_dist.wire.keys import parse_request_key, request_key, verb_of
+from enact_dist.wire.keys import ANY, NAMELESS, identity_of, parse_request_key, request_key, verb_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -69,6 +70,8 @@ def discover(endpoints: Sequence[str], hello: Hello, *, timeout_s: float) -> tup
                 answer = _greet(session, found, hello, deadline_s)
                 if isinstance(answer, Welcome):
                     return found.cell, answer
+                if isinstance(answer, Refused):
+                    raise error_of(answer)
                 if answer is not None:
                     raise ProtocolError(f"shard {found.shard} answered a hello with {answer!r}")
     finally:
@@ -121,15 +124,15 @@ def ask_shards(
     return answers
 
 
-def _key(shard: FoundShard, message: Request, actor: str = "") -> str:
-    return request_key(shard.cell, shard.shard, verb_of(message), actor or NAMELESS)
+def _key(shard: FoundShard, message: Request, identity: str = NAMELESS) -> str:
+    return request_key(shard.cell, shard.shard, verb_of(message), identity)
 
 
 def _find(session: zenoh.Session, deadline_s: float) -> tuple[FoundShard, ...]:
     """Ask until somebody has answered or time is up."""
     if not wait_connected(session, deadline_s - time.monotonic()):
         return ()
-    key = request_key("*", "*", verb_of(QUESTION), "anyone")
+    key = request_key(ANY, ANY, verb_of(QUESTION), NAMELESS)
     while (left_s := deadline_s - time.monotonic()) > 0:
         keys = [
             str(reply.ok.key_expr)
@@ -145,7 +148,7 @@ def _find(session: zenoh.Session, deadline_s: float) -> tuple[FoundShard, ...]:
 def _greet(
     session: zenoh.Session, found: FoundShard, hello: Hello, deadline_s: float
 ) -> Answer | None:
-    key = _key(found, hello, hello.actor)
+    key = _key(found, hello, identity_of(hello.actor, hello.host, hello.pid))
     for reply in _get(session, key, hello, max(0.05, deadline_s - time.monotonic())):
         if reply.ok is not None:
             return answer_in(reply.ok, found.shard)

@@ -10,26 +10,22 @@ A query is answered once and then dropped; one that is dropped without an answer
 
 from __future__ import annotations
 
-import dataclasses
 import logging
 import queue
 import threading
-from collections.abc import Callable
-from operator import attrgetter
-from typing import TYPE_CHECKING, Final, cast, get_args
+from typing import TYPE_CHECKING, Final, cast
 
 import zenoh
 
 from enact_dist.core.messages import (
     Answer,
     Fetch,
-    Finish,
     Reached,
     Refused,
     Request,
-    Resolve,
     Stage,
 )
+from enact_dist.core.owners import SESSION_OF, named_session
 from enact_dist.core.records import SessionSeen
 from enact_dist.errors import ProtocolError
 from enact_dist.link.recycling import recycle_blocks
@@ -37,11 +33,14 @@ from enact_dist.link.senders import Senders, size_of
 from enact_dist.link.zenoh_config import QUEUED_MAX, keep_after_fork
 from enact_dist.wire.frames import decode_frame, encode_frame
 from enact_dist.wire.keys import (
+    ANY,
     notice_key,
+    parse_request_key,
     queryable_key,
     request_key,
-    session_of,
     token_key,
+    token_of,
+    verb_of,
 )
 
 if TYPE_CHECKING:
@@ -78,7 +77,7 @@ class ZenohService:
         )
         self._unwatch = host.watch(self._publish)
         self._tokens = session.liveliness().declare_subscriber(
-            token_key(cell, "*"), zenoh.handlers.FifoChannel(QUEUED_MAX), history=True
+            token_key(cell, ANY, ANY), zenoh.handlers.FifoChannel(QUEUED_MAX), history=True
         )
         self._sights: zenoh.Handler[zenoh.Sample] = self._tokens.handler
         self._queryable = session.declare_queryable(
@@ -88,7 +87,7 @@ class ZenohService:
         # and have no handler any more for a thread that begins when they are.
         self._inbox: zenoh.Handler[zenoh.Query] = self._queryable.handler
         host.add_inbox(self.drain_inbox)
-        self._staged: queue.SimpleQueue[tuple[Stage, _Call] | None] = queue.SimpleQueue()
+        self._staged: queue.SimpleQueue[tuple[Stage, _Call, str] | None] = queue.SimpleQueue()
         self._staged_mutex = threading.Lock()
         self._staged_bytes = 0
         self._threads = [
@@ -133,9 +132,11 @@ class ZenohService:
                 bytes(header) if header is not None else b"",
                 bytes(payload) if payload is not None else b"",
             )
-            client_of = _CLIENT_OF.get(type(message))
-            if client_of is None:
+            if type(message) not in SESSION_OF:
                 raise ProtocolError(f"{type(message).__name__} is no request")
+            verb, identity = parse_request_key(str(query.key_expr))[2:]
+            if verb != verb_of(message):
+                raise ProtocolError(f"a {verb_of(message)} came on the key of a {verb}")
         except Exception as error:  # noqa: BLE001 - every query is answered
             if not isinstance(error, ProtocolError):
                 # A fault of the decoder: whoever found it must not make the shard deaf.
@@ -143,15 +144,17 @@ class ZenohService:
             self._host.count("frames_refused")
             _Call(self, query, str(query.key_expr))(Refused("protocol", str(error)))
             return
-        client = client_of(message) or str(query.key_expr)
+        client = named_session(message) or str(query.key_expr)
+        if type(message) in _SLICES:
+            client += DATA_SUFFIX
         self.senders.heard(client)
         call = _Call(self, query, client)
         if type(message) is Stage:
-            self._stage_later(message, call)
+            self._stage_later(message, call, identity)
         else:
-            self._submit(cast("Request", message), call)
+            self._submit(cast("Request", message), call, identity)
 
-    def _stage_later(self, message: Stage, call: _Call) -> None:
+    def _stage_later(self, message: Stage, call: _Call, identity: str) -> None:
         size = message.body.size
         with self._staged_mutex:
             full = self._staged_bytes and self._staged_bytes + size > STAGED_BYTES_MAX
@@ -161,7 +164,7 @@ class ZenohService:
             self._host.count("slices_dropped")
             call.drop()
         else:
-            self._staged.put((message, call))
+            self._staged.put((message, call, identity))
 
     def _stage(self) -> None:
         """Take the slices of large data to where they belong: making room for them takes time."""
@@ -170,9 +173,9 @@ class ZenohService:
             with self._staged_mutex:
                 self._staged_bytes -= staged[0].body.size
 
-    def _submit(self, message: Request, call: _Call) -> None:
+    def _submit(self, message: Request, call: _Call, identity: str) -> None:
         try:
-            self._host.submit(message, call)
+            self._host.submit(message, call, identity)
         except Exception:  # noqa: BLE001 - these threads serve all clients
             _log.exception("a %s was not taken", type(message).__name__)
             call.drop()
@@ -202,10 +205,10 @@ class ZenohService:
         try:
             while True:
                 sample = self._sights.recv()
-                session = session_of(str(sample.key_expr))
+                identity, session = token_of(str(sample.key_expr))
                 if session:
                     present = sample.kind == zenoh.SampleKind.PUT
-                    self._host.event(SessionSeen(session, present))
+                    self._host.event(SessionSeen(session, present, identity))
         except zenoh.ZError:
             return
 
@@ -276,26 +279,4 @@ class _Call:
         self._query.drop()  # type: ignore[no-untyped-call]  # as Zenoh's stub has it
 
 
-def _nameless(_: object) -> str:
-    """Stand for a request that does not say whose it is: its key has to do."""
-    return ""
-
-
-def _data_client(request: object) -> str:
-    """Return for whom a slice travels."""
-    session = request.session if isinstance(request, Stage) else cast("Fetch", request).lock.session
-    return session + DATA_SUFFIX
-
-
-def _client_getter(kind: type) -> Callable[[object], str]:
-    if kind in (Finish, Resolve):
-        return _nameless  # it comes from a shard, which must not wait for its lock's client
-    if kind in (Fetch, Stage):
-        return _data_client
-    fields = {field.name for field in dataclasses.fields(kind)}
-    path = "lock.session" if "lock" in fields else "session" if "session" in fields else ""
-    return attrgetter(path) if path else _nameless
-
-
-_CLIENT_OF: Final = {kind: _client_getter(kind) for kind in get_args(Request)}
-"""How to read from each request whose answer counts together with whose."""
+_SLICES: Final = frozenset((Fetch, Stage))

@@ -17,5 +17,5 @@ def require_libraries() -> None:
     if missing:
         raise ConfigError(
             f"recordings need {' and '.join(missing)}, which this Python does not have: install"
-            " the extra 'record' (pip install 'enact-dist[record]')"
+            " the extra 'record' (pip install -e '.[record]' in the clone of enact-dist)"
         )

@@ -1,16 +1,18 @@
 """Names of the cell's parts on Zenoh: which key carries what.
 
-==================================  ==========================================================
-key                                 what
-==================================  ==========================================================
-`enact/<cell>/<shard>/<verb>/<actor>`  a request; verb and actor are there for access rules
-`enact/<cell>/<shard>/**`              where the shard receives all of them
-`enact/<cell>/@notices/<shard>`        the notices that the shard publishes
-`enact/<cell>/@sessions/<session>`     the liveliness token of a session
-==================================  ==========================================================
+============================================  ================================================
+key                                           what
+============================================  ================================================
+`enact/<cell>/<shard>/<verb>/<identity>`     a request; the shard holds it to its verb and identity
+`enact/<cell>/<shard>/**`                    where the shard receives all of them
+`enact/<cell>/@notices/<shard>`              the notices that the shard publishes
+`enact/<cell>/@sessions/<identity>/<session>`  the liveliness token of a session
+============================================  ================================================
 
 No name starts with ``@`` and Zenoh's wildcards do not match a chunk that does, so requests and the
-rest cannot collide.  `ANY` stands for all shards, all sessions, or (in requests) all cells.
+rest cannot collide.  `ANY` stands for all shards, all sessions, or (in requests) all cells.  An
+identity (`identity_of`) is who asks: the access rules of a Zenoh session and the shard itself
+compare it, see `enact_dist.core.owners`.
 Rules to keep: a key holds only characters that Zenoh allows (no ``# ? $``, no empty chunk), and
 making a key from the parts of one gives the same key again.
 """
@@ -20,7 +22,7 @@ from __future__ import annotations
 import re
 from functools import lru_cache
 from typing import TYPE_CHECKING, Final, NamedTuple
-from urllib.parse import quote, unquote
+from urllib.parse import quote
 
 from enact_dist.errors import ProtocolError
 from enact_dist.terms import checked_name
@@ -31,7 +33,13 @@ if TYPE_CHECKING:
 ROOT: Final = "enact"
 ANY: Final = "*"
 NOBODY: Final = "-"
-"""Stands for a client without an actor name; no name starts with a hyphen."""
+"""Stands for no identity at all; no name starts with a hyphen."""
+SHOWN_CHARACTERS: Final = 64
+"""So much of an actor's and a host's name goes into an identity."""
+KEY_CHARACTERS_MAX: Final = 4096
+"""Longest key of a request: two names, a verb, and an identity of characters beyond ASCII."""
+NAMELESS: Final = "client"
+"""Stands in the identity of a client that gave no name."""
 
 _NOTICES: Final = "@notices"
 _SESSIONS: Final = "@sessions"
@@ -39,29 +47,46 @@ _HUMP = re.compile(r"(?<=[a-z0-9])(?=[A-Z])")
 
 
 class RequestKey(NamedTuple):
-    """The parts of a request's key; `actor` is empty for a client without a name."""
+    """The parts of a request's key."""
 
     cell: str
     shard: str
     verb: str
-    actor: str
+    identity: str
+
+
+def identity_of(actor: str, host: str, pid: int) -> str:
+    """Return the identity of a client: its actor, host and process, in printable ASCII.
+
+    The process is a part of it: what one process may take of a shard is bounded, and two hundred
+    processes of one name must not share one bound.
+    """
+    names = (quote(name[:SHOWN_CHARACTERS], safe="") for name in (actor or NAMELESS, host or "-"))
+    return f"{'@'.join(names)}:{pid}"
 
 
 @lru_cache(maxsize=1024)
-def request_key(cell: str, shard: str, verb: str, actor: str) -> str:
-    """Return the key on which `actor` sends a request.
+def request_key(cell: str, shard: str, verb: str, identity: str) -> str:
+    """Return the key on which a client or shard of that identity sends a request.
 
     Args:
         cell: Name of the cell, or `ANY`.
         shard: Name of the shard, or `ANY`.
         verb: See `verb_of`.
-        actor: Any text; characters outside names are written as ``%XX`` of their UTF-8 bytes.
+        identity: Any text; characters that cannot stand in a key are written as ``%XX`` of their
+            UTF-8 bytes.
 
     Raises:
         ValueError: A part cannot stand in a key.
     """
-    who = quote(actor, safe="%") if actor else NOBODY
+    who = quoted_identity(identity)
     return f"{ROOT}/{_part('cell', cell)}/{_part('shard', shard)}/{_name('verb', verb)}/{who}"
+
+
+def quoted_identity(identity: str) -> str:
+    """Return an identity as it travels: printable ASCII, which Zenoh's wildcards match."""
+    who = quote(identity, safe="%@:") or NOBODY
+    return f"%40{who[1:]}" if who.startswith("@") else who
 
 
 def queryable_key(cell: str, shard: str) -> str:
@@ -74,9 +99,10 @@ def notice_key(cell: str, shard: str) -> str:
     return f"{ROOT}/{_name('cell', cell)}/{_NOTICES}/{_part('shard', shard)}"
 
 
-def token_key(cell: str, session: str) -> str:
-    """Return the key of the liveliness token of a session (or `ANY`)."""
-    return f"{ROOT}/{_name('cell', cell)}/{_SESSIONS}/{_part('session', session)}"
+def token_key(cell: str, identity: str, session: str) -> str:
+    """Return the key of the liveliness token of a session, either of which may be `ANY`."""
+    who = ANY if identity == ANY else quoted_identity(identity)
+    return f"{ROOT}/{_name('cell', cell)}/{_SESSIONS}/{who}/{_part('session', session)}"
 
 
 def verb_of(message: Message) -> str:
@@ -89,35 +115,37 @@ def _verb(class_name: str) -> str:
     return _HUMP.sub("_", class_name).lower()
 
 
+@lru_cache(maxsize=4096)
 def parse_request_key(key: str) -> RequestKey:
-    """Take a request's key apart.
+    """Take a request's key apart; the identity is left as it stands there.
 
     Raises:
         ProtocolError: It is no such key.
     """
-    chunks = key.split("/")
+    chunks = key.split("/", 5) if len(key) <= KEY_CHARACTERS_MAX else []
     if len(chunks) != 5 or chunks[0] != ROOT or chunks[2].startswith("@") or not all(chunks):
         raise ProtocolError(
             f"a request came on the key {key[:200]!r} instead of"
-            " enact/<cell>/<shard>/<verb>/<actor>"
+            " enact/<cell>/<shard>/<verb>/<identity>"
         )
-    actor = "" if chunks[4] == NOBODY else unquote(chunks[4])
-    return RequestKey(chunks[1], chunks[2], chunks[3], actor)
+    if "*" in chunks[3] or quoted_identity(chunks[4]) != chunks[4]:
+        raise ProtocolError(
+            f"the key {key[:200]!r} names no single verb and identity, so nobody is answered there"
+        )
+    return RequestKey(*chunks[1:])
 
 
-def session_of(key: str) -> str:
-    """Return the session of a token's key, or nothing where it is no such key."""
-    return _last(key, _SESSIONS)
+def token_of(key: str) -> tuple[str, str]:
+    """Return identity and session of a token's key, or nothing where it is no such key."""
+    chunks = key.split("/")
+    fits = len(chunks) == 5 and chunks[0] == ROOT and chunks[2] == _SESSIONS
+    return (chunks[3], chunks[4]) if fits else ("", "")
 
 
 def shard_of(key: str) -> str:
     """Return the shard of a notice's key, or nothing where it is no such key."""
-    return _last(key, _NOTICES)
-
-
-def _last(key: str, kind: str) -> str:
     chunks = key.split("/")
-    fits = len(chunks) == 4 and chunks[0] == ROOT and chunks[2] == kind
+    fits = len(chunks) == 4 and chunks[0] == ROOT and chunks[2] == _NOTICES
     return chunks[3] if fits else ""
 
 

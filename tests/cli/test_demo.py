@@ -44,5 +44,5 @@ def test_missing_extra_is_named_with_its_command(enact, monkeypatch):
     assert result.status == 2
     assert result.err == (
         "enact: the demo needs open3d, which is not installed; install the actors extra:"
-        " pip install 'enact-dist[actors]'\n"
+        " pip install -e '.[actors]' in the clone of enact-dist\n"
     )

@@ -167,7 +167,7 @@ def test_missing_library_is_named_with_its_extra(cell_file, tmp_path):
     )
     assert done.returncode == 2, done.stderr
     assert "mcap" in done.stderr
-    assert "enact-dist[record]" in done.stderr
+    assert "pip install -e '.[record]' in the clone" in done.stderr
 
 
 def test_progress_is_shown_on_a_terminal_only(enact, cell_file, put, tmp_path, monkeypatch):

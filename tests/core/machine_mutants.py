@@ -216,7 +216,9 @@ def vanished_waiters_keep_their_place(patch):
 
     def wrong(self, message, _):
         sessions, now_ns = self._state.sessions, self._state.now_ns
-        sessions.token_seen(message.session, message.present, now_ns=now_ns)
+        sessions.token_seen(
+            message.session, message.present, identity=message.identity, now_ns=now_ns
+        )
         return iter(())
 
     patch(SessionDesk, "on_session_seen", wrong)

@@ -102,6 +102,7 @@ class ShardBench:
         self.answers: dict[int, Answer] = {}
         self._handles = count(1)
         self._counts: dict[str, count[int]] = {}
+        self.identity = ""
         self._boot(recovered or Recovered(1))
         if register and recovered is None:
             self.ask(Register("admin", (), ASPECTS))
@@ -121,13 +122,25 @@ class ShardBench:
         """Send a request and return its answer, if there is one yet."""
         return self.answers.get(self.send(message))
 
+    def ask_as(self, identity: str, message: Request) -> Answer | None:
+        """Ask under an identity, as a transport does; everything else is the process's own word."""
+        self.identity = identity
+        try:
+            return self.ask(message)
+        finally:
+            self.identity = ""
+
     def event(self, event: Event) -> None:
         """Tell the shard of an event of its host."""
         self._give(event, 0)
 
     def _give(self, message: Request | Event, handle: int) -> None:
         effects = self.shard.handle(
-            message, reply_to=handle, now_ns=self.now_ns, wall_ns=self.wall_ns
+            message,
+            reply_to=handle,
+            identity=self.identity if handle else "",
+            now_ns=self.now_ns,
+            wall_ns=self.wall_ns,
         )
         self.shard.assert_invariants()
         for effect in effects:

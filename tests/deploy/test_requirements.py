@@ -72,3 +72,29 @@ def test_build_tools_are_asked_for_in_one_way():
     text = (FOLDER / "build.in").read_text("utf-8")
 
     assert text.split() == PROJECT["build-system"]["requires"]
+
+
+def pip_lines():
+    """Yield where a document or a message tells people to install this project, and what."""
+    folders = [ROOT / name for name in ("deploy", "enact_dist", "actors")]
+    files = [
+        file for folder in folders for kind in ("md", "py") for file in folder.rglob(f"*.{kind}")
+    ]
+    for file in (ROOT / "README.md", *files):
+        for what in re.findall(
+            r"""pip install (?:-e )?['"]?([^\s'"`)]*)""", file.read_text("utf-8")
+        ):
+            if what.startswith(("enact", ".", "/")) or "[" in what:
+                yield str(file.relative_to(ROOT)), what
+
+
+def test_every_pip_line_works_from_a_clone():
+    """Nothing is on an index yet: each line names the clone, and only extras that there are."""
+    extras = PROJECT["project"]["optional-dependencies"].keys()
+    found = list(pip_lines())
+
+    assert {"README.md", "enact_dist/doctor.py"} <= {place for place, _ in found}
+    for place, what in found:
+        path, _, wanted = what.rstrip("]").partition("[")
+        assert path in {".", "/path/to/enact-dist"}, (place, what)
+        assert {*filter(None, wanted.split(","))} <= extras, (place, what)

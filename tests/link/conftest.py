@@ -28,7 +28,7 @@ from enact_dist.core.messages import (
 )
 from enact_dist.core.shard_state import ShardSettings
 from enact_dist.link.log import in_words
-from enact_dist.link.socket_frames import Kind, Stream, send_frame
+from enact_dist.link.socket_frames import Kind, Stream, greeting_of, send_frame
 from enact_dist.terms import Access
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -166,7 +166,7 @@ def carry(request):
         session = session or secrets.token_hex(16)
         carrier = ZenohCarrier("cell", session, "tester", endpoints, ttl_s=ttl_s, **options)
         if over_socket:
-            carrier = SocketCarrier(carrier, session, forced=True)
+            carrier = SocketCarrier(carrier, session, "tester", forced=True)
         opened.append(carrier)
         if over_socket:
             hello = Hello(session, 0, int(TTL_S * 1e9), "tester", "host", os.getpid(), True)
@@ -234,7 +234,7 @@ def raw(daemon, endpoint):
         near.connect(folder.address("socket"))
         opened.append(near)
         if greet:
-            send_frame(near, session.encode(), kind=Kind.OPEN)
+            send_frame(near, greeting_of(session, "tester"), kind=Kind.OPEN)
             assert Stream(near).receive()[0] == Kind.OPENED
         return near
 

@@ -16,7 +16,7 @@ from enact_dist.core.datum import Datum, LockId, Token
 from enact_dist.errors import ProtocolError
 from enact_dist.link.zenoh_config import close_session, open_session
 from enact_dist.wire.frames import decode_frame, encode_frame
-from enact_dist.wire.keys import request_key
+from enact_dist.wire.keys import request_key, verb_of
 from enact_dist.wire.limits import FRAME_VERSION
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "wire"))
@@ -41,7 +41,7 @@ def raw(endpoint):
             opened.append(open_session(connect=(endpoint,), lease_s=30.0))
         sent = [
             opened[0].get(
-                request_key("cell", "s0", "hello", "fuzz"),
+                request_key("cell", "s0", verb(header, payload), "fuzz"),
                 attachment=header,
                 payload=payload,
                 timeout=10.0,
@@ -54,6 +54,12 @@ def raw(endpoint):
     yield ask
     for session in opened:
         close_session(session)
+
+
+def verb(header, payload):
+    """Return the verb of the message that these bytes are; of what is none it does not matter."""
+    kind = kind_of(header, payload)
+    return verb_of(object.__new__(kind)) if kind in m.Request.__args__ else "hello"
 
 
 def answer_of(replies):
@@ -177,9 +183,9 @@ def test_slices_that_wait_for_their_place_are_bounded(daemon, endpoint, raw, mon
     shard, full = daemon(endpoint), threading.Event()
     take, count = shard.host._stage, shard.host.count
 
-    def take_later(message, reply):
+    def take_later(message, reply, identity):
         full.wait(10)
-        take(message, reply)
+        take(message, reply, identity)
 
     def note(name, amount=1):
         count(name, amount)

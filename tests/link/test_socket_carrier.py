@@ -415,7 +415,7 @@ def test_signals_do_not_lengthen_a_call(daemon, carry, endpoint):
 def test_shard_that_offers_no_socket_is_told_of_once(tmp_path, monkeypatch, caplog):
     """Its line tries again and again while the shard is gone; its log is not filled by that."""
     monkeypatch.setenv("ENACT_SHARED_FOLDER", str(tmp_path))
-    line = SocketLine("s0", "s0-1", bytes(16), "session")
+    line = SocketLine("s0", "s0-1", bytes(16), b"session tester")
     with caplog.at_level(logging.DEBUG, "enact.link"):
         for _ in range(3):
             line._retry_at_s = 0.0

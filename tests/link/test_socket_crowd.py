@@ -12,7 +12,7 @@ from socket_parts import ask, counters
 
 from enact_dist.core.datum import LockId
 from enact_dist.core.messages import Acquire, Hello, Item, ListLocks, Locks
-from enact_dist.link.socket_frames import Kind, Stream, prefixed, send_frame
+from enact_dist.link.socket_frames import Kind, Stream, greeting_of, prefixed, send_frame
 from enact_dist.terms import Access
 from enact_dist.wire.frames import encode_frame
 
@@ -44,7 +44,8 @@ class Visitor:
         if self._draw.random() < 0.1:
             return
         known = self._draw.random() < 0.9
-        send_frame(near, self._name.encode() if known else os.urandom(9), kind=Kind.OPEN)
+        greeting = greeting_of(self._name, "crowd") if known else os.urandom(9)
+        send_frame(near, greeting, kind=Kind.OPEN)
         if self._draw.random() < 0.2:
             return  # before it is answered
         stream = Stream(near)

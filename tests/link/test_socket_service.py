@@ -27,7 +27,7 @@ from enact_dist.core.messages import (
 )
 from enact_dist.link import socket_connection, socket_service, socket_watcher
 from enact_dist.link.notices import Interest
-from enact_dist.link.socket_frames import Kind, Stream, read_skipped, send_frame
+from enact_dist.link.socket_frames import Kind, Stream, greeting_of, read_skipped, send_frame
 from enact_dist.terms import Access
 from enact_dist.wire.frames import decode_frame, encode_frame
 
@@ -62,9 +62,9 @@ def test_answer_that_another_thread_brings_at_once_is_sent_once(raw, monkeypatch
         time.sleep(0.1)  # as if the kernel had let the other thread run
         return send_what_fits(connection, answer)
 
-    def brought_by_another(message, reply):
+    def brought_by_another(message, reply, identity):
         answers = queue.SimpleQueue()
-        submit(message, answers.put)
+        submit(message, answers.put, identity)
         answer = answers.get(timeout=30)
         threads.append(threading.Thread(target=reply, args=(answer,)))
         threads[-1].start()
@@ -105,7 +105,7 @@ def test_session_with_too_many_connections_is_refused_by_name(raw, monkeypatch):
     monkeypatch.setattr(socket_service, "SESSION_CONNECTIONS_MAX", 3)
     kept = [raw("greedy") for _ in range(3)]
     one_more = raw("greedy", greet=False)
-    send_frame(one_more, b"greedy", kind=Kind.OPEN)
+    send_frame(one_more, greeting_of("greedy", "tester"), kind=Kind.OPEN)
 
     kind, text, _ = Stream(one_more).receive()
 
@@ -140,7 +140,7 @@ def test_place_of_a_client_that_left_before_its_greeting_was_answered_is_free(
 
     monkeypatch.setattr(socket_service.SocketService, "admit", admit_late)
     for near in nears:
-        send_frame(near, b"hasty", kind=Kind.OPEN)
+        send_frame(near, greeting_of("hasty", "tester"), kind=Kind.OPEN)
     until(lambda: len(left) == 3)
     for near in nears:
         near.close()
@@ -199,7 +199,7 @@ def test_shard_serves_no_stranger(raw):
     """A peer that is neither the shard's user nor root gets no connection."""
     raw.shard._sockets._users = frozenset((123_456,))
     near = raw(greet=False)
-    send_frame(near, b"stranger", kind=Kind.OPEN)
+    send_frame(near, greeting_of("stranger", "tester"), kind=Kind.OPEN)
 
     kind, text, _ = Stream(near).receive()
 

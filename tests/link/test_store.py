@@ -1,6 +1,7 @@
 """The store gives back what it was given, after a clean end."""
 
 import os
+import sqlite3
 import subprocess
 import sys
 
@@ -19,9 +20,11 @@ from enact_dist.core.records import (
     WorldRecord,
 )
 from enact_dist.errors import StoreError
-from enact_dist.link.folder_lock import FORMAT
+from enact_dist.link.folder_lock import FORMAT, FORMAT_READ_MIN
 from enact_dist.link.store import open_store
+from enact_dist.link.store_fields import pack
 from enact_dist.link.store_outcomes import OUTCOMES_KEPT_NS
+from enact_dist.link.store_rows import Key, Kind, row_checksum
 from enact_dist.terms import Durability, NullReason
 
 SLOT = Slot("online", "tray/package/1", "surface")
@@ -249,7 +252,9 @@ def test_second_opener_is_refused_by_pid_and_host(tmp_path):
     reopened(tmp_path)
 
 
-@pytest.mark.parametrize(("other", "age"), [(FORMAT + 1, "a newer"), (FORMAT - 1, "an older")])
+@pytest.mark.parametrize(
+    ("other", "age"), [(FORMAT + 1, "a newer"), (FORMAT_READ_MIN - 1, "an older")]
+)
 def test_folder_of_another_format_is_refused_untouched(tmp_path, other, age):
     """A program leaves the folder of a newer or older one exactly as it is, and names both."""
     store, _ = open_store(tmp_path, unix_s=1)
@@ -261,6 +266,28 @@ def test_folder_of_another_format_is_refused_untouched(tmp_path, other, age):
     with pytest.raises(StoreError, match=said):
         open_store(tmp_path, unix_s=1)
     assert files_of(tmp_path) == before
+
+
+def test_folder_of_the_format_before_is_read_and_marked(tmp_path):
+    """Its sessions and acts name nobody; from then on an older program leaves the folder alone."""
+    store, _ = open_store(tmp_path, unix_s=1)
+    store.write([persist(SessionRecord("x", 5), AuditRecord(3, "broken"))])
+    store.close()
+    (tmp_path / "format").write_text(f"enact-dist store {FORMAT_READ_MIN}\n")
+    with sqlite3.connect(tmp_path / "store.db") as database:
+        for kind, body in ((Kind.SESSION, pack([5])), (Kind.AUDIT, pack([3, "broken", "broken"]))):
+            found = database.execute("SELECT key, batch FROM record WHERE kind = ?", (kind,))
+            ((name, batch),) = found
+            crc = row_checksum(Key(kind, name), batch, body)
+            change = "UPDATE record SET body = ?, crc = ? WHERE kind = ?"
+            database.execute(change, (body, crc, kind))
+    database.close()
+
+    store, found = open_store(tmp_path, unix_s=2)
+    store.close()
+
+    assert (found.sessions, found.audit) == ([SessionRecord("x", 5)], [AuditRecord(3, "broken")])
+    assert (tmp_path / "format").read_text() == f"enact-dist store {FORMAT}\n"
 
 
 @pytest.mark.parametrize("text", ["", "enact-dist store", "something else 1", None])

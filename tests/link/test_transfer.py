@@ -260,7 +260,7 @@ class InterruptedSooner(deque):
 @pytest.mark.parametrize("queue", [Interrupted, InterruptedSooner])
 def test_interrupt_between_two_steps_leaves_no_connection_open(queue, monkeypatch):
     """What neither waits nor stands in the queue when Ctrl-C comes is closed all the same."""
-    line, far = SocketLine("s0", "x", b"", "session"), []
+    line, far = SocketLine("s0", "x", b"", b"session tester"), []
 
     def connected():
         near, other = socket.socketpair()

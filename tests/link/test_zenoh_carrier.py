@@ -34,7 +34,8 @@ both = pytest.mark.parametrize("carry", ["zenoh", "socket"], indirect=True)
 
 
 def speak(carrier, make_peer, **options):
-    """Return a session that has said hello over `carrier`."""
+    """Return the session of `carrier`, which has said hello over it."""
+    options = {"session": getattr(carrier, "behind", carrier)._session, **options}
     peer = make_peer(
         lambda shard, message: carrier.request(shard, message, timeout_s=30), **options
     )

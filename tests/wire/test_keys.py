@@ -14,13 +14,15 @@ from enact_dist.errors import ProtocolError
 from enact_dist.wire.keys import (
     ANY,
     RequestKey,
+    identity_of,
     notice_key,
     parse_request_key,
     queryable_key,
+    quoted_identity,
     request_key,
-    session_of,
     shard_of,
     token_key,
+    token_of,
     verb_of,
 )
 
@@ -38,12 +40,31 @@ def test_request_key_is_valid_for_every_actor_name(cell, shard, actor):
     assert key.count("/") == 4
 
 
-@given(NAMES, NAMES, st.text(max_size=40).filter(lambda actor: "%" not in actor and actor != "-"))
-def test_request_key_comes_apart_into_its_parts(cell, shard, actor):
-    """Cell, shard, verb and actor are read back from the key."""
-    key = request_key(cell, shard, "take_view", actor)
+@given(NAMES, NAMES, st.text(max_size=40))
+def test_request_key_comes_apart_into_its_parts(cell, shard, identity):
+    """Cell, shard, verb and identity, as it travels, are read back from the key."""
+    key = request_key(cell, shard, "take_view", identity)
 
-    assert parse_request_key(key) == RequestKey(cell, shard, "take_view", actor)
+    expected = RequestKey(cell, shard, "take_view", quoted_identity(identity))
+    assert parse_request_key(key) == expected
+
+
+@given(st.text(max_size=40), st.text(max_size=40), st.integers(0, 2**22))
+def test_identity_of_a_client_travels_as_it_is_and_is_no_shard(actor, host, pid):
+    """Whatever the names, it stands in a key unchanged, and never reads as that of a shard."""
+    identity = identity_of(actor, host, pid)
+
+    assert quoted_identity(identity) == identity
+    assert len(identity) <= 2000
+    assert "@" in identity.removeprefix("shard.")
+    assert token_of(token_key("cell", identity, "a1")) == (identity, "a1")
+
+
+def test_identities_of_two_processes_or_two_hosts_differ():
+    """One process of a name never speaks for another one."""
+    assert identity_of("camera", "robot", 7) == "camera@robot:7"
+    assert identity_of("", "", 0) == "client@-:0"
+    assert identity_of("a@b", "c", 1) != identity_of("a", "b@c", 1)
 
 
 @given(NAMES, st.text(max_size=40))
@@ -63,18 +84,18 @@ def test_keys_are_laid_out_as_documented():
     assert queryable_key("cell", "s0") == "enact/cell/s0/**"
     assert notice_key("cell", "s0") == "enact/cell/@notices/s0"
     assert notice_key("cell", ANY) == "enact/cell/@notices/*"
-    assert token_key("cell", "a1b2") == "enact/cell/@sessions/a1b2"
-    assert token_key("cell", ANY) == "enact/cell/@sessions/*"
+    assert token_key("cell", "fusion", "a1b2") == "enact/cell/@sessions/fusion/a1b2"
+    assert token_key("cell", ANY, ANY) == "enact/cell/@sessions/*/*"
 
 
 def test_keys_of_tokens_and_notices_name_their_owner():
     """Each parser knows its own kind of key and no other."""
-    assert session_of(token_key("cell", "a1b2")) == "a1b2"
+    assert token_of(token_key("cell", "fusion", "a1b2")) == ("fusion", "a1b2")
     assert shard_of(notice_key("cell", "s0")) == "s0"
-    assert session_of(notice_key("cell", "s0")) == ""
-    assert shard_of(token_key("cell", "a1b2")) == ""
-    assert session_of("other/cell/@sessions/a1b2") == ""
-    assert session_of("enact/cell/@sessions/a/b") == ""
+    assert token_of(notice_key("cell", "s0")) == ("", "")
+    assert shard_of(token_key("cell", "fusion", "a1b2")) == ""
+    assert token_of("other/cell/@sessions/fusion/a1b2") == ("", "")
+    assert token_of("enact/cell/@sessions/a1b2") == ("", "")
 
 
 @pytest.mark.parametrize(
@@ -88,10 +109,21 @@ def test_keys_refuse_names_that_cannot_stand_in_them(name):
         lambda: request_key("cell", "s0", name, ""),
         lambda: queryable_key("cell", name),
         lambda: notice_key(name, "s0"),
-        lambda: token_key("cell", name),
+        lambda: token_key("cell", "fusion", name),
     ):
         with pytest.raises(ValueError, match="name"):
             make()
+
+
+@pytest.mark.parametrize(
+    "key",
+    ["enact/cell/s0/*/a", "enact/cell/s0/hello/*", "enact/cell/s0/he$*/a", "enact/*/**/hello/a$*",
+     "enact/cell/s0/hello/@a", "enact/cell/s0/hello/ä"],
+)  # fmt: skip
+def test_request_key_that_stands_for_several_askers_is_refused(key):
+    """A wildcard in verb or identity would let one message count as many."""
+    with pytest.raises(ProtocolError, match="names no single verb and identity"):
+        parse_request_key(key)
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,7 @@ import zenoh
 from enact_dist.core.messages import Hello, Refused, Welcome
 from enact_dist.errors import LinkError, ProtocolError
 from enact_dist.link.shared_folder import open_shared
-from enact_dist.link.socket_frames import Kind, Stream, send_frame, wait_at_most
+from enact_dist.link.socket_frames import Kind, Stream, greeting_of, send_frame, wait_at_most
 from enact_dist.link.socket_service import SOCKET_NAME
 from enact_dist.link.zenoh_config import session_config
 from enact_dist.wire.frames import decode_frame, encode_frame
@@ -236,7 +236,7 @@ class RawSocket:
 
     def _open(self, session: str) -> bool:
         try:
-            send_frame(self.connected, session.encode(), kind=Kind.OPEN)
+            send_frame(self.connected, greeting_of(session, ACTOR), kind=Kind.OPEN)
             kind, _, _ = self._stream.receive()
         except (OSError, EOFError, ProtocolError):
             self._tally[ENDED] += 1

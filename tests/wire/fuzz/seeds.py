@@ -78,7 +78,7 @@ def key_texts(rng: random.Random) -> Iterator[bytes]:
         yield keys.request_key("cell", "s0", "take_view", actor).encode()
     yield keys.request_key(keys.ANY, keys.ANY, "hello", "x").encode()
     yield keys.notice_key("cell", "s0").encode()
-    yield keys.token_key("cell", "5e55").encode()
+    yield keys.token_key("cell", "fusion@host:7", "5e55").encode()
     yield keys.queryable_key("cell", "s0").encode()
 
 

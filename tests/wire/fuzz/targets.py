@@ -167,7 +167,7 @@ def datum(raw: bytes) -> object:
 def key(raw: bytes) -> object:
     """Read the key of a request, a notice or a token."""
     text = raw.decode("utf-8", "surrogatepass") if _is_text(raw) else raw.decode("latin-1")
-    keys.session_of(text)
+    keys.token_of(text)
     keys.shard_of(text)
     try:
         parts = keys.parse_request_key(text)

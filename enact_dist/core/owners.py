@@ -1,0 +1,106 @@
+"""Whose session a message speaks for: the identity under which it came decides.
+
+An identity is a short text.  The transport says it with each message (`Shard.handle`), and this
+module is all that asks for it, so that what vouches for an identity may change without the rules.
+Today a client says its own: actor, host and process, in the key of its requests and when it opens
+a socket.  That stops a fault or a stray tool; against malice it needs certificates or users, whose
+name stands in the same place then.
+
+Rules to keep
+
+- The first `Hello` of a session binds it to its identity, on the disk too; everything else that
+  names the session has to come under that identity.  What became of a commit anybody may ask: the
+  session that made it may be gone.
+- `Finish` and `Resolve` come from the shard that they name, under `shard_identity`.
+- The identity "" is this process itself: an embedded shard, or a simulated one.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from operator import attrgetter
+from typing import TYPE_CHECKING, Final, get_args
+
+from enact_dist.core.messages import (
+    Break,
+    DropWorld,
+    EpochChanged,
+    Finish,
+    ForceAbort,
+    Fork,
+    Hello,
+    KeepVersions,
+    Outcome,
+    Refused,
+    Request,
+    Resolve,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from enact_dist.core.records import Event
+    from enact_dist.core.sessions import SessionTable
+
+PERMISSION: Final = "permission"
+"""The code of a refusal because of who asks."""
+_SHARD: Final = "shard."
+
+
+def shard_identity(shard: str) -> str:
+    """Return the identity under which a shard calls the others."""
+    return _SHARD + shard
+
+
+def _session_getter(kind: type) -> Callable[[object], str] | None:
+    fields = {field.name for field in dataclasses.fields(kind)}
+    path = "lock.session" if "lock" in fields else "session" if "session" in fields else ""
+    return attrgetter(path) if path and kind not in (Finish, Resolve) else None
+
+
+SESSION_OF: Final = {kind: _session_getter(kind) for kind in get_args(Request)}
+"""How to read from each request for which session it speaks; None for what speaks for none."""
+_SAY_EPOCH: Final = frozenset((Break, DropWorld, ForceAbort, Fork, KeepVersions))
+
+
+def named_session(message: object) -> str:
+    """Return the session for which a request speaks, or nothing."""
+    getter = SESSION_OF.get(type(message))
+    return getter(message) if getter is not None else ""
+
+
+def refusal(
+    message: Request | Event, identity: str, sessions: SessionTable, epoch: int
+) -> Refused | EpochChanged | None:
+    """Return why a message under this identity is not for the shard to handle, else None."""
+    kind = type(message)
+    getter = SESSION_OF.get(kind)
+    if getter is None:
+        if kind is Finish or kind is Resolve:
+            return _not_its_shard(message, identity)  # type: ignore[arg-type]  # one of the two
+    elif kind is not Outcome:
+        session = getter(message)
+        owner = sessions.owner(session)
+        if owner and owner != identity:
+            return not_yours(session, owner, identity)
+        if owner == "" and kind is not Hello and session in sessions.by_id:
+            return EpochChanged(epoch)  # kept by a release that noted no owner: who greets has it
+    if kind in _SAY_EPOCH and not message.epoch:  # type: ignore[union-attr]  # those have one
+        return Refused("protocol", f"a {kind.__name__} came that names no epoch of this shard")
+    return None
+
+
+def not_yours(session: str, owner: str, asker: str) -> Refused:
+    """Refuse to let one client speak for another's session."""
+    return Refused(
+        PERMISSION,
+        f"session {session[:8]} belongs to {owner}; {asker} asked and may not speak for it",
+    )
+
+
+def _not_its_shard(message: Finish | Resolve, identity: str) -> Refused | None:
+    named = message.position.shard if isinstance(message, Finish) else message.asker
+    if identity == shard_identity(named):
+        return None
+    said = f"{type(message).__name__} in the name of shard {named}"
+    return Refused(PERMISSION, f"{identity} asked a {said}; only that shard itself may")

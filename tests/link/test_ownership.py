@@ -1,0 +1,127 @@
+"""Over either carrier: nobody speaks for another's session, and each message comes on its own key."""
+
+import pytest
+import zenoh
+
+from enact_dist.core import messages as m
+from enact_dist.core.datum import Datum, LockId, Position
+from enact_dist.errors import PermissionDeniedError
+from enact_dist.link.refusals import error_of
+from enact_dist.link.zenoh_config import close_session, open_session
+from enact_dist.wire.frames import decode_frame, encode_frame
+from enact_dist.wire.keys import request_key, verb_of
+
+both = pytest.mark.parametrize("carry", ["zenoh", "socket"], indirect=True)
+
+
+def peer_over(carrier, make_peer):
+    """Return the session of `carrier`, which has said hello over it."""
+    session = getattr(carrier, "behind", carrier)._session
+    peer = make_peer(lambda shard, one: carrier.request(shard, one, timeout_s=30), session=session)
+    peer.hello()
+    return peer
+
+
+@pytest.fixture
+def stranger(endpoint):
+    """A bare Zenoh session: `ask(message, identity, verb=…)` gives the answer."""
+    opened = []
+
+    def ask(message, identity, *, verb=""):
+        if not opened:
+            opened.append(open_session(connect=(endpoint,), lease_s=30.0))
+        header, payload = encode_frame(message)
+        replies = opened[0].get(
+            request_key("cell", "s0", verb or verb_of(message), identity),
+            attachment=header,
+            payload=payload,
+            timeout=30.0,
+            consolidation=zenoh.ConsolidationMode.NONE,
+        )
+        (reply,) = replies
+        return decode_frame(bytes(reply.ok.attachment), bytes(reply.ok.payload))
+
+    yield ask
+    for session in opened:
+        close_session(session)
+
+
+@both
+def test_stranger_takes_nothing_from_a_session(daemon, carry, make_peer, endpoint, stranger):
+    """Its lock stays through release, goodbye and hello under its name, and its commit stands."""
+    daemon(endpoint)
+    victim = peer_over(carry(endpoint), make_peer)
+    granted = victim.acquire("cup")
+    forged = (
+        m.Release(granted.lock),
+        m.Goodbye(victim.session),
+        m.Commit(granted.lock, granted.token, (), 0),
+        m.Stage(victim.session, f"{victim.session}-1", 0, 9, Datum(b"", b"", 0)),
+        m.Hello(victim.session, victim.epoch, 2_000_000_000, "eve", "h", 1, False),
+    )
+    refused = [stranger(message, "eve@h:1") for message in forged]
+    committed = victim.commit(granted, "cup", b"1")
+
+    assert [type(answer) for answer in refused] == [m.Refused] * len(forged)
+    assert {answer.code for answer in refused} == {"permission"}
+    assert all("tester" in answer.text and "eve@h:1" in answer.text for answer in refused)
+    assert isinstance(error_of(refused[0]), PermissionDeniedError)
+    assert isinstance(committed, m.Committed)
+
+
+@both
+def test_stranger_takes_nothing_after_a_restart_either(
+    daemon, carry, make_peer, endpoint, stranger, tmp_path, until
+):
+    """Whose a session is lies in the shard's folder."""
+    first = daemon(endpoint, folder=tmp_path)
+    carrier = carry(endpoint)
+    victim = peer_over(carrier, make_peer)
+    first.stop(drain_s=0.0)
+    daemon(endpoint, folder=tmp_path)
+    alive = m.ListSessions()
+    until(lambda: carrier.request("s0", alive, timeout_s=0.5), limit_s=30.0)
+
+    hello = m.Hello(victim.session, 0, 2_000_000_000, "eve", "h", 1, False)
+
+    assert isinstance(stranger(hello, "eve@h:1"), m.Refused)
+    assert isinstance(stranger(m.Goodbye(victim.session), "eve@h:1"), m.Refused)
+    victim.hello()
+    victim.hello()  # in the new epoch: the grace is over
+    assert isinstance(victim.write("cup", b"1"), m.Committed)
+
+
+def test_message_on_the_key_of_another_verb_is_refused(daemon, endpoint, stranger):
+    """Access rules that look at keys would let it pass as what it is not."""
+    shard = daemon(endpoint)
+
+    answer = stranger(m.ListLocks(), "eve@h:1", verb="survey")
+
+    assert isinstance(answer, m.Refused)
+    assert answer.text == "a list_locks came on the key of a survey"
+    assert shard.host._shard.counters["frames_refused"] == 1
+
+
+def test_decision_from_an_actor_is_refused(daemon, endpoint, stranger):
+    """Only the shard that it names may send one."""
+    daemon(endpoint)
+    finish = m.Finish(LockId("somebody", 0, 1), Position(2**62, "far"))
+
+    assert stranger(finish, "eve@h:1").code == "permission"
+    assert isinstance(stranger(finish, "shard.far"), m.Finished)
+
+
+def test_connection_speaks_for_its_own_session_only(raw, make_peer):
+    """Not for that of another connection, of the same user even; decisions do not come this way."""
+    from socket_parts import ask
+
+    near, other = raw("mine"), raw("yours")
+    hello = m.Hello("yours", 0, 2_000_000_000, "you", "h", 1, False)
+    welcome = ask(other, hello)
+    forged = [ask(near, one) for one in (m.Goodbye("yours"), m.Release(LockId("yours", 0, 1)))]
+    finish = ask(near, m.Finish(LockId("yours", 0, 1), Position(1, "far")))
+    sessions = ask(other, m.ListSessions())
+
+    assert isinstance(welcome, m.Welcome)
+    assert {answer.code for answer in (*forged, finish)} == {"permission"}
+    assert [session.session for session in sessions.sessions] == ["yours"]
