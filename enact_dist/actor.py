@@ -88,9 +88,15 @@ class Actor:
       capture stamp, in the order of their stamps; at the start for the newest one.  `lock[…]` of
       the `Together`, or of a `View` in it, shows the data of that stamp, whatever came later.
       Sets that stay incomplete are counted and named, see `enact actor ls`.
-    - with `every_s`: at that rate, on a grid without drift; late ticks are counted as missed.
+    - with `every_s`: at that rate, at the multiples of the period since 1970, so that sources of
+      one period tick together; late ticks are counted as missed.
       A tick whose lock was refused is over: the next one takes a newer measurement.
     - with neither: once, then the actor is done.
+
+    What an update writes bears the capture stamp of what caused it, unless `lock.put(…, stamp_ns=)`
+    says another (0: none): of a set its stamp; of other triggers the newest stamp among their data
+    of `lock.entity`; of a source `lock.tick_ns`.  So a camera's stamp goes on to what is made of
+    its images, and a `Together` behind that finds its sets.
 
     An update that raises is reported and counted and not run again before its entity changes: an
     update is a function of what it reads, so the same data would fail again.  Hence every datum
@@ -101,6 +107,8 @@ class Actor:
     Attributes:
         triggers: Declared reading requests; the actor must not write what triggers it.
         every_s: Period of a source in seconds; may be set per instance.
+        in_phase: False lets the ticks of `every_s` begin when the actor is ready, in place of
+            the multiples of the period: for sources that would disturb each other.
         only_entity: The one entity that an instance works on, of those that its patterns match; a
             source needs it where it names a pattern.  `entity` in `cell.toml`, ``--entity``; of
             what `__init__` sets, `enact actor check` knows nothing.  A `Together` names its
@@ -117,6 +125,7 @@ class Actor:
     ] = ()
     shared: ClassVar[Sequence[LockRequest[Any]]] = ()
     every_s: float | None = None
+    in_phase: bool = True
     only_entity: Entity | None = None
     wait_s: float = 10.0
     hold_s: float = 60.0

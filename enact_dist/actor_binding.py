@@ -104,6 +104,7 @@ class BoundActor:
         wait_s: float | None = None,
         stop: threading.Event | None = None,
         captured_ns: int = 0,
+        tick_ns: int = 0,
     ) -> ActorLock:
         """Return the lock of one update, not yet taken.
 
@@ -113,6 +114,7 @@ class BoundActor:
             wait_s: How long to wait for it; None: as long as the actor says.
             stop: Ends the waiting once it is set.
             captured_ns: Capture stamp of the set that triggered it; 0 without one.
+            tick_ns: The tick of a source that it is for; 0 of anything else.
         """
         entity = entity or self.only
         return ActorLock(
@@ -123,6 +125,8 @@ class BoundActor:
             stop=stop,
             together=self.declaration.together,
             captured_ns=captured_ns,
+            tick_ns=tick_ns,
+            triggers=self.declaration.triggers,
         )
 
     def writes(self) -> tuple[str, ...]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
+from enact_dist.core.datum import Slot
 from enact_dist.lock import Lock
 from enact_dist.reading import slot_of
 from enact_dist.terms import Entity, LockRequest, World
@@ -15,7 +16,7 @@ from enact_dist.together import Together
 
 if TYPE_CHECKING:
     import threading
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from enact_dist.core.messages import Item
     from enact_dist.terms import LockRequestOne
@@ -37,6 +38,8 @@ class ActorLock(Lock):
         stop: Ends the waiting for the lock within 0.2 s once it is set.
         together: The set that triggers the actor, if one does.
         captured_ns: Its capture stamp.
+        tick_ns: The tick of `every_s` that it is for, 0 if it is for none.
+        triggers: The declared requests that trigger the actor.
     """
 
     def __init__(
@@ -49,6 +52,8 @@ class ActorLock(Lock):
         stop: threading.Event | None = None,
         together: Together[Any] | None = None,
         captured_ns: int = 0,
+        tick_ns: int = 0,
+        triggers: Sequence[LockRequest[Any]] = (),
     ) -> None:
         super().__init__(*bound.values(), wait_s=wait_s, hold_s=hold_s)
         self._interrupt = stop
@@ -56,6 +61,8 @@ class ActorLock(Lock):
         self._bound = bound
         self._together = together
         self._captured_ns = captured_ns
+        self._tick_ns = tick_ns
+        self._triggers = triggers
         views = together.requests if together is not None else ()
         self._in_set: dict[Any, None] = {bound[view]: None for view in views}
 
@@ -66,6 +73,23 @@ class ActorLock(Lock):
     def missing(self) -> list[int]:
         """Return which data of the set were outside retention at the grant, by their index."""
         return [index for index, view in enumerate(self._in_set) if self._is_null(slot_of(view))]
+
+    def _stamp(self, stamp_ns: int | None) -> int:
+        if stamp_ns is not None:
+            return stamp_ns
+        return self._captured_ns or self._tick_ns or self._stamp_of_triggers()
+
+    def _stamp_of_triggers(self) -> int:
+        """Return the newest capture stamp of the data that trigger this update; 0 of none."""
+        states = map(self._readings.state, map(self._slot_of_trigger, self._triggers))
+        return max((state.captured_ns for state in states if state is not None), default=0)
+
+    def _slot_of_trigger(self, declared: LockRequest[Any]) -> Slot:
+        request = self._resolve(declared)
+        if isinstance(request.entity, Entity):
+            return slot_of(request)
+        context, _, aspect = request.address
+        return Slot(context, self.entity.name, aspect)
 
     def _resolve(self, request: R) -> R:
         """Return what a declared request stands for in this update."""

@@ -285,11 +285,13 @@ class ActorRun:
                 self._report()
 
     def _run_source(self, every_s: float) -> None:
-        rate = FixedRate(every_s, start_ns=monotonic_ns())
+        rate = FixedRate(
+            every_s, now_ns=monotonic_ns(), wall_ns=wall_ns(), in_phase=self._actor.in_phase
+        )
         missed = 0
         while not self._stop.wait(max(0, rate.due_ns() - monotonic_ns()) / 1e9):
-            if rate.tick(monotonic_ns()):
-                in_vain = isinstance(self._attempt(None), REFUSALS)
+            if tick_ns := rate.tick(monotonic_ns(), wall_ns()):
+                in_vain = isinstance(self._attempt(None, tick_ns=tick_ns), REFUSALS)
                 self._record.missed(rate.missed - missed + in_vain)
                 missed = rate.missed
             self._report()
@@ -305,14 +307,20 @@ class ActorRun:
             self._stop.wait(self._pause_s(refused))
             refused += 1
 
-    def _attempt(self, entity: Entity | None, *, captured_ns: int = 0) -> Exception | None:
+    def _attempt(
+        self, entity: Entity | None, *, captured_ns: int = 0, tick_ns: int = 0
+    ) -> Exception | None:
         """Run `update` once under its lock; return what ended it early."""
         asked_ns, granted_ns = monotonic_ns(), 0
         missing: list[int] = []
         seen: dict[tuple[int, Entity], tuple[int, int]] = {}
         try:
             lock = self._bound.lock(
-                entity, wait_s=self._wait_s, stop=self._stop, captured_ns=captured_ns
+                entity,
+                wait_s=self._wait_s,
+                stop=self._stop,
+                captured_ns=captured_ns,
+                tick_ns=tick_ns,
             )
             with lock:
                 granted_ns = monotonic_ns()

@@ -9,8 +9,8 @@ tested without a thread.  Rules that a change must keep:
    changes while it runs goes to the end.  So a busy entity cannot starve a quiet one.
 3. A state that was already handed in is no change: a watch that was opened again repeats its
    snapshot without running everything again.
-4. A source's ticks lie on one grid counted from its start: no drift, and after a late update no
-   bunch of ticks to catch up.
+4. A source's ticks lie on one grid, the multiples of its period: no drift, sources of one period
+   tick together, and after a late update there is no bunch of ticks to catch up.
 """
 
 from __future__ import annotations
@@ -174,35 +174,56 @@ class PendingTriggers:
 
 
 class FixedRate:
-    """Ticks of a source on the grid `start_ns + k * every_ns`.
+    """Ticks of a source on the multiples of its period since 1970, by the wall clock.
 
-    The first tick is due at once.  A tick that is late runs at once; those that passed before it
-    are counted as missed and do not run.
+    So sources of one period tick together, on any host whose clock is right.  The first tick is due
+    at once, as one that is late: a tick that is late runs at once, and those that passed before it
+    are counted as missed and do not run.  Time is measured by the monotonic clock; at each tick the
+    grid follows the wall clock, where that was set too, without counting that as missed ticks.
+
+    Args:
+        every_s: The period.
+        now_ns: Monotonic time.
+        wall_ns: Wall-clock time, since 1970.
+        in_phase: False lets the grid begin now, apart from those of other sources.
 
     Attributes:
         missed: Ticks that never ran.
     """
 
-    __slots__ = ("_every_ns", "_next", "_start_ns", "missed")
+    __slots__ = ("_ahead_ns", "_every_ns", "_next", "_offset_ns", "missed")
 
-    def __init__(self, every_s: float, *, start_ns: int) -> None:
+    def __init__(self, every_s: float, *, now_ns: int, wall_ns: int, in_phase: bool = True) -> None:
         self._every_ns = max(1, round(every_s * 1e9))
-        self._start_ns = start_ns
-        self._next = 0
+        self._offset_ns = 0 if in_phase else wall_ns % self._every_ns
+        self._ahead_ns = wall_ns - now_ns
+        self._next = self._index(wall_ns)
         self.missed = 0
 
     def due_ns(self) -> int:
-        """Return when the next tick is due."""
-        return self._start_ns + self._next * self._every_ns
+        """Return when the next tick is due, in monotonic time."""
+        return self._next * self._every_ns + self._offset_ns - self._ahead_ns
 
-    def tick(self, now_ns: int) -> bool:
-        """Say whether a tick is due, and if so take it."""
+    def tick(self, now_ns: int, wall_ns: int) -> int:
+        """Take a tick if one is due; return when it was due, in ns since 1970, else 0."""
         if now_ns < self.due_ns():
-            return False
-        latest = (now_ns - self._start_ns) // self._every_ns
+            return 0
+        latest = self._index(now_ns + self._ahead_ns)
         self.missed += latest - self._next
+        ahead_ns = wall_ns - now_ns
+        if abs(ahead_ns - self._ahead_ns) > self._every_ns // 2:
+            latest = self._index(wall_ns)  # the wall clock was set
+        self._ahead_ns = ahead_ns
         self._next = latest + 1
-        return True
+        return latest * self._every_ns + self._offset_ns
+
+    def _index(self, wall_ns: int) -> int:
+        return (wall_ns - self._offset_ns) // self._every_ns
+
+
+def tick_before(wall_ns: int, every_s: float) -> int:
+    """Return the newest tick of a source of this period, in ns since 1970."""
+    return FixedRate(every_s, now_ns=0, wall_ns=wall_ns).tick(0, wall_ns)
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,6 +27,7 @@ from enact_dist.errors import (
 from enact_dist.in_place import refuse_changed
 from enact_dist.lock_reads import reads_of
 from enact_dist.lock_statistics import LockStatistics
+from enact_dist.lock_trigger import Triggered
 from enact_dist.reading import (
     EachData,
     Readings,
@@ -81,7 +82,7 @@ def refuse_inside_lock(what: str) -> None:
         )
 
 
-class Lock:
+class Lock(Triggered):
     """A set of data, granted at once or not at all.
 
     An array arrives read-only: ``lock[joints] += 1`` works on it in place, which numpy refuses
@@ -142,7 +143,6 @@ class Lock:
         self._each: dict[LockRequest[Any], EachData[Any]] = {}
         self._writing = Writing(self._session.client.payloads)
         self._expects: dict[Slot, SlotVersion] = {}
-        self._entity: Entity | None = None
         self._asked_s = self._granted_s = self._ended_s = 0.0
         self.position: Position | None = None
 
@@ -320,13 +320,14 @@ class Lock:
         """Set the datum when the block ends cleanly; see `put`."""
         self.put(request, datum)
 
-    def put(self, request: Write[T], datum: T, *, stamp_ns: int = 0) -> None:
+    def put(self, request: Write[T], datum: T, *, stamp_ns: int | None = None) -> None:
         """Set the datum when the block ends cleanly.
 
         Args:
             request: A `Write` of this lock.
             datum: A value of the aspect's type; arrays are copied.
             stamp_ns: When it was captured, nanoseconds since 1970; 0 where that has no meaning.
+                Left out, it is that of what triggered the update of an actor, see `Actor`, else 0.
 
         Raises:
             ReadonlyError: The request does not allow writing.
@@ -334,11 +335,11 @@ class Lock:
             NoRoomError: The shard's cap of shared memory is reached.
         """
         request = self._check_writable(request)
-        self._put(slot_of(request), request.aspect, datum, stamp_ns=stamp_ns)
+        self._put(slot_of(request), request.aspect, datum, stamp_ns)
 
-    def _put(self, slot: Slot, aspect: Aspect[T], datum: T, *, stamp_ns: int = 0) -> None:
+    def _put(self, slot: Slot, aspect: Aspect[T], datum: T, stamp_ns: int | None) -> None:
         try:
-            encoded = encode_parts(datum, aspect.datum_type, stamp_ns=stamp_ns)
+            encoded = encode_parts(datum, aspect.datum_type, stamp_ns=self._stamp(stamp_ns))
         except DatumTypeError as error:
             raise misfit(slot, "is not set", error) from error.__cause__
         self._writing.put(slot, encoded, self._shard)
@@ -349,10 +350,15 @@ class Lock:
 
     @overload
     def new(
-        self, request: Write[T], shape: ShapesLike, dtype: DTypesLike = None, *, stamp_ns: int = 0
+        self,
+        request: Write[T],
+        shape: ShapesLike,
+        dtype: DTypesLike = None,
+        *,
+        stamp_ns: int | None = None,
     ) -> T: ...
     @overload
-    def new(self, request: Write[T], *, like: T, stamp_ns: int = 0) -> T: ...
+    def new(self, request: Write[T], *, like: T, stamp_ns: int | None = None) -> T: ...
     def new(
         self,
         request: Write[T],
@@ -360,7 +366,7 @@ class Lock:
         dtype: DTypesLike = None,
         *,
         like: T | None = None,
-        stamp_ns: int = 0,
+        stamp_ns: int | None = None,
     ) -> T:
         """Return a datum whose arrays are to be filled in place; committing it copies nothing.
 
@@ -382,7 +388,7 @@ class Lock:
             NoRoomError: As `put`.
         """
         request = self._check_writable(request)
-        asked = Asked(request.aspect.datum_type, like, shape, dtype, stamp_ns)
+        asked = Asked(request.aspect.datum_type, like, shape, dtype, self._stamp(stamp_ns))
         value: T = self._writing.new(slot_of(request), asked, self._shard)
         return value
 
@@ -432,17 +438,6 @@ class Lock:
 
     # ---------------------------------------------------------------- state
 
-    @property
-    def entity(self) -> Entity:
-        """The entity that triggered this update of an actor.
-
-        Raises:
-            MisuseError: The lock was not made for a triggering entity.
-        """
-        if self._entity is None:
-            raise MisuseError(f"{self!r} was not made by a trigger, so no entity triggered it")
-        return self._entity
-
     def version(self, request: LockRequestOne[Any]) -> int:
         """Return the version of the datum as granted (0: never set)."""
         state = self._readings.state(slot_of(self._check(request)))
@@ -453,7 +448,11 @@ class Lock:
         if isinstance(request, Together):
             raise MisuseError(f"{request!r} is no part of this lock; an actor's trigger can be")
         slot = slot_of(self._check(request))
-        return 0 if self._is_null(slot) else self._readings.datum(slot).stamp_ns
+        if slot in self._writing.data:
+            datum = self._writing.data[slot]
+            return datum.stamp_ns if datum is not None else 0
+        state = self._readings.state(slot)
+        return state.captured_ns if state is not None else 0
 
     def valid(self) -> bool:
         """Whether this process may still believe that it holds the lock; asks nobody."""

@@ -19,10 +19,12 @@ from __future__ import annotations
 
 import contextlib
 from typing import TYPE_CHECKING, Final
+from weakref import WeakKeyDictionary
 
 from enact_dist.actor_binding import BoundActor
-from enact_dist.actor_triggers import PendingTriggers
+from enact_dist.actor_triggers import PendingTriggers, tick_before
 from enact_dist.connecting import local
+from enact_dist.link.clock import wall_ns
 from enact_dist.session import session_of
 from enact_dist.together import captured_versions
 
@@ -38,6 +40,10 @@ if TYPE_CHECKING:
 STEP_NS: Final = 100_000_000
 """Time passes in steps of 0.1 s: a shard takes a longer one for its own standing still, for which
 no holder has to pay (a quarter of the session TTL, 2 s)."""
+
+
+_clocks: WeakKeyDictionary[Cell, ManualClock] = WeakKeyDictionary()
+"""The clocks of cells that have a manual one."""
 
 
 class ManualClock:
@@ -100,6 +106,7 @@ def worlds(*names: str, clock: ManualClock | None = None) -> Iterator[Cell]:
         local(worlds=names, actor="testing", clock=clock) as cell,
         clock.ticking(cell._host.tick),  # noqa: SLF001 (the shard must see each step)
     ):
+        _clocks[cell] = clock
         yield cell
 
 
@@ -108,7 +115,8 @@ def run_once(actor: Actor, cell: Cell, worlds: Mapping[str, str] | None = None) 
 
     An actor with triggers is updated once per entity whose trigger datum is new to this actor
     object: all existing ones at the first call, those that changed since at the next.  A source,
-    or an actor that runs once, is updated once.  One with a `Together` is updated once per complete
+    or an actor that runs once, is updated once; `lock.tick_ns` of a source is the newest multiple
+    of its period by the cell's clock.  One with a `Together` is updated once per complete
     set: at the first call for the newest one.  `start` and `stop` are called around it.
 
     Args:
@@ -127,7 +135,9 @@ def run_once(actor: Actor, cell: Cell, worlds: Mapping[str, str] | None = None) 
     actor.start()
     try:
         if not bound.declaration.triggers:
-            _update(bound, None)
+            clock = _clocks.get(cell)
+            now_ns = clock.wall_ns() if clock is not None else wall_ns()
+            _update(bound, None, tick_before(now_ns, actor.every_s) if actor.every_s else 0)
             return 1
         if bound.declaration.together is not None:
             return _update_sets(actor, bound)
@@ -141,8 +151,8 @@ def run_once(actor: Actor, cell: Cell, worlds: Mapping[str, str] | None = None) 
         actor.stop()
 
 
-def _update(bound: BoundActor, entity: Entity | None) -> None:
-    with bound.lock(entity) as lock:
+def _update(bound: BoundActor, entity: Entity | None, tick_ns: int = 0) -> None:
+    with bound.lock(entity, tick_ns=tick_ns) as lock:
         bound.actor.update(lock)
 
 

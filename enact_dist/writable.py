@@ -72,21 +72,26 @@ class WritableEach(EachData[T], MutableMapping[Entity, T]):
     def __setitem__(self, entity: Entity, datum: T) -> None:
         self.put(entity, datum)
 
-    def put(self, entity: Entity, datum: T, *, stamp_ns: int = 0) -> None:
+    def put(self, entity: Entity, datum: T, *, stamp_ns: int | None = None) -> None:
         """Set one entity's datum when the block ends cleanly; see `Lock.put`."""
         self.follow()
         slot = self._slot(entity)
         self._lock._use()
-        self._lock._put(slot, self._request.aspect, datum, stamp_ns=stamp_ns)
+        self._lock._put(slot, self._request.aspect, datum, stamp_ns)
         self._note(entity, slot, null=False)
         self._followed = self._lock._writing.edits
 
     @overload
     def new(
-        self, entity: Entity, shape: ShapesLike, dtype: DTypesLike = None, *, stamp_ns: int = 0
+        self,
+        entity: Entity,
+        shape: ShapesLike,
+        dtype: DTypesLike = None,
+        *,
+        stamp_ns: int | None = None,
     ) -> T: ...
     @overload
-    def new(self, entity: Entity, *, like: T, stamp_ns: int = 0) -> T: ...
+    def new(self, entity: Entity, *, like: T, stamp_ns: int | None = None) -> T: ...
     def new(
         self,
         entity: Entity,
@@ -94,13 +99,15 @@ class WritableEach(EachData[T], MutableMapping[Entity, T]):
         dtype: DTypesLike = None,
         *,
         like: T | None = None,
-        stamp_ns: int = 0,
+        stamp_ns: int | None = None,
     ) -> T:
         """Return one entity's datum, whose arrays are to be filled in place; see `Lock.new`."""
         self.follow()
         slot = self._slot(entity)
         self._lock._use()
-        asked = Asked(self._request.aspect.datum_type, like, shape, dtype, stamp_ns)
+        asked = Asked(
+            self._request.aspect.datum_type, like, shape, dtype, self._lock._stamp(stamp_ns)
+        )
         value: T = self._lock._writing.new(slot, asked, self._lock._shard)
         self._note(entity, slot, null=False)
         self._followed = self._lock._writing.edits

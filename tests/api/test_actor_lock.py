@@ -12,6 +12,7 @@ from enact_dist.actor_binding import BoundActor
 from enact_dist.connecting import local
 from enact_dist.errors import ReadonlyError
 from enact_dist.lock import Lock
+from enact_dist.lock_trigger import Triggered
 from enact_dist.terms import Aspect, Entities, Entity, Read, View, World, Write
 
 if TYPE_CHECKING:
@@ -75,7 +76,7 @@ CALLS: dict[str, Callable[[ActorLock], Any]] = {
     "version": lambda lock: lock.version(Meshing.cloud) == 1,
     "stamp_ns": lambda lock: lock.stamp_ns(Meshing.cloud) == 11,
 }
-WITHOUT_REQUEST = {"check", "entity", "running", "statistics", "token", "valid"}
+WITHOUT_REQUEST = {"check", "entity", "running", "statistics", "tick_ns", "token", "valid"}
 INDEXING = {"__getitem__", "__setitem__", "__delitem__"}
 
 
@@ -92,7 +93,7 @@ def bound() -> Iterator[BoundActor]:
 
 def test_each_public_method_of_a_lock_is_called_here():
     """A method that comes to be has to say here how an actor calls it."""
-    public = {name for name in vars(Lock) if not name.startswith("_")}
+    public = {name for name in {**vars(Triggered), **vars(Lock)} if name[0] != "_"}
     assert public | INDEXING == set(CALLS) | WITHOUT_REQUEST
 
 

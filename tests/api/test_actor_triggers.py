@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -234,8 +235,9 @@ def test_pending_hands_out_every_newest_state_whatever_comes_between(
 
 def test_rate_ticks_at_once_and_then_on_its_grid_when_updates_are_short():
     """The first tick is at the start, the k-th at k periods, however late it was taken."""
-    rate = FixedRate(0.1, start_ns=0)
-    taken_ns = [now_ns for now_ns in range(0, 500_000_001, 7_000_000) if rate.tick(now_ns)]
+    rate = FixedRate(0.1, now_ns=0, wall_ns=SECOND_NS)
+    times_ns = range(0, 500_000_001, 7_000_000)
+    taken_ns = [now_ns for now_ns in times_ns if rate.tick(now_ns, SECOND_NS + now_ns)]
 
     assert [now_ns // 100_000_000 for now_ns in taken_ns] == [0, 1, 2, 3, 4]
     assert rate.due_ns() == 500_000_000
@@ -244,15 +246,53 @@ def test_rate_ticks_at_once_and_then_on_its_grid_when_updates_are_short():
 
 def test_rate_counts_and_does_not_bunch_ticks_when_an_update_took_long():
     """After 3.5 periods one tick is late, two are missed, the next is on the grid."""
-    rate = FixedRate(0.1, start_ns=0)
-    rate.tick(0)
+    rate = FixedRate(0.1, now_ns=0, wall_ns=SECOND_NS)
+    rate.tick(0, SECOND_NS)
 
-    late = rate.tick(350_000_000)
+    late = rate.tick(350_000_000, SECOND_NS + 350_000_000)
 
-    assert late
+    assert late == SECOND_NS + 300_000_000
     assert rate.missed == 2
-    assert not rate.tick(399_999_999)
+    assert not rate.tick(399_999_999, SECOND_NS + 399_999_999)
     assert rate.due_ns() == 400_000_000
+
+
+def test_sources_of_one_period_tick_together_whenever_they_are_ready():
+    """Their ticks are the multiples of the period since 1970; the first is late, and at once."""
+    ticks = []
+    for ready_ns in (3 * SECOND_NS + 1, 3 * SECOND_NS + 70_000_000):  # monotonic 0 for each
+        rate = FixedRate(0.1, now_ns=0, wall_ns=ready_ns)
+        first = rate.tick(0, ready_ns)
+        assert rate.due_ns() == 3_100_000_000 - ready_ns
+        ticks.append((first, rate.tick(rate.due_ns(), ready_ns + rate.due_ns())))
+
+    assert ticks == [(3 * SECOND_NS, 3 * SECOND_NS + 100_000_000)] * 2
+
+
+def test_source_apart_from_others_begins_its_grid_when_it_is_ready():
+    """`in_phase = False`: sources that would disturb each other do not tick together."""
+    rate = FixedRate(0.1, now_ns=0, wall_ns=SECOND_NS + 33, in_phase=False)
+
+    assert rate.tick(0, SECOND_NS + 33) == SECOND_NS + 33
+    assert rate.due_ns() == 100_000_000
+
+
+@pytest.mark.parametrize("set_s", [3600, -3600, 0.04, -0.04])
+def test_grid_follows_a_wall_clock_that_was_set(set_s):
+    """The source neither waits for an hour nor counts one as missed, and no tick comes twice."""
+    rate = FixedRate(0.1, now_ns=0, wall_ns=SECOND_NS * 10_000)
+    rate.tick(0, SECOND_NS * 10_000)
+    ahead_ns = SECOND_NS * 10_000 + round(set_s * 1e9)
+    ticks = []
+    for now_ns in range(1_000_000, 1_000_000_000, 1_000_000):
+        if tick := rate.tick(now_ns, now_ns + ahead_ns):
+            ticks.append(tick)
+
+    assert rate.missed == 0
+    assert 9 <= len(ticks) <= 11
+    assert all(tick % 100_000_000 == 0 for tick in ticks)
+    assert len(set(ticks)) == len(ticks)
+    assert abs(ticks[-1] - ahead_ns - SECOND_NS) <= 100_000_000
 
 
 def test_back_off_doubles_up_to_its_limit_when_refused_again():

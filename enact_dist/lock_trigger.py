@@ -1,0 +1,46 @@
+"""What a lock knows of why an actor's update runs; a lock of one's own knows none of it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from enact_dist.errors import MisuseError
+
+if TYPE_CHECKING:
+    from enact_dist.terms import Entity
+
+
+class Triggered:
+    """The part of `Lock` that an actor's runner fills in."""
+
+    _entity: Entity | None = None
+    _tick_ns = 0
+
+    @property
+    def entity(self) -> Entity:
+        """The entity that triggered this update of an actor.
+
+        Raises:
+            MisuseError: The lock was not made for a triggering entity.
+        """
+        if self._entity is None:
+            raise MisuseError(f"{self!r} was not made by a trigger, so no entity triggered it")
+        return self._entity
+
+    @property
+    def tick_ns(self) -> int:
+        """When the tick of `every_s` was due that this update is for, nanoseconds since 1970.
+
+        A multiple of the period, on every host: sources of one period have the same ticks.  What
+        the update writes bears it as its capture stamp, unless `put` is given another.
+
+        Raises:
+            MisuseError: The lock was not made for a tick.
+        """
+        if not self._tick_ns:
+            raise MisuseError(f"{self!r} was not made for a tick of every_s, so it has no tick_ns")
+        return self._tick_ns
+
+    def _stamp(self, stamp_ns: int | None) -> int:
+        """Return the capture stamp of a datum that is written with `stamp_ns`."""
+        return stamp_ns or 0
