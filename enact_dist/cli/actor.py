@@ -41,10 +41,11 @@ from enact_dist.errors import (
 from enact_dist.link.log import READY, TEXT, JsonLines, say
 from enact_dist.link.service_manager import ServiceManager
 from enact_dist.link.signals import StopSignals
+from enact_dist.user_code import raised
 
 if TYPE_CHECKING:
     import argparse
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from enact_dist.actor import Actor
     from enact_dist.actor_report import ActorStatistics
@@ -153,11 +154,26 @@ def run_actor(arguments: argparse.Namespace) -> int:
                 manager.ready()
                 _warn_of_namesakes(cell, name)
 
-            statistics = run.run(on_ready=ready)
+            statistics = _run(run, ready)
         drain.over()
     counted = {key: getattr(statistics, key) for key in ("state", "updates", "failures", "refused")}
     say(formatter, "actor.end", _farewell(name, statistics), **counted)
     return DONE
+
+
+def _run(run: ActorRun, ready: Callable[[], None]) -> ActorStatistics:
+    """Run an actor to its end.
+
+    Raises:
+        EnactError: Its `start` or `stop` raised something of its own: it may do better next time.
+    """
+    try:
+        return run.run(on_ready=ready)
+    except EnactError:
+        raise
+    except Exception as error:
+        method = "start" if run.statistics().state == "starting" else "stop"
+        raise EnactError(f"{method} of actor {run.name} failed: {raised(error)}") from error
 
 
 def _bound(

@@ -38,6 +38,22 @@ class LeaverAtStart(Hung):
     def start(self):
         sys.exit(3)
 """
+AWAY = """\
+from enact_dist import Actor, Aspect, Entity, World, Write
+
+
+class Camera(Actor):
+    count = Write(World("online"), Entity("away"), Aspect("count_of_away", int))
+
+    def METHOD(self):
+        raise ConnectionRefusedError("no camera at 1.2.3.4")
+
+    def OTHER(self):
+        pass
+
+    def update(self, lock):
+        lock[self.count] = 1
+"""
 ARM = """\
 from drivers import LIMITS
 
@@ -140,6 +156,21 @@ def test_actor_that_calls_sys_exit_is_not_silent(module, spawn, until, cell_file
     assert "stopped: actor Leaver after 0 updates" in rest
     assert start.wait(60) == 1
     assert "LeaverAtStart.start called sys.exit(3) at hung.py:31" in start.stdout.read()
+
+
+@pytest.mark.parametrize(("method", "does"), [("start", "stop"), ("stop", "start")])
+def test_a_device_that_is_away_is_an_error_with_its_place(enact, tmp_path, cell_file, method, does):
+    """One line: which actor, what went wrong, and where in the user's own code."""
+    text = AWAY.replace("METHOD", method).replace("OTHER", does)
+    (tmp_path / f"away_{method}.py").write_text(text, encoding="utf-8")
+
+    ended = enact("actor", "run", f"away_{method}:Camera", "--cell", cell_file)
+
+    assert ended.status == 1
+    assert ended.err.splitlines()[-1] == (
+        f"enact: {method} of actor Camera failed: ConnectionRefusedError at away_{method}.py:8:"
+        " no camera at 1.2.3.4"
+    )
 
 
 def test_module_that_fails_to_import_shows_the_lines_of_its_own(module, enact, cell_file):
