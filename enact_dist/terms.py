@@ -17,12 +17,15 @@ Requests are values: two that name the same context, entity, aspect and access a
 
 from __future__ import annotations
 
+import dataclasses
 import enum
 import re
 import secrets
+import typing
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, Self, TypeVar
 
+from enact_dist.errors import DatumTypeError
 from enact_dist.patterns import checked_pattern, pattern_matches
 from enact_dist.retention import DEFAULT_RETENTION as DEFAULT_RETENTION  # noqa: PLC0414
 from enact_dist.retention import Retention as Retention  # noqa: PLC0414 - both are found here, too
@@ -146,7 +149,8 @@ class Aspect(Generic[T]):
     Args:
         name: Letters, digits, ``_ . -``.
         datum_type: `int`, `float`, `bool`, `str`, `bytes`, `list`, `dict`, `numpy.ndarray`, a
-            frozen dataclass of these, or a type with a registered codec.
+            frozen dataclass of these, or a type with a codec that was registered before.  The
+            whole list: `enact_dist/docs/data.md`.
         durability: What a commit of this aspect survives; ``None`` leaves it to `cell.toml`
             (there: `durable` unless written otherwise).  `cell.toml` wins over this argument.
         retention: How much of each datum's history stays, as a number of versions (the newest
@@ -158,6 +162,7 @@ class Aspect(Generic[T]):
 
     Raises:
         ValueError: The name is not allowed, or the retention is none that can be kept to.
+        DatumTypeError: The type is a dataclass that is not frozen, or contains one.
     """
 
     name: str
@@ -172,9 +177,49 @@ class Aspect(Generic[T]):
             checked_retention(self.retention)
         except ValueError as error:
             raise ValueError(f"aspect {self.name!r}: {error}") from None
+        try:
+            refuse_unfrozen(self.datum_type)
+        except DatumTypeError as error:
+            raise DatumTypeError(f"aspect {self.name!r}: {error}") from None
 
     def __str__(self) -> str:
         return self.name
+
+
+CODED: Final[set[type[Any]]] = set()
+"""The types with a registered codec, whose values may be what their codec makes plain data of."""
+_frozen: set[type[Any]] = set()
+"""The dataclasses that were looked at and are frozen, with all that they contain."""
+
+
+def refuse_unfrozen(hint: Any, where: str = "") -> None:
+    """Raise `DatumTypeError` for a dataclass in a type that is not frozen; `where` is its place.
+
+    What a dataclass contains whose annotations cannot be resolved yet is not looked at.
+    """
+    if not isinstance(hint, type) or typing.get_origin(hint) is not None:
+        for part in typing.get_args(hint):
+            refuse_unfrozen(part, where)
+        return
+    if hint in CODED or hint in _frozen or not dataclasses.is_dataclass(hint):
+        return
+    if not hint.__dataclass_params__.frozen:  # type: ignore[attr-defined]  # of every dataclass
+        raise DatumTypeError(
+            f"{where and where + ': '}dataclass {hint.__qualname__} is not frozen; data are"
+            " immutable values: write @dataclass(frozen=True), or call"
+            f" register_codec({hint.__qualname__}, …) before"
+        )
+    try:
+        hints = typing.get_type_hints(hint)
+    except (NameError, TypeError, AttributeError):
+        return
+    _frozen.add(hint)  # first: one that contains itself is refused by name where it is used
+    try:
+        for name in (one.name for one in dataclasses.fields(hint)):
+            refuse_unfrozen(hints[name], f"{where or hint.__qualname__}.{name}")
+    except DatumTypeError:
+        _frozen.discard(hint)
+        raise
 
 
 class NullReason(enum.Enum):

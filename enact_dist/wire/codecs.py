@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import Any, Final, TypeVar
 
 from enact_dist.errors import MisuseError
+from enact_dist.terms import CODED
 
 T = TypeVar("T")
 
@@ -76,6 +77,7 @@ def register_codec(
         )
     codec = Codec(datum_type, name, encode, decode)
     _by_type[datum_type] = _by_name[name] = codec
+    CODED.add(datum_type)
     for tell in changed:
         tell()
 

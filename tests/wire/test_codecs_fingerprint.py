@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from enact_dist import Aspect
 from enact_dist.errors import DatumTypeError, MisuseError, ProtocolError
 from enact_dist.wire.codecs import register_codec
 from enact_dist.wire.fingerprint import FINGERPRINT_CHARACTERS_MAX, fingerprint
@@ -226,3 +227,46 @@ def test_codec_that_refuses_what_came_is_a_protocol_error():
 
     with pytest.raises(ProtocolError, match="codec even cannot decode: ValueError"):
         decode_datum(encode_datum(Even(2), Even), Even)
+
+
+# ---------------------------------------------------------------- aspects
+
+
+@dataclass(frozen=True)
+class Holder:
+    parts: list[dict[str, tuple[Thawed | None, ...]]]
+
+
+@pytest.mark.parametrize(
+    ("datum_type", "message"),
+    [
+        (Thawed, r"aspect 'pose': dataclass Thawed is not frozen; .*@dataclass\(frozen=True\)"),
+        (list[Thawed], "dataclass Thawed is not frozen"),
+        (Holder, r"aspect 'pose': Holder\.parts: dataclass Thawed is not frozen"),
+    ],
+)
+def test_aspect_of_a_dataclass_that_is_not_frozen_is_refused(datum_type, message):
+    """Where the aspect is made, and not in the first lock of a program that runs."""
+    for _ in range(2):
+        with pytest.raises(DatumTypeError, match=message):
+            Aspect("pose", datum_type)
+
+
+def test_aspect_takes_a_type_whose_annotations_cannot_be_read_yet():
+    """What it contains is looked at in its first use, when all classes are there."""
+    assert Aspect("pose", Unresolved).datum_type is Unresolved
+    assert Aspect("pose", Path).datum_type is Path
+
+
+def test_aspect_takes_a_dataclass_that_has_a_codec_though_it_is_not_frozen():
+    """The codec makes plain data of it, nested or not."""
+
+    @dataclass
+    class Loose:
+        x: int
+
+    with pytest.raises(DatumTypeError, match=r"register_codec\(.*Loose, …\) before"):
+        Aspect("pose", Loose)
+    register_codec(Loose, "loose", encode=lambda loose: loose.x, decode=Loose)
+
+    assert Aspect("pose", list[Loose]).datum_type == list[Loose]
