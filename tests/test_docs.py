@@ -14,13 +14,15 @@ PAGES = sorted((ROOT / "enact_dist" / "docs").glob("*.md"))
 def programs():
     """Return the Python blocks that are whole programs: they begin with their imports."""
     for page in PAGES:
-        blocks = re.findall(r"^```python\n(.*?)^```", page.read_text("utf-8"), re.DOTALL | re.M)
+        blocks = re.findall(
+            r"^```python\n(.*?)^```", page.read_text("utf-8"), re.DOTALL | re.MULTILINE
+        )
         for number, code in enumerate(blocks, 1):
             if re.match(r"(from|import) ", code):
                 yield pytest.param(code, id=f"{page.name}-{number}")
 
 
-@pytest.mark.parametrize("code", programs())
+@pytest.mark.parametrize("code", list(programs()))
 def test_program_of_a_page_runs_as_pasted(code):
     """What it prints stands beside it."""
     done = subprocess.run(
