@@ -20,7 +20,7 @@ from enact_dist.actor import (
 from enact_dist.actor_lock import ActorLock
 from enact_dist.actor_sets import PendingSets
 from enact_dist.errors import MisuseError
-from enact_dist.link.session_client import CALL_S
+from enact_dist.link.calls import CALL_S
 from enact_dist.reading import slot_of
 from enact_dist.terms import Entities, Entity, View, refuse_duplicates
 

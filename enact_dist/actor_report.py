@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import msgpack
 
+from enact_dist.core.inspection import REPORT_BYTES_MAX
 from enact_dist.errors import ProtocolError
 
 if TYPE_CHECKING:
@@ -29,6 +30,8 @@ RATE_WINDOW_NS: Final = 5_000_000_000
 """Rates are over the last 5 s: long enough for 1 Hz sources, short enough to see a stall."""
 STAMPS_MAX: Final = 512
 WAITS_MAX: Final = 512
+BRIEF_LENGTH_MAX: Final = 80
+"""Longest text of an actor in the report of a process with many."""
 ERROR_LENGTH_MAX: Final = 500
 """Longest error text in a report; the whole one is in the actor's log."""
 WRITES_MAX: Final = 64
@@ -90,6 +93,7 @@ class ActorStatistics:
 
 
 _NAMES: Final = [field.name for field in dataclasses.fields(ActorStatistics)]
+_BLANK: Final = dataclasses.asdict(ActorStatistics())
 
 
 class _Newest:
@@ -233,10 +237,39 @@ def percentile(ascending: list[int], part: float) -> int:
 
 
 def encode_reports(reports: list[ActorStatistics]) -> bytes:
-    """Return the reports of all actors of one session as msgpack."""
+    """Return the reports of all actors of one session as msgpack, short enough to be listed.
+
+    Where there are too many for whole reports, errors are shortened and blank fields left out, then
+    only names and states stay, and at last the actors that are left are only counted.
+    """
     rows = [{name: getattr(report, name) for name in _NAMES} for report in reports]
-    encoded: bytes = msgpack.packb({"version": REPORT_VERSION, "actors": rows})
+    encoded = _packed(rows)
+    for shorten in (_brief, _named):
+        if len(encoded) > REPORT_BYTES_MAX:
+            rows = [shorten(row) for row in rows]
+            encoded = _packed(rows)
+    shown = len(rows)
+    while len(encoded) > REPORT_BYTES_MAX:
+        shown = shown * 9 // 10
+        encoded = _packed(rows[:shown], left_out=len(rows) - shown)
     return encoded
+
+
+def _packed(rows: list[dict[str, Any]], **more: int) -> bytes:
+    encoded: bytes = msgpack.packb({"version": REPORT_VERSION, "actors": rows, **more})
+    return encoded
+
+
+def _brief(row: dict[str, Any]) -> dict[str, Any]:
+    return {
+        name: value[:BRIEF_LENGTH_MAX] if isinstance(value, str) and name != "name" else value
+        for name, value in row.items()
+        if value != _BLANK[name]
+    }
+
+
+def _named(row: dict[str, Any]) -> dict[str, Any]:
+    return {name: row[name] for name in ("name", "state") if name in row}
 
 
 def decode_reports(report: bytes) -> tuple[ActorStatistics, ...]:
@@ -268,7 +301,7 @@ def read_reports(report: Mapping[str, object]) -> tuple[ActorStatistics, ...]:
     if report == {}:
         return ()
     rows: Any
-    blank = dataclasses.asdict(ActorStatistics())
+    blank = _BLANK
     try:
         rows = report["actors"]
         return tuple(

@@ -415,7 +415,7 @@ class Cell(Closing):
         )
 
     def set_report(self, report: bytes) -> None:
-        """Let the keep-alives carry an actor's own statistics (msgpack of a map)."""
+        """Let keep-alives carry an actor's statistics: msgpack of a map, shown up to 4 KiB."""
         self._client.set_report(report)
 
     def aspects(self, *, enough: str = "") -> dict[str, tuple[str, str]]:

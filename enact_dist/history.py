@@ -13,7 +13,7 @@ A listing carries no data: `Version.datum` fetches one when it is asked.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from enact_dist.asking import versions_in
@@ -24,8 +24,6 @@ from enact_dist.core.messages import (
     ListHistory,
     Refused,
     SlotVersion,
-    Survey,
-    Surveyed,
 )
 from enact_dist.errors import ForgottenError, MisuseError, ProtocolError
 from enact_dist.lineage import Made
@@ -137,10 +135,7 @@ def kept_versions(
     answers = session.client.call_all([(shard, request) for shard in shards])
     found: dict[str, list[Version[Any]]] = {}
     for shard, answer in zip(shards, answers, strict=True):
-        entries = list(versions_in(answer).entries)
-        if versions_in(answer).left_out:  # more than one answer can say: slot by slot
-            entries = [e for slot in _slots(session, shard) for e in listed(session, shard, slot)]
-        for entry in entries:
+        for entry in versions_in(answer).entries:
             if not entry.kept:
                 continue
             slot = entry.state.slot
@@ -213,7 +208,7 @@ def _check_label(label: str) -> None:
 def listed(
     session: Session, shard: str, slot: Slot, since_ns: int = 0, count: int = 0
 ) -> list[VersionEntry]:
-    """Return what a shard knows of one slot's versions, by as many answers as that takes.
+    """Return what a shard knows of one slot's versions.
 
     Args:
         session: Who asks.
@@ -226,21 +221,7 @@ def listed(
         ShardUnreachableError: The shard does not answer.
     """
     request = ListHistory((slot.context,), (slot.entity,), (slot.aspect,), since_ns, count)
-    answer = versions_in(session.client.call(shard, request))
-    entries = list(answer.entries)
-    while answer.left_out and entries and entries[-1].until_ns:
-        request = replace(request, since_ns=entries[-1].until_ns)
-        answer = versions_in(session.client.call(shard, request))
-        entries += answer.entries
-    return entries
-
-
-def _slots(session: Session, shard: str) -> list[Slot]:
-    """Return all slots of a shard."""
-    answer = session.client.call(shard, Survey((), (), ()))
-    if not isinstance(answer, Surveyed):
-        raise ProtocolError(f"{type(answer).__name__} came as the answer to Survey")
-    return [state.slot for state in answer.states]
+    return list(versions_in(session.client.call(shard, request)).entries)
 
 
 def _version(shard: str, world: WorldContext, aspect: Aspect[T], entry: VersionEntry) -> Version[T]:

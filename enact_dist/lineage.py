@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
-from enact_dist.asking import ask_in_parts, versions_in
+from enact_dist.asking import versions_in
 from enact_dist.core.datum import LockId, Position, Slot
 from enact_dist.core.messages import (
     Cause,
@@ -68,8 +68,7 @@ class Made:
         stamp_ns: When the datum was captured, as the actor said (0: not).
         held_s: How long the lock had been held when it committed.
         null_reason: Why the version is null; the empty string for a datum.
-        left_out: How many further data its lock had read than a commit names; in a tree of
-            effects, how many further effects it has than an answer of its shards names.
+        left_out: How many further data its lock had read than a commit names.
         elsewhere: Whether it stands in the tree a second time, nearer to the root or before; what
             follows it is shown there.
         unfollowed: How many versions come next that were not followed, because of the depth.
@@ -286,8 +285,10 @@ class _Search:
         """Return what each of these versions went into."""
         found: dict[DatumRead, dict[DatumRead, None]] = {one: {} for one in level}
         shards = self._client.shards()
-        parts = [(shard, some) for shard in shards for some in _in_parts(level, ASKED_MAX)]
-        for entry in self._asked(FindEffects, parts):
+        calls = [
+            (shard, FindEffects(some)) for shard in shards for some in _in_parts(level, ASKED_MAX)
+        ]
+        for entry in self._asked(calls):
             made = _read_of(entry)
             self._known[made] = entry
             for read in self._cause(made).reads:
@@ -300,24 +301,18 @@ class _Search:
         for version in versions:
             by_shard.setdefault(self._client.shard_of(version.slot.entity), []).append(version)
         return self._asked(
-            Explain,
             [
-                (shard, some)
+                (shard, Explain(some))
                 for shard, wanted in by_shard.items()
                 for some in _in_parts(wanted, ASKED_MAX)
-            ],
+            ]
         )
 
-    def _asked(
-        self, kind: Callable[[Any], Request], parts: Sequence[tuple[str, tuple[Any, ...]]]
-    ) -> list[VersionEntry]:
-        """Ask shards about data, and note what even the answer to a single one leaves out."""
+    def _asked(self, calls: Sequence[tuple[str, Request]]) -> list[VersionEntry]:
         entries: list[VersionEntry] = []
-        for asked, answer in ask_in_parts(self._client, kind, parts):
+        for answer in map(versions_in, self._client.call_all(calls)):
             self._now_ns = max(self._now_ns, answer.stamp_ns)
             entries += answer.entries
-            if answer.left_out:
-                self._left_out[asked[0]] = self._left_out.get(asked[0], 0) + answer.left_out
         return entries
 
     def made(

@@ -16,8 +16,8 @@ from enact_dist.errors import (
     ShardUnreachableError,
     UnknownWorldError,
 )
+from enact_dist.link.calls import CALL_S
 from enact_dist.link.datum_cache import DatumCache
-from enact_dist.link.session_client import CALL_S
 from enact_dist.reading import slot_of
 from enact_dist.retention import checked_retention
 from enact_dist.terms import Entity, LockRequest

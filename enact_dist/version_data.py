@@ -11,7 +11,7 @@ from __future__ import annotations
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from enact_dist.asking import ask_in_parts
+from enact_dist.asking import versions_in
 from enact_dist.core.messages import Explain, Item, SlotVersion
 from enact_dist.errors import ForgottenError, LeaseLostError
 from enact_dist.history import listed
@@ -96,14 +96,14 @@ def explained(session: Session, wanted: Sequence[Wanted]) -> dict[Wanted, Versio
     by_shard: dict[str, list[SlotVersion]] = {}
     for each in wanted:
         by_shard.setdefault(each.shard, []).append(SlotVersion(each.slot, each.version))
-    parts = [
-        (shard, tuple(versions[first : first + EXPLAINED_MAX]))
+    calls = [
+        (shard, Explain(tuple(versions[first : first + EXPLAINED_MAX])))
         for shard, versions in by_shard.items()
         for first in range(0, len(versions), EXPLAINED_MAX)
     ]
     found = {
         (state.slot, state.version, state.stamp_ns): entry
-        for _, answer in ask_in_parts(session.client, Explain, parts)
+        for answer in map(versions_in, session.client.call_all(calls))
         for entry in answer.entries
         for state in (entry.state,)
     }

@@ -175,9 +175,14 @@ class Watch(Following[Change]):
             return
         following.number = notice.number
         for slot, version, stamp_ns, null, captured_ns in notice.changes:
-            if self._interest.wants(slot):
+            if self._interest.wants(slot) and not self._is_past(slot, version, stamp_ns):
                 known = _Known(notice.epoch, (version, stamp_ns))
                 self._note(notice.shard, slot, known, null=null, captured=captured_ns)
+
+    def _is_past(self, slot: Slot, version: int, stamp_ns: int) -> bool:
+        """Whether a later state is known: a long listing ends after the notice it begins with."""
+        known = self._known.get(slot)
+        return known is not None and version < known.state[0] and stamp_ns < known.state[1]
 
     def _pass_over(self, skipped: Skipped) -> None:
         """Account for notices of other slots; one that is missing before them remains missing."""

@@ -6,9 +6,11 @@ from dataclasses import dataclass
 
 from enact_dist.core.datum import Datum, LockId, Position, Slot, Token
 from enact_dist.core.message_parts import (
+    START,
     AspectEntry,
     AuditEntry,
     Counter,
+    Cursor,
     GrantLeft,
     Holder,
     PlacementMap,
@@ -253,6 +255,7 @@ class Surveyed:
     notice_number: int
     stamp_ns: int
     states: tuple[SlotState, ...]
+    more: Cursor = START
 
 
 @dataclass(frozen=True, slots=True)
@@ -261,11 +264,12 @@ class Locks:
 
     epoch: int
     holders: tuple[Holder, ...]
+    more: Cursor = START
 
 
 @dataclass(frozen=True, slots=True)
 class Sessions:
-    """Sessions, catalogue and counters of a shard."""
+    """Sessions, catalogue and counters of a shard; the catalogue stands on the first page alone."""
 
     shard: str
     epoch: int
@@ -278,6 +282,7 @@ class Sessions:
     worlds: tuple[str, ...]
     aspects: tuple[AspectEntry, ...]
     counters: tuple[Counter, ...]
+    more: Cursor = START
 
 
 @dataclass(frozen=True, slots=True)
@@ -294,6 +299,7 @@ class Audited:
 
     alarms: int
     entries: tuple[AuditEntry, ...]
+    more: Cursor = START
 
 
 @dataclass(frozen=True, slots=True)
@@ -320,12 +326,12 @@ class Refused:
 
 @dataclass(frozen=True, slots=True)
 class Versions:
-    """Versions of slots: slot by slot, oldest first; `left_out` is how many more there are."""
+    """Versions of slots: slot by slot, oldest first."""
 
     epoch: int
     stamp_ns: int
     entries: tuple[VersionEntry, ...]
-    left_out: int = 0
+    more: Cursor = START
 
 
 @dataclass(frozen=True, slots=True)

@@ -336,6 +336,6 @@ _GRANTS_COUNT = frozenset((Phase.ACQUIRING, Phase.VIEWING, Phase.HELD))
 
 
 def _epoch_of(request: Request) -> int | None:
-    """Return the epoch that a request was made for (that of its grant, where it bears a token)."""
-    token = getattr(request, "token", None)
-    return getattr(request, "epoch", None) if token is None else token.epoch
+    """Return the epoch that a request was made for (that of its grant, token or cursor)."""
+    made_in = getattr(request, "token", None) or getattr(request, "after", None)
+    return getattr(request, "epoch", None) if made_in is None else made_in.epoch

@@ -73,6 +73,9 @@ class Audit:
         newest_ns = max((r.wall_ns for r in self._records if r.kind == ALARM), default=0)
         return self.alarms > 0 and (not seen_ns or newest_ns <= seen_ns)
 
+    def __len__(self) -> int:
+        return len(self._records)
+
     def entries(self) -> tuple[AuditEntry, ...]:
         """Return the newest records, for people."""
         return tuple(

@@ -12,18 +12,21 @@ from enact_dist.core.messages import (
     ListHistory,
     Refused,
 )
+from enact_dist.core.pages import over_slots
 from enact_dist.core.records import KeptRecord, Persist, Reply, Story
-from enact_dist.core.version_list import bounded, entries_of
+from enact_dist.core.version_list import bytes_of, entries_of, version_of, versions
 from enact_dist.terms import Durability
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from enact_dist.core.datum import Slot
     from enact_dist.core.messages import Answer, SlotVersion, VersionEntry
     from enact_dist.core.prepares import PrepareDesk
     from enact_dist.core.records import Effect, MakeRoom, Record
     from enact_dist.core.session_desk import SessionDesk
     from enact_dist.core.shard_state import ShardState
+    from enact_dist.core.slots import Content
 
 KEPT_MAX: Final = 10_000
 """Most versions that labels keep at one shard: nothing else lets go of them."""
@@ -43,18 +46,28 @@ class HistoryDesk:
 
     def on_list_history(self, message: ListHistory, reply_to: int) -> Iterator[Effect]:
         """List the known versions of slots, oldest first, without their data."""
-        wrong = wrong_patterns(message.patterns)
-        yield Reply(reply_to, wrong or bounded(self._state, self._listed(message)))
-
-    def _listed(self, message: ListHistory) -> Iterator[VersionEntry]:
         slots = self._state.slots
-        for slot, _ in slots.selected(message.contexts, message.patterns, message.aspects):
+
+        def listed(slot: Slot, _: Content) -> tuple[list[VersionEntry], int]:
+            known = list(entries_of(slots, slot))
             found = [
                 entry
-                for entry in entries_of(slots, slot)
+                for entry in known
                 if not 0 < entry.until_ns <= message.since_ns and (entry.kept or not message.kept)
             ]
-            yield from found[-message.count_max :] if message.count_max else found
+            shown = found[-message.count_max :] if message.count_max else found
+            return shown, 1 + len(known) - len(shown)
+
+        steps = over_slots(
+            slots,
+            message,
+            message.after,
+            listed,
+            epoch=self._state.epoch,
+            version_of=version_of,
+            bytes_of=bytes_of,
+        )
+        yield Reply(reply_to, wrong_patterns(message.patterns) or versions(self._state, steps))
 
     # ---------------------------------------------------------------- labels
 

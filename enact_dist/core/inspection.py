@@ -6,24 +6,42 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.lock_table import Mode
 from enact_dist.core.messages import (
+    Audited,
     Counter,
+    Cursor,
     Holder,
+    ListAudit,
+    ListLocks,
+    ListSessions,
+    Locks,
     SessionInfo,
     Sessions,
     SlotState,
     Survey,
     Surveyed,
 )
+from enact_dist.core.pages import HOLDER_WORK, bytes_in_frame, over_slots, page_of
 from enact_dist.core.slots import state_of
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from enact_dist.core.datum import Slot
+    from enact_dist.core.pages import Step
+    from enact_dist.core.sessions import Session
     from enact_dist.core.shard_state import ShardState
+    from enact_dist.core.slots import Content
     from enact_dist.core.tenures import Tenure
 
 SLOTS_TOLD_MAX: Final = 16
 """Slots of one lock that are listed by name."""
 WAITS_TOLD_MAX: Final = 16
 """Locks that one waiter is shown to wait for."""
+
+REPORT_BYTES_MAX: Final = 4096
+"""Longest report of an actor in a listing; a longer one is left out."""
+STATE_BYTES: Final = 72
+"""A state without its datum in an answer, names left out."""
 
 _WORDS: Final = {Mode.S: "read", Mode.X: "write", Mode.SIX: "read all, write some"}
 
@@ -58,9 +76,31 @@ def holder(state: ShardState, tenure: Tenure, *, now_ns: int) -> Holder:
     )
 
 
-def sessions(state: ShardState) -> Sessions:
-    """Describe the sessions, the catalogue and the counters."""
-    now_ns = state.now_ns
+def locks(state: ShardState, message: ListLocks) -> Locks:
+    """Describe holders and waiters, oldest first."""
+
+    def steps() -> Iterator[Step[Holder]]:
+        begin = message.after.number
+        for tenure in sorted(state.tenures.by_lock.values(), key=lambda t: t.claim.ticket):
+            number = tenure.claim.ticket
+            if number > begin:
+                told = state.describe(tenure, state.now_ns)
+                yield told, bytes_in_frame(told), HOLDER_WORK, Cursor(state.epoch, (), number)
+
+    return Locks(state.epoch, *page_of(steps()))
+
+
+def sessions(state: ShardState, message: ListSessions) -> Sessions:
+    """Describe the sessions, and on the first page the catalogue and the counters."""
+    now_ns, begin = state.now_ns, message.after.names[:1]
+
+    def steps() -> Iterator[Step[SessionInfo]]:
+        for name in sorted(state.sessions.by_id):
+            if (name,) > begin:
+                told = _session_info(state, state.sessions.by_id[name])
+                yield told, bytes_in_frame(told), 1, Cursor(state.epoch, (name,))
+
+    told, more = page_of(steps())
     return Sessions(
         state.settings.name,
         state.epoch,
@@ -69,23 +109,37 @@ def sessions(state: ShardState) -> Sessions:
         state.wall_ns,
         state.slots.count,
         state.slots.bytes,
-        tuple(
-            SessionInfo(
-                session.session,
-                session.actor,
-                session.host,
-                session.pid,
-                session.lease_end_ns(now_ns) - now_ns,
-                session.token_present,
-                len(state.tenures.by_session.get(session.session, {})),
-                session.report,
-            )
-            for session in state.sessions
-        ),
-        tuple(state.catalogue.worlds),
-        tuple(state.catalogue.aspects.values()),
+        told,
+        () if begin else tuple(state.catalogue.worlds),
+        () if begin else tuple(state.catalogue.aspects.values()),
         tuple(Counter(name, count) for name, count in sorted(counted(state).items())),
+        more,
     )
+
+
+def _session_info(state: ShardState, session: Session) -> SessionInfo:
+    return SessionInfo(
+        session.session,
+        session.actor,
+        session.host,
+        session.pid,
+        session.lease_end_ns(state.now_ns) - state.now_ns,
+        session.token_present,
+        len(state.tenures.by_session.get(session.session, {})),
+        session.report if len(session.report) <= REPORT_BYTES_MAX else b"",
+    )
+
+
+def audited(state: ShardState, message: ListAudit) -> Audited:
+    """List the newest acts of operators, oldest first, and count the alarms."""
+    entries = state.audit.entries()
+    first = len(state.audit) - len(entries) + 1
+    steps = (
+        (entry, bytes_in_frame(entry), 1, Cursor(state.epoch, (), number))
+        for number, entry in enumerate(entries, first)
+        if number > message.after.number
+    )
+    return Audited(state.audit.alarms, *page_of(steps))
 
 
 def counted(state: ShardState) -> dict[str, int]:
@@ -102,10 +156,27 @@ def counted(state: ShardState) -> dict[str, int]:
 
 def surveyed(state: ShardState, message: Survey, *, stamp_ns: int) -> Surveyed:
     """List the slots that match, null ones too, without their data; retained versions if asked."""
-    states: list[SlotState] = []
-    for slot, newest in state.slots.selected(message.contexts, message.patterns, message.aspects):
+
+    def listed(slot: Slot, newest: Content) -> tuple[list[SlotState], int]:
         replaced = state.slots.history.of(slot) if message.retained else None
-        if replaced is not None:
-            states += [state_of(slot, older, with_datum=False) for older in replaced.retained()]
-        states.append(state_of(slot, newest, with_datum=False))
-    return Surveyed(state.epoch, state.commits.notice_number, stamp_ns, tuple(states))
+        contents = [*replaced.retained(), newest] if replaced is not None else [newest]
+        return [state_of(slot, content, with_datum=False) for content in contents], 1
+
+    steps = over_slots(
+        state.slots,
+        message,
+        message.after,
+        listed,
+        epoch=state.epoch,
+        version_of=_version_of,
+        bytes_of=_bytes_of,
+    )
+    return Surveyed(state.epoch, state.commits.notice_number, stamp_ns, *page_of(steps))
+
+
+def _version_of(state: SlotState) -> int:
+    return state.version
+
+
+def _bytes_of(state: SlotState) -> int:
+    return STATE_BYTES + sum(map(bytes_in_frame, state.slot))

@@ -8,16 +8,20 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.core.messages import Explain, FindEffects, Refused
+from enact_dist.core.messages import Cursor, Explain, FindEffects, Refused
+from enact_dist.core.pages import over_slots
 from enact_dist.core.records import Reply
-from enact_dist.core.version_list import bounded, entries_of
+from enact_dist.core.version_list import bytes_of, entries_of, version_of, versions
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from enact_dist.core.datum import Slot
     from enact_dist.core.message_parts import Cause, VersionEntry
+    from enact_dist.core.pages import Step
     from enact_dist.core.records import Effect
     from enact_dist.core.shard_state import ShardState
+    from enact_dist.core.slots import Content
 
 ASKED_MAX: Final = 4096
 """Versions or data that one question names."""
@@ -34,41 +38,61 @@ class LineageDesk:
         if len(message.versions) > ASKED_MAX:
             yield Reply(reply_to, _too_many(len(message.versions)))
             return
-        yield Reply(reply_to, bounded(self._state, self._explained(message)))
+        yield Reply(reply_to, versions(self._state, self._explained(message)))
 
-    def _explained(self, message: Explain) -> Iterator[VersionEntry]:
-        for slot, version in message.versions:
-            slots = self._state.slots
-            yield from entries_of(slots, slot, version=version or slots[slot].version)
+    def _explained(self, message: Explain) -> Iterator[Step[VersionEntry]]:
+        begin, slots = max(0, message.after.number), self._state.slots
+        for number, (slot, version) in enumerate(message.versions[begin:], begin + 1):
+            after = Cursor(self._state.epoch, number=number)
+            found = entries_of(slots, slot, version=version or slots[slot].version)
+            entry = next(found, None)
+            yield entry, bytes_of(entry) if entry is not None else 0, 1, after
 
     def on_find_effects(self, message: FindEffects, reply_to: int) -> Iterator[Effect]:
         """Return every known version whose cause names one of these data."""
         if len(message.reads) > ASKED_MAX:
             yield Reply(reply_to, _too_many(len(message.reads)))
             return
-        yield Reply(reply_to, bounded(self._state, self._effects(message)))
+        yield Reply(reply_to, versions(self._state, self._effects(message)))
 
-    def _effects(self, message: FindEffects) -> Iterator[VersionEntry]:
+    def _effects(self, message: FindEffects) -> Iterator[Step[VersionEntry]]:
         wanted = {(read.slot, read.stamp_ns) for read in message.reads}
         since_ns = min((stamp_ns for _, stamp_ns in wanted), default=0)
         known: dict[int, bool] = {}
+        slots, looked = self._state.slots, 0
 
         def is_effect(cause: Cause | None) -> bool:
             # All that a commit has written shares its cause.
+            nonlocal looked
+            looked += 1
             if cause is None:
                 return False
             found = known.get(id(cause))
             if found is None:
+                looked += len(cause.reads)
                 found = any((slot, stamp_ns) in wanted for slot, _, stamp_ns in cause.reads)
                 known[id(cause)] = found
             return found
 
-        slots = self._state.slots
-        for slot in slots.all():
-            if slots[slot].stamp_ns >= since_ns and any(
+        def listed(slot: Slot, newest: Content) -> tuple[list[VersionEntry], int]:
+            nonlocal looked
+            found: list[VersionEntry] = []
+            looked = 1
+            if newest.stamp_ns >= since_ns and any(
                 is_effect(content.cause) for content, _ in slots.versions(slot)
             ):
-                yield from (entry for entry in entries_of(slots, slot) if is_effect(entry.cause))
+                found = [entry for entry in entries_of(slots, slot) if is_effect(entry.cause)]
+            return found, looked
+
+        return over_slots(
+            slots,
+            None,
+            message.after,
+            listed,
+            epoch=self._state.epoch,
+            version_of=version_of,
+            bytes_of=bytes_of,
+        )
 
 
 def _too_many(count: int) -> Refused:

@@ -7,6 +7,24 @@ from typing import Final, NamedTuple
 from enact_dist.core.datum import Datum, LockId, Slot, Token
 
 
+class Cursor(NamedTuple):
+    """Where a listing goes on: made by a shard for itself, and sent back to it as it is.
+
+    With epoch 0 it means the begin in a request, and in an answer that nothing is left to ask for.
+    The rest says what comes next: after the entry that `names` and `number` stand for, and of the
+    versions of one slot after `version`.
+    """
+
+    epoch: int = 0
+    names: tuple[str, ...] = ()
+    number: int = 0
+    version: int = 0
+
+
+START: Final = Cursor()
+"""The begin of a listing; in an answer: its end."""
+
+
 class Item(NamedTuple):
     """One line of a lock or view: `access` is an `enact_dist.terms.Access` number.
 

@@ -15,6 +15,9 @@ tuples of these, NamedTuples and dataclasses of the protocol's four files and of
     messages           notices, and everything of the protocol under one roof
 
 Durations travel, points in time do not (except wall-clock stamps): clocks are never compared.
+
+Listings come in pages (see `core.pages`): an answer with a cursor in `more` is asked on with that
+cursor in `after`.  A cursor of an earlier epoch is answered `EpochChanged`: list from the begin.
 """
 
 from __future__ import annotations
@@ -66,10 +69,12 @@ from enact_dist.core.answers import (
 )
 from enact_dist.core.datum import Slot
 from enact_dist.core.message_parts import (
+    START,
     AspectEntry,
     AuditEntry,
     Cause,
     Counter,
+    Cursor,
     DatumRead,
     GrantLeft,
     Holder,
@@ -214,6 +219,7 @@ __all__ = [
     "RESOLVED_ABORTED",
     "RESOLVED_COMMITTED",
     "RESOLVED_OPEN",
+    "START",
     "Acquire",
     "Alive",
     "Answer",
@@ -229,6 +235,7 @@ __all__ = [
     "Commit",
     "Committed",
     "Counter",
+    "Cursor",
     "DatumRead",
     "DropWorld",
     "Dropped",

@@ -6,7 +6,9 @@ from dataclasses import dataclass
 
 from enact_dist.core.datum import Datum, LockId, Position, Slot, Token
 from enact_dist.core.message_parts import (
+    START,
     AspectEntry,
+    Cursor,
     DatumRead,
     Item,
     LaneView,
@@ -240,22 +242,28 @@ class Survey:
 
     Empty `contexts` or `aspects` mean all; `patterns` are entity patterns, empty means all.
     With `retained` the retained versions of each slot come before its newest one, oldest first.
+    A listing of several pages is no cut: each page shows its slots as they are when it is asked.
     """
 
     contexts: tuple[str, ...]
     patterns: tuple[str, ...]
     aspects: tuple[str, ...]
     retained: bool = False
+    after: Cursor = START
 
 
 @dataclass(frozen=True, slots=True)
 class ListLocks:
     """List holders and waiters.  Answer: `Locks`."""
 
+    after: Cursor = START
+
 
 @dataclass(frozen=True, slots=True)
 class ListSessions:
     """List sessions, catalogue and counters of the shard.  Answer: `Sessions`."""
+
+    after: Cursor = START
 
 
 @dataclass(frozen=True, slots=True)
@@ -295,6 +303,7 @@ class ListAudit:
 
     settle: str
     seen_ns: int = 0
+    after: Cursor = START
 
 
 @dataclass(frozen=True, slots=True)
@@ -312,6 +321,7 @@ class ListHistory:
     since_ns: int = 0
     count_max: int = 0
     kept: bool = False
+    after: Cursor = START
 
 
 @dataclass(frozen=True, slots=True)
@@ -322,6 +332,7 @@ class Explain:
     """
 
     versions: tuple[SlotVersion, ...]
+    after: Cursor = START
 
 
 @dataclass(frozen=True, slots=True)
@@ -329,6 +340,7 @@ class FindEffects:
     """Ask for all known versions that one of these data went into.  Answer: `Versions`."""
 
     reads: tuple[DatumRead, ...]
+    after: Cursor = START
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,8 +23,8 @@ from enact_dist.core.history_desk import HistoryDesk
 from enact_dist.core.lineage_desk import LineageDesk
 from enact_dist.core.lock_desk import LockDesk
 from enact_dist.core.messages import (
+    START,
     Acquire,
-    Audited,
     AwaitStamp,
     Break,
     Broken,
@@ -45,7 +45,6 @@ from enact_dist.core.messages import (
     ListHistory,
     ListLocks,
     ListSessions,
-    Locks,
     Outcome,
     Prepare,
     Reached,
@@ -170,6 +169,8 @@ class Shard:
         refusal = (
             owners.refusal(message, identity, state.sessions, state.epoch) if identity else None
         )
+        if refusal is None and getattr(message, "after", START).epoch not in (0, self.epoch):
+            refusal = EpochChanged(self.epoch)
         if refusal is None:
             effects = list(self._handlers[type(message)](message, reply_to))
         else:
@@ -338,14 +339,11 @@ class Shard:
         stamp_ns = self.state.stamp()
         yield Reply(reply_to, wrong or inspection.surveyed(self.state, message, stamp_ns=stamp_ns))
 
-    def _on_list_locks(self, _: ListLocks, reply_to: int) -> Iterator[Effect]:
-        oldest_first = sorted(self.state.tenures.by_lock.values(), key=lambda t: t.claim.ticket)
-        holders = tuple(self.state.describe(tenure, self.state.now_ns) for tenure in oldest_first)
-        yield Reply(reply_to, Locks(self.epoch, holders))
+    def _on_list_locks(self, message: ListLocks, reply_to: int) -> Iterator[Effect]:
+        yield Reply(reply_to, inspection.locks(self.state, message))
 
-    def _on_list_sessions(self, _: ListSessions, reply_to: int) -> Iterator[Effect]:
-        answer = inspection.sessions(self.state)
-        yield Reply(reply_to, answer)
+    def _on_list_sessions(self, message: ListSessions, reply_to: int) -> Iterator[Effect]:
+        yield Reply(reply_to, inspection.sessions(self.state, message))
 
     def _on_break(self, message: Break, reply_to: int) -> Iterator[Effect]:
         tell = self._sessions.answer_when_durable
@@ -380,7 +378,7 @@ class Shard:
                     AuditRecord(self.state.wall_ns, message.settle, SETTLED, self.state.asker)
                 ),
             )
-        answer = Audited(audit.alarms, audit.entries())
+        answer = inspection.audited(self.state, message)
         yield from self._sessions.answer_when_durable(reply_to, answer, records, Durability.OS)
 
     def biggest(self, count: int) -> list[tuple[str, int]]:

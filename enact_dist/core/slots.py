@@ -345,18 +345,9 @@ class SlotMap:
         """Yield every (context, aspect) that has slots."""
         yield from self._columns
 
-    def selected(
-        self, contexts: Collection[str], patterns: Collection[str], aspects: Collection[str]
-    ) -> Iterator[tuple[Slot, Content]]:
-        """Yield the slots of these contexts, entities and aspects, null ones too; empty: of all."""
-        for column in self._columns:
-            if contexts and column.context not in contexts:
-                continue
-            if aspects and column.aspect not in aspects:
-                continue
-            for slot, content in self.matching(column, "**"):
-                if not patterns or any(pattern_matches(one, slot.entity) for one in patterns):
-                    yield slot, content
+    def of_column(self, column: Column) -> Mapping[str, Content]:
+        """Return the slots of a column by entity, as they came, null ones too."""
+        return self._columns.get(column, {})
 
     def _asked(self, item: Item) -> list[tuple[Slot, Content]]:
         """Return the slots that an item names, or that match its pattern."""

@@ -1,23 +1,21 @@
-"""Versions as a shard lists them, for history and lineage: without data, and in bounded answers."""
+"""Versions as a shard lists them, for history and lineage: without data."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.messages import VersionEntry, Versions
+from enact_dist.core.pages import page_of
 from enact_dist.core.slots import state_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
     from enact_dist.core.datum import Slot
+    from enact_dist.core.pages import Step
     from enact_dist.core.shard_state import ShardState
     from enact_dist.core.slots import SlotMap
 
-NAMED_MAX: Final = 50_000
-"""Versions, and data that their causes name, in one answer; further ones are only counted."""
-NAMED_BYTES_MAX: Final = 14 << 20
-"""Bytes of one answer: below what a frame may have, above what the longest cause needs."""
 _SLOT_BYTES: Final = 48
 """A slot with its version and stamp in an answer, names left out."""
 _ENTRY_BYTES: Final = 256
@@ -34,23 +32,17 @@ def entries_of(slots: SlotMap, slot: Slot, *, version: int | None = None) -> Ite
         yield VersionEntry(shown, until_ns, labels, content.cause)
 
 
-def bounded(state: ShardState, found: Iterable[VersionEntry]) -> Versions:
-    """Return an answer with the first of these entries, as far as there is room for them."""
-    entries: list[VersionEntry] = []
-    named = size = left_out = 0
-    for entry in found:
-        cause = entry.cause
-        named += 1 + (len(cause.reads) + len(cause.writes) if cause is not None else 0)
-        if named <= NAMED_MAX:
-            size += _size_of(entry)
-        if named <= NAMED_MAX and size <= NAMED_BYTES_MAX:
-            entries.append(entry)
-        else:
-            left_out += 1
-    return Versions(state.epoch, state.stamp(), tuple(entries), left_out)
+def versions(state: ShardState, steps: Iterable[Step[VersionEntry]]) -> Versions:
+    """Return one page of a listing of versions."""
+    return Versions(state.epoch, state.stamp(), *page_of(steps))
 
 
-def _size_of(entry: VersionEntry) -> int:
+def version_of(entry: VersionEntry) -> int:
+    """Return which version of its slot an entry is."""
+    return entry.state.version
+
+
+def bytes_of(entry: VersionEntry) -> int:
     """Return at least how many bytes an entry takes in an answer."""
     cause = entry.cause
     slots, names = [entry.state.slot], list(entry.kept)

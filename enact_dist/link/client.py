@@ -29,15 +29,13 @@ from enact_dist.core.messages import (
 from enact_dist.core.multilock import MultiLock
 from enact_dist.core.phase import Phase
 from enact_dist.errors import CommitUnknownError, EnactError, MisuseError
+from enact_dist.link.calls import BYTES_PER_S_MIN, CALL_S, bytes_with
 from enact_dist.link.lock_names import name_of, read_name
 from enact_dist.link.refusals import error_of, not_committed, not_granted
 from enact_dist.link.session_client import (
-    BYTES_PER_S_MIN,
-    CALL_S,
     CALLS_S_MAX,
     FINISH_S,
     SessionClient,
-    bytes_with,
 )
 from enact_dist.link.staging import drop_staged, stage
 

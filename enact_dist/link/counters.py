@@ -124,6 +124,10 @@ OF_A_SHARD: Final[dict[str, Counter]] = {
         "see the shard's log; raise LimitNOFILE",
     ),
     "answers_dropped": Counter("answers to clients that did not read them", _SLOW_READER),
+    "answers_refused": Counter(
+        "answers longer than a frame, in place of which the request was refused",
+        "ask for less at once: a narrower pattern",
+    ),
     "notices_dropped": Counter(
         "notices to watchers that did not read them; a watch tells its gap", _SLOW_READER
     ),

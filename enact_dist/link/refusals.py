@@ -205,6 +205,7 @@ def error_of(refused: Refused | Forgotten) -> EnactError:
         "value": MisuseError,
         "held": MisuseError,
         "protocol": ProtocolError,
+        "too_long": MisuseError,
         "overload": LinkError,
         "no_room": NoRoomError,
         PERMISSION: PermissionDeniedError,

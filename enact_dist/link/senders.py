@@ -24,7 +24,18 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
-from enact_dist.core.messages import Granted, Slice, Surveyed, Viewed
+from enact_dist.core.messages import (
+    Audited,
+    Granted,
+    Locks,
+    Sessions,
+    Slice,
+    Surveyed,
+    Versions,
+    Viewed,
+)
+from enact_dist.core.pages import bytes_in_frame
+from enact_dist.wire.frames import encode_answer
 
 if TYPE_CHECKING:
     from enact_dist.core.messages import Answer
@@ -33,6 +44,8 @@ OUTSTANDING_BYTES_MAX: Final = 64 << 10
 """What a client may have outstanding before its own sender takes over: one transport batch."""
 SURVEYED_BYTES: Final = 160
 """Estimated length of one slot in the answer to a `Survey`."""
+VERSION_BYTES: Final = 1024
+"""Estimated length of one version, its cause included, in a listing."""
 QUEUED_ANSWERS_MAX: Final = 1024
 """Answers that wait for one client; a client has some calls per thread in flight."""
 QUEUED_BYTES_MAX: Final = 256 << 20
@@ -213,6 +226,17 @@ class _Sender:
                 return
 
 
+def encoded(
+    answer: Answer, count: Callable[[str, int], None]
+) -> tuple[bytes, list[bytes | memoryview]]:
+    """Return header and bodies of an answer, of a refusal in place of one that cannot be sent."""
+    header, bodies, problem = encode_answer(answer)
+    if problem:
+        count("answers_refused", 1)
+        _log.warning("answer %s became a refusal: %s", type(answer).__name__, problem)
+    return header, bodies
+
+
 def size_of(answer: Answer) -> int:
     """Estimate the length of an answer's data in bytes, without encoding it."""
     estimate = _SIZE_OF.get(type(answer))
@@ -232,4 +256,8 @@ _SIZE_OF: Final[dict[type, Callable[[Any], int]]] = {
     Viewed: _size_of_states,
     Slice: lambda answer: answer.body.size,
     Surveyed: lambda answer: SURVEYED_BYTES * len(answer.states),
+    Versions: lambda answer: VERSION_BYTES * len(answer.entries),
+    Locks: lambda answer: bytes_in_frame(answer.holders),
+    Sessions: lambda answer: bytes_in_frame(answer.sessions + answer.aspects),
+    Audited: lambda answer: bytes_in_frame(answer.entries),
 }

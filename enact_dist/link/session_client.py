@@ -18,23 +18,19 @@ import weakref
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.messages import (
-    Acquire,
     Alive,
     Answer,
     AspectEntry,
     AwaitStamp,
-    Commit,
     EpochChanged,
     Goodbye,
-    Hello,
-    KeepAlive,
-    Prepare,
     Refused,
     Register,
     Welcome,
 )
 from enact_dist.core.placement import shard_of
 from enact_dist.errors import EnactError, MisuseError
+from enact_dist.link.calls import CALL_S, Calls, patience_s
 from enact_dist.link.carrier import FORKED_REMEDY
 from enact_dist.link.catalogue import CATALOGUES, KnownCatalogue
 from enact_dist.link.clock import boottime_ns
@@ -48,14 +44,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
     from enact_dist.core.client import Client
-    from enact_dist.core.messages import Request, Survey, WorldEntry, WriteItem
+    from enact_dist.core.messages import Request, Survey, WorldEntry
     from enact_dist.errors import ShardUnreachableError
     from enact_dist.link.carrier import Begun, Carrier, NoticeFeed
 
-CALL_S: Final = 1.0
-"""How long one call may stay unanswered before it counts as unknown and is made again."""
-BYTES_PER_S_MIN: Final = 10e6
-"""A call that carries data gets this much more time per byte."""
 FINISH_S: Final = 10.0
 """How long calls are made again before their shard counts as unreachable, unless said otherwise."""
 
@@ -63,8 +55,6 @@ FIRST_STAGED: Final = 1 << SERIES_BITS
 """Numbers of payloads that travel in slices; files that a client fills itself begin at 1."""
 # Tuples: a union would be made anew for each call.
 _GREETINGS: Final = (Welcome, Alive)
-_WITH_DATA: Final = (Commit, Prepare)
-_SIGNS_OF_LIFE: Final = (Hello, KeepAlive)
 
 CALLS_S_MAX: Final = 1e8
 """Three years; whoever waits longer means for ever."""
@@ -193,23 +183,30 @@ class SessionClient:
     def call_each(
         self, calls: Sequence[tuple[str, Request]], *, timeout_s: float | None = None
     ) -> list[Answer | None]:
-        """Make idempotent calls at once, each again until it is answered or the time is over."""
+        """Make idempotent calls at once, each again until it is answered or the time is over.
+
+        Listings come whole; the time begins anew with each of their pages.
+        """
         self.check_usable()
-        answers: list[Answer | None] = [None] * len(calls)
+        made = Calls(calls)
         deadline_ns = self._deadline_ns(timeout_s)
         pause_s = 0.02
-        while True:
-            left = [index for index, answer in enumerate(answers) if answer is None]
-            sent = [calls[index] for index in left]
+        while left := made.left:
+            sent = [made.asked[index] for index in left]
             epochs = [self.core.epoch(shard) for shard, _ in sent]
+            turned = False
             for index, answer, epoch in zip(left, self._send(sent), epochs, strict=True):
                 if answer is not None:
-                    self._take(*calls[index], answer, epoch)
-                    answers[index] = answer
-            if None not in answers or self._now_ns() >= deadline_ns:
-                return answers
-            self._rest(pause_s, self._returns)
-            pause_s = min(2 * pause_s, 0.3)
+                    self._take(*made.asked[index], answer, epoch)
+                    turned |= made.take(index, answer)
+            if turned:
+                deadline_ns = self._deadline_ns(timeout_s)
+            elif made.left and self._now_ns() >= deadline_ns:
+                break
+            elif made.left:
+                self._rest(pause_s, self._returns)
+                pause_s = min(2 * pause_s, 0.3)
+        return made.answers
 
     def _deadline_ns(self, timeout_s: float | None) -> int:
         """Return when calls are over that may take so long (None: `patience_s`)."""
@@ -258,13 +255,25 @@ class SessionClient:
     def call_once(
         self, calls: Sequence[tuple[str, Request]], *, timeout_s: float = CALL_S
     ) -> list[Answer | None]:
-        """Make calls at once, none of them twice; None stands for no answer."""
+        """Make calls at once, none of them twice; None stands for no answer.
+
+        Listings come whole, and `timeout_s` holds for each of their pages.
+        """
         self.check_usable()
-        answers = self.carrier.request_all(calls, timeout_s=timeout_s)
-        for (shard, request), answer in zip(calls, answers, strict=True):
-            if answer is not None:
-                self._take(shard, request, answer)
-        return answers
+        made = Calls(calls)
+        left = made.left
+        while left:
+            asked = [made.asked[index] for index in left]
+            found = self.carrier.request_all(asked, timeout_s=timeout_s)
+            some = [
+                (index, answer)
+                for index, answer in zip(left, found, strict=True)
+                if answer is not None
+            ]
+            for index, answer in some:
+                self._take(*made.asked[index], answer)
+            left = [index for index, answer in some if made.take(index, answer)]
+        return made.answers
 
     def begin(self, shard: str, request: Request, *, timeout_s: float) -> Begun:
         """Send one request of a transfer, whose answer the caller waits for later.
@@ -285,9 +294,9 @@ class SessionClient:
     def _send(self, calls: Sequence[tuple[str, Request]]) -> list[Answer | None]:
         if len(calls) == 1:
             shard, request = calls[0]
-            return [self.carrier.request(shard, request, timeout_s=_patience_s(request))]
-        patience_s = max((_patience_s(request) for _, request in calls), default=CALL_S)
-        return self.carrier.request_all(calls, timeout_s=patience_s)
+            return [self.carrier.request(shard, request, timeout_s=patience_s(request))]
+        longest_s = max((patience_s(request) for _, request in calls), default=CALL_S)
+        return self.carrier.request_all(calls, timeout_s=longest_s)
 
     def _take(self, shard: str, request: Request, answer: Answer, sent_in: int = 0) -> None:
         """Let the session learn from an answer, asked in that epoch of the shard."""
@@ -475,24 +484,3 @@ class SessionClient:
         """Add to one of the counters that `Cell.counters` shows."""
         with self._mutex:
             self.counters[name] = self.counters.get(name, 0) + amount
-
-
-def bytes_with(writes: Iterable[Sequence[WriteItem]]) -> int:
-    """Return how many bytes of data travel with the messages that write these."""
-    size = 0
-    for each in writes:
-        for _, datum in each:
-            if datum is not None and not datum.file:
-                size += datum.size
-    return size
-
-
-def _patience_s(request: Request) -> float:
-    """Return how long to wait for the answer to one call."""
-    if isinstance(request, Acquire):
-        return request.wait_ns / 1e9 + CALL_S
-    if isinstance(request, _WITH_DATA):
-        return CALL_S + bytes_with([request.writes]) / BYTES_PER_S_MIN
-    if isinstance(request, _SIGNS_OF_LIFE):
-        return CALL_S / 2
-    return CALL_S

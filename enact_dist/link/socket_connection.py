@@ -16,7 +16,7 @@ from enact_dist.core.messages import Answer, Outcome, Refused, Request, Survey
 from enact_dist.core.owners import SESSION_OF, named_session, not_yours
 from enact_dist.errors import LinkError, ProtocolError
 from enact_dist.link.notices import Interest
-from enact_dist.link.senders import size_of
+from enact_dist.link.senders import encoded, size_of
 from enact_dist.link.socket_frames import (
     BUFFER_BYTES,
     Kind,
@@ -27,7 +27,7 @@ from enact_dist.link.socket_frames import (
     wait_at_most,
 )
 from enact_dist.link.socket_watcher import SocketWatcher
-from enact_dist.wire.frames import decode_frame, encode_frame, encode_parts
+from enact_dist.wire.frames import decode_frame
 
 if TYPE_CHECKING:
     from enact_dist.link.socket_service import SocketService
@@ -185,22 +185,18 @@ class SocketConnection:
             self._send(answer)
 
     def _send(self, answer: Answer) -> None:
-        try:
-            header, bodies = encode_parts(answer)
-        except ProtocolError as error:
-            _log.warning("answer %s not sent: %s", type(answer).__name__, error)
-            raise EOFError from error  # closed, which tells the client *unknown*
-        send_frame(self.connected, header, bodies)
+        send_frame(self.connected, *encoded(answer, self._service.host.count))
 
     def _send_what_fits(self, answer: Answer) -> memoryview | None:
         """Send without waiting; return what is left for the connection's thread."""
+        header, bodies = encoded(answer, self._service.host.count)
+        payload = b"".join(bodies)
+        frame = prefixed(header, len(payload)) + payload
         try:
-            header, payload = encode_frame(answer)
-            frame = prefixed(header, len(payload or b"")) + (payload or b"")
             sent = self.connected.send(frame, socket.MSG_DONTWAIT)
         except BlockingIOError:
             sent = 0
-        except (OSError, ProtocolError) as error:
+        except OSError as error:
             _log.info("answer %s not sent: %s", type(answer).__name__, error)
             end_socket(self.connected)
             return None

@@ -19,8 +19,9 @@ from typing import TYPE_CHECKING, Final
 from enact_dist.core.datum import Datum
 from enact_dist.core.messages import EpochChanged, Refused, Stage, Staged
 from enact_dist.errors import EnactError, LeaseLostError, ProtocolError, ShardUnreachableError
+from enact_dist.link.calls import CALL_S
 from enact_dist.link.refusals import error_of
-from enact_dist.link.session_client import CALL_S, FIRST_STAGED
+from enact_dist.link.session_client import FIRST_STAGED
 from enact_dist.link.transfer import Piece, Transfer, in_turn
 from enact_dist.wire.limits import PAYLOAD_BYTES_MIN
 

@@ -17,8 +17,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from itertools import chain, zip_longest
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+from enact_dist.link.calls import BYTES_PER_S_MIN, CALL_S
 from enact_dist.link.refusals import unreachable
-from enact_dist.link.session_client import BYTES_PER_S_MIN, CALL_S
 
 if TYPE_CHECKING:
     from enact_dist.core.messages import Answer, Request

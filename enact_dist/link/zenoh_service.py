@@ -29,7 +29,7 @@ from enact_dist.core.owners import SESSION_OF, named_session
 from enact_dist.core.records import SessionSeen
 from enact_dist.errors import ProtocolError
 from enact_dist.link.recycling import recycle_blocks
-from enact_dist.link.senders import Senders, size_of
+from enact_dist.link.senders import Senders, encoded, size_of
 from enact_dist.link.zenoh_config import QUEUED_MAX, keep_after_fork
 from enact_dist.wire.frames import decode_frame, encode_frame
 from enact_dist.wire.keys import (
@@ -63,11 +63,13 @@ class ZenohService:
 
     Attributes:
         senders: Who sends the answers.
+        count: Adds to a counter of the shard.
     """
 
     def __init__(self, host: ShardHost, session: zenoh.Session, cell: str) -> None:
         self._host = host
         self._cell = cell
+        self.count = host.count
         self.senders = Senders(host.count)
         self._closed = False
         keep_after_fork(self)
@@ -267,9 +269,10 @@ class _Call:
         """Encode and send; a connection that has gone takes the answer with it."""
         query, answer = self._query, self._answer
         try:
-            header, payload = encode_frame(answer)
-            query.reply(self._service.reply_key(query, answer), payload or b"", attachment=header)
-        except (zenoh.ZError, ProtocolError) as error:
+            header, bodies = encoded(answer, self._service.count)
+            payload = bytes(bodies[0]) if len(bodies) == 1 else b"".join(bodies)
+            query.reply(self._service.reply_key(query, answer), payload, attachment=header)
+        except zenoh.ZError as error:
             _log.warning("answer %s not sent: %s", type(answer).__name__, error)
         finally:
             self.drop()

@@ -31,6 +31,11 @@ from enact_dist.wire.limits import (
 from enact_dist.wire.message_parts import reader_of, values_of, writers_of
 from enact_dist.wire.quick_readers import quick_reader_of
 
+
+class FrameTooLongError(ProtocolError):
+    """A message would be longer than any that is read."""
+
+
 CODES: Final[dict[type[Any], int]] = {
     # Requests from 1, answers from 33, notices from 97: all fit into one byte of msgpack.
     m.Hello: 1,
@@ -136,11 +141,23 @@ def encode_parts(message: m.Message) -> tuple[bytes, list[bytes | memoryview]]:
     except (TypeError, ValueError, OverflowError, KeyError) as error:
         raise ProtocolError(f"{type(message).__name__} cannot be sent: {error}") from error
     if len(header) > HEADER_BYTES_MAX:
-        raise ProtocolError(
+        raise FrameTooLongError(
             f"{type(message).__name__} has a header of {len(header)} bytes; at most"
             f" {HEADER_BYTES_MAX}; ask for less at once"
         )
     return header, bodies.parts
+
+
+def encode_answer(answer: m.Answer) -> tuple[bytes, list[bytes | memoryview], str]:
+    """Return an answer as `encode_parts` does, or what refuses the request in its place, and why.
+
+    Without any answer a client would take the shard for dead, and ask again and again.
+    """
+    try:
+        return *encode_parts(answer), ""
+    except ProtocolError as error:
+        code = "too_long" if isinstance(error, FrameTooLongError) else "protocol"
+        return *encode_parts(m.Refused(code, str(error))), str(error)
 
 
 def decode_frame(header: bytes, payload: bytes | memoryview = b"") -> m.Message:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import sys
 
+import msgpack
 import pytest
 
 from enact_dist.actor_report import (
@@ -15,6 +16,7 @@ from enact_dist.actor_report import (
     encode_reports,
     percentile,
 )
+from enact_dist.core.inspection import REPORT_BYTES_MAX
 from enact_dist.errors import ProtocolError
 
 SECOND_NS = 1_000_000_000
@@ -126,3 +128,32 @@ def test_reports_are_refused_by_name_when_the_bytes_are_none(report: bytes):
     """Bytes that are no report raise `ProtocolError`."""
     with pytest.raises(ProtocolError, match="actor report"):
         decode_reports(report)
+
+
+@pytest.mark.parametrize(
+    ("count", "errors", "shown"), [(3, True, 3), (30, True, 30), (70, False, 70)]
+)
+def test_report_of_a_process_with_many_actors_is_short_enough_to_be_listed(count, errors, shown):
+    """Texts and figures go before the names and states of actors do."""
+    error = "ValueError: " + "x" * 480 if errors else ""
+    reports = [
+        ActorStatistics(f"actor{number}", "running", updates=10**6, last_error=error)
+        for number in range(count)
+    ]
+
+    encoded = encode_reports(reports)
+
+    assert len(encoded) <= REPORT_BYTES_MAX
+    found = decode_reports(encoded)
+    assert [(one.name, one.state) for one in found] == [
+        (f"actor{number}", "running") for number in range(shown)
+    ]
+
+
+def test_actors_beyond_a_report_are_counted():
+    """Hundreds of actors in one process are no more than a number."""
+    encoded = encode_reports([ActorStatistics("a" * 200, "running")] * 300)
+
+    report = msgpack.unpackb(encoded)
+    assert len(encoded) <= REPORT_BYTES_MAX
+    assert len(report["actors"]) + report["left_out"] == 300

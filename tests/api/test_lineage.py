@@ -376,18 +376,17 @@ def test_depth_of_effects_says_how_many_more_there_are(cell, online):
 
 
 def test_answers_that_would_be_too_long_lose_nothing_silently(cell, online, monkeypatch):
-    """Causes are asked for in parts; effects of one datum beyond an answer are counted."""
+    """Causes and effects beyond one page are asked for on the next."""
     each, source = WriteEach(online, Entities("part/*"), COUNT), Read(online, here, COUNT)
     online.init(here, COUNT, 1)
     for number in range(5):
         with Lock(each, source) as lock:
             lock[each][Entity(f"part/{number}")] = lock[source]
     added(online, *(Read(online, Entity(f"part/{number}"), COUNT) for number in range(5)))
-    monkeypatch.setattr("enact_dist.core.version_list.NAMED_MAX", 8)
+    monkeypatch.setattr("enact_dist.core.pages.PAGE_BYTES_MAX", 1_000)
 
     why, impact = cell.why("online", total, SUM), cell.impact("online", here, COUNT)
 
     assert {one.kind for one in why.walk()} == {"commit"}
     assert len(why.children) == 5
-    assert len(impact.children) + impact.left_out == 5
-    assert impact.left_out > 0
+    assert (len(impact.children), impact.left_out) == (5, 0)

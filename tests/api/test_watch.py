@@ -5,6 +5,8 @@ import threading
 import pytest
 
 from enact_dist import Aspect, Entities, Entity, Lock, Write
+from enact_dist.core import pages
+from enact_dist.core.messages import START, Survey
 from enact_dist.errors import MisuseError
 from enact_dist.link import notices
 
@@ -183,3 +185,33 @@ def test_versions_from_before_the_watch_are_no_gap_where_the_slot_was_null(onlin
         change = watch.next(SOON_S)
         assert (change.version, change.gap, change.null) == (3, 0, False)
         assert watch.missed == 0
+
+
+def test_what_changes_between_two_pages_of_a_listing_is_told_once_and_in_order(
+    cell, online, monkeypatch
+):
+    """A later page shows more than the number of the first; the notices between bring no more."""
+    first, second = Write(online, bench, COUNT), Write(online, piece, NAME)
+    online.init(bench, COUNT, 1)
+    online.init(piece, NAME, "a")
+    monkeypatch.setattr(pages, "WORK_MAX", 1)
+    carrier, request = cell._client.carrier, cell._client.carrier.request
+    writes = iter([(first, 2), (second, "b"), (second, "c"), (first, 3)])
+
+    def between(shard, message, **options):
+        if isinstance(message, Survey) and message.after != START:
+            for slot, datum in writes:
+                write(slot, datum)
+        return request(shard, message, **options)
+
+    monkeypatch.setattr(carrier, "request", between)
+
+    with online.watch("**") as watch:
+        seen = []
+        while len(seen) < 4:
+            seen.append(watch.next(SOON_S))
+
+        assert [(c.aspect, c.version, c.gap) for c in seen] == [
+            ("count", 1, 0), ("name", 3, 0), ("count", 2, 0), ("count", 3, 0)
+        ]  # fmt: skip
+        assert (watch.next(0), watch.missed) == (None, 0)

@@ -6,12 +6,14 @@ strings; `hello` opens one.  `restart` builds the next epoch from what the disk 
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import count
 from typing import TYPE_CHECKING
 
 from enact_dist.core.datum import Datum, LockId, Slot, Token
 from enact_dist.core.ledger import Ledger
 from enact_dist.core.messages import (
+    START,
     Acquire,
     Answer,
     AspectEntry,
@@ -78,6 +80,14 @@ def datum(text: str = "1") -> Datum:
 def lock_id(session: str = "ann", lane: int = 0, seq: int = 1) -> LockId:
     """Return the identity of a lock."""
     return LockId(session, lane, seq)
+
+
+def pages_of(bench: ShardBench, request: Request) -> list[Answer]:
+    """Return all pages of a listing."""
+    listed = [bench.ask(request)]
+    while listed[-1].more != START:
+        listed.append(bench.ask(replace(request, after=listed[-1].more)))
+    return listed
 
 
 class ShardBench:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import pytest
 from client_bench import CellBench
-from shard_bench import MS, S, ShardBench, datum, item, lock_id, slot
+from shard_bench import MS, S, ShardBench, datum, item, lock_id, pages_of, slot
 
+from enact_dist.core import pages
 from enact_dist.core.causes import READ_BYTES
 from enact_dist.core.message_parts import READS_MAX
 from enact_dist.core.messages import (
@@ -23,10 +24,11 @@ from enact_dist.core.messages import (
     SlotVersion,
     WriteItem,
 )
+from enact_dist.core.pages import PAGE_BYTES_MAX
 from enact_dist.core.phase import Phase
+from enact_dist.core.version_list import bytes_of
 from enact_dist.terms import Access
 from enact_dist.wire.frames import encode_frame
-from enact_dist.wire.limits import HEADER_BYTES_MAX
 
 W, R, V = Access.WRITE, Access.READ, Access.VIEW
 READ = DatumRead(slot("view/1", "frame"), 3, 77)
@@ -210,17 +212,19 @@ def test_effects_of_what_was_replaced_since_are_found():
     assert entry.state.version == 1
 
 
-def test_answer_about_effects_is_bounded_and_says_so(monkeypatch):
-    """What does not fit is counted."""
-    monkeypatch.setattr("enact_dist.core.version_list.NAMED_MAX", 10)
+def test_effects_come_in_pages_that_lose_none(monkeypatch):
+    """A page has room for three; the next one goes on where it ends."""
     bench = ShardBench()
     bench.hello("ann")
     for seq in range(1, 8):
         committed(bench, (slot(f"e{seq}"), "1"), seq=seq, reads=[READ])
+    whole = bench.ask(FindEffects((READ,)))
+    monkeypatch.setattr(pages, "PAGE_BYTES_MAX", 3 * bytes_of(whole.entries[0]))
 
-    answer = bench.ask(FindEffects((READ,)))
+    listed = pages_of(bench, FindEffects((READ,)))
 
-    assert (len(answer.entries), answer.left_out) == (3, 4)
+    assert [len(page.entries) for page in listed] == [3, 3, 1]
+    assert sum((page.entries for page in listed), ()) == whole.entries
 
 
 @pytest.mark.parametrize("kind", [Explain, FindEffects])
@@ -245,7 +249,7 @@ def test_lineage_counts_in_the_cap_of_history(monkeypatch):
     assert history.bytes == 3 * (100 * READ_BYTES + 1)
 
 
-def test_answer_of_long_names_fits_into_a_frame():
+def test_answers_of_long_names_fit_into_frames():
     """What the shard could not send, its client would ask for again and again."""
     bench = ShardBench()
     bench.hello("ann")
@@ -254,12 +258,11 @@ def test_answer_of_long_names_fits_into_a_frame():
     for seq in range(1, 81):
         committed(bench, (slot(f"{seq:03}".ljust(200, "e")), "1"), seq=seq, reads=reads)
 
-    answer = bench.ask(ListHistory((), (), ()))
+    listed = pages_of(bench, ListHistory((), (), ()))
 
-    header, _ = encode_frame(answer)
-    assert len(header) < HEADER_BYTES_MAX
-    assert len(answer.entries) > 40
-    assert len(answer.entries) + answer.left_out == 80
+    assert max(len(encode_frame(page)[0]) for page in listed) < PAGE_BYTES_MAX * 5 // 4
+    assert len(listed) == 3
+    assert sum(len(page.entries) for page in listed) == 80
 
 
 def test_each_version_is_explained_as_it_is_listed():

@@ -406,7 +406,7 @@ def test_versions_are_explained_in_parts_where_one_answer_is_too_short(cell, onl
     for number in range(9):
         put((request, number))
     versions = online.history(piece, COUNT)
-    monkeypatch.setattr("enact_dist.core.version_list.NAMED_MAX", 4)
+    monkeypatch.setattr("enact_dist.core.pages.PAGE_BYTES_MAX", 1_000)
     wanted = [
         version_data.Wanted(v.position.stamp_ns, v.slot, v.version, v.position.shard)
         for v in versions

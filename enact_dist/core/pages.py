@@ -1,0 +1,119 @@
+"""Listings in pages: no answer outgrows a frame, and none keeps the shard from the others for long.
+
+::
+
+    ListLocks()               ─> Locks(…, more=Cursor(epoch, …))
+    ListLocks(after=that)     ─> Locks(…, more=START)              the end
+
+A page ends at `PAGE_BYTES_MAX`, or after as much looking as `WORK_MAX`, so it may be empty though
+the listing goes on.  The shard keeps nothing between two pages: a cursor says all, and whoever
+stops asking costs nothing.  What stays from one page to the next comes exactly once; what is added
+or goes meanwhile may come or not.
+
+Slots go column by column, by name, and within a column as they came: no slot leaves a column but
+with all of its context, so a place in it names the same slot for a whole epoch.
+"""
+
+from __future__ import annotations
+
+from itertools import islice
+from typing import TYPE_CHECKING, Final, TypeVar
+
+from enact_dist.core.datum import Slot
+from enact_dist.core.message_parts import START, Cursor
+from enact_dist.patterns import pattern_matches
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Sequence
+
+    from enact_dist.core.requests import ListHistory, Survey
+    from enact_dist.core.slots import Content, SlotMap
+
+PAGE_BYTES_MAX: Final = 8 << 20
+"""Bytes of one page: half of what a header may have, so that an entry may be large, too."""
+WORK_MAX: Final = 2_000
+"""Slots, versions and causes that are looked at for one page: about 5 ms."""
+HOLDER_WORK: Final = 10
+"""What it takes to describe a lock, which looks for those that are in its way."""
+
+E = TypeVar("E")
+Step = tuple[E | None, int, int, Cursor]
+"""An entry (None: nothing was found), its bytes, what it took to look, and what comes after it."""
+
+
+def page_of(steps: Iterable[Step[E]]) -> tuple[tuple[E, ...], Cursor]:
+    """Return the entries of one page, and where the next one begins (`START`: there is none)."""
+    entries: list[E] = []
+    size = looked = 0
+    end = START
+    for entry, entry_bytes, work, after in steps:
+        if looked >= WORK_MAX or (entries and size + entry_bytes > PAGE_BYTES_MAX):
+            return tuple(entries), end
+        looked += work
+        if entry is not None:
+            size += entry_bytes
+            entries.append(entry)
+        end = after
+    return tuple(entries), START
+
+
+def over_slots(
+    slots: SlotMap,
+    asked: Survey | ListHistory | None,
+    after: Cursor,
+    listed: Callable[[Slot, Content], tuple[Sequence[E], int]],
+    *,
+    epoch: int,
+    version_of: Callable[[E], int],
+    bytes_of: Callable[[E], int],
+) -> Iterator[Step[E]]:
+    """Yield what is listed of each slot that is asked for, from a cursor on.
+
+    Args:
+        slots: All slots.
+        asked: Which of them; None: all.
+        after: Where the page begins.
+        listed: Returns the entries of one slot, oldest version first, and what that took.
+        epoch: In which the cursors are good.
+        version_of: Returns the version of an entry.
+        bytes_of: Returns at least how many bytes it takes in an answer.
+    """
+    for column in sorted(slots.columns()):
+        here = column == after.names
+        if column < after.names or (asked is not None and not _wanted(asked, *column)):
+            continue
+        begin = max(0, after.number) if here else 0
+        column_slots = islice(slots.of_column(column).items(), begin, None)
+        for number, (entity, content) in enumerate(column_slots, begin):
+            found: Sequence[E] = ()
+            work = 1
+            if asked is None or not asked.patterns or _matches(asked.patterns, entity):
+                found, work = listed(Slot(column.context, entity, column.aspect), content)
+            if here and number == begin and after.version:
+                found = [entry for entry in found if version_of(entry) > after.version]
+            for entry in found[:-1]:
+                yield entry, bytes_of(entry), 1, Cursor(epoch, column, number, version_of(entry))
+            last = found[-1] if found else None
+            size = bytes_of(last) if last is not None else 0
+            yield last, size, work, Cursor(epoch, column, number + 1)
+
+
+def _wanted(asked: Survey | ListHistory, context: str, aspect: str) -> bool:
+    return not (asked.contexts and context not in asked.contexts) and not (
+        asked.aspects and aspect not in asked.aspects
+    )
+
+
+def _matches(patterns: Iterable[str], entity: str) -> bool:
+    return any(pattern_matches(pattern, entity) for pattern in patterns)
+
+
+def bytes_in_frame(value: object) -> int:
+    """Return at least how many bytes a value of a message's header takes, data left out."""
+    if isinstance(value, str):
+        return 5 + (len(value) if value.isascii() else len(value.encode(errors="replace")))
+    if isinstance(value, bytes):
+        return 5 + len(value)
+    if isinstance(value, tuple):
+        return 5 + sum(map(bytes_in_frame, value))
+    return 9

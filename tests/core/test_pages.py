@@ -1,0 +1,135 @@
+"""Listings come in pages: whole, in order, each short enough, each with as little work."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from shard_bench import ShardBench, item, lock_id, pages_of, slot
+
+from enact_dist.core import pages
+from enact_dist.core.messages import (
+    START,
+    AspectEntry,
+    Cursor,
+    EpochChanged,
+    FindEffects,
+    ListAudit,
+    ListHistory,
+    ListLocks,
+    ListSessions,
+    Register,
+    Survey,
+    Surveyed,
+)
+from enact_dist.core.records import AuditRecord
+from enact_dist.terms import Access
+from enact_dist.wire.frames import encode_frame
+
+ENTITIES = [f"tray/{number:02}" for number in range(7)]
+
+
+@pytest.fixture
+def bench():
+    """Slots of two aspects, one of them with three versions each, sessions and locks."""
+    bench = ShardBench()
+    bench.hello("ann")
+    bench.ask(Register("ann", (), (AspectEntry("mask", "int", "durable", 3),)))
+    seq = 0
+    for aspect, body in (("mask", "1"), ("mask", "2"), ("mask", "3"), ("note", "1")):
+        for entity in ENTITIES:
+            seq += 1
+            lock = lock_id("ann", 0, seq)
+            grant = bench.granted(lock, item(Access.WRITE, entity, aspect))
+            bench.commit(lock, grant.token, (slot(entity, aspect), body))
+    for number in range(5):
+        bench.hello(f"waiter{number}")
+        bench.acquire(lock_id(f"waiter{number}"), item(Access.WRITE, "piece", "count"))
+    for number in range(5):
+        bench.shard.state.audit.keep(AuditRecord(number + 1, f"act {number}", "broken"))
+    return bench
+
+
+LISTINGS = [
+    (Survey((), (), ()), "states", 14),
+    (Survey((), (), (), retained=True), "states", 28),
+    (Survey(("online",), ("tray/*",), ("note",)), "states", 7),
+    (ListHistory((), (), ("mask",)), "entries", 21),
+    (ListHistory((), (), (), count_max=2), "entries", 21),
+    (ListLocks(), "holders", 5),
+    (ListSessions(), "sessions", 6),
+    (ListAudit(""), "entries", 5),
+]
+
+
+@pytest.mark.parametrize(("request_", "field", "count"), LISTINGS)
+@pytest.mark.parametrize("bytes_max", [1, 300, 1_000])
+def test_pages_of_a_listing_are_the_listing(bench, monkeypatch, request_, field, count, bytes_max):
+    """Whatever fits on one: nothing twice, nothing left out, the same order."""
+    whole = bench.ask(request_)
+    assert (len(getattr(whole, field)), whole.more) == (count, START)
+    monkeypatch.setattr(pages, "PAGE_BYTES_MAX", bytes_max)
+
+    listed = pages_of(bench, request_)
+
+    assert sum((getattr(page, field) for page in listed), ()) == getattr(whole, field)
+    assert len(listed) > 1 or bytes_max > 1
+    assert all(getattr(page, field) for page in listed)
+
+
+@pytest.mark.parametrize(
+    ("request_", "field", "count"), [*LISTINGS, (FindEffects(()), "entries", 0)]
+)
+def test_page_ends_after_some_work_though_nothing_was_found(
+    bench, monkeypatch, request_, field, count
+):
+    """What looks at everything lets others have their turn, page by page."""
+    whole = getattr(bench.ask(request_), field)
+    monkeypatch.setattr(pages, "WORK_MAX", 1)
+
+    listed = pages_of(bench, request_)
+
+    assert sum((getattr(page, field) for page in listed), ()) == whole
+    assert len(listed) >= max(2, count // 4)
+
+
+def test_cursor_of_an_earlier_epoch_is_refused(bench):
+    """A restart may have ordered the slots anew: whoever lists begins again."""
+    bench.restart()
+
+    answer = bench.ask(Survey((), (), (), after=Cursor(1, ("online", "mask"), 3)))
+
+    assert answer == EpochChanged(2)
+
+
+@given(
+    st.sampled_from([request for request, _, _ in LISTINGS]),
+    st.lists(st.text(max_size=3), max_size=3).map(tuple),
+    st.integers(-5, 1 << 62),
+    st.integers(-5, 1 << 62),
+)
+def test_no_cursor_breaks_the_shard(request_, names, number, version):
+    """It comes from outside, though only honest clients send back what they got."""
+    bench = ShardBench()
+    bench.hello("ann")
+
+    answer = bench.ask(type(request_)(**_fields(request_), after=Cursor(1, names, number, version)))
+
+    assert encode_frame(answer)
+
+
+def _fields(request_):
+    names = [name for name in request_.__slots__ if name != "after"]
+    return {name: getattr(request_, name) for name in names}
+
+
+def test_page_goes_on_in_what_has_changed_meanwhile(bench, monkeypatch):
+    """What stays comes once, though a context goes and slots come between two pages."""
+    monkeypatch.setattr(pages, "PAGE_BYTES_MAX", 500)
+    first = bench.ask(Survey((), (), ()))
+    grant = bench.granted(lock_id("ann", 0, 99), item(Access.WRITE, "late", "note"))
+    bench.commit(lock_id("ann", 0, 99), grant.token, (slot("late", "note"), "1"))
+
+    listed = [first, *pages_of(bench, Survey((), (), (), after=first.more))]
+
+    assert all(isinstance(page, Surveyed) for page in listed)
+    slots = [state.slot for page in listed for state in page.states]
+    assert len(slots) == len(set(slots)) == 15
