@@ -248,6 +248,20 @@ class Reached:
 
 
 @dataclass(frozen=True, slots=True)
+class Pong:
+    """This shard is there: since when, and whether it grants locks (`state` as in `core.epochs`).
+
+    It stays this small whatever the shard holds.
+    """
+
+    shard: str
+    epoch: int
+    open: bool
+    state: str
+    uptime_ns: int
+
+
+@dataclass(frozen=True, slots=True)
 class Surveyed:
     """Slots without data, and the notice number up to which they are current."""
 

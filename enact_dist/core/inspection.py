@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
+from enact_dist.core import epochs
 from enact_dist.core.lock_table import Mode
 from enact_dist.core.messages import (
     Audited,
@@ -14,6 +15,7 @@ from enact_dist.core.messages import (
     ListLocks,
     ListSessions,
     Locks,
+    Pong,
     SessionInfo,
     Sessions,
     SlotState,
@@ -140,6 +142,17 @@ def audited(state: ShardState, message: ListAudit) -> Audited:
         if number > message.after.number
     )
     return Audited(state.audit.alarms, *page_of(steps))
+
+
+def pong(state: ShardState) -> Pong:
+    """Say that the shard is there, and whether it grants."""
+    return Pong(
+        state.settings.name,
+        state.epoch,
+        state.grants,
+        epochs.state_of(grants=state.grants, draining=state.draining),
+        state.now_ns - state.born_ns,
+    )
 
 
 def counted(state: ShardState) -> dict[str, int]:

@@ -49,6 +49,7 @@ from enact_dist.core.answers import (
     Kept,
     Locks,
     OutcomeIs,
+    Pong,
     Prepared,
     Reached,
     Refused,
@@ -111,6 +112,7 @@ from enact_dist.core.requests import (
     ListLocks,
     ListSessions,
     Outcome,
+    Ping,
     Prepare,
     Register,
     Release,
@@ -160,6 +162,7 @@ Request = (
     | Release
     | Goodbye
     | AwaitStamp
+    | Ping
     | Survey
     | ListLocks
     | ListSessions
@@ -194,6 +197,7 @@ Answer = (
     | Valid
     | Released
     | Reached
+    | Pong
     | Surveyed
     | Locks
     | Sessions
@@ -271,7 +275,9 @@ __all__ = [
     "Outcome",
     "OutcomeIs",
     "Pin",
+    "Ping",
     "PlacementMap",
+    "Pong",
     "Prepare",
     "Prepared",
     "Reached",

@@ -237,6 +237,11 @@ class AwaitStamp:
 
 
 @dataclass(frozen=True, slots=True)
+class Ping:
+    """Is a shard there, and does it grant?  Answer: `Pong`, at once; no session is needed."""
+
+
+@dataclass(frozen=True, slots=True)
 class Survey:
     """List slots without their data.  Answer: `Surveyed`.
 

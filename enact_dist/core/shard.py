@@ -46,6 +46,7 @@ from enact_dist.core.messages import (
     ListLocks,
     ListSessions,
     Outcome,
+    Ping,
     Prepare,
     Reached,
     Refused,
@@ -125,6 +126,7 @@ class Shard:
             ShardReturned: self._prepares.on_shard_returned,
             ForceAbort: self._prepares.on_force_abort,
             AwaitStamp: self._on_await_stamp,
+            Ping: self._on_ping,
             Survey: self._on_survey,
             ListLocks: self._on_list_locks,
             ListSessions: self._on_list_sessions,
@@ -333,6 +335,9 @@ class Shard:
         yield from self._answer_reached()
 
     # ---------------------------------------------------------------- people
+
+    def _on_ping(self, _: Ping, reply_to: int) -> Iterator[Effect]:
+        yield Reply(reply_to, inspection.pong(self.state))
 
     def _on_survey(self, message: Survey, reply_to: int) -> Iterator[Effect]:
         wrong = wrong_patterns(message.patterns)

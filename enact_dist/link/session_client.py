@@ -21,9 +21,9 @@ from enact_dist.core.messages import (
     Alive,
     Answer,
     AspectEntry,
-    AwaitStamp,
     EpochChanged,
     Goodbye,
+    Ping,
     Refused,
     Register,
     Welcome,
@@ -249,7 +249,7 @@ class SessionClient:
 
     def unreachable(self, shard: str, waited_s: float) -> ShardUnreachableError:
         """Return the error for a shard without an answer, after a question that needs no disk."""
-        runs = self.carrier.request(shard, AwaitStamp(0, 0), timeout_s=CALL_S / 4) is not None
+        runs = self.carrier.request(shard, Ping(), timeout_s=CALL_S / 4) is not None
         return unreachable(shard, waited_s, self.carrier.endpoint_of, runs=runs)
 
     def call_once(

@@ -28,6 +28,7 @@ from enact_dist.link.shard_calls import ShardCalls
 from enact_dist.link.shared_folder import SharedFolder
 from enact_dist.link.signals import StopSignals
 from enact_dist.link.socket_service import SocketService
+from enact_dist.link.zenoh_access import listening_settings
 from enact_dist.link.zenoh_config import close_session, open_session, to_reach
 from enact_dist.link.zenoh_discovery import FoundShard, find_shards
 from enact_dist.link.zenoh_service import ZenohService
@@ -115,7 +116,11 @@ class RunningShard:
             if settings.metrics is not None:
                 self._metrics = _metrics_server(settings, self.host)
                 undo.callback(self._metrics.close)
-            self._session = open_session(listen=settings.listen, lease_s=settings.link_lease_s)
+            self._session = open_session(
+                listen=settings.listen,
+                lease_s=settings.link_lease_s,
+                more=listening_settings(settings.cell, shard.name),
+            )
             undo.callback(close_session, self._session)
             self._calls = ShardCalls(
                 settings.cell,

@@ -10,8 +10,7 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from enact_dist.core.epochs import state_of
-from enact_dist.core.messages import ListSessions, Sessions
+from enact_dist.core.messages import Ping, Pong
 from enact_dist.errors import ShardUnreachableError
 from enact_dist.link.zenoh_config import to_reach
 from enact_dist.link.zenoh_discovery import FoundShard, ask_shards, find_shards
@@ -65,7 +64,7 @@ def of_shards(
     reached = {name: list(dict.fromkeys(map(to_reach, some))) for name, some in endpoints.items()}
     everywhere = list(dict.fromkeys(endpoint for some in reached.values() for endpoint in some))
     shards = [FoundShard(cell, name) for name in reached]
-    answers = ask_shards(everywhere, shards, ListSessions(), timeout_s=timeout_s)
+    answers = ask_shards(everywhere, shards, Ping(), timeout_s=timeout_s)
     took_s = time.monotonic() - started_s
     return [
         _health(shard.shard, answers.get(shard), ", ".join(reached[shard.shard]), took_s)
@@ -94,20 +93,19 @@ def of_endpoint(endpoint: str, name: str | None, *, timeout_s: float) -> list[Sh
             shard=name or "",
             endpoint=endpoint,
         )
-    answers = ask_shards([endpoint], wanted, ListSessions(), timeout_s=timeout_s)
+    answers = ask_shards([endpoint], wanted, Ping(), timeout_s=timeout_s)
     took_s = time.monotonic() - started_s
     return [_health(shard.shard, answers.get(shard), endpoint, took_s) for shard in wanted]
 
 
 def _health(name: str, answer: object, endpoint: str, took_s: float) -> ShardHealth:
-    if not isinstance(answer, Sessions):
+    if not isinstance(answer, Pong):
         return ShardHealth(name, False, False, "unreachable", endpoint, took_s=took_s)
-    counters = {counter.name: counter.value for counter in answer.counters}
     return ShardHealth(
         name,
         alive=True,
         ready=answer.open,
-        state=state_of(grants=answer.open, draining=bool(counters.get("draining"))),
+        state=answer.state,
         endpoint=endpoint,
         epoch=answer.epoch,
         uptime_s=answer.uptime_ns / 1e9,

@@ -19,7 +19,7 @@ import threading
 import weakref
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.core.messages import Alive, ListLocks, Locks, Welcome
+from enact_dist.core.messages import Alive, Ping, Pong, Welcome
 from enact_dist.errors import LinkError
 from enact_dist.link.carrier import check_usable
 from enact_dist.link.notices import NoticeQueue
@@ -241,8 +241,8 @@ class SocketCarrier:
         shard, problem = welcome.shard, line.problem if line is not None else "it offers none"
         if not problem:
             return
-        answer = self._behind.request(shard, ListLocks(), timeout_s=THERE_S)
-        if isinstance(answer, Locks) and answer.epoch == welcome.epoch:
+        answer = self._behind.request(shard, Ping(), timeout_s=THERE_S)
+        if isinstance(answer, Pong) and answer.epoch == welcome.epoch:
             raise LinkError(
                 f"the socket is asked for (ENACT_CARRIER=socket), and that of shard {shard} cannot"
                 f" be used: {problem}"

@@ -30,7 +30,7 @@ from typing import TYPE_CHECKING, Final
 
 import zenoh
 
-from enact_dist.core.messages import Answer, AwaitStamp, Commit, Notice, Prepare
+from enact_dist.core.messages import Answer, Commit, Notice, Ping, Prepare
 from enact_dist.errors import ProtocolError, ShardUnreachableError
 from enact_dist.link.carrier import check_usable, failure_of, read_answer
 from enact_dist.link.inside import Inside
@@ -71,7 +71,7 @@ JOIN_S: Final = 1.0
 UNCHECKED_MAX: Final = 256
 """Answered queries that are still watched for a second reply."""
 
-QUESTION: Final = AwaitStamp(0, 0)
+QUESTION: Final = Ping()
 """The cheapest request: answered at once, changes nothing."""
 _NONE = zenoh.ConsolidationMode.NONE
 _BLOCK, _DROP = zenoh.CongestionControl.BLOCK, zenoh.CongestionControl.DROP

@@ -14,6 +14,7 @@ relay between peers).  Reasons for the settings, measured with 1.10 on a loopbac
 - `max_wait_before_drop_fragments` 2 s: slices of a large datum over a slow network are not
   dropped after 50 ms; only senders of their own ever wait for it.
 - Reconnection every 50 ms: a restarted shard is back in use after 0.1 s, not 1 s.
+- `zenoh_access`: who listens relays nothing, and silent connections keep nobody out.
 - `zenoh_links`: lost connections hold up nobody, and a cut one is back soon.
 
 Sessions must be closed before the interpreter ends (it hangs otherwise), and must never be closed
@@ -27,6 +28,7 @@ import ctypes
 import json
 import os
 import weakref
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
 import zenoh
@@ -37,7 +39,7 @@ from enact_dist.link.zenoh_links import LinkWatch
 from enact_dist.wire.limits import BODY_BYTES_MAX, HEADER_BYTES_MAX
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
 QUEUED_MAX: Final = 65_536
 """Messages in a channel between Zenoh and Python: the network thread must not wait for Python."""
@@ -63,6 +65,7 @@ def session_config(
     connect: Sequence[str] = (),
     lease_s: float,
     open_s: float = OPEN_S,
+    more: Mapping[str, object] = MappingProxyType({}),
 ) -> zenoh.Config:
     """Return the settings of a session.
 
@@ -71,6 +74,7 @@ def session_config(
         connect: Endpoints to connect to, and to connect to again whenever a link is lost.
         lease_s: After so long without a sign of life of this process, a peer drops the link.
         open_s: How long a connected endpoint has to answer in Zenoh's language.
+        more: Further settings; those of a shard come from `zenoh_access.listening_settings`.
 
     Raises:
         ConfigError: Zenoh does not understand an endpoint.
@@ -95,6 +99,7 @@ def session_config(
         "transport/link/tx/keep_alive": 4,
         "transport/link/tx/queue/congestion_control": congestion,
         "transport/link/rx/max_message_size": MESSAGE_BYTES_MAX,
+        **more,
     }
     config = zenoh.Config()
     for key, value in settings.items():
@@ -118,6 +123,7 @@ def open_session(
     connect: Sequence[str] = (),
     lease_s: float,
     open_s: float = OPEN_S,
+    more: Mapping[str, object] = MappingProxyType({}),
 ) -> zenoh.Session:
     """Open a session; whoever opens one closes it.
 
@@ -127,7 +133,9 @@ def open_session(
         MisuseError: This process was forked from one that has had a session.
     """
     check_not_forked()
-    config = session_config(listen=listen, connect=connect, lease_s=lease_s, open_s=open_s)
+    config = session_config(
+        listen=listen, connect=connect, lease_s=lease_s, open_s=open_s, more=more
+    )
     _used_in.add(os.getpid())
     try:
         session = zenoh.open(config)

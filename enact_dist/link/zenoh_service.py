@@ -20,7 +20,7 @@ import zenoh
 from enact_dist.core.messages import (
     Answer,
     Fetch,
-    Reached,
+    Ping,
     Refused,
     Request,
     Stage,
@@ -136,15 +136,21 @@ class ZenohService:
             )
             if type(message) not in SESSION_OF:
                 raise ProtocolError(f"{type(message).__name__} is no request")
-            verb, identity = parse_request_key(str(query.key_expr))[2:]
+            cell, shard, verb, identity = parse_request_key(str(query.key_expr))
             if verb != verb_of(message):
                 raise ProtocolError(f"a {verb_of(message)} came on the key of a {verb}")
+            if (ANY in cell or ANY in shard) and type(message) is not Ping:
+                raise ProtocolError(f"a {verb} came to several shards at once; only a ping may")
         except Exception as error:  # noqa: BLE001 - every query is answered
             if not isinstance(error, ProtocolError):
                 # A fault of the decoder: whoever found it must not make the shard deaf.
                 _log.exception("a frame of %d bytes broke the decoder", len(header or b""))
             self._host.count("frames_refused")
-            _Call(self, query, str(query.key_expr))(Refused("protocol", str(error)))
+            call = _Call(self, query, str(query.key_expr))
+            if _answerable(str(query.key_expr)):
+                call(Refused("protocol", str(error)))
+            else:
+                call.drop()
             return
         client = named_session(message) or str(query.key_expr)
         if type(message) in _SLICES:
@@ -182,10 +188,10 @@ class ZenohService:
             _log.exception("a %s was not taken", type(message).__name__)
             call.drop()
 
-    def reply_key(self, query: zenoh.Query, answer: Answer) -> zenoh.KeyExpr | str:
+    def reply_key(self, query: zenoh.Query) -> zenoh.KeyExpr | str:
         """Return the key to answer under: the query's own, unless that asked every shard."""
         key = query.key_expr
-        if type(answer) is not Reached or "*" not in str(key):
+        if ANY not in str(key):
             return key
         return request_key(self._cell, self._host.name, *str(key).split("/")[-2:])
 
@@ -271,7 +277,7 @@ class _Call:
         try:
             header, bodies = encoded(answer, self._service.count)
             payload = bytes(bodies[0]) if len(bodies) == 1 else b"".join(bodies)
-            query.reply(self._service.reply_key(query, answer), payload, attachment=header)
+            query.reply(self._service.reply_key(query), payload, attachment=header)
         except zenoh.ZError as error:
             _log.warning("answer %s not sent: %s", type(answer).__name__, error)
         finally:
@@ -280,6 +286,14 @@ class _Call:
     def drop(self) -> None:
         """Leave the client without an answer, which tells it to ask again."""
         self._query.drop()  # type: ignore[no-untyped-call]  # as Zenoh's stub has it
+
+
+def _answerable(key: str) -> bool:
+    """Whether an answer to what came on this key can say who gives it."""
+    try:
+        return bool(parse_request_key(key))
+    except ProtocolError:
+        return ANY not in key
 
 
 _SLICES: Final = frozenset((Fetch, Stage))

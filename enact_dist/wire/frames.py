@@ -66,6 +66,7 @@ CODES: Final[dict[type[Any], int]] = {
     m.Fork: 26,
     m.DropWorld: 27,
     m.KeepVersions: 28,
+    m.Ping: 29,
     m.Welcome: 33,
     m.Registered: 34,
     m.Granted: 35,
@@ -99,6 +100,7 @@ CODES: Final[dict[type[Any], int]] = {
     m.Forked: 63,
     m.Dropped: 64,
     m.Kept: 65,
+    m.Pong: 66,
     m.Notice: 97,
 }
 
