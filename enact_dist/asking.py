@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import time
+from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.messages import AwaitStamp, Reached, Refused, Versions
 from enact_dist.errors import ProtocolError
@@ -11,6 +12,9 @@ from enact_dist.link.refusals import error_of
 if TYPE_CHECKING:
     from enact_dist.core.messages import Answer
     from enact_dist.link.client import CellClient
+
+EARLY_PAUSE_S: Final = 0.02
+"""Pause before a question is asked again that a shard has answered before its time."""
 
 
 def versions_in(answer: Answer) -> Versions:
@@ -25,6 +29,36 @@ def versions_in(answer: Answer) -> Versions:
     if not isinstance(answer, Versions):
         raise ProtocolError(f"{type(answer).__name__} came where versions were asked for")
     return answer
+
+
+def await_stamp(
+    client: CellClient, shard: str, stamp_ns: int, *, wait_s: float, timeout_s: float | None = None
+) -> bool:
+    """Wait until a shard shows every commit up to a stamp, one slice at most; say whether it does.
+
+    Args:
+        client: Who asks.
+        shard: Whom it asks.
+        stamp_ns: Up to which stamp.
+        wait_s: How long the shard may wait for it.
+        timeout_s: How long the shard may stay without an answer (None: `patience_s`).
+
+    Raises:
+        ShardUnreachableError: It does.
+    """
+    core, wait_ns, begin_s = client.core, int(wait_s * 1e9), time.monotonic()
+    answers = client.ask_each(
+        [shard],
+        lambda _, epoch, __: AwaitStamp(stamp_ns, wait_ns, core.session, epoch),
+        timeout_s=timeout_s,
+    )
+    answer = answers[shard]
+    if answer is None:
+        raise client.unreachable(shard, time.monotonic() - begin_s)
+    reached = isinstance(answer, Reached) and answer.reached
+    if not reached and time.monotonic() - begin_s < wait_s / 2:
+        client.rest(EARLY_PAUSE_S)  # too many of this process wait, or the shard ends
+    return reached
 
 
 def present_ns(client: CellClient) -> int:

@@ -11,6 +11,7 @@ import contextlib
 import time
 from typing import TYPE_CHECKING, Any
 
+from enact_dist.asking import await_stamp
 from enact_dist.aspect_info import AspectInfo, aspect_infos
 from enact_dist.cell_info import (
     ActorInfo,
@@ -25,7 +26,6 @@ from enact_dist.closing import Closing
 from enact_dist.core.datum import Position
 from enact_dist.core.messages import (
     Audited,
-    AwaitStamp,
     Break,
     Broken,
     ForceAbort,
@@ -33,7 +33,6 @@ from enact_dist.core.messages import (
     ListLocks,
     ListSessions,
     Locks,
-    Reached,
     Welcome,
 )
 from enact_dist.errors import EnactError, MisuseError
@@ -197,9 +196,10 @@ class Cell(Closing):
         deadline_s = time.monotonic() + timeout_s
         while True:
             left_s = max(0.0, deadline_s - time.monotonic())
-            request = AwaitStamp(position.stamp_ns, int(min(left_s, 0.5) * 1e9))
-            answer = self._client.call(position.shard, request, timeout_s=left_s + 1.0)
-            if isinstance(answer, Reached) and answer.reached:
+            wait_s, stamp_ns, timeout_s = min(left_s, 0.5), position.stamp_ns, left_s + 1.0
+            if await_stamp(
+                self._client, position.shard, stamp_ns, wait_s=wait_s, timeout_s=timeout_s
+            ):
                 return True
             if time.monotonic() >= deadline_s:
                 return False

@@ -5,9 +5,10 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING, Any, Final
 
+from enact_dist.asking import await_stamp
 from enact_dist.config_table import suggestion
 from enact_dist.core.datum_types import type_conflict
-from enact_dist.core.messages import AspectEntry, AwaitStamp, Item, Reached
+from enact_dist.core.messages import AspectEntry, Item
 from enact_dist.core.placement import shard_of
 from enact_dist.core.retaining import said
 from enact_dist.errors import (
@@ -35,7 +36,7 @@ if TYPE_CHECKING:
 
 SETTLE_S: Final = 10.0
 """How long our own commit may take to be shown by all its shards."""
-SETTLE_SLICE_NS: Final = 500_000_000
+SETTLE_SLICE_S: Final = 0.5
 ENTRIES_MAX: Final = 1024
 """Aspect objects whose catalogue entries are remembered."""
 LOOKED_UP_S: Final = 1.0
@@ -264,8 +265,7 @@ class Session:
         stamp_ns = self.client.unsettled_ns(shard)
         deadline_s = time.monotonic() + SETTLE_S
         while stamp_ns:
-            answer = self.client.call(shard, AwaitStamp(stamp_ns, SETTLE_SLICE_NS))
-            if isinstance(answer, Reached) and answer.reached:
+            if await_stamp(self.client, shard, stamp_ns, wait_s=SETTLE_SLICE_S):
                 self.client.reached(shard, stamp_ns)
                 return
             if time.monotonic() >= deadline_s:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final
 from enact_dist.core.message_parts import READS_MAX
 from enact_dist.core.messages import Commit, Refused
 from enact_dist.core.retaining import NO_LIMIT
+from enact_dist.core.stamps import AHEAD_NS_MAX
 from enact_dist.patterns import checked_pattern
 from enact_dist.terms import Access, Durability, checked_name
 
@@ -161,13 +162,15 @@ def wrong_decision(
     """Refuse the stamp of a decision that no shard with a right clock gives.
 
     It would become the time of this shard for good, since stamps only grow.  The decision may be
-    said again: it is taken once the clocks agree.
+    said again: it is taken once the clocks agree.  Where this host's clock was set back, what was
+    promised lies ahead of it, and an honest decision a little later still.
     """
     if position.stamp_ns <= 0:
         return _refused(
             f"{lock} is said to be committed at stamp {position.stamp_ns}, which is none"
         )
-    if not stamps.too_far_ahead(position.stamp_ns, wall_ns=wall_ns):
+    after_promise = position.stamp_ns <= stamps.last_ns + AHEAD_NS_MAX
+    if after_promise or not stamps.too_far_ahead(position.stamp_ns, wall_ns=wall_ns):
         return None
     ahead_s = (position.stamp_ns - wall_ns) / 1e9
     return Refused(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import islice
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core import epochs
@@ -52,11 +53,11 @@ def holder(state: ShardState, tenure: Tenure, *, now_ns: int) -> Holder:
     """Describe one lock: who holds or awaits it, since when, and for whom it waits."""
     session = state.sessions.by_id.get(tenure.lock.session)
     modes = {mode: None for mode in tenure.claim.wants.values() if mode in _WORDS}
-    named = [
+    named = (
         f"{resource} ({_WORDS[mode]})"
         for resource, mode in tenure.claim.wants.items()
         if mode in _WORDS
-    ]
+    )
     waits_for = state.tenures.table.blockers(tenure.claim, count_max=WAITS_TOLD_MAX)
     granted = tenure.token is not None
     words = [_WORDS[mode] for mode in modes]
@@ -73,7 +74,7 @@ def holder(state: ShardState, tenure: Tenure, *, now_ns: int) -> Holder:
         now_ns - (tenure.granted_ns if granted else tenure.asked_ns),
         max(0, session.lease_end_ns(now_ns) - now_ns) if session else 0,
         max(0, tenure.hold_end_ns - now_ns) if granted else tenure.hold_ns,
-        tuple(named[:SLOTS_TOLD_MAX]),
+        tuple(islice(named, SLOTS_TOLD_MAX)),
         tuple(claim.ticket for claim in waits_for),
     )
 

@@ -230,10 +230,17 @@ class Goodbye:
 
 @dataclass(frozen=True, slots=True)
 class AwaitStamp:
-    """Wait until all commits up to a stamp are visible.  Answer: `Reached` (maybe not yet)."""
+    """Wait until all commits up to a stamp are visible.  Answer: `Reached` (maybe not yet).
+
+    Only a session is waited for, in the epoch that it knows, at most `WAIT_SLICE_NS_MAX`; without
+    one the answer comes at once.  Of a session that asks more than 64 such questions, the oldest
+    one is answered early.
+    """
 
     stamp_ns: int
     wait_ns: int
+    session: str = ""
+    epoch: int = 0
 
 
 @dataclass(frozen=True, slots=True)

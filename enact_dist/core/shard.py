@@ -14,7 +14,7 @@ ours.  Its rule *one lock per thread* is the lane: a newer seq ends the older on
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from enact_dist.core import inspection, owners
 from enact_dist.core.admission import wrong_patterns
@@ -48,7 +48,6 @@ from enact_dist.core.messages import (
     Outcome,
     Ping,
     Prepare,
-    Reached,
     Refused,
     Register,
     Release,
@@ -76,7 +75,8 @@ from enact_dist.core.records import (
 )
 from enact_dist.core.session_desk import SessionDesk
 from enact_dist.core.shard_state import ShardSettings, ShardState
-from enact_dist.core.tenures import HELD_TOO_LONG, WAIT_SLICE_NS_MAX
+from enact_dist.core.stamp_desk import StampDesk
+from enact_dist.core.tenures import HELD_TOO_LONG
 from enact_dist.core.view_desk import ViewDesk
 from enact_dist.core.worlds import WorldDesk
 from enact_dist.terms import Durability
@@ -86,6 +86,9 @@ if TYPE_CHECKING:
 
     from enact_dist.core.messages import Request
     from enact_dist.core.records import Event
+
+_DECIDE: Final = frozenset((Persisted, Called, Drain))
+"""After these, what was undecided may be decided; after no other message."""
 
 
 class Shard:
@@ -103,8 +106,7 @@ class Shard:
         self._views = ViewDesk(self.state, self._locks, self._prepares)
         self._worlds = WorldDesk(self.state, self._prepares)
         lineage = LineageDesk(self.state)
-        self._parked_stamps: dict[int, AwaitStamp] = {}
-        self._parked_stamp_ends: dict[int, int] = {}
+        self._stamps = StampDesk(self.state, self._prepares)
         self._handlers: dict[type, Callable[..., Iterator[Effect]]] = {
             Hello: self._sessions.on_hello,
             Register: self._sessions.on_register,
@@ -125,7 +127,7 @@ class Shard:
             Called: self._prepares.on_called,
             ShardReturned: self._prepares.on_shard_returned,
             ForceAbort: self._prepares.on_force_abort,
-            AwaitStamp: self._on_await_stamp,
+            AwaitStamp: self._stamps.on_await_stamp,
             Ping: self._on_ping,
             Survey: self._on_survey,
             ListLocks: self._on_list_locks,
@@ -181,10 +183,10 @@ class Shard:
                 state.count("epoch_refusals")
             else:
                 state.count("requests_refused")
-        if self._views.waits:
-            effects += self._views.answer_parked()
-        if self._worlds.waits:
-            effects += self._worlds.answer_waiting()
+        if self._views.waits or self._worlds.waits:
+            decided = type(message) in _DECIDE
+            effects += self._views.answer_parked(decided=decided)
+            effects += self._worlds.answer_waiting(decided=decided)
         if self.state.tenures.table.any_ready:
             effects += self.state.grant_ready()
         return effects
@@ -208,11 +210,11 @@ class Shard:
         deadlines = [now_ns + self.state.shortest_ttl_ns // 8]
         if self.state.sessions.in_grace(now_ns):
             deadlines.append(self.state.sessions.grace_end_ns)
-        deadlines += self._parked_stamp_ends.values()
         soonest = self.state.tenures.next_deadline_ns()
         if soonest is not None:
             deadlines.append(soonest)
-        for desk in (self._prepares, self._views, self._worlds, self.state.decisions):
+        state = self.state
+        for desk in (self._prepares, self._stamps, self._views, self._worlds, state.decisions):
             due_ns = desk.next_deadline_ns()
             if due_ns is not None:
                 deadlines.append(due_ns)
@@ -263,30 +265,12 @@ class Shard:
                 yield from self._worlds.persisted(message.ticket)
             else:
                 yield from self._prepares.persisted(message.ticket)
-            yield from self._answer_reached()
+            yield from self._stamps.answer_reached()
         else:
             yield from self._sessions.persisted(message.ticket)
 
     def _on_outcome(self, message: Outcome, reply_to: int) -> Iterator[Effect]:
         yield from self.state.commits.outcome(message, reply_to=reply_to)
-
-    def _on_await_stamp(self, message: AwaitStamp, reply_to: int) -> Iterator[Effect]:
-        self._parked_stamps[reply_to] = message
-        wait_ns = max(0, min(message.wait_ns, WAIT_SLICE_NS_MAX))
-        self._parked_stamp_ends[reply_to] = self.state.now_ns + wait_ns
-        yield from self._answer_reached()
-
-    def _answer_reached(self) -> Iterator[Effect]:
-        for reply_to, message in list(self._parked_stamps.items()):
-            stamp_ns = self.state.stamp()
-            undecided = [stamp for stamp, _ in self.state.commits.undecided()]
-            undecided += [record.stamp_ns for record in self._prepares.undecided()]
-            reached = stamp_ns >= message.stamp_ns and (
-                not undecided or min(undecided) > message.stamp_ns
-            )
-            if reached or self._parked_stamp_ends[reply_to] <= self.state.now_ns:
-                del self._parked_stamps[reply_to], self._parked_stamp_ends[reply_to]
-                yield Reply(reply_to, Reached(reached, stamp_ns))
 
     # ---------------------------------------------------------------- time
 
@@ -302,7 +286,7 @@ class Shard:
             yield from self._sessions.end(idle.session, "its session stayed away")
         yield from self.state.grant_ready()
         yield from self.state.tenures.end_slices(now_ns)
-        yield from self._answer_reached()
+        yield from self._stamps.answer_reached()
         yield from self._prepares.ask()
         yield from self.state.decisions.tell(now_ns)
         yield from self._history.tidy()
@@ -330,9 +314,7 @@ class Shard:
         for tenure in list(self.state.tenures.by_lock.values()):
             if tenure.parked is not None:
                 yield self.state.tenures.waiting(tenure, self.state.now_ns)
-        for reply_to in list(self._parked_stamps):
-            self._parked_stamp_ends[reply_to] = self.state.now_ns
-        yield from self._answer_reached()
+        yield from self._stamps.answer_all()
 
     # ---------------------------------------------------------------- people
 

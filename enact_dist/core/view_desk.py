@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Final
 from enact_dist.core.admission import unknown_world
 from enact_dist.core.datum import Column, Slot
 from enact_dist.core.messages import EpochChanged, Forgotten, Refused, TakeView, Viewed
+from enact_dist.core.parked import Parked
 from enact_dist.core.records import Reply
 from enact_dist.patterns import pattern_matches
 from enact_dist.terms import ACCESSES
@@ -27,13 +28,15 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from enact_dist.core.lock_desk import LockDesk
-    from enact_dist.core.messages import Item
+    from enact_dist.core.messages import Item, WriteItem
     from enact_dist.core.prepares import PrepareDesk
     from enact_dist.core.records import Effect
     from enact_dist.core.shard_state import ShardState
 
 VIEW_WAIT_NS: Final = 400_000_000
 """How long a view waits for undecided commits; then it is answered, and may be asked again."""
+WAITING_MAX: Final = 2048
+"""Views that wait at one shard; further ones are answered as if they had waited enough."""
 
 
 class ViewDesk:
@@ -43,7 +46,9 @@ class ViewDesk:
         self._state = state
         self._locks = locks
         self._prepares = prepares
-        self._parked: dict[int, tuple[TakeView, int]] = {}
+        self._parked = Parked[TakeView]()
+        self._behind: dict[int, dict[int, None]] = {}
+        self._behind_of: dict[int, int] = {}
 
     @property
     def waits(self) -> bool:
@@ -70,11 +75,25 @@ class ViewDesk:
         session.renewed_ns = max(session.renewed_ns, state.now_ns)
         session.count_seen = max(session.count_seen, message.count)
         state.stamp(max(message.seen_stamp_ns, message.at_ns))
-        if message.at_ns and self._undecided_ns(message.items) <= message.at_ns:
+        full = len(self._parked) >= WAITING_MAX
+        if not full and message.at_ns and self._waits(reply_to, message):
             state.count("views_waited")
-            self._parked[reply_to] = (message, state.now_ns + VIEW_WAIT_NS)
+            end_ns = state.now_ns + VIEW_WAIT_NS
+            oldest = self._parked.add(reply_to, message, session=session.session, end_ns=end_ns)
+            if oldest is not None:
+                yield self._answer(oldest, self._parked.take(oldest))
         else:
             yield Reply(reply_to, self._viewed(message))
+
+    def _waits(self, reply_to: int, message: TakeView) -> bool:
+        """Whether an undecided commit stands before a view; it waits for the first one then."""
+        undecided_ns = self._undecided_ns(message.items)
+        if undecided_ns > message.at_ns:
+            return False
+        # Here each commit has a stamp of its own.
+        self._behind.setdefault(undecided_ns, {})[reply_to] = None
+        self._behind_of[reply_to] = undecided_ns
+        return True
 
     def _in_the_future(self, at_ns: int) -> Refused:
         ahead_s = (at_ns - self._state.wall_ns) / 1e9
@@ -86,8 +105,7 @@ class ViewDesk:
 
     def _undecided_ns(self, items: tuple[Item, ...]) -> int:
         """Return the smallest stamp that an undecided commit on these items may get."""
-        undecided = list(self._state.commits.undecided())
-        undecided += [(record.stamp_ns, record.writes) for record in self._prepares.undecided()]
+        undecided = self._undecided()
         if not undecided:
             return _NEVER_NS
         slots = {Slot(i.context, i.entity, i.aspect) for i in items if not ACCESSES[i.access].each}
@@ -119,13 +137,37 @@ class ViewDesk:
             until_ns = min(until_ns, message.at_ns)
         return Viewed(message.lock, state.epoch, stamp_ns, tuple(states), from_ns, until_ns)
 
-    def answer_parked(self) -> Iterator[Effect]:
-        """Answer the views that nothing undecided stands before any more, or that waited enough."""
-        for reply_to, (message, end_ns) in list(self._parked.items()):
-            waited = end_ns <= self._state.now_ns or self._state.draining
-            if waited or self._undecided_ns(message.items) > message.at_ns:
-                del self._parked[reply_to]
-                yield Reply(reply_to, self._dropped(message) or self._viewed(message))
+    def answer_parked(self, *, decided: bool) -> Iterator[Effect]:
+        """Answer the views that waited enough, or that nothing undecided stands before any more.
+
+        Args:
+            decided: Whether a commit may have been decided since the last time.
+        """
+        if self._state.draining:
+            for reply_to, message in self._parked.all():
+                yield self._answer(reply_to, message)
+        for reply_to, message in self._parked.ended(self._state.now_ns):
+            yield self._answer(reply_to, message)
+        if decided:
+            undecided = {stamp_ns for stamp_ns, _ in self._undecided()}
+            for stamp_ns in sorted(self._behind.keys() - undecided):
+                for reply_to in self._behind.pop(stamp_ns):
+                    del self._behind_of[reply_to]
+                    if not self._waits(reply_to, self._parked.by_reply[reply_to].question):
+                        yield self._answer(reply_to, self._parked.take(reply_to))
+
+    def _answer(self, reply_to: int, message: TakeView) -> Effect:
+        stamp_ns = self._behind_of.pop(reply_to, None)
+        if stamp_ns is not None:
+            del self._behind[stamp_ns][reply_to]
+            if not self._behind[stamp_ns]:
+                del self._behind[stamp_ns]
+        return Reply(reply_to, self._dropped(message) or self._viewed(message))
+
+    def _undecided(self) -> list[tuple[int, tuple[WriteItem, ...]]]:
+        """Return stamps and writes of the commits that are not decided."""
+        prepared = ((record.stamp_ns, record.writes) for record in self._prepares.undecided())
+        return [*self._state.commits.undecided(), *prepared]
 
     def _dropped(self, message: TakeView) -> Refused | EpochChanged | None:
         """Refuse a view whose session, or one of whose contexts, ended while it waited.
@@ -140,7 +182,7 @@ class ViewDesk:
 
     def next_deadline_ns(self) -> int | None:
         """Return when a view has waited enough."""
-        return min((end_ns for _, end_ns in self._parked.values()), default=None)
+        return self._parked.next_end_ns()
 
 
 _NEVER_NS: Final = 1 << 62

@@ -63,6 +63,8 @@ if TYPE_CHECKING:
 
 FORK_WAIT_NS: Final = 400_000_000
 """How long a fork waits for undecided commits; then it is refused, and may be asked again."""
+WAITING_MAX: Final = 64
+"""Forks that wait at one shard; further ones are refused, and may be asked again."""
 CHANGES_MAX: Final = 512
 """Changes in one notice about a context that was made or has gone."""
 
@@ -117,6 +119,10 @@ class WorldDesk:
         if answer is not None:
             yield from self._told(act, answer)
             return
+        if len(self._waiting) >= WAITING_MAX:
+            text = f"{WAITING_MAX} forks wait for commits to be decided; ask again"
+            yield from self._told(act, Refused("overload", text))
+            return
         self._state.stamp(message.at_ns)
         self._state.busy_worlds[message.world] = f"being forked from {message.source!r}"
         self._waiting[message.world] = act
@@ -164,8 +170,15 @@ class WorldDesk:
             for stamp_ns, writes in undecided
         )
 
-    def answer_waiting(self) -> Iterator[Effect]:
-        """Make the forks that nothing undecided stands before now; refuse the others in time."""
+    def answer_waiting(self, *, decided: bool) -> Iterator[Effect]:
+        """Make the forks that nothing undecided stands before now; refuse the others in time.
+
+        Args:
+            decided: Whether a commit may have been decided since the last time.
+        """
+        due_ns = self.next_deadline_ns()
+        if not decided and not self._state.draining and (due_ns or 0) > self._state.now_ns:
+            return
         for act in list(self._waiting.values()):
             message = act.message
             assert isinstance(message, Fork)

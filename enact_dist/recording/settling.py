@@ -74,10 +74,13 @@ class Settling:
 
     def _all_show(self, stamp_ns: int) -> bool:
         """Whether every shard that answers shows all that is committed up to a stamp."""
-        question = AwaitStamp(stamp_ns, int(ASK_S * 1e9))
-        asked = [(shard, question) for shard in self._client.shards()]
+        session, wait_ns = self._client.core.session, int(ASK_S * 1e9)
         try:
-            answers = self._client.call_once(asked, timeout_s=ANSWER_S)
+            answers = self._client.ask_each(
+                self._client.shards(),
+                lambda _, epoch, __: AwaitStamp(stamp_ns, wait_ns, session, epoch),
+                timeout_s=ANSWER_S,
+            )
         except LinkError:
             return True
-        return all(answer.reached for answer in answers if isinstance(answer, Reached))
+        return all(answer.reached for answer in answers.values() if isinstance(answer, Reached))

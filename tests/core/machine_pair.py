@@ -21,6 +21,7 @@ from enact_dist.core.messages import (
     AspectEntry,
     AwaitStamp,
     Commit,
+    EpochChanged,
     Reached,
     Register,
     TakeView,
@@ -67,7 +68,7 @@ class Pair:
         self.tokens: dict[LockId, Token] = {}
         self.history: dict[Slot, list[tuple]] = {slot: [(0, 0, None)] for slot in SLOTS}
         self.promised_ns: dict[Slot, int] = {}
-        self.awaited: dict[int, int] = {}
+        self.awaited: dict[int, tuple[int, str]] = {}
         self.asked: dict[int, dict[Slot, int]] = {}
         self.tally: Counter[str] = Counter()
         self.reached_ns = 0
@@ -81,7 +82,7 @@ class Pair:
         handle = next(self._handles)
         self._tell(message)
         if isinstance(message, AwaitStamp):
-            self.awaited[handle] = message.stamp_ns
+            self.awaited[handle] = message.stamp_ns, message.session
         if isinstance(message, TakeView):
             stamps = {Slot(*item[1:4]): item.captured_ns for item in message.items}
             self.asked[handle] = {slot: ns for slot, ns in stamps.items() if ns}
@@ -183,6 +184,14 @@ class Pair:
                 if isinstance(effect.answer, Reached):
                     self._judge_reached(effect)
                     continue
+                if effect.reply_to in self.awaited:
+                    session = self.awaited.pop(effect.reply_to)[1]
+                    person = self.reference.people.get(session)
+                    self.same(
+                        "the session may not wait", person is None or not person.present, True
+                    )
+                    self.same("is told the epoch", type(effect.answer), EpochChanged)
+                    continue
                 answers[effect.reply_to] = effect.answer
                 self.floor_ns = max(self.floor_ns, getattr(effect.answer, "stamp_ns", 0))
         found = {to: plain(answer) for to, answer in answers.items()}
@@ -240,7 +249,7 @@ class Pair:
         self.tally["by stamp: as of the past"] += past
 
     def _judge_reached(self, effect: Reply) -> None:
-        stamp_ns = self.awaited.pop(effect.reply_to)
+        stamp_ns, _ = self.awaited.pop(effect.reply_to)
         if effect.answer.reached:
             self.reached_ns = max(self.reached_ns, stamp_ns)
 

@@ -235,7 +235,10 @@ class ShardMachine(Staging, RuleBasedStateMachine):
         """Somebody lists the locks and what is retained, and somebody waits for a stamp."""
         self.pair.give(ListLocks())
         self.pair.give(Survey((), (), (), retained=True))
-        self.pair.give(AwaitStamp(self.pair.floor_ns + Pick(pick).below(3) - 1, 90 * MS))
+        pick = Pick(pick)
+        session, epoch = pick.one(("", *TTLS)), self.pair.shard.epoch
+        stamp_ns = self.pair.floor_ns + pick.below(3) - 1
+        self.pair.give(AwaitStamp(stamp_ns, 90 * MS, session, epoch))
 
     @precondition(lambda self: self.reference.draining)
     @rule(pick=PICK)

@@ -64,7 +64,8 @@ def test_late_commit_does_not_hide_the_outcome_of_a_newer_one_of_its_lane():
 def test_wait_for_a_stamp_is_answered_after_a_slice_however_long_it_asks():
     """Nobody parks a request at a shard for longer than one slice of waiting."""
     bench = ShardBench()
-    handle = bench.send(AwaitStamp(bench.wall_ns + 100 * S, 1 << 60))
+    bench.hello("ann")
+    handle = bench.send(AwaitStamp(bench.wall_ns + 100 * S, 1 << 60, "ann", 1))
     bench.wait(900 * MS)
     assert handle not in bench.answers
     bench.wait(200 * MS)

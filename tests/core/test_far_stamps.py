@@ -168,6 +168,14 @@ def test_stamps_of_others_from_before_the_wall_clock_was_set_back_are_taken(benc
     assert isinstance(refused, Refused)
 
 
+def test_decision_is_taken_though_the_wall_clock_was_set_back(bench):
+    """What was promised lies an hour ahead of it now; refused, the lock would be in doubt for it."""
+    promised_ns = bench.ask(prepare_of(prepared(bench))).stamp_ns
+    bench.wall_ns -= 3600 * S
+
+    assert bench.ask(Finish(ANN, Position(promised_ns + 5, "far"))) == Finished(ANN)
+
+
 def test_client_passes_over_a_stamp_that_no_clock_gives():
     """All its later commits would be refused, by every shard."""
     client = Client("ann", ttl_ns=TTL_NS)

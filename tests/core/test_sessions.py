@@ -340,7 +340,7 @@ class TestWaitingForStamps:
         grant = bench.granted(ANN, item(W))
         bench.disk_is_done = False
         bench.commit(ANN, grant.token, (slot(), "1"))
-        handle = bench.send(AwaitStamp(bench.shard.state.stamps.last_ns, S))
+        handle = bench.send(AwaitStamp(bench.shard.state.stamps.last_ns, S, "ann", 1))
         assert handle not in bench.answers
 
         bench.finish_disk()
@@ -350,7 +350,8 @@ class TestWaitingForStamps:
 
     def test_stamp_of_the_future_is_not_reached_in_time(self, bench):
         """The wait ends with its slice, and says that it did not get there."""
-        handle = bench.send(AwaitStamp(bench.wall_ns + 10 * S, 500 * MS))
+        bench.hello("ann")
+        handle = bench.send(AwaitStamp(bench.wall_ns + 10 * S, 500 * MS, "ann", 1))
         bench.wait(600 * MS)
 
         assert not bench.answers[handle].reached

@@ -235,7 +235,7 @@ def test_host_answers_the_parked_and_grants_nothing_when_it_drains(start, make_p
     granted = holder.acquire("cup")
     answers = []
     host.submit(waiter.acquire_message("cup", wait_s=50.0), answers.append)
-    host.submit(AwaitStamp(2**62, 50_000_000_000), answers.append)
+    host.submit(AwaitStamp(2**62, 50_000_000_000, holder.session, holder.epoch), answers.append)
 
     host.drain()
     idle_at_first = host.wait_idle(0.0)
@@ -252,14 +252,15 @@ def test_host_answers_the_parked_and_grants_nothing_when_it_drains(start, make_p
     assert isinstance(after, Waiting)
 
 
-def test_host_refuses_and_counts_when_too_many_requests_wait(start, monkeypatch):
+def test_host_refuses_and_counts_when_too_many_requests_wait(start, make_peer, monkeypatch):
     """Parked requests are bounded; one too many is told so at once."""
     monkeypatch.setattr("enact_dist.link.host.PARKED_MAX", 2)
     host = start()
-    answers = []
+    peer, answers = make_peer(call_of(host)), []
+    peer.hello()
 
     for _ in range(3):
-        host.submit(AwaitStamp(2**62, 9_000_000_000), answers.append)
+        host.submit(AwaitStamp(2**62, 9_000_000_000, peer.session, peer.epoch), answers.append)
 
     assert [(type(answer), answer.code) for answer in answers] == [(Refused, "overload")]
 

@@ -8,10 +8,10 @@ import threading
 import time
 
 import pytest
+from parked_parts import parked
 from quiet_moments import judge, met_once
 
 from enact_dist.core.messages import (
-    AwaitStamp,
     Committed,
     Granted,
     ListLocks,
@@ -190,13 +190,14 @@ def test_daemon_ends_with_status_0_on_a_signal(process, carry, make_peer, endpoi
     started = process(endpoint)
     holder = speak(carry(endpoint), make_peer)
     holder.acquire("cup", hold_s=600.0)
-    parked = carry(endpoint).begin("s0", AwaitStamp(2**62, 300_000_000_000), timeout_s=300)
+    other = carry(endpoint)
+    begun = other.begin("s0", parked(other, 300.0), timeout_s=300)
     holder.call("s0", ListLocks())
 
     started.send_signal(number)
 
     assert started.wait(120) == 0, started.stderr.read()
-    assert parked.wait() is not None
+    assert begun.wait() is not None
 
 
 @pytest.mark.slow

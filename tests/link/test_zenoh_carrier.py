@@ -6,9 +6,9 @@ import threading
 import time
 
 import pytest
+from parked_parts import parked
 
 from enact_dist.core.messages import (
-    AwaitStamp,
     Committed,
     Fetch,
     ListLocks,
@@ -58,10 +58,10 @@ def test_carrier_keeps_many_calls_in_flight_at_once(daemon, carry, endpoint):
     """100 parked calls and one quick one are under way together; the quick one comes at once."""
     daemon(endpoint)
     carrier = carry(endpoint)
-    parked = [("s0", AwaitStamp(2**62, 2_000_000_000))] * 100  # 200 s one by one
+    waiting = [("s0", parked(carrier, 2.0))] * 100  # 200 s one by one
     started_s = time.monotonic()
 
-    answers = carrier.request_all([*parked, ("s0", ListLocks())], timeout_s=100)
+    answers = carrier.request_all([*waiting, ("s0", ListLocks())], timeout_s=100)
 
     assert [type(answer) for answer in answers] == [*[Reached] * 100, Locks]
     assert time.monotonic() - started_s < 100.0
@@ -72,7 +72,9 @@ def test_carrier_says_unknown_when_an_answer_takes_too_long(daemon, carry, endpo
     """A call that is parked for longer than its caller waits returns None."""
     daemon(endpoint)
 
-    answer = carry(endpoint).request("s0", AwaitStamp(2**62, 5_000_000_000), timeout_s=0.1)
+    carrier = carry(endpoint)
+
+    answer = carrier.request("s0", parked(carrier, 5.0), timeout_s=0.1)
 
     assert answer is None
 
@@ -317,7 +319,7 @@ def test_carrier_wakes_pending_calls_when_it_is_closed(daemon, carry, endpoint):
     daemon(endpoint)
     carrier = carry(endpoint)
     answers = []
-    begun = carrier.begin("s0", AwaitStamp(2**62, 60_000_000_000), timeout_s=60)
+    begun = carrier.begin("s0", parked(carrier, 60.0), timeout_s=60)
     waiting = threading.Thread(target=lambda: answers.append(begun.wait()))
     waiting.start()
     feed = carrier.subscribe()

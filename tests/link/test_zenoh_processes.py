@@ -6,11 +6,14 @@ from enact_dist.core.messages import ListSessions
 
 LEFT_OPEN = """
 import sys, threading
-from enact_dist.core.messages import AwaitStamp
+from enact_dist.core.messages import AwaitStamp, Hello
 from enact_dist.link.zenoh_carrier import ZenohCarrier
 carrier = ZenohCarrier("cell", "left-open", "tester", [sys.argv[1]], ttl_s=2.0)
 feed = carrier.subscribe()
-forever = lambda: carrier.request("s0", AwaitStamp(2**62, 600_000_000_000), timeout_s=600)
+hello = Hello("left-open", 0, 2_000_000_000, "tester", "host", 1, True)
+epoch = carrier.request("s0", hello, timeout_s=60).epoch
+question = AwaitStamp(2**62, 600_000_000_000, "left-open", epoch)
+forever = lambda: carrier.request("s0", question, timeout_s=600)
 threading.Thread(target=forever, daemon=True).start()
 threading.Thread(target=lambda: feed.get(None), daemon=True).start()
 print("open", flush=True)

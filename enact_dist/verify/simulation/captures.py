@@ -96,7 +96,9 @@ class Captures:
             if not stamp_ns:
                 return True
             self._world.tally["surveys that waited"] += 1
-            (answer,) = yield Calls([(shard, AwaitStamp(stamp_ns, SLICE_NS))])
+            session, epoch = host.client.session, host.client.epoch(shard)
+            question = AwaitStamp(stamp_ns, SLICE_NS, session, epoch)
+            (answer,) = yield Calls([(shard, question)])
             if isinstance(answer, Reached) and answer.reached:
                 host.client.reached(shard, stamp_ns)
                 return True
