@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
+from enact_dist.core import quotas
 from enact_dist.core.admission import unknown_world, wrong_access
 from enact_dist.core.datum import Datum, LockId
 from enact_dist.core.messages import (
@@ -77,6 +78,10 @@ class LockDesk:
                 state.count("stale")
                 yield Reply(reply_to, Stale(lock, state.epoch))
                 return
+            if self._has_its_share(session):
+                bound = f"{quotas.WAITERS_MAX} locks held or awaited"
+                yield from state.quotas.refuse(reply_to, session.identity, bound)
+                return
             if state.pins or lock.session in state.tenures.by_session:
                 yield from self._supersede(lock)
             lane.top = lock.seq
@@ -105,6 +110,14 @@ class LockDesk:
                     text = f"aspect {item.aspect!r} has the datum type {entry.fingerprint} now"
                     return Refused(NEWER_TYPE, text)
         return None
+
+    def _has_its_share(self, session: Session) -> bool:
+        """Whether the identity of a session has as many locks as one may have."""
+        tenures = self._state.tenures
+        if not session.identity or len(tenures.by_lock) < quotas.WAITERS_MAX:
+            return False
+        mine = self._state.sessions.of(session.identity)
+        return sum(len(tenures.by_session.get(one, ())) for one in mine) >= quotas.WAITERS_MAX
 
     def _supersede(self, lock: LockId) -> Iterator[Effect]:
         """A newer lock of a lane ends the older ones: their release was lost."""

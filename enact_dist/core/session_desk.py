@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
+from enact_dist.core import quotas
 from enact_dist.core.admission import wrong_aspect, wrong_name
 from enact_dist.core.messages import (
     Alive,
@@ -62,9 +63,17 @@ class SessionDesk:
     def on_hello(self, message: Hello, reply_to: int) -> Iterator[Effect]:
         """Open a session, or take its acknowledgement of this epoch."""
         known = self._state.sessions.by_id.get(message.session)
-        if known is None and len(self._state.sessions.by_id) >= SESSIONS_MAX:
-            yield Reply(reply_to, Refused("overload", f"{SESSIONS_MAX} sessions are open"))
-            return
+        if known is None:
+            sessions, asker = self._state.sessions, self._state.asker
+            if asker and len(sessions.of(asker)) >= quotas.SESSIONS_MAX:
+                bound = f"{quotas.SESSIONS_MAX} sessions"
+                yield from self._state.quotas.refuse(reply_to, asker, bound)
+                return
+            if len(sessions.by_id) >= SESSIONS_MAX:
+                yield from self._make_room()
+            if len(sessions.by_id) >= SESSIONS_MAX:
+                yield Reply(reply_to, Refused("overload", f"{SESSIONS_MAX} sessions are open"))
+                return
         ttl_ns = max(TTL_NS_MIN, min(message.ttl_ns, self._state.settings.ttl_ns_max))
         session, unrecorded = self._state.sessions.hello(
             message,
@@ -98,6 +107,14 @@ class SessionDesk:
         else:
             session.present = session.present or not unrecorded
             yield from self.answer_when_durable(reply_to, welcome, ())
+
+    def _make_room(self) -> Iterator[Effect]:
+        """End the oldest session that has done nothing since its hello, if there is one."""
+        for session in self._state.sessions.unproven():
+            if session.session not in self._state.tenures.by_session:
+                self._state.count("sessions_displaced")
+                yield from self.end(session.session, "it made room for another session")
+                return
 
     def answer_when_durable(
         self,

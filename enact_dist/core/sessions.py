@@ -12,10 +12,11 @@ deadline moves by as much (`stalled`).
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import islice
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Collection, Iterable, Iterator
 
     from enact_dist.core.datum import LockId, Token
     from enact_dist.core.messages import Answer, Changed, Hello
@@ -25,6 +26,8 @@ LANES_MAX: Final = 1024
 """Threads of one process that may hold locks; bounds the outcome table."""
 SESSIONS_MAX: Final = 10_000
 """Sessions of one shard; a cell has some dozens."""
+LOOKED_AT_MAX: Final = 1_000
+"""Sessions among which one is looked for that may make room for another."""
 DRIFT_PER_CENT: Final = 1
 """Assumed bound on the rate error between two hosts' monotonic clocks (a crystal has 0.01 %)."""
 IDLE_TTLS: Final = 4
@@ -107,7 +110,7 @@ class Session:
 class SessionTable:
     """All sessions of one shard, and the grace after a restart."""
 
-    __slots__ = ("_retired", "_tokens", "by_id", "grace_end_ns")
+    __slots__ = ("_of_identity", "_retired", "_tokens", "by_id", "grace_end_ns")
 
     def __init__(
         self,
@@ -119,6 +122,7 @@ class SessionTable:
         self.by_id: dict[str, Session] = {}
         self._tokens: dict[tuple[str, str], None] = {}
         self._retired: dict[str, _Retired] = {}
+        self._of_identity: dict[str, set[str]] = {}
         for record in recovered:
             self.by_id[record.session] = Session(
                 record.session,
@@ -127,6 +131,7 @@ class SessionTable:
                 durable=True,
                 identity=record.identity,
             )
+            self._of_identity.setdefault(record.identity, set()).add(record.session)
         for outcome in outcomes:
             session = self.by_id.get(outcome.lock.session)
             lanes = (
@@ -157,6 +162,25 @@ class SessionTable:
         found = self.by_id.get(session) or self._retired.get(session)
         return found.identity if found is not None else None
 
+    def of(self, identity: str) -> Collection[str]:
+        """Return the sessions of an identity."""
+        return self._of_identity.get(identity, ())
+
+    def _disown(self, session: Session) -> None:
+        mine = self._of_identity.get(session.identity, set())
+        mine.discard(session.session)
+        if not mine:
+            self._of_identity.pop(session.identity, None)
+
+    def unproven(self) -> Iterator[Session]:
+        """Yield sessions, the oldest first, that showed no sign of life since their hello.
+
+        Only the oldest of all are looked at: it is asked for each hello beyond the bound.
+        """
+        for session in islice(self.by_id.values(), LOOKED_AT_MAX):
+            if session.present and not session.token_present and not session.count_seen:
+                yield session
+
     def hello(
         self, message: Hello, *, identity: str, epoch: int, ttl_ns: int, now_ns: int
     ) -> tuple[Session, bool]:
@@ -172,7 +196,10 @@ class SessionTable:
                 session.lanes, session.act = retired.lanes, retired.act
             self.by_id[message.session] = session
         bound = bool(identity) and not session.identity
-        session.identity = session.identity or identity
+        if bound:
+            self._disown(session)
+            session.identity = identity
+        self._of_identity.setdefault(session.identity, set()).add(session.session)
         if (message.session, identity) in self._tokens:
             del self._tokens[message.session, identity]
             session.token_present = True
@@ -242,6 +269,7 @@ class SessionTable:
         found = self.by_id.pop(session, None)
         if found is None:
             return
+        self._disown(found)
         if found.token_present:
             self._expect(session, found.identity)
         if found.lanes or found.act[0]:

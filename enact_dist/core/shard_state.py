@@ -22,6 +22,7 @@ from enact_dist.core.messages import (
     Refused,
     WorldEntry,
 )
+from enact_dist.core.quotas import Quotas
 from enact_dist.core.sessions import Session, SessionTable
 from enact_dist.core.slots import SlotMap
 from enact_dist.core.stamps import Stamps, newest_stamp
@@ -131,6 +132,7 @@ class ShardState:
             epoch=self.epoch, slots=self.slots, sessions=self.sessions, count=self.count
         )
         self.tenures.describe = self.describe
+        self.quotas = Quotas(self.count)
         self.audit = Audit(recovered.audit)
         self.decisions = Decisions(recovered.decisions, now_ns=now_ns, count=self.count)
         self.commits = Commits(

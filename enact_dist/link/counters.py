@@ -109,6 +109,14 @@ OF_A_SHARD: Final[dict[str, Counter]] = {
         "move the shard's folder to another disk; see its log for when",
     ),
     "overloads": Counter("requests refused because too many wait", "find who asks: enact lock ls"),
+    "quota_refused": Counter(
+        "requests refused because their process has its whole share of the shard",
+        "see the shard's log for whose; a program that connects in a loop does that",
+    ),
+    "sessions_displaced": Counter(
+        "sessions that did nothing after their hello and made room where the table was full",
+        "see the shard's log: somebody opens sessions in a loop, under ever new names",
+    ),
     "requests_refused": Counter(
         "requests in the name of another's session or of another shard, or that name no epoch",
         "see the error at who sent them; the same session or process may be copied",

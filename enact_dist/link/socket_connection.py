@@ -26,6 +26,7 @@ from enact_dist.link.socket_frames import (
     send_frame,
     wait_at_most,
 )
+from enact_dist.link.socket_peers import Peer
 from enact_dist.link.socket_watcher import SocketWatcher
 from enact_dist.wire.frames import decode_frame
 
@@ -54,6 +55,7 @@ class SocketConnection:
     Attributes:
         session: For which session it speaks; empty until the service has admitted it.
         identity: Whose that is.
+        peer: Which process is at the other end, as the kernel says.
         step: 3n while it waits for its n-th request, 3n + 1 once it has read that, 3n + 2 once the
             host has it, too.
         ended: Set once the thread is through.
@@ -61,7 +63,7 @@ class SocketConnection:
 
     __slots__ = (
         "_answer", "_answered", "_late", "_rest", "_service", "_stream", "_thread", "connected",
-        "ended", "identity", "session", "step",
+        "ended", "identity", "peer", "session", "step",
     )  # fmt: skip
 
     def __init__(self, service: SocketService, connected: socket.socket) -> None:
@@ -74,6 +76,7 @@ class SocketConnection:
         self._rest: memoryview | None = None
         self.connected = connected
         self.session = self.identity = ""
+        self.peer = Peer(0, 0, 0)
         self.step = 2
         self.ended = threading.Event()
 

@@ -14,6 +14,7 @@ import select
 import socket
 import threading
 import time
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -21,7 +22,7 @@ from enact_dist.core.records import SessionDied
 from enact_dist.errors import LinkError
 from enact_dist.link.socket_connection import SocketConnection, end_socket
 from enact_dist.link.socket_frames import prefixed
-from enact_dist.link.socket_peers import Deaths, check_peer
+from enact_dist.link.socket_peers import Deaths, Peer, check_peer
 from enact_dist.wire.frames import encode_frame
 
 if TYPE_CHECKING:
@@ -35,6 +36,10 @@ CONNECTIONS_MAX: Final = 1024
 """Connections of one shard: each costs a thread and 0.1 MB."""
 SESSION_CONNECTIONS_MAX: Final = 128
 """Connections of one session: one per thread that calls at the same time, and one per feed."""
+PROCESS_CONNECTIONS_MAX: Final = 128
+"""Connections of one process that it may have in any case; more only while many are free."""
+KEPT_FREE: Final = 512
+"""So many connections are for processes with less than that, whatever the others open."""
 BACKLOG: Final = 256
 DRAIN_ROUNDS: Final = 20
 DRAIN_STEP_S: Final = 0.001
@@ -63,6 +68,7 @@ class SocketService:
         self._closing = threading.Event()
         self._mutex = threading.Lock()
         self._connections: dict[str, set[SocketConnection]] = {}
+        self._processes: Counter[Peer] = Counter()
         self._count = 0
         self._watchers: tuple[SocketWatcher, ...] = ()
         self._listener = _listen(folder)
@@ -99,22 +105,46 @@ class SocketService:
         Raises:
             LinkError: It comes from a stranger, or there are too many.
         """
-        check_peer(connection.connected, users=self._users, group=self._access.group)
+        peer = check_peer(connection.connected, users=self._users, group=self._access.group)
+        connection.peer = peer
         with self._mutex:
-            mine = self._connections.setdefault(session, set())
-            if self._closing.is_set() or self._count >= CONNECTIONS_MAX:
-                problem = f"{CONNECTIONS_MAX} connections to shard {self.host.name} are open"
-            elif len(mine) >= SESSION_CONNECTIONS_MAX:
-                problem = f"session {session[:8]} has {SESSION_CONNECTIONS_MAX} connections open"
-            else:
+            mine = self._connections.get(session, set())
+            problem = self._problem_with(session, mine, peer)
+            crowded = not problem and self._has_its_share(peer)
+            if not problem and not crowded:
+                self._connections[session] = mine
                 mine.add(connection)
+                self._processes[peer] += 1
                 self._count += 1
-                problem = ""
-            if not mine:
-                del self._connections[session]
+        if crowded:
+            self.host.count("quota_refused")
+            problem = (
+                f"process {peer.pid} has {PROCESS_CONNECTIONS_MAX} connections or more to shard"
+                f" {self.host.name} open, and the last {KEPT_FREE} are for others"
+            )
         if problem:
             raise LinkError(problem)
         self._deaths.connected(session, connection.connected)
+
+    def _problem_with(self, session: str, mine: set[SocketConnection], peer: Peer) -> str:
+        """Return why a process may not have one more connection for a session; "" if it may."""
+        other = next((one.peer for one in mine if one.peer != peer), None)
+        if other is not None:
+            # One session is one process; it would not know what the other one does in its name.
+            return (
+                f"session {session[:8]} belongs to process {other.pid} of user {other.user};"
+                f" process {peer.pid} of user {peer.user} may not speak for it"
+            )
+        if len(mine) >= SESSION_CONNECTIONS_MAX:
+            return f"session {session[:8]} has {SESSION_CONNECTIONS_MAX} connections open"
+        if self._closing.is_set() or self._count >= CONNECTIONS_MAX:
+            return f"{CONNECTIONS_MAX} connections to shard {self.host.name} are open"
+        return ""
+
+    def _has_its_share(self, peer: Peer) -> bool:
+        """Whether a process has to leave the connections that are free to others."""
+        free = CONNECTIONS_MAX - self._count
+        return self._processes[peer] >= PROCESS_CONNECTIONS_MAX and free <= KEPT_FREE
 
     def left(self, connection: SocketConnection, session: str) -> None:
         """Take note that an admitted connection has ended."""
@@ -122,6 +152,9 @@ class SocketService:
             mine = self._connections.get(session, set())
             mine.discard(connection)
             self._count -= 1
+            self._processes[connection.peer] -= 1
+            if not self._processes[connection.peer]:
+                del self._processes[connection.peer]
             if not mine:
                 self._connections.pop(session, None)
         self._deaths.disconnected(session)

@@ -34,6 +34,17 @@ from enact_dist.wire.frames import decode_frame, encode_frame
 ANSWER_S = 30.0
 """How long an answer that nothing delays may take on a busy machine."""
 
+OPENS = """
+import socket, sys
+from enact_dist.link.socket_frames import Kind, Stream, greeting_of, send_frame
+near = socket.socket(socket.AF_UNIX)
+near.connect(sys.argv[1])
+send_frame(near, greeting_of(sys.argv[2], "tester"), kind=Kind.OPEN)
+kind, text, _ = Stream(near).receive()
+print(int(kind), text.decode(), sep="\\n", flush=True)
+sys.stdin.read()
+"""
+
 # ---------------------------------------------------------------- what the shard refuses
 
 
@@ -112,6 +123,41 @@ def test_session_with_too_many_connections_is_refused_by_name(raw, monkeypatch):
     assert (kind, b"3 connections" in text) == (Kind.REFUSED, True)
     assert isinstance(ask(raw("modest"), ListLocks()), Locks)
     assert isinstance(ask(kept[0], ListLocks()), Locks)
+
+
+def test_process_that_opens_more_than_its_share_leaves_the_rest_to_others(
+    raw, monkeypatch, program, until
+):
+    """While many are free it may have more; the last ones are for processes with fewer."""
+    for name, most in (("CONNECTIONS_MAX", 8), ("PROCESS_CONNECTIONS_MAX", 3), ("KEPT_FREE", 4)):
+        monkeypatch.setattr(socket_service, name, most)
+    kept = [raw(f"greedy{number}") for number in range(4)]
+    one_more = raw("greedy4", greet=False)
+    send_frame(one_more, greeting_of("greedy4", "tester"), kind=Kind.OPEN)
+    kind, text, _ = Stream(one_more).receive()
+    folder = raw.shard._shared.path
+    other = program(OPENS, folder / "socket", "modest")
+
+    assert kind == Kind.REFUSED
+    assert b"the last 4 are for others" in text
+    assert other.stdout.readline() == f"{int(Kind.OPENED)}\n"
+    assert counters(raw.shard)["quota_refused"] == 1
+    kept[0].close()
+    kept[1].close()
+    until(lambda: raw.shard._sockets._count == 3)
+    raw("greedy4")
+
+
+def test_session_of_one_process_is_not_opened_by_another_one(raw, program):
+    """The kernel says who connects; a session is one process."""
+    mine = raw("mine")
+    other = program(OPENS, raw.shard._shared.path / "socket", "mine")
+
+    assert other.stdout.readline() == f"{int(Kind.REFUSED)}\n"
+    text = other.stdout.readline()
+    assert f"belongs to process {os.getpid()} of user" in text
+    assert f"process {other.pid} of user" in text
+    assert isinstance(ask(mine, ListLocks()), Locks)
 
 
 def test_place_of_a_connection_is_free_again_when_it_ends(raw, monkeypatch, until):
