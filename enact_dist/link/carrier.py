@@ -184,6 +184,12 @@ class Carrier(Protocol):
     def way_to(self, shard: str) -> str:
         """Return how calls to a shard travel now, for people: "zenoh", "socket", …."""
 
+    def away(self, shard: str) -> bool:
+        """Whether a shard is known to be out of reach; asks nobody.
+
+        Once it no longer is, what `tell_returns` was given is called.
+        """
+
     def tell_returns(self, returned: Callable[[str], None]) -> None:
         """Call `returned` with the name of each shard that comes (back) into reach.
 

@@ -12,8 +12,10 @@ from __future__ import annotations
 
 import itertools
 import logging
+import random
 from typing import TYPE_CHECKING, Final
 
+from enact_dist.core.backoff import CALLED_NS_MAX, CALLED_NS_MIN, Backoff
 from enact_dist.core.lock_desk import NEWER_TYPE
 from enact_dist.core.messages import (
     OUTCOME_COMMITTED,
@@ -164,11 +166,12 @@ class CellClient(SessionClient):
 
     def _pause(self, pause_s: float) -> None:
         """Wait before asking again; raises if the cell is closed meanwhile."""
-        if self._rest(pause_s, self._returns):
+        if self._pauses.rest(pause_s):
             self.check_usable()
 
     def _drive(self, lock: MultiLock, *, interrupt: threading.Event | None = None) -> None:
         """Make the lock's calls until it rests."""
+        far, returns = Backoff(CALLED_NS_MIN, CALLED_NS_MAX, random.random), self._pauses.returns
         try:
             while lock.phase.busy or interrupt is not None:
                 with self._mutex:
@@ -178,9 +181,12 @@ class CellClient(SessionClient):
                 if not calls:
                     if not lock.phase.busy:
                         return
-                    pause_s = (wait_until_ns - self._now_ns()) / 1e9
-                    self._pause(max(0.001, min(pause_s, lock.slice_ns / 1e9)))
+                    if lock.silent_shard and self.carrier.away(lock.silent_shard):
+                        later_ns = self._now_ns() + far.pause_ns()
+                        wait_until_ns = min(max(wait_until_ns, later_ns), lock.give_up_ns)
+                    self._wait_until(lock, wait_until_ns, returns, interrupt)
                     continue
+                returns = self._pauses.returns
                 answers = self._send(calls)
                 with self._mutex:
                     for (shard, request), answer in zip(calls, answers, strict=True):
@@ -195,6 +201,20 @@ class CellClient(SessionClient):
         finally:
             if lock.farewells:
                 self._say_farewell(lock)
+
+    def _wait_until(
+        self, lock: MultiLock, until_ns: int, returns: int, interrupt: threading.Event | None
+    ) -> None:
+        """Wait before a lock asks again, unless a shard has come back since or it is given up."""
+        while True:
+            left_ns = max(1_000_000, until_ns - self._now_ns())
+            if interrupt is not None:
+                left_ns = min(left_ns, lock.slice_ns)
+            if self._pauses.rest(left_ns / 1e9, returns):
+                self.check_usable()
+            interrupted = interrupt is not None and interrupt.is_set()
+            if interrupted or self._pauses.returns != returns or self._now_ns() >= until_ns:
+                return
 
     def _say_farewell(self, lock: MultiLock) -> None:
         """Send the releases of a lock that rests; the keep-alives repair what gets lost."""

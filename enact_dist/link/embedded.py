@@ -155,6 +155,10 @@ class EmbeddedCarrier:
         """Return how calls travel: not at all."""
         return "call"
 
+    def away(self, shard: str) -> bool:
+        """Say no: the shard is in this process."""
+        return False
+
     def tell_returns(self, returned: Callable[[str], None]) -> None:
         """Do nothing: the shard is in reach as long as this process lives."""
 

@@ -13,10 +13,12 @@ from __future__ import annotations
 import itertools
 import logging
 import os
+import random
 import threading
 import weakref
 from typing import TYPE_CHECKING, Final
 
+from enact_dist.core.backoff import CALLED_NS_MAX, CALLED_NS_MIN, Backoff, SignsOfLife
 from enact_dist.core.messages import (
     Alive,
     Answer,
@@ -28,6 +30,7 @@ from enact_dist.core.messages import (
     Register,
     Welcome,
 )
+from enact_dist.core.multilock import RETRY_NS_MAX, RETRY_NS_MIN
 from enact_dist.core.placement import shard_of
 from enact_dist.errors import EnactError, MisuseError
 from enact_dist.link.calls import CALL_S, Calls, patience_s
@@ -36,6 +39,7 @@ from enact_dist.link.catalogue import CATALOGUES, KnownCatalogue
 from enact_dist.link.clock import boottime_ns
 from enact_dist.link.further_shards import FurtherShards
 from enact_dist.link.lanes import Lanes
+from enact_dist.link.pauses import Pauses
 from enact_dist.link.payload_client import SharedPayloads
 from enact_dist.link.refusals import error_of, unreachable
 from enact_dist.link.used_names import SERIES_BITS
@@ -97,9 +101,8 @@ class SessionClient:
         self.staged_numbers = itertools.count(FIRST_STAGED)
         self._now_ns = now_ns
         self._mutex = threading.RLock()
-        self._stopping = threading.Event()
-        self._news = threading.Condition(threading.Lock())
-        self._returns = 0
+        self._pauses = Pauses()
+        self._signs = SignsOfLife(random.random)
         self._lanes = Lanes()
         self._catalogue = KnownCatalogue()
         self.payloads = SharedPayloads(
@@ -130,9 +133,7 @@ class SessionClient:
         if self.closed or self.forked:
             return
         self.closed = True
-        with self._news:
-            self._stopping.set()
-            self._news.notify_all()
+        self._pauses.end()
         if self._renewer is not None and self._renewer.is_alive():
             self._renewer.join()
         goodbyes = [(shard, Goodbye(self.core.session)) for shard in self.core.shards_in_use()]
@@ -190,22 +191,25 @@ class SessionClient:
         self.check_usable()
         made = Calls(calls)
         deadline_ns = self._deadline_ns(timeout_s)
-        pause_s = 0.02
+        near = Backoff(RETRY_NS_MIN, RETRY_NS_MAX, random.random)
+        far = Backoff(CALLED_NS_MIN, CALLED_NS_MAX, random.random)
         while left := made.left:
             sent = [made.asked[index] for index in left]
-            epochs = [self.core.epoch(shard) for shard, _ in sent]
+            epochs, returns = [self.core.epoch(shard) for shard, _ in sent], self._pauses.returns
             turned = False
             for index, answer, epoch in zip(left, self._send(sent), epochs, strict=True):
                 if answer is not None:
                     self._take(*made.asked[index], answer, epoch)
                     turned |= made.take(index, answer)
+            left_ns = deadline_ns - self._now_ns()
             if turned:
                 deadline_ns = self._deadline_ns(timeout_s)
-            elif made.left and self._now_ns() >= deadline_ns:
+            elif made.left and left_ns <= 0:
                 break
             elif made.left:
-                self._rest(pause_s, self._returns)
-                pause_s = min(2 * pause_s, 0.3)
+                away = all(self.carrier.away(made.asked[index][0]) for index in made.left)
+                pause_ns = (far if away else near).pause_ns()
+                self._pauses.rest(min(pause_ns, left_ns) / 1e9, returns)
         return made.answers
 
     def _deadline_ns(self, timeout_s: float | None) -> int:
@@ -286,7 +290,7 @@ class SessionClient:
 
     def rest(self, pause_s: float) -> None:
         """Wait a little before something is asked again, but not once a shard has come back."""
-        self._rest(pause_s, self._returns)
+        self._pauses.rest(pause_s)
 
     def _staged(self, shard: str, request: Request) -> Answer | None:
         return self.call_once([(shard, request)])[0]
@@ -429,9 +433,13 @@ class SessionClient:
     def _renew(self) -> None:
         returns = 0
         while True:
-            if self._rest(self.core.ttl_ns / 4e9, returns):
+            shards, usual_ns = self.core.shards_in_use(), self.core.ttl_ns // 4
+            if self._pauses.rest(
+                self._signs.pause_ns(shards, self.carrier.away, usual_ns, self._now_ns()) / 1e9,
+                returns,
+            ):
                 return
-            returns = self._returns
+            returns = self._pauses.returns
             try:
                 self.renew_once()
                 if any(self.core.needs_hello(shard) for shard in self.core.shards_in_use()):
@@ -441,29 +449,21 @@ class SessionClient:
                 self.count("keep_alives_failed")
                 _log.warning("keep-alive of session %s: %s", self.core.session[:8], error)
 
-    def _rest(self, pause_s: float, returns: int) -> bool:
-        """Wait, but not once more shards than `returns` have come back; say whether it is over."""
-        with self._news:
-            self._news.wait_for(
-                lambda: self._stopping.is_set() or self._returns != returns, max(0.0, pause_s)
-            )
-        return self._stopping.is_set()
-
     def _shard_returned(self, _: str) -> None:
         """Let everybody who waits ask again at once."""
         with self._mutex:
             self.core.ask_again()
-        with self._news:
-            self._returns += 1
-            self._news.notify_all()
+        self._pauses.shard_returned()
 
     def renew_once(self) -> None:
-        """Send one keep-alive to every shard in use and take the answers."""
+        """Send one keep-alive to every shard in use that is in reach, and take the answers.
+
+        One that is known to be away is asked more and more rarely.
+        """
         with self._mutex:
             now_ns = self._now_ns()
-            calls = [
-                (shard, self.core.keep_alive(shard, now_ns)) for shard in self.core.shards_in_use()
-            ]
+            due = self._signs.due(self.core.shards_in_use(), self.carrier.away, now_ns)
+            calls = [(shard, self.core.keep_alive(shard, now_ns)) for shard in due]
         answers = self.carrier.request_all(calls, timeout_s=max(0.1, self.core.ttl_ns / 4e9))
         for (shard, request), answer in zip(calls, answers, strict=True):
             if answer is not None:

@@ -272,6 +272,11 @@ class SocketCarrier:
             for feed in list(self._feeds.values()):
                 feed.settle()
 
+    def away(self, shard: str) -> bool:
+        """Whether a shard is out of reach: of Zenoh, and of a socket as far as was tried."""
+        line = self._lines.get(shard)
+        return (line is None or bool(line.problem)) and self._behind.away(shard)
+
     def tell_returns(self, returned: Callable[[str], None]) -> None:
         """Call `returned` with the name of each shard that comes (back) into reach."""
         self._behind.tell_returns(returned)

@@ -196,6 +196,8 @@ class ZenohCarrier:
     def _send(
         self, shard: str, message: Request, timeout_s: float
     ) -> zenoh.Handler[zenoh.Reply] | None:
+        if self.away(shard):
+            return None  # Zenoh knows of nobody who would answer
         link = self._link_of.get(shard) or self._links[0]
         header, payload = encode_frame(message)
         priority = _CONTROL
@@ -340,6 +342,11 @@ class ZenohCarrier:
     def way_to(self, shard: str) -> str:
         """Return how calls travel, for people."""
         return "zenoh"
+
+    def away(self, shard: str) -> bool:
+        """Whether Zenoh has noted that a shard is out of reach."""
+        presence = self._presences.get(shard)
+        return presence is not None and not presence.here
 
     def tell_returns(self, returned: Callable[[str], None]) -> None:
         """Call `returned` with the name of each shard that comes (back) into reach."""

@@ -13,7 +13,8 @@ relay between peers).  Reasons for the settings, measured with 1.10 on a loopbac
   the link of whoever was sent something meanwhile, though not its lease.
 - `max_wait_before_drop_fragments` 2 s: slices of a large datum over a slow network are not
   dropped after 50 ms; only senders of their own ever wait for it.
-- Reconnection every 50 ms: a restarted shard is back in use after 0.1 s, not 1 s.
+- Reconnection after 50 ms, then more and more rarely up to once a second: a shard that restarts
+  at once is back in use after 0.1 s, and one that stays away costs its clients nothing.
 - `zenoh_access`: who listens relays nothing, and silent connections keep nobody out.
 - `zenoh_links`: lost connections hold up nobody, and a cut one is back soon.
 
@@ -27,6 +28,7 @@ import atexit
 import ctypes
 import json
 import os
+import random
 import weakref
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
@@ -45,6 +47,9 @@ QUEUED_MAX: Final = 65_536
 """Messages in a channel between Zenoh and Python: the network thread must not wait for Python."""
 MESSAGE_BYTES_MAX: Final = BODY_BYTES_MAX + HEADER_BYTES_MAX + (1 << 20)
 """Longest message: the largest datum with its header."""
+RETRY_MS, RETRY_MS_MAX, RETRY_FACTOR = 50, 1_000, 1.5
+"""Pauses between two attempts to connect to a place where nobody listens: they grow from the first
+to the second figure, or to a part of it that each session draws."""
 CONNECT_WAIT_MS: Final = 50
 """How long `open` may wait for a connection; where there is none it goes on trying behind."""
 OPEN_S: Final = 5.0
@@ -79,7 +84,11 @@ def session_config(
     Raises:
         ConfigError: Zenoh does not understand an endpoint.
     """
-    retry = {"period_init_ms": 50, "period_max_ms": 50, "period_increase_factor": 1}
+    retry = {
+        "period_init_ms": RETRY_MS,
+        "period_max_ms": round(RETRY_MS_MAX * (1 - random.random() / 2)),  # noqa: S311 - no secret
+        "period_increase_factor": RETRY_FACTOR,
+    }
     congestion = {
         "drop": {"wait_before_drop": 1_000, "max_wait_before_drop_fragments": 2_000_000},
         "block": {"wait_before_close": round(1e6 * (lease_s if listen else CLIENT_BLOCK_S))},

@@ -1,18 +1,24 @@
-"""Looks after the connections of a Zenoh session: none holds up others, a cut one is back soon.
+"""Looks after the connections of Zenoh's sessions: none holds up others, a cut one is back soon.
 
 `settle` says what a connection is given as soon as it is there, and why.
 
 A connection that nobody answers is repeated by the kernel once a second at best, so after a cut
-Zenoh is connected again up to 1.1 s late (0.6 s with this).  From the loss of a connection on,
-whoever waits for an answer longer than `LOOK_S` is therefore checked: if a connection of our own is
-answered at once, the network is there again and the waiting one is given up; Zenoh tries anew after
-50 ms.
+Zenoh is connected again up to 1.1 s late (0.6 s with this).  From the loss of a connection to
+another host on, whoever waits for an answer longer than `LOOK_S` is therefore checked: if a
+connection of our own is answered at once, the network is there again and the waiting one is given
+up; Zenoh tries anew after 50 ms.
+
+Sockets are found by listing all descriptors of the process.  One thread does that for all sessions
+of the process together, at most once in `COST` times the time that it takes, and the more rarely
+the longer a connection has been lost: what it costs grows neither with the connections nor with
+the time for which a shard is away.
 """
 
 from __future__ import annotations
 
 import contextlib
 import logging
+import queue
 import socket
 import threading
 import time
@@ -21,15 +27,19 @@ from typing import TYPE_CHECKING, Final
 import zenoh
 
 from enact_dist.link.endpoints import split_endpoint
+from enact_dist.link.zenoh_events import Events
 from enact_dist.link.zenoh_sockets import give_up, settle, unanswered
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
+    from typing import TypeAlias
 
-EVENTS_MAX: Final = 65_536
-"""Comings and goings of connections that wait to be looked at."""
 LOOK_S: Final = 0.1
-"""How often is looked while a connection is lost, and how soon a host has to answer."""
+"""How soon is looked after the loss of a connection, and how soon a host has to answer."""
+LOOK_S_MAX: Final = 2.0
+"""The longest pause between two looks."""
+LATER: Final = 10
+"""A look comes a tenth of the time later for which a connection has been lost."""
 COST: Final = 50
 """A look lists all descriptors of the process; the pause after it is this many times as long."""
 FAILED_S: Final = 1.0
@@ -39,9 +49,15 @@ JOIN_S: Final = 1.0
 _FAILED: Final = "connections are not looked after at the moment: %s"
 _log = logging.getLogger("enact.link")
 
+Host: TypeAlias = "tuple[str, int]"
+
 
 class LinkWatch:
-    """Looks after the connections of a session, from a thread of its own, until that is closed.
+    """Looks after the connections of a session until that is closed.
+
+    Attributes:
+        lost: Where connections went that are lost, of a session that connects.
+        patience_s: As given.
 
     Args:
         session: Not closed with this.
@@ -50,78 +66,158 @@ class LinkWatch:
     """
 
     def __init__(self, session: zenoh.Session, connect: Sequence[str], patience_s: float) -> None:
-        self._connect = tuple(connect)
-        self._patience_s = patience_s
-        self._lost = 0
-        self._closing = threading.Event()
-        self._listener = session.info.declare_link_events_listener(
-            zenoh.handlers.FifoChannel(EVENTS_MAX), history=True
-        )
-        self._thread = threading.Thread(
-            target=self._run, args=(self._listener.handler,), name="enact-links", daemon=True
-        )
+        self.lost: list[str] = []
+        self.patience_s = patience_s
+        self._connects = bool(connect)
+        _keeper.enter(self)
+        try:
+            self._events: Events[zenoh.LinkEvent] = Events(
+                "enact-link-events",
+                lambda callback: session.info.declare_link_events_listener(callback, history=True),
+                lambda event: _keeper.tell(self, event),
+            )
+        except BaseException:
+            _keeper.leave(self)
+            raise
+
+    def note(self, events: Iterable[zenoh.LinkEvent]) -> None:
+        """Take what came and went."""
+        if self._connects:
+            self.lost = _lost_after(events, self.lost)
+
+    def join(self) -> None:
+        """Wait for the end of what is heard, which follows that of the session."""
+        self._events.join(JOIN_S)
+        _keeper.leave(self)
+
+
+Told: TypeAlias = "tuple[LinkWatch, zenoh.LinkEvent]"
+
+
+class _Keeper:
+    """The one thread of this process that looks after connections, while there are sessions."""
+
+    def __init__(self) -> None:
+        self._mutex = threading.Lock()
+        self._watches: set[LinkWatch] = set()
+        self._round: _Round | None = None
+
+    def enter(self, watch: LinkWatch) -> None:
+        """Look after the connections of a session from now on."""
+        with self._mutex:
+            if self._round is None:
+                self._round = _Round()
+            self._watches.add(watch)
+
+    def tell(self, watch: LinkWatch, event: zenoh.LinkEvent) -> None:
+        """Let the thread know what came or went; does not wait for it."""
+        current = self._round
+        if current is not None:
+            current.told.put((watch, event))
+
+    def leave(self, watch: LinkWatch) -> None:
+        """Forget a session; with the last one the thread ends."""
+        with self._mutex:
+            self._watches.discard(watch)
+            ended = None
+            if self._watches:
+                if self._round is not None:
+                    self._round.forget(watch)
+            else:
+                ended, self._round = self._round, None
+        if ended is not None:
+            ended.end()
+
+
+_keeper = _Keeper()
+
+
+class _Round:
+    """The life of that thread, from the first session to the end of the last one."""
+
+    def __init__(self) -> None:
+        self.told: queue.SimpleQueue[Told | None] = queue.SimpleQueue()
+        self._over = threading.Event()
+        self._losing: set[LinkWatch] = set()
+        self._lost_s = self._look_s = self._rest_until_s = 0.0
+        self._waited: set[int] = set()
+        self._thread = threading.Thread(target=self._run, name="enact-links", daemon=True)
         self._thread.start()
 
-    def _run(self, events: zenoh.Handler[zenoh.LinkEvent]) -> None:
-        while True:
-            try:
-                self._note(_all_here(events, events.recv()))
-                if self._lost and self._connect:
-                    self._knock(events)
-            except zenoh.ZError:  # the session is closed
+    def _run(self) -> None:
+        while not self._over.is_set():
+            here = self._here()
+            if self._over.wait(max(0.0, self._rest_until_s - time.monotonic())):
                 return
+            here += _all_here(self.told)  # they are settled by one look
+            began_s = time.thread_time()
+            pause_s = 0.0
+            try:
+                self._note(here)
+                if self._losing and time.monotonic() >= self._look_s:
+                    self._waited = _given_up(_hosts_of(self._losing), self._waited)
             except Exception as error:  # noqa: BLE001 - no descriptor is free, most likely
                 _log.warning(_FAILED, error)
+                pause_s = FAILED_S
+            self._rest(time.thread_time() - began_s, pause_s)
 
-    def _note(self, here: Sequence[zenoh.LinkEvent]) -> None:
-        """Count what is lost, and settle what has come if that can be done."""
-        self._lost = _lost_after(here, self._lost)
+    def _here(self) -> list[Told]:
+        """Wait for what comes or goes, or until a look is due; return it."""
+        wait_s = max(0.0, self._look_s - time.monotonic()) if self._losing else None
         try:
-            _settle_new(here, self._patience_s)
+            first = self.told.get(timeout=wait_s)
+        except queue.Empty:
+            return []
+        return [first] if first is not None else []
+
+    def _rest(self, cost_s: float, pause_s: float) -> None:
+        """Say when is looked again, after what the last time has cost."""
+        now_s = time.monotonic()
+        self._rest_until_s = now_s + min(FAILED_S, COST * cost_s)
+        later_s = min(LOOK_S_MAX, (now_s - self._lost_s) / LATER)
+        self._look_s = now_s + max(LOOK_S, later_s, pause_s)
+
+    def _note(self, here: Sequence[Told]) -> None:
+        """Count what is lost, and settle what has come if that can be done."""
+        for watch in {watch: None for watch, _ in here}:
+            events = [event for of, event in here if of is watch]
+            before = watch.lost
+            watch.note(events)
+            if watch.lost and watch.lost != before:
+                self._lost_s = self._look_s = time.monotonic()
+            (self._losing.add if _hosts_of((watch,)) else self._losing.discard)(watch)
+        try:
+            _settle_new(here)
         except Exception as error:  # noqa: BLE001 - what is lost is looked after all the same
             _log.warning(_FAILED, error)
 
-    def _knock(self, events: zenoh.Handler[zenoh.LinkEvent]) -> None:
-        """Look at what waits for an answer until every lost connection is back."""
-        hosts, pause_s = list(_hosts_of(self._connect)), LOOK_S
-        waited: set[int] = set()
-        while not self._closing.wait(pause_s):
-            event = events.try_recv()
-            if event is not None:
-                self._note(_all_here(events, event))
-            if not self._lost:
-                return
-            began_s = time.thread_time()
-            try:
-                waited = _given_up(hosts, waited)
-            except Exception as error:  # noqa: BLE001 - as above; nothing else would wake us
-                _log.warning(_FAILED, error)
-                pause_s = FAILED_S
-            else:
-                pause_s = max(LOOK_S, COST * (time.thread_time() - began_s))
+    def forget(self, watch: LinkWatch) -> None:
+        """Look no more for what a closed session has lost."""
+        self._losing.discard(watch)
 
-    def join(self) -> None:
-        """Wait for the end of the thread, which follows that of the session."""
-        self._closing.set()
-        self._thread.join(JOIN_S)
+    def end(self) -> None:
+        """End the thread."""
+        self._over.set()
+        self.told.put(None)
+        if self._thread is not threading.current_thread():
+            self._thread.join(JOIN_S)
 
 
-def _given_up(hosts: Iterable[tuple[str, int]], waited: set[int]) -> set[int]:
+def _given_up(hosts: Iterable[Host], waited: set[int]) -> set[int]:
     """Give up what has `waited` since the last look for a host that answers; return what waits."""
-    waiting = {host: unanswered(*host) for host in hosts}
+    waiting = unanswered(hosts)
     for host, inodes in waiting.items():
         if inodes & waited and _answers(*host):
             give_up(inodes & waited)
     return set().union(*waiting.values())
 
 
-def _all_here(
-    events: zenoh.Handler[zenoh.LinkEvent], first: zenoh.LinkEvent
-) -> list[zenoh.LinkEvent]:
-    """Return the first event and all that wait behind it."""
-    here = [first]
-    while (event := events.try_recv()) is not None:
-        here.append(event)
+def _all_here(told: queue.SimpleQueue[Told | None]) -> list[Told]:
+    """Return all that waits."""
+    here = []
+    with contextlib.suppress(queue.Empty):
+        while (one := told.get_nowait()) is not None:
+            here.append(one)
     return here
 
 
@@ -130,35 +226,54 @@ def _has_come(event: zenoh.LinkEvent) -> bool:
     return event.kind == zenoh.SampleKind.PUT
 
 
-def _settle_new(events: Iterable[zenoh.LinkEvent], patience_s: float) -> None:
+def _settle_new(here: Iterable[Told]) -> None:
     """Settle the connections that have come.
 
     A thousand that come at once are settled together: each look lists all descriptors.
     """
     came = {
-        (_port_of(event.link.src), _port_of(event.link.dst)) for event in events if _has_come(event)
+        (_port_of(event.link.src), _port_of(event.link.dst)): watch.patience_s
+        for watch, event in here
+        if _has_come(event)
     }
     if came:
-        settle(came, patience_s)
+        settle(came)
 
 
-def _lost_after(events: Iterable[zenoh.LinkEvent], lost: int = 0) -> int:
-    """Return how many connections are lost after these events, of `lost` before.
+def _lost_after(events: Iterable[zenoh.LinkEvent], lost: Sequence[str] = ()) -> list[str]:
+    """Return where connections went that are lost after these events, of `lost` before.
 
-    One that comes stands for one that was lost, where there is such a one.
+    One that comes stands for one that was lost, where there is such a one: for that to the same
+    place, else for the oldest, since a host may have another address now.
     """
+    left = list(lost)
     for event in events:
-        lost = max(0, lost - 1) if _has_come(event) else lost + 1
-    return lost
+        if not _has_come(event):
+            left.append(event.link.dst)
+        elif left:
+            left.remove(event.link.dst if event.link.dst in left else left[0])
+    return left
 
 
-def _hosts_of(endpoints: Iterable[str]) -> Iterable[tuple[str, int]]:
-    """Yield the IPv4 addresses and ports of endpoints."""
-    for endpoint in endpoints:
+def _hosts_of(watches: Iterable[LinkWatch]) -> set[Host]:
+    """Return the IPv4 addresses and ports of other hosts to which connections are lost."""
+    hosts = set()
+    for endpoint in {endpoint for watch in watches for endpoint in watch.lost}:
         protocol, host, _ = split_endpoint(endpoint)
-        if protocol == "tcp":
-            with contextlib.suppress(OSError, UnicodeError):  # IPv6, or not known yet
-                yield socket.gethostbyname(host), _port_of(endpoint)
+        if protocol == "tcp" and _is_elsewhere(host):
+            hosts.add((host, _port_of(endpoint)))
+    return hosts
+
+
+def _is_elsewhere(address: str) -> bool:
+    """Say whether an IPv4 address is that of another host: the way to our own is never cut."""
+    try:
+        socket.inet_aton(address)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as mine:
+            mine.bind((address, 0))
+    except OSError as error:
+        return error.errno is not None  # else it is no IPv4 address
+    return False
 
 
 def _port_of(endpoint: str) -> int:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator
+    from collections.abc import Iterable, Iterator, Mapping
 
 _DESCRIPTORS: Final = Path("/proc/self/fd")
 _TABLE: Final = Path("/proc/self/net/tcp")
@@ -28,7 +28,7 @@ _INTERNET: Final = (socket.AF_INET, socket.AF_INET6)
 _log = logging.getLogger("enact.link")
 
 
-def settle(ports: Collection[tuple[int, int]], patience_s: float) -> int:
+def settle(patience_s: Mapping[tuple[int, int], float]) -> int:
     """Let connections end when nobody acknowledges what they sent, and close at once.
 
     Zenoh 1.10 waits for the kernel in two places, each time with threads that serve everybody:
@@ -43,8 +43,8 @@ def settle(ports: Collection[tuple[int, int]], patience_s: float) -> int:
       on sending what is left, behind the process's back.
 
     Args:
-        ports: Own and other port of each; only connections with exactly Zenoh's linger time count.
-        patience_s: How long sent bytes, or a closed window, may stay as they are.
+        patience_s: Own and other port of each connection, and how long sent bytes, or a closed
+            window, may stay as they are; only connections with exactly Zenoh's linger time count.
 
     Returns:
         How many were settled; each is once.
@@ -54,28 +54,37 @@ def settle(ports: Collection[tuple[int, int]], patience_s: float) -> int:
         with connection, contextlib.suppress(OSError):
             if connection.getsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _LINGER.size) != _ZENOHS:
                 continue
-            if (connection.getsockname()[1], connection.getpeername()[1]) not in ports:
+            ports = connection.getsockname()[1], connection.getpeername()[1]
+            if ports not in patience_s:
                 continue
-            patience_ms = max(1, round(1e3 * patience_s))
+            patience_ms = max(1, round(1e3 * patience_s[ports]))
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, patience_ms)
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _NONE)
             found += 1
     return found
 
 
-def unanswered(address: str, port: int) -> set[int]:
-    """Return the inodes of this process's sockets that wait for this IPv4 address to answer."""
+def unanswered(hosts: Iterable[tuple[str, int]]) -> dict[tuple[str, int], set[int]]:
+    """Return the inodes of this process's sockets that wait for IPv4 addresses to answer."""
+    hosts = tuple(hosts)
     waiting = set()
     for connection in connections():
         with connection, contextlib.suppress(OSError):
             if _state(connection) == _SYN_SENT:
                 waiting.add(os.fstat(connection.fileno()).st_ino)
     if not waiting:
-        return waiting
+        return {host: set() for host in hosts}
     # The kernel does not tell whom a socket waits for, except in its table.
-    whom = f"{int.from_bytes(socket.inet_aton(address), 'little'):08X}:{port:04X}"
     rows = [line.split() for line in _TABLE.read_text().splitlines()[1:]]
-    return waiting & {int(row[9]) for row in rows if row[2] == whom}
+    inodes = {(row[2], int(row[9])) for row in rows}
+    return {
+        host: {inode for inode in waiting if (_written(*host), inode) in inodes} for host in hosts
+    }
+
+
+def _written(address: str, port: int) -> str:
+    """Return an address as the kernel's table has it."""
+    return f"{int.from_bytes(socket.inet_aton(address), 'little'):08X}:{port:04X}"
 
 
 def give_up(inodes: set[int]) -> None:

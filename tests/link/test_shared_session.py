@@ -141,6 +141,9 @@ class Carrier:
         self.failures = list(failures)
         self.tried = 0
 
+    def away(self, shard):
+        return False
+
     def add_endpoints(self, entries):
         self.tried += 1
         if self.failures:

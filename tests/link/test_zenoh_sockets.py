@@ -18,7 +18,7 @@ import zenoh
 from enact_dist.link import zenoh_config, zenoh_links
 from enact_dist.link.zenoh_carrier import wait_connected
 from enact_dist.link.zenoh_config import close_session, open_session
-from enact_dist.link.zenoh_links import _all_here, _lost_after, _settle_new
+from enact_dist.link.zenoh_links import _lost_after
 from enact_dist.link.zenoh_sockets import connections, give_up, settle, unanswered
 
 LINGER = struct.Struct("ii")
@@ -51,7 +51,7 @@ def test_only_zenohs_sockets_of_the_session_are_settled(before, known, after):
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, LINGER.pack(*before))
         ports = connection.getsockname()[1], connection.getpeername()[1]
 
-        found = settle({ports} if known else {ports[::-1]}, 1.5)
+        found = settle({ports if known else ports[::-1]: 1.5})
 
         assert (linger_of(connection)[0], patience_ms_of(connection)) == after
         assert found == (after[1] > 0)
@@ -172,12 +172,17 @@ def test_sessions_that_were_left_open_are_closed_before_their_threads_are_waited
     assert process.wait(timeout=60.0) == 0
 
 
-def link_events(kinds):
+FAR = "192.0.2.1"
+"""An address of no host, and so none of this one."""
+
+
+def link_events(kinds, host="127.0.0.1"):
     """Return events of connections that came (+) and went (-), each with ports of its own."""
     kind_of = {"+": zenoh.SampleKind.PUT, "-": zenoh.SampleKind.DELETE}
     return [
         SimpleNamespace(
-            kind=kind_of[kind], link=SimpleNamespace(src=f"tcp/[::1]:{port}", dst="tcp/[::1]:1")
+            kind=kind_of[kind],
+            link=SimpleNamespace(src=f"tcp/127.0.0.1:{port}", dst=f"tcp/{host}:1"),
         )
         for port, kind in enumerate(kinds, 2)
     ]
@@ -189,22 +194,38 @@ def link_events(kinds):
 )
 def test_connection_that_comes_stands_for_a_lost_one(kinds, before, lost):
     """One that comes while none is lost is a new one, and makes up for none that goes later."""
-    assert _lost_after(link_events(kinds), before) == lost
+    assert len(_lost_after(link_events(kinds), ["tcp/127.0.0.1:1"] * before)) == lost
 
 
-def test_connections_that_come_together_are_settled_together(monkeypatch):
+def test_connection_to_another_address_stands_for_the_oldest_lost_one():
+    """A host that was lost may come back with another address, and is looked for no more."""
+    lost = _lost_after(link_events("-", "192.0.2.2") + link_events("-", "192.0.2.3"))
+    assert lost == ["tcp/192.0.2.2:1", "tcp/192.0.2.3:1"]
+    assert _lost_after(link_events("+", "192.0.2.3"), lost) == ["tcp/192.0.2.2:1"]
+    assert _lost_after(link_events("+", "192.0.2.4"), lost) == ["tcp/192.0.2.3:1"]
+
+
+def test_connections_of_all_sessions_are_settled_together(watching, monkeypatch):
     """Of a hundred none is looked for alone, and those that have gone are not looked for."""
-    settled = []
-    monkeypatch.setattr(zenoh_links, "settle", lambda ports, _: settled.append(ports))
-    first, *others = link_events("+-+")
-    waiting = iter(others)
+    settled, begun, go_on = queue.SimpleQueue(), threading.Event(), threading.Event()
 
-    here = _all_here(SimpleNamespace(try_recv=lambda: next(waiting, None)), first)
-    _settle_new(here, 1.0)
-    _settle_new(link_events("--"), 1.0)
+    def settle_later(patience_s):
+        settled.put(patience_s)
+        begun.set()
+        go_on.wait(30.0)
 
-    assert here == [first, *others]
-    assert settled == [{(2, 1), (4, 1)}]
+    monkeypatch.setattr(zenoh_links, "settle", settle_later)
+    first, second = watching(patience_s=1.0), watching(patience_s=2.0)
+    first(link_events("+")[0])
+    assert begun.wait(30.0)
+    for event in link_events("+-+"):
+        first(event)
+        second(event)
+    go_on.set()
+
+    assert settled.get(timeout=30) == {(2, 1): 1.0}
+    assert settled.get(timeout=30) == {(2, 1): 2.0, (4, 1): 2.0}
+    assert settled.empty()
 
 
 def test_connection_that_nobody_answers_is_given_up_and_no_other():
@@ -215,15 +236,16 @@ def test_connection_that_nobody_answers_is_given_up_and_no_other():
         for one in asking:
             one.setblocking(False)
             one.connect_ex((address, port))
-        found = unanswered(address, port)
+        found = unanswered([(address, port)])[address, port]
         stuck = [one for one in asking if os.fstat(one.fileno()).st_ino in found]
         try:
             assert 0 < len(stuck) == len(found) < len(asking)
-            assert unanswered(address, port + 1) == set()
+            assert unanswered([(address, port + 1)]) == {(address, port + 1): set()}
 
             give_up({os.fstat(stuck[0].fileno()).st_ino})
 
-            assert unanswered(address, port) == found - {os.fstat(stuck[0].fileno()).st_ino}
+            left = unanswered([(address, port)])[address, port]
+            assert left == found - {os.fstat(stuck[0].fileno()).st_ino}
             assert select.select([], [stuck[0]], [], 30.0)[1]
         finally:
             for one in asking:
@@ -231,46 +253,40 @@ def test_connection_that_nobody_answers_is_given_up_and_no_other():
 
 
 @pytest.fixture
-def watching(monkeypatch):
-    """Watch made-up events: `watching(connect)` gives their queue; `None` ends it."""
+def watching():
+    """Watch made-up events: `watching(connect)` gives what tells one."""
     made = []
 
-    def make(connect=()):
-        events = queue.SimpleQueue()
-
-        def taken(event):
-            if event is None:
-                raise zenoh.ZError("closed")
-            return event
-
-        def try_recv():
-            return None if events.empty() else taken(events.get())
-
-        handler = SimpleNamespace(recv=lambda: taken(events.get()), try_recv=try_recv)
-        listener = SimpleNamespace(handler=handler)
-        info = SimpleNamespace(declare_link_events_listener=lambda *_, **__: listener)
-        made.append((zenoh_links.LinkWatch(SimpleNamespace(info=info), connect, 1.0), events))
-        return events
+    def make(connect=(), patience_s=1.0):
+        callbacks = []
+        info = SimpleNamespace(
+            declare_link_events_listener=lambda callback, **_: callbacks.append(callback)
+        )
+        made.append(
+            (zenoh_links.LinkWatch(SimpleNamespace(info=info), connect, patience_s), callbacks[0])
+        )
+        return callbacks[0]
 
     yield make
-    for watch, events in made:
-        events.put(None)
+    for _, callback in made:
+        callback.drop()
+    for watch, _ in made:
         watch.join()
-        assert not watch._thread.is_alive()
+    assert "enact-links" not in {thread.name for thread in threading.enumerate()}
 
 
 def test_connections_are_looked_after_again_after_an_error(watching, monkeypatch):
     """A process that is short of descriptors for a moment cannot list its connections."""
     settled = queue.SimpleQueue()
 
-    def settle_or_fail(ports, _):
-        settled.put(ports)
+    def settle_or_fail(patience_s):
+        settled.put(set(patience_s))
         raise OSError(errno.EMFILE, "too many open files")
 
     monkeypatch.setattr(zenoh_links, "settle", settle_or_fail)
-    events, found = watching(), []
+    tell, found = watching(), []
     for event in link_events("++"):
-        events.put(event)
+        tell(event)
         found.append(settled.get(timeout=30))
 
     assert found == [{(2, 1)}, {(3, 1)}]
@@ -283,21 +299,77 @@ def test_lost_connection_is_looked_after_though_others_cannot_be_settled(watchin
     def fail(*_):
         raise OSError(errno.EMFILE, "too many open files")
 
-    def fail_once(*host):
-        looks.put(host)
+    def fail_once(hosts):
+        looks.put(hosts)
         if looks.qsize() == 1:
             fail()
-        return set()
+        return {}
 
     monkeypatch.setattr(zenoh_links, "FAILED_S", 0.0)
     monkeypatch.setattr(zenoh_links, "settle", fail)
     monkeypatch.setattr(zenoh_links, "unanswered", fail_once)
-    came, lost = link_events("+-")
-    monkeypatch.setattr(zenoh_links, "_all_here", lambda *_: [came, lost])
 
-    watching(["tcp/127.0.0.1:7"]).put(came)
+    tell = watching(["tcp/192.0.2.1:1"])
+    for event in link_events("+-", FAR):
+        tell(event)
 
     until = time.monotonic() + 30.0
     while looks.qsize() < 2:
         assert time.monotonic() < until, "nobody looks"
         time.sleep(0.005)  # nothing tells of a look that did not fail
+    assert looks.get() == {(FAR, 1)}
+
+
+def test_lost_connection_to_this_host_is_not_looked_for(watching, monkeypatch):
+    """The way to the own host is never cut: its shard stands still, and says when it goes on."""
+    looks, settled = queue.SimpleQueue(), queue.SimpleQueue()
+    monkeypatch.setattr(zenoh_links, "unanswered", looks.put)
+    monkeypatch.setattr(zenoh_links, "settle", settled.put)
+
+    tell = watching(["tcp/127.0.0.1:1"])
+    for event in link_events("+-+"):
+        tell(event)
+        if event.kind == zenoh.SampleKind.PUT:
+            settled.get(timeout=30)
+    for event in link_events("-+", FAR):  # while one is looked for, so is none of this host
+        tell(event)
+    settled.get(timeout=30)
+
+    assert all(looks.get() == {(FAR, 1)} for _ in range(looks.qsize()))
+
+
+def test_looks_for_a_lost_connection_come_more_and_more_rarely(watching, monkeypatch):
+    """After a hundred seconds one is made every two seconds, however many sessions have lost one."""
+    clock, looks = [1_000.0], []
+
+    def look(hosts):
+        looks.append((clock[0], hosts))
+        return {host: set() for host in hosts}
+
+    class Told(queue.SimpleQueue):
+        def get(self, timeout=None, **_):
+            if self.empty() and timeout is not None:
+                clock[0] += timeout
+            with contextlib.suppress(queue.Empty):
+                return super().get(timeout=0.0 if timeout is not None else 30.0)
+            if clock[0] > 1_100.0:
+                return super().get(timeout=30.0)
+            raise queue.Empty
+
+    made = SimpleNamespace(monotonic=lambda: clock[0], thread_time=lambda: 0.0)
+    monkeypatch.setattr(zenoh_links, "time", made)
+    monkeypatch.setattr(zenoh_links, "unanswered", look)
+    monkeypatch.setattr(zenoh_links, "settle", lambda _: None)
+    monkeypatch.setattr(queue, "SimpleQueue", Told)
+
+    for tell in [watching([f"tcp/{FAR}:1"]) for _ in range(20)]:
+        for event in link_events("+-", FAR):
+            tell(event)
+    until = time.monotonic() + 30.0
+    while clock[0] <= 1_100.0:
+        assert time.monotonic() < until, looks
+        time.sleep(0.005)  # the clock of the thread is made up
+
+    assert 40 < len(looks) < 200, len(looks)
+    assert looks[-1][0] - looks[-2][0] == pytest.approx(2.0)
+    assert {hosts == {(FAR, 1)} for _, hosts in looks} == {True}
