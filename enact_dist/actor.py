@@ -9,8 +9,9 @@ What a run promises to `update(self, lock)`:
   once, an exception publishes nothing.
 - It is called with the newest data, by one thread at a time.
 - It may be called again for a datum that it has seen: at each start (once per existing entity),
-  and after a commit whose answer was lost.  So an update sets what follows from what it reads;
-  it does not count calls.
+  after its lock was lost (`hold_s` has passed, or the shard was away for long), and after a commit
+  whose answer was lost.  So an update sets what follows from what it reads; it does not count
+  calls, and it moves nothing.  One that moves something says `once = True`.
 
 Departure from ENACT 3.1: the paper's actor owns a fixed set of entities E_a; here E_a is a name
 pattern, because its own 4.2 meets new entities at run time.
@@ -24,6 +25,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 from enact_dist.errors import MisuseError
+from enact_dist.outcome import Outcome, outcome_of
 from enact_dist.patterns import patterns_overlap
 from enact_dist.terms import (
     Entities,
@@ -34,6 +36,7 @@ from enact_dist.terms import (
     View,
     ViewEach,
     World,
+    Write,
     refuse_duplicates,
 )
 from enact_dist.together import Together
@@ -107,6 +110,8 @@ class Actor:
     Attributes:
         triggers: Declared reading requests; the actor must not write what triggers it.
         every_s: Period of a source in seconds; may be set per instance.
+        once: True for an actor that moves something: each version of its only trigger is acted on
+            at most once, under no lock, whatever dies.  See *Actuators* in `enact_dist/docs`.
         in_phase: False lets the ticks of `every_s` begin when the actor is ready, in place of
             the multiples of the period: for sources that would disturb each other.
         only_entity: The one entity that an instance works on, of those that its patterns match; a
@@ -126,6 +131,7 @@ class Actor:
     shared: ClassVar[Sequence[LockRequest[Any]]] = ()
     every_s: float | None = None
     in_phase: bool = True
+    once: ClassVar[bool] = False
     only_entity: Entity | None = None
     wait_s: float = 10.0
     hold_s: float = 60.0
@@ -167,6 +173,7 @@ class Declaration:
         roles: Names of the world roles that the requests use, in order of appearance.
         per_entity: Whether some request stands for the triggering entity.
         together: The set that triggers, whose views are the `triggers`; None without one.
+        outcome: Where an actor with `once` writes what became of each version; None without.
     """
 
     actor: str
@@ -176,6 +183,7 @@ class Declaration:
     roles: tuple[str, ...]
     per_entity: bool
     together: Together[Any] | None = None
+    outcome: Write[Outcome] | None = None
 
     @staticmethod
     def of(actor_class: type[Actor]) -> Declaration:
@@ -185,16 +193,18 @@ class Declaration:
             MisuseError: A request without a `World` role, two accesses to one datum, a trigger
                 that is not declared or not a reading request or written by the actor itself, both
                 `triggers` and `every_s`, a pattern that no triggering entity can match, an
-                `update` without any request, a `Together` that is not the only trigger.
+                `update` without any request, a `Together` that is not the only trigger, a
+                `once` that does not go with the triggers or has no request for its outcomes.
         """
         requests = _requests_of(actor_class)
         together = _together_of(actor_class, requests)
+        chosen = () if together is not None else _chosen(actor_class, "triggers", requests)
+        triggers = together.requests if together is not None else chosen
         declaration = Declaration(
             actor=actor_class.__name__,
             requests=requests,
-            triggers=together.requests
-            if together is not None
-            else _chosen(actor_class, "triggers", requests),
+            triggers=triggers,
+            outcome=outcome_of(actor_class.__name__, actor_class.once, requests, triggers),
             together=together,
             shared=_chosen(actor_class, "shared", requests),
             roles=tuple(dict.fromkeys(request.world.name for request in requests.values())),

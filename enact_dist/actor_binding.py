@@ -21,6 +21,7 @@ from enact_dist.actor_lock import ActorLock
 from enact_dist.actor_sets import PendingSets
 from enact_dist.errors import MisuseError
 from enact_dist.link.calls import CALL_S
+from enact_dist.once_lock import OnceLock
 from enact_dist.reading import slot_of
 from enact_dist.terms import Entities, Entity, View, refuse_duplicates
 
@@ -137,6 +138,19 @@ class BoundActor:
         return tuple(
             f"{context}:{one.entity}/{one.aspect.name}"
             for context, one in zip(contexts, named, strict=True)
+        )
+
+    def once_lock(
+        self, entity: Entity, *, wait_s: float | None = None, stop: threading.Event | None = None
+    ) -> OnceLock:
+        """Return the lock in which a version is taken that is acted on once; as `lock`."""
+        return OnceLock(
+            self._bound_for(entity),
+            entity=entity,
+            wait_s=self.actor.wait_s if wait_s is None else wait_s,
+            hold_s=self.actor.hold_s,
+            stop=stop,
+            triggers=self.declaration.triggers,
         )
 
     def check_usable(self) -> None:

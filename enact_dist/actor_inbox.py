@@ -92,6 +92,9 @@ class _Box(Generic[P]):
 class Inbox(_Box[PendingTriggers]):
     """`PendingTriggers` that the watching threads fill and the actor's thread empties."""
 
+    meanwhile = False
+    """Whether it has to hear of changes while an update runs, so by a thread of its own."""
+
     def __init__(self, *, per_entity: bool) -> None:
         super().__init__(PendingTriggers(per_entity=per_entity))
 
@@ -205,7 +208,8 @@ def _broke_s(group: Sequence[Watched], error: Exception, refused: int) -> float:
 def watching(bound: BoundActor, inbox: Inbox | SetInbox) -> Watching | OwnWatch:
     """Return what follows an actor's triggers: by its own thread where one watch sees them all."""
     one = len(_by_context(bound.watched())) == 1
-    return OwnWatch(bound, inbox) if one else Watching(bound, inbox)
+    own = one and not (isinstance(inbox, Inbox) and inbox.meanwhile)
+    return OwnWatch(bound, inbox) if own else Watching(bound, inbox)
 
 
 class Watching:

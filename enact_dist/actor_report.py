@@ -66,6 +66,8 @@ class ActorStatistics:
         unstamped: Data that could be in no set, because their writer gave no stamp.
         writes: What it declares to write, as ``world:entities/aspect``; at most `WRITES_MAX`.
         updating_s: How long the update that runs has taken so far; 0 between updates.
+        interrupted: Versions that an actor with `once` found taken by a process that is gone.
+        last_interrupted: The newest of these.
         lock_lost: Whether that update has lost its lock, so that it can commit nothing.
     """
 
@@ -90,6 +92,8 @@ class ActorStatistics:
     writes: tuple[str, ...] = ()
     updating_s: float = 0.0
     lock_lost: bool = False
+    interrupted: int = 0
+    last_interrupted: str = ""
 
 
 _NAMES: Final = [field.name for field in dataclasses.fields(ActorStatistics)]

@@ -37,6 +37,7 @@ from enact_dist.actor_binding import BoundActor
 from enact_dist.actor_doing import Doing
 from enact_dist.actor_inbox import Inbox, SetInbox, watching
 from enact_dist.actor_log import Repeated, kind_of
+from enact_dist.actor_once import REFUSALS, Once, OnceInbox, TakenError
 from enact_dist.actor_report import (
     ERROR_LENGTH_MAX,
     WRITES_MAX,
@@ -46,7 +47,6 @@ from enact_dist.actor_report import (
 )
 from enact_dist.actor_triggers import BackOff, FixedRate
 from enact_dist.errors import (
-    ChangedError,
     CommitUnknownError,
     LeaseLostError,
     LinkError,
@@ -65,15 +65,6 @@ if TYPE_CHECKING:
 
 OnError = Callable[["Entity | None", Exception], None]
 """Told of each error of a run, with the triggering entity; called in the actor's thread."""
-
-REFUSALS: Final = (
-    LockTimeoutError,
-    LeaseLostError,
-    ChangedError,
-    CommitUnknownError,
-    LinkError,
-)
-"""Errors of an attempt that are not the actor's fault."""
 
 STOP_LOOK_S: Final = 0.1
 """An idle actor looks at `stop` this often; an `Event` and a `Condition` cannot be awaited both."""
@@ -150,7 +141,9 @@ class ActorRun:
         self._on_error = on_error
         sets = self._bound.pending_sets()
         self._sets = SetInbox(sets) if sets is not None else None
-        self._inbox = Inbox(per_entity=self._bound.declaration.per_entity)
+        per_entity = self._bound.declaration.per_entity
+        self._once: Once | None = None
+        self._inbox = Inbox(per_entity=per_entity)
         self._back_off = BackOff()
         self._failures = Repeated()
         self.name = name or name_of(actor)
@@ -158,6 +151,11 @@ class ActorRun:
         self._board = ReportBoard.of(cell)
         self._ended = threading.Event()
         self.doing = Doing(type(actor).__name__)
+        if self._bound.declaration.outcome is not None:
+            self._inbox = inbox = OnceInbox(per_entity=per_entity)
+            self._once = Once(self._bound, self.name, self.doing, stop=stop, inbox=inbox)
+        self._lost: set[Entity | None] = set()
+        self._warned = False
         self._reported_ns = 0
         if self._every_s is not None:
             check_period(self.name, self._every_s)
@@ -175,6 +173,11 @@ class ActorRun:
             state = "stuck" if lost else statistics.state
             statistics = dataclasses.replace(
                 statistics, state=state, updating_s=round(lasted_s, 3), lock_lost=lost
+            )
+        if self._once is not None:
+            interrupted, last = self._once.interrupted, self._once.last_interrupted
+            return dataclasses.replace(
+                statistics, interrupted=interrupted, last_interrupted=last[:ERROR_LENGTH_MAX]
             )
         if self._sets is None:
             return statistics
@@ -252,12 +255,18 @@ class ActorRun:
         return False
 
     def _run_triggered(self) -> None:
+        if self._once is not None:
+            try:
+                self._once.sweep()
+            except LinkError as error:
+                log.warning("%s: what was taken before is not known yet: %s", self.name, error)
         with watching(self._bound, self._inbox) as changes:
             while not self._stop.is_set():
                 trigger = changes.take(STOP_LOOK_S)
                 if trigger is not None:
-                    error = self._attempt(trigger.entity)
-                    if isinstance(error, REFUSALS):
+                    attempt = self._attempt if self._once is None else self._attempt_once
+                    ending = attempt(trigger.entity)
+                    if isinstance(ending, REFUSALS):
                         pause_s = self._pause_s(trigger.refused)
                         self._inbox.postpone(trigger, monotonic_ns() + round(pause_s * 1e9))
                 self._report()
@@ -327,6 +336,7 @@ class ActorRun:
                 missing = lock.missing()
                 seen = self._seen(lock)
                 if not missing:
+                    self._warn_of_repetition(entity)
                     about = _about(entity)
                     with self.doing.inside("update", about=about, lock=lock, remains=NOTHING):
                         self._actor.update(lock)
@@ -336,13 +346,13 @@ class ActorRun:
         except REFUSALS as error:
             if isinstance(error, LockTimeoutError) and self._stop.is_set():
                 return error  # told to stop while it waited: nothing was refused
-            self._record.refused(error, unknown=isinstance(error, CommitUnknownError))
-            log.warning("%s%s: refused: %s", self.name, _about(entity), error)
+            self._refused(entity, error)
+            if granted_ns and isinstance(error, LeaseLostError):
+                self._lost.add(entity)
             ending: Exception | None = error
         except Exception as error:  # noqa: BLE001 (an update can raise anything)
             self._bound.check_usable()
-            self._record.failed(error)
-            self._tell(entity, error)
+            self._failed(entity, error)
             ending = error
         else:
             ended_ns = monotonic_ns()
@@ -358,6 +368,56 @@ class ActorRun:
         if ending is not None and self._on_error is not None:
             self._on_error(entity, ending)
         return ending
+
+    def _attempt_once(self, entity: Entity) -> Exception | None:
+        """Act on the newest version once; return what kept it from being taken, to try again."""
+        assert self._once is not None
+        asked_ns = monotonic_ns()
+        granted_ns: list[int] = []
+        try:
+            acted = self._once.attempt(
+                entity, wait_s=self._wait_s, granted=lambda: granted_ns.append(monotonic_ns())
+            )
+        except TakenError as error:
+            return error  # told when it was found
+        except REFUSALS as error:
+            if not (isinstance(error, LockTimeoutError) and self._stop.is_set()):
+                self._refused(entity, error)
+            return error
+        if acted.error is not None:
+            self._bound.check_usable()
+            self._failed(entity, acted.error)
+            if self._on_error is not None:
+                self._on_error(entity, acted.error)
+        elif acted.ran:
+            now_ns = monotonic_ns()
+            self._record.updated(took_ns=now_ns - granted_ns[0], now_ns=now_ns, wall_ns=wall_ns())
+        self._record.waited((granted_ns[0] if granted_ns else monotonic_ns()) - asked_ns)
+        self._inbox.used(acted.states)
+        return None
+
+    def _refused(self, entity: Entity | None, error: Exception) -> None:
+        self._record.refused(error, unknown=isinstance(error, CommitUnknownError))
+        log.warning("%s%s: refused: %s", self.name, _about(entity), error)
+
+    def _failed(self, entity: Entity | None, error: Exception) -> None:
+        self._record.failed(error)
+        self._tell(entity, error)
+
+    def _warn_of_repetition(self, entity: Entity | None) -> None:
+        """Say once that an update that has lost its lock runs again, and how it would not."""
+        if entity not in self._lost or self._every_s is not None:
+            return
+        self._lost.discard(entity)
+        if not self._warned:
+            self._warned = True
+            log.warning(
+                "%s%s: %s.update runs again, as it lost its lock before (hold_s = %g): nothing of"
+                " it was written, but what it did outside of the cell was done. An actor that moves"
+                " something says once = True (enact_dist/docs/actuators.md); another one may be"
+                " given a longer hold_s",
+                self.name, _about(entity), type(self._actor).__name__, self._actor.hold_s,
+            )  # fmt: skip
 
     def _tell(self, entity: Entity | None, error: Exception) -> None:
         """Log an error of an update: its traceback, or a count where it is one like before."""

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from enact_dist.errors import MisuseError
 
 if TYPE_CHECKING:
+    from enact_dist.newer import Newer
     from enact_dist.terms import Entity
 
 
@@ -15,6 +16,7 @@ class Triggered:
 
     _entity: Entity | None = None
     _tick_ns = 0
+    _newer: Newer | None = None
 
     @property
     def entity(self) -> Entity:
@@ -40,6 +42,22 @@ class Triggered:
         if not self._tick_ns:
             raise MisuseError(f"{self!r} was not made for a tick of every_s, so it has no tick_ns")
         return self._tick_ns
+
+    @property
+    def newer(self) -> Newer:
+        """Set when a newer version has come, the version was deleted, or the actor is to stop.
+
+        Of an actor with ``once = True``; to be waited on or looked at in the loop of its motion, in
+        any thread.
+
+        Raises:
+            MisuseError: The lock is not that of an update that acts once.
+        """
+        if self._newer is None:
+            raise MisuseError(
+                f"{self!r} has no `newer`: only an update with once = True can be preempted"
+            )
+        return self._newer
 
     def _stamp(self, stamp_ns: int | None) -> int:
         """Return the capture stamp of a datum that is written with `stamp_ns`."""

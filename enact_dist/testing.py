@@ -21,7 +21,10 @@ import contextlib
 from typing import TYPE_CHECKING, Final
 from weakref import WeakKeyDictionary
 
+from enact_dist.actor import name_of
 from enact_dist.actor_binding import BoundActor
+from enact_dist.actor_doing import Doing
+from enact_dist.actor_once import Once
 from enact_dist.actor_triggers import PendingTriggers, tick_before
 from enact_dist.connecting import local
 from enact_dist.link.clock import wall_ns
@@ -117,7 +120,9 @@ def run_once(actor: Actor, cell: Cell, worlds: Mapping[str, str] | None = None) 
     object: all existing ones at the first call, those that changed since at the next.  A source,
     or an actor that runs once, is updated once; `lock.tick_ns` of a source is the newest multiple
     of its period by the cell's clock.  One with a `Together` is updated once per complete
-    set: at the first call for the newest one.  `start` and `stop` are called around it.
+    set: at the first call for the newest one.  One with `once` acts on versions that no actor has
+    acted on, and none preempts it here: that takes an `ActorThread`.  `start` and `stop` are called
+    around it.
 
     Args:
         actor: The actor.
@@ -143,12 +148,26 @@ def run_once(actor: Actor, cell: Cell, worlds: Mapping[str, str] | None = None) 
             return _update_sets(actor, bound)
         pending = _pending(actor, bound)
         updates = 0
+        if bound.declaration.outcome is not None:
+            return _act(actor, bound, pending)
         while trigger := pending.take(0):
             _update(bound, trigger.entity)
             updates += 1
         return updates
     finally:
         actor.stop()
+
+
+def _act(actor: Actor, bound: BoundActor, pending: PendingTriggers) -> int:
+    """Let an actor act on each version that is new, and that nobody has acted on."""
+    once = Once(bound, name_of(actor), Doing(type(actor).__name__))
+    updates = 0
+    while trigger := pending.take(0):
+        acted = once.attempt(trigger.entity)
+        if acted.error is not None:
+            raise acted.error
+        updates += acted.ran
+    return updates
 
 
 def _update(bound: BoundActor, entity: Entity | None, tick_ns: int = 0) -> None:

@@ -298,11 +298,13 @@ def list_actors(arguments: argparse.Namespace) -> int:
 def _losses(report: ActorStatistics) -> Iterator[str]:
     """Yield what an actor has lost and the table does not show; nothing where it lost nothing."""
     last = f", the newest a {report.last_incomplete}" if report.last_incomplete else ""
+    never = f", the newest {report.last_interrupted}: how far they came is not known"
     lost = (
         (report.incomplete, f"incomplete sets{last}"),
         (report.late, "data too late for their set"),
         (report.unstamped, "data without a capture stamp, which no set can have"),
         (report.missed, "ticks missed"),
+        (report.interrupted, f"versions taken and never ended{never}; written anew they are done"),
         (report.unknown, "commits never answered, which may stand (see its log)"),
     )
     yield from (f"{count} {what}" for count, what in lost if count)

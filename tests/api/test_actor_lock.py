@@ -76,7 +76,9 @@ CALLS: dict[str, Callable[[ActorLock], Any]] = {
     "version": lambda lock: lock.version(Meshing.cloud) == 1,
     "stamp_ns": lambda lock: lock.stamp_ns(Meshing.cloud) == 11,
 }
-WITHOUT_REQUEST = {"check", "entity", "running", "statistics", "tick_ns", "token", "valid"}
+WITHOUT_REQUEST = {
+    "check", "entity", "newer", "running", "statistics", "tick_ns", "token", "valid"
+}  # fmt: skip
 INDEXING = {"__getitem__", "__setitem__", "__delitem__"}
 
 
