@@ -7,8 +7,10 @@ would be looked for by its name, and nothing found.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from numbers import Real
 from typing import Any, TypeVar
 
+from enact_dist.errors import MisuseError
 from enact_dist.terms import Aspect, Context, Entities, Entity, wrong_argument
 
 T = TypeVar("T")
@@ -25,6 +27,16 @@ def check_argument(call: str, name: str, found: object, *wanted: type[Any]) -> N
     """
     if not isinstance(found, wanted):
         raise wrong_argument(call, name, found, *wanted)
+
+
+def check_seconds(name: str, found: object) -> None:
+    """Raise `MisuseError` unless an argument is a number of seconds, 0 or more."""
+    if isinstance(found, Real):
+        if float(found) >= 0.0:
+            return
+        raise MisuseError(f"{name} is {found!r}; it must be 0 or more seconds")
+    remedy = f"; write float({found!r})" if isinstance(found, str) else ""
+    raise MisuseError(f"{name} is {found!r}; it must be a number of seconds{remedy}")
 
 
 def check_pattern(call: str, name: str, found: object) -> None:

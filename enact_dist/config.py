@@ -134,6 +134,7 @@ __all__ = [
     "parse_config",
 ]
 
+_EXAMPLE: Final = "tcp/127.0.0.1:7447"
 _DOTTED_NAME: Final = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*\Z")
 
 
@@ -151,11 +152,13 @@ def load_config(
     """
     file = Path(path).expanduser().absolute()
     try:
-        text = file.read_text(encoding="utf-8")
+        text = file.read_text(encoding="utf-8-sig")  # some editors write a byte-order mark
     except OSError as error:
         raise ConfigError(f"cannot read {path}: {error.strerror}", path=str(path)) from error
     except UnicodeDecodeError as error:
-        raise ConfigError(f"{path} is not UTF-8: {error}", path=str(path)) from error
+        raise ConfigError(
+            f"{path} is not UTF-8 ({error}); save it as UTF-8", path=str(path)
+        ) from error
     return parse_config(text, file, environment=environment, shown=str(path))
 
 
@@ -269,7 +272,7 @@ def _shard(name: str, table: Table, file: Path, data_folder: Path | None) -> Sha
     _check_title(name, "shard", table)
     listen = _endpoints(table, "listen")
     if not listen:
-        table.refuse("listen", f"{table.title} needs the key 'listen', such as tcp/127.0.0.1:7447")
+        table.refuse("listen", f"{table.title} needs the key 'listen', such as {_EXAMPLE}")
     advertise = _endpoints(table, "advertise") or listen
     for endpoint in advertise:
         if is_wildcard(endpoint):
@@ -312,6 +315,11 @@ def _refuse_shared(table: Table, shard: ShardConfig, other: ShardConfig) -> None
 
 
 def _endpoints(table: Table, key: str) -> tuple[str, ...]:
+    found = table.values.get(key)
+    if "" in (found if isinstance(found, list) else (found,)):
+        table.refuse(
+            key, f"{key!r} in {table.title} is empty; write an endpoint, such as {_EXAMPLE}"
+        )
     endpoints = table.take_strings(key)
     for endpoint in endpoints:
         table.checked(key, lambda endpoint=endpoint: checked_endpoint(endpoint))  # type: ignore[misc]

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from enact_dist.arguments import check_seconds
 from enact_dist.cell import Cell
 from enact_dist.core.client import Client
 from enact_dist.core.messages import PlacementMap, ShardEntry, Welcome
@@ -59,8 +60,7 @@ def connect(
     from enact_dist.link.zenoh_config import OPEN_S
 
     for word, waits_s in (("timeout_s", timeout_s), ("patience_s", patience_s)):
-        if not waits_s >= 0.0:
-            raise MisuseError(f"{word} is {waits_s!r}; it must be 0 or more seconds")
+        check_seconds(word, waits_s)
     name, ttl_s = "", TTL_S
     carrier = carrier_of(os.environ)
     endpoints: tuple[str, ...] = (str(target),)

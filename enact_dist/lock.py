@@ -15,6 +15,7 @@ import threading
 import time
 from typing import TYPE_CHECKING, Any, TypeVar, overload
 
+from enact_dist.arguments import check_seconds
 from enact_dist.core.messages import SlotVersion
 from enact_dist.core.phase import Phase
 from enact_dist.errors import (
@@ -125,8 +126,8 @@ class Lock(Triggered):
                 f"a lock of {len(requests)} requests; at most {ITEMS_MAX}: name a pattern"
                 " (ReadEach, WriteEach, ViewEach) instead"
             )
-        if not wait_s >= 0.0:
-            raise MisuseError(f"wait_s is {wait_s!r}; it must be 0 or more seconds")
+        check_seconds("wait_s", wait_s)
+        check_seconds("hold_s", hold_s)
         if not 0.0 < hold_s <= HOLD_S_MAX:
             raise MisuseError(f"hold_s is {hold_s!r}; it must lie in (0, {HOLD_S_MAX:g}] seconds")
         self._session = session_of(requests)

@@ -17,6 +17,7 @@ from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+from enact_dist.arguments import check_seconds
 from enact_dist.closing import Following
 from enact_dist.core.datum import Position, Slot
 from enact_dist.core.epochs import is_kept
@@ -129,8 +130,10 @@ class Watch(Following[Change]):
             timeout_s: How long to wait; None waits until `close`, 0 takes what has arrived.
 
         Raises:
-            MisuseError: The cell was closed.
+            MisuseError: The cell was closed, or `timeout_s` is no number of seconds.
         """
+        if timeout_s is not None:
+            check_seconds("timeout_s", timeout_s)
         deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
         while not self._closed.is_set():
             if self._pending:

@@ -40,7 +40,10 @@ def moment(text: str) -> When:
     text = text.strip()
     ago = _AGO.match(text)
     if ago:
-        return time.time() - float(ago[1]) * _SECONDS[ago[2]]
+        at_s = time.time() - float(ago[1]) * _SECONDS[ago[2]]
+        if at_s < 0.0:
+            raise argparse.ArgumentTypeError(f"{text!r} lies before 1970; give {MOMENT_HELP}")
+        return at_s
     position = _POSITION.match(text)
     if position:
         return Position(int(position[1]), position[2])

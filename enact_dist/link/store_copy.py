@@ -49,7 +49,7 @@ from enact_dist.link.private_copy import (
     partial_folder,
 )
 from enact_dist.link.store import open_store, read_store
-from enact_dist.link.store_errors import store_error
+from enact_dist.link.store_errors import backup_error, store_error
 from enact_dist.link.store_folder import (
     BLOB_FOLDER,
     DATABASE_FILE,
@@ -112,10 +112,15 @@ def back_up(folder: Path, into: Path, *, cell: str, shard: str, unix_s: int) -> 
     """
     if not holds_store(folder):
         raise StoreError(f"no shard has its data in {folder}", path=str(folder))
-    if into.exists():
-        raise _is_there(into)
+    if into.absolute().is_relative_to(folder.absolute()):
+        raise StoreError(
+            f"{into} lies in the folder of the shard, {folder}; name a folder elsewhere with --to",
+            path=str(into),
+        )
     refuse_moving(folder)
     try:
+        if into.exists():
+            raise _is_there(into)
         with held_bodies(folder, into) as bodies, partial_folder(into, ".partial") as partial:
             stored = _copied(folder, bodies, partial)
             backup = _told(stored, cell=cell, shard=shard, unix_s=unix_s)
@@ -128,7 +133,7 @@ def back_up(folder: Path, into: Path, *, cell: str, shard: str, unix_s: int) -> 
             if not _renamed(partial, into):
                 raise _is_there(into)
     except OSError as failure:
-        raise store_error(into, failure) from failure
+        raise backup_error(folder, into, failure) from failure
     return backup
 
 

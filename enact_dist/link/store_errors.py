@@ -5,12 +5,10 @@ from __future__ import annotations
 import errno
 import os
 import sqlite3
-from typing import TYPE_CHECKING, Final
+from pathlib import Path
+from typing import Final
 
 from enact_dist.errors import StoreError
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 _FULL_ERRNOS: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 _DENIED_ERRNOS: Final = frozenset({errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR})
@@ -18,6 +16,13 @@ _DENIED_ERRNOS: Final = frozenset({errno.EACCES, errno.EPERM, errno.EROFS, errno
 
 def store_error(folder: Path, failure: OSError | sqlite3.Error) -> StoreError:
     """Return what an operator must read about an error of the system."""
+    if (file := _file_in(folder)) is not None:
+        return StoreError(
+            f"{file} is a file, not a folder, so a shard cannot keep its data in {folder}; name"
+            " another folder in cell.toml (`folder` of the shard, or `data_folder`), or move the"
+            " file away",
+            path=str(file),
+        )
     path = str(getattr(failure, "filename", None) or folder)
     code = getattr(failure, "sqlite_errorcode", 0) & 0xFF
     number = failure.errno if isinstance(failure, OSError) else None
@@ -41,6 +46,31 @@ def store_error(folder: Path, failure: OSError | sqlite3.Error) -> StoreError:
         " is kept",
         path=path,
     )
+
+
+def backup_error(folder: Path, into: Path, failure: OSError) -> StoreError:
+    """Return what an operator must read about an error of the system during a backup."""
+    remedy = "name another place with --to, which this user may write and which has room"
+    where = Path(str(getattr(failure, "filename", None) or into))
+    if (file := _file_in(into.parent)) is not None:
+        found = f"{file} is a file, not a folder: no backup can be written to {into}"
+    elif where.is_relative_to(folder):
+        found = f"the data of the shard in {folder} cannot be read ({failure})"
+        remedy = "make the backup as the user that runs the shard"
+    else:
+        found = f"the backup cannot be written to {into} ({failure})"
+    return StoreError(f"{found}; {remedy}; the shard is as it was", path=str(where))
+
+
+def _file_in(folder: Path) -> Path | None:
+    """Return the file that stands where a folder, or one above it, has to be."""
+    for place in (folder, *folder.parents):
+        try:
+            if place.exists():
+                return None if place.is_dir() else place
+        except OSError:
+            return None
+    return None
 
 
 def _free_bytes(folder: Path) -> int | str:

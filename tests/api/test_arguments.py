@@ -2,9 +2,11 @@
 
 import re
 
+import numpy as np
 import pytest
 
-from enact_dist import Aspect, Entities, Entity, View, World
+from enact_dist import Aspect, Entities, Entity, Lock, View, World, Write, connect
+from enact_dist.errors import MisuseError
 
 PLAN = Aspect("plan", dict)
 robot = Entity("robot")
@@ -99,3 +101,32 @@ def test_wrong_argument_is_refused_by_name(online, name):
         call(online, past)
     for text in texts:
         assert text in str(refused.value)
+
+
+SECONDS = {
+    "wait_s": lambda world, wrong: Lock(Write(world, robot, PLAN), wait_s=wrong),
+    "hold_s": lambda world, wrong: Lock(Write(world, robot, PLAN), hold_s=wrong),
+    "timeout_s of a watch": lambda world, wrong: world.watch("**").next(wrong),
+    "timeout_s of connect": lambda _, wrong: connect("tcp/127.0.0.1:1", timeout_s=wrong),
+    "patience_s": lambda _, wrong: connect("tcp/127.0.0.1:1", patience_s=wrong),
+}
+
+
+@pytest.mark.parametrize("wrong", ["1", float("nan"), -1.0, [2.0]])
+@pytest.mark.parametrize("name", SECONDS)
+def test_what_is_no_number_of_seconds_is_refused_by_name(online, name, wrong):
+    """A text from a configuration or an option is none, and said at once."""
+    with pytest.raises(MisuseError) as refused:
+        SECONDS[name](online, wrong)
+
+    assert f"{name.split()[0]} is {wrong!r}" in str(refused.value)
+    assert "second" in str(refused.value)
+    if wrong == "1":
+        assert "float('1')" in str(refused.value)
+
+
+def test_seconds_may_be_any_number(online):
+    """Of numpy too, and without limit where that has a meaning."""
+    for wait_s in (1, 0.5, np.float32(0.5), np.int64(1), float("inf")):
+        with Lock(Write(online, robot, PLAN), wait_s=wait_s) as lock:
+            lock[Write(online, robot, PLAN)] = {}

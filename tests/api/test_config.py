@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from enact_dist.config import parse_config
+from enact_dist.config import load_config, parse_config
 from enact_dist.config_environment import carrier_of
 from enact_dist.core.messages import AspectEntry, Pin, ShardEntry
 from enact_dist.errors import ConfigError
@@ -368,3 +368,30 @@ def test_example_of_the_docstring_is_a_valid_cell():
 
     assert [shard.name for shard in config.shards] == ["left", "right"]
     assert config.shard("right").folder == Path("/cells/demo/data/right")
+
+
+def test_byte_order_mark_is_no_error(tmp_path):
+    """Some editors write one at the start of each file."""
+    text = 'name = "cell"\n[shards.a]\nlisten = "tcp/127.0.0.1:7447"\n'
+    (tmp_path / "cell.toml").write_bytes(b"\xef\xbb\xbf" + text.encode())
+
+    assert load_config(tmp_path / "cell.toml", environment={}).name == "cell"
+
+
+def test_file_in_utf_16_is_told_to_be_saved_as_utf_8(tmp_path):
+    """As other editors write files; one line, with the remedy."""
+    (tmp_path / "cell.toml").write_bytes('name = "cell"\n'.encode("utf-16"))
+
+    with pytest.raises(ConfigError, match=r"cell\.toml is not UTF-8 .*save it as UTF-8$"):
+        load_config(tmp_path / "cell.toml", environment={})
+
+
+@pytest.mark.parametrize("listen", ['""', "[]", '["tcp/127.0.0.1:7447", ""]'])
+def test_empty_endpoint_is_refused_with_an_example(listen):
+    """It says what to write, not which types of TOML there are."""
+    text = f'name = "cell"\n[shards.a]\nlisten = {listen}\n'
+
+    with pytest.raises(
+        ConfigError, match=r"line 3: .*(empty|needs).*such as tcp/127\.0\.0\.1:7447"
+    ):
+        parse_config(text, FILE, environment={})

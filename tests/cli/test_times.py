@@ -101,3 +101,10 @@ def test_value_that_begins_with_a_dash_and_a_digit_is_taken_as_it_is(value):
     arguments = build_parser().parse_args(["world", "put", "online", "a/b", value])
 
     assert arguments.value == value
+
+
+@pytest.mark.parametrize("text", ["-99999d", "-999999999999999999999999d"])
+def test_moment_before_1970_is_refused_as_it_was_written(text):
+    """By the text, and not by the seconds that come out of it."""
+    with pytest.raises(ArgumentTypeError, match=rf"^'{text}' lies before 1970"):
+        moment(text)

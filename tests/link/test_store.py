@@ -325,3 +325,17 @@ def files_of(folder):
         for path in sorted(folder.rglob("*"))
         if path.is_file() and path.name != "lock"
     }
+
+
+@pytest.mark.parametrize("place", ["file", "file/left"])
+def test_folder_that_is_a_file_is_named_with_the_remedy(tmp_path, place):
+    """Nothing is wrong with the disk, and no permission is missing."""
+    (tmp_path / "file").write_text("notes")
+
+    with pytest.raises(
+        StoreError, match=r"/file is a file, not a folder.*`data_folder`"
+    ) as refused:
+        open_store(tmp_path / place, unix_s=1)
+
+    assert "start the shard again" not in str(refused.value)
+    assert (tmp_path / "file").read_text() == "notes"

@@ -417,3 +417,25 @@ def test_a_backup_names_no_file_outside_of_it(folder, tmp_path):
         (tmp_path / "copy" / BACKUP_FILE).write_bytes(text)
         with pytest.raises(StoreError, match="is no file of a backup"):
             restore(tmp_path / "copy", tmp_path / "new", unix_s=200, **NAMES)
+
+
+@pytest.mark.parametrize(
+    ("place", "found"),
+    [
+        ("file/copy", r"file is a file, not a folder"),
+        ("/proc/copy", r"cannot be written to /proc/copy \(.*No such file"),
+        ("x" * 300, r"cannot be written to .*File name too long"),
+        ("left/copy", r"lies in the folder of the shard"),
+    ],
+)
+def test_a_place_that_takes_no_backup_is_named_and_not_the_shard(folder, tmp_path, place, found):
+    """The remedy is another place; the shard has nothing to do with it and need not start again."""
+    (tmp_path / "file").touch()
+    before = sorted(tmp_path.rglob("*"))
+
+    with pytest.raises(StoreError, match=found) as refused:
+        back_up(folder, tmp_path / place, unix_s=100, **NAMES)
+
+    assert "--to" in str(refused.value)
+    assert "start the shard" not in str(refused.value)
+    assert sorted(tmp_path.rglob("*")) == before
