@@ -82,7 +82,9 @@ shared_bytes_max       none           cap of each shard's large data in the memo
   drain_s              8              how long its update may still take after SIGTERM, seconds
 =====================  =============  =====================================================
 
-Relative folders are relative to the file.  An unknown key, a wrong type or a name that does not
+A cell.toml is a program: the modules that it names run as the user who starts it.  They are looked
+up beside the file first, the working folder comes last.  Relative folders are relative to the file.
+An unknown key, a wrong type or a name that does not
 exist is a `ConfigError` with file, line and, where one is close, a suggestion.  The environment
 overrides the file: see `enact_dist.config_environment`.
 """

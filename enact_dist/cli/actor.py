@@ -22,13 +22,15 @@ from enact_dist.cli.verbs import (
     add_timeout,
     add_verb,
     cell_config,
+    cell_target,
     duration,
+    is_endpoint,
     one_entity,
     open_cell,
     pair,
     pairs,
     seconds,
-    see_working_folder,
+    see_modules,
     verbs_of,
 )
 from enact_dist.errors import (
@@ -133,7 +135,6 @@ def _add_run(verbs: argparse._SubParsersAction[Verb]) -> None:
 
 def run_actor(arguments: argparse.Namespace) -> int:
     """Run one actor until it is done or a signal comes."""
-    see_working_folder()
     manager = ServiceManager()
     json_lines = JsonLines(process=f"actor {arguments.name or arguments.target}")
     formatter = json_lines if arguments.log == "json" else logging.Formatter(TEXT)
@@ -232,10 +233,12 @@ def _made(arguments: argparse.Namespace) -> tuple[Actor, str, dict[str, str] | N
     options = pairs(arguments.option, "--option")
     drain_s = arguments.drain_s
     if ":" in arguments.target:
+        see_modules(_cell_file(arguments))
         actor = load_actor(arguments.target, options)
         name = ""
     else:
         config = cell_config(arguments)
+        see_modules(config.path)
         for entry in config.actors:
             if entry.name == arguments.target:
                 break
@@ -262,6 +265,15 @@ def _made(arguments: argparse.Namespace) -> tuple[Actor, str, dict[str, str] | N
         raise ConfigError(str(error)) from None
     name = arguments.name or name or name_of(actor)
     return actor, name, worlds, DRAIN_S if drain_s is None else drain_s
+
+
+def _cell_file(arguments: argparse.Namespace) -> Path | None:
+    """Return the cell.toml that the command names; None where it names an endpoint, or nothing."""
+    try:
+        target = cell_target(arguments)
+    except ConfigError:
+        return None  # said when the cell is opened
+    return None if is_endpoint(target) else Path(target).expanduser()
 
 
 def _farewell(name: str, statistics: ActorStatistics) -> str:
@@ -354,8 +366,8 @@ def check_actors(arguments: argparse.Namespace) -> int:
     """Print what is wrong with the actors of a `cell.toml`; status 1 if there is an error."""
     from enact_dist.actor_check import check_cell
 
-    see_working_folder()
     config = cell_config(arguments)
+    see_modules(config.path)
     findings = check_cell(config, initial=arguments.initial)
     wrong = any(finding.level == "error" for finding in findings)
     if arguments.json:

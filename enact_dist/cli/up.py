@@ -15,7 +15,7 @@ from enact_dist.cli.verbs import (
     add_log,
     add_verb,
     cell_config,
-    see_working_folder,
+    see_modules,
 )
 from enact_dist.errors import ConfigError, LinkError
 from enact_dist.link.signals import StopSignals
@@ -57,8 +57,8 @@ def run_up(arguments: argparse.Namespace) -> int:
     """Run the cell until a signal; drain actors, then shards."""
     from enact_dist.supervise import Supervisor
 
-    see_working_folder()
     config = cell_config(arguments)
+    see_modules(config.path)
     host = arguments.host or socket.gethostname()
     shards = [shard for shard in config.shards if shard.host in {"", host}]
     actors = [actor for actor in config.actors if actor.host in {"", host}]

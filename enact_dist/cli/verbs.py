@@ -296,8 +296,20 @@ def open_cell(arguments: argparse.Namespace, *, observer: bool = True, actor: st
     )
 
 
-def see_working_folder() -> None:
-    """Let ``MODULE:CLASS`` name a module of the working folder, as ``python -m`` would."""
-    folder = os.getcwd()  # noqa: PTH109 (sys.path holds text)
-    if folder not in sys.path:
-        sys.path.insert(0, folder)
+def see_modules(cell_file: Path | None = None, *, runs_cell: bool = True) -> None:
+    """Let ``MODULE:CLASS`` name a module beside the cell.toml, or of the working folder.
+
+    The folder of a cell.toml whose program is to run comes first.  Any other folder comes last:
+    no file in it hides an installed module.
+
+    Args:
+        cell_file: The cell.toml, if there is one.
+        runs_cell: Whether the command runs the cell's program, and does not only look at the cell.
+    """
+    folders = [os.getcwd()]  # noqa: PTH109 (sys.path holds text)
+    if cell_file is not None:
+        beside = str(cell_file.absolute().parent)
+        if runs_cell and sys.path[:1] != [beside]:
+            sys.path.insert(0, beside)
+        folders.insert(0, beside)
+    sys.path.extend(folder for folder in dict.fromkeys(folders) if folder not in sys.path)

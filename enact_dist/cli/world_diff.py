@@ -24,7 +24,7 @@ from enact_dist.cli.verbs import (
     entities,
     is_endpoint,
     open_cell,
-    see_working_folder,
+    see_modules,
 )
 from enact_dist.errors import ConfigError
 from enact_dist.terms import Aspect
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from enact_dist.cell_info import SlotInfo
     from enact_dist.cli.verbs import Verb
     from enact_dist.comparing import Tolerance
+    from enact_dist.config_types import CellConfig
     from enact_dist.diffing import Comparison, Diff
     from enact_dist.moments import When
     from enact_dist.past_context import PastContext
@@ -77,6 +78,12 @@ def add_diff(verbs: argparse._SubParsersAction[Verb]) -> None:
         " wins over cell.toml, and holds for every aspect that has none where none is named",
     )
     diff.add_argument("--all", action="store_true", help="list every slot that only one side has")
+    diff.add_argument(
+        "--trust",
+        action="store_true",
+        help="run whatever module a `compare` in cell.toml names, not only those beside the cell's"
+        " actors: a cell.toml is a program",
+    )
     add_reader(diff)
 
 
@@ -129,15 +136,36 @@ def configured_aspects(arguments: argparse.Namespace) -> dict[str, Aspect[Any]]:
     target = cell_target(arguments)
     if is_endpoint(target):
         return {}
-    see_working_folder()
+    config = load_config(target)
+    see_modules(config.path, runs_cell=False)
     allowed = dict(arguments.tolerance)
-    return {
-        entry.name: load_aspect(entry.name, entry.compare)
-        for entry in load_config(target).aspects
+    wanted = [
+        entry
+        for entry in config.aspects
         if entry.compare
         and entry.name not in allowed
         and (not arguments.aspect or entry.name in arguments.aspect)
-    }
+    ]
+    for entry in wanted:
+        if not arguments.trust and not _is_of_actors(entry.compare, config):
+            raise ConfigError(
+                f"{config.path}: [aspects.{entry.name}] compare = {entry.compare!r} would run a"
+                " module that no actor of the cell has in its package; if you trust who wrote the"
+                f" file, say --trust, else --tolerance {entry.name}=0",
+                path=str(config.path),
+            )
+    return {entry.name: load_aspect(entry.name, entry.compare) for entry in wanted}
+
+
+def _is_of_actors(target: str, config: CellConfig) -> bool:
+    """Whether ``module:NAME`` lies in the module of an actor of the cell, or in its package."""
+    module = target.partition(":")[0]
+    for actor in config.actors:
+        known = actor.class_path.partition(":")[0]
+        package, dot, _ = known.rpartition(".")
+        if module == known or (dot and f"{module}.".startswith(f"{package}.")):
+            return True
+    return False
 
 
 def load_aspect(name: str, target: str) -> Aspect[Any]:

@@ -15,7 +15,8 @@ from enact_dist.cli.output import print_json, shown_bytes
 from enact_dist.cli.record import COMPRESSIONS, shows_of
 from enact_dist.cli.times import MOMENT_HELP, moment
 from enact_dist.cli.verbs import DONE, add_reader, add_verb, add_world, open_cell, pair
-from enact_dist.errors import ConfigError, EnactError
+from enact_dist.errors import ConfigError, EnactError, ProtocolError
+from enact_dist.terms import checked_name
 
 if TYPE_CHECKING:
     import argparse
@@ -93,6 +94,24 @@ def _into_folder(world: WorldContext, folder: Path, at_ns: int) -> dict[str, obj
     return {"path": str(folder), "data": len(index), "size_bytes": size}
 
 
+def _checked_names(version: Recorded) -> tuple[str, str]:
+    """Return the names of an entity and an aspect that may become those of files.
+
+    Raises:
+        ProtocolError: A shard has told a name that no client can have made.
+    """
+    _, entity, aspect = version.slot
+    try:
+        checked_name("entity", entity, slashes=True)
+        checked_name("aspect", aspect, slashes=False)
+    except ValueError as error:
+        raise ProtocolError(
+            f"shard {version.shard!r} has told a name that would lead out of the folder, or is no"
+            f" name of a file: {error}; nothing was written for it"
+        ) from None
+    return entity, aspect
+
+
 def _save(version: Recorded, folder: Path) -> dict[str, object]:
     """Write one datum; return its line of the index."""
     import numpy as np
@@ -102,7 +121,7 @@ def _save(version: Recorded, folder: Path) -> dict[str, object]:
 
     assert version.datum is not None, "an export has no null"
     value: Any = decode_untyped(version.datum)
-    _, entity, aspect = version.slot
+    entity, aspect = _checked_names(version)
     place = folder / entity
     place.mkdir(parents=True, exist_ok=True)
     if isinstance(value, np.ndarray):

@@ -1,5 +1,6 @@
 """`enact record` and `enact replay`: a running cell into a file and back, ends and errors."""
 
+import dataclasses
 import json
 import signal
 import subprocess
@@ -255,3 +256,31 @@ def test_an_actor_that_writes_the_same_is_named(enact, spawn, until, cell_file, 
     assert f"enact: actor scale (process {actor.pid} on " in done.err
     assert "writes both:a/count, too" in done.err
     assert f"  both:a/count: actor scale (process {actor.pid} on " in done.out
+
+
+@pytest.mark.parametrize(
+    ("entity", "aspect"),
+    [("../escaped", "count"), ("/tmp/escaped", "count"), ("x" * 201, "count"), ("a", "../count")],
+)
+def test_export_makes_no_path_of_a_name_that_is_none(
+    enact, cell_file, put, tmp_path, monkeypatch, entity, aspect
+):
+    """Whatever a shard, or what answers in its place, says: nothing is written outside."""
+    from enact_dist.recording import exporting
+
+    put("online", bench=1)
+    told = exporting.world_as_of
+
+    def lying(world, at_ns):
+        for version in told(world, at_ns):
+            slot = version.slot._replace(entity=entity, aspect=aspect)
+            yield dataclasses.replace(version, slot=slot)
+
+    monkeypatch.setattr(exporting, "world_as_of", lying)
+    before = set(tmp_path.rglob("*"))
+    done = enact("world", "export", "online", "--out", tmp_path / "out", "--cell", cell_file)
+
+    assert done.status == 1
+    assert "no name of a file" in done.err
+    assert set(tmp_path.rglob("*")) == before
+    assert not (tmp_path.parent / "escaped").exists()

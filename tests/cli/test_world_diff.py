@@ -1,9 +1,11 @@
 """`enact world diff` against two real shards: a table for people, JSON and exit status for scripts."""
 
 import itertools
+import sys
 import threading
 import time
 from dataclasses import dataclass
+from unittest.mock import ANY
 
 import numpy as np
 import pytest
@@ -83,7 +85,7 @@ def with_vocabulary(enact, cell, cell_file, tmp_path, monkeypatch):
     def call(target, *words):
         file = tmp_path / "cell.toml"
         file.write_text(f'{cell_file.read_text()}\n[aspects.pose]\ncompare = "{target}"\n')
-        return enact("world", "diff", *words, "--cell", file)
+        return enact("world", "diff", *words, "--trust", "--cell", file)
 
     return call
 
@@ -256,3 +258,63 @@ def test_comparing_holds_no_lock_where_there_is_no_cut(cell, cell_file, writer, 
             diffs.append(one.diff(two, "sum/*", [COUNT, own]))
     assert {(len(diff), diff.equal) for diff in diffs} == {(0, 5)}
     assert held == []
+
+
+STRANGE = """
+from pathlib import Path
+Path({mark!r}).touch()
+def compare(left, right):
+    raise AssertionError
+"""
+
+
+@pytest.fixture
+def strangers(enact, cell, cell_file, tmp_path, monkeypatch):
+    """Call `enact world diff` in a stranger's folder, whose cell.toml names a module of its own."""
+    monkeypatch.setattr("sys.path", list(sys.path))
+    mark = tmp_path / "it ran"
+    folder = tmp_path / "theirs"
+    for name in ("strange_comparator", "strange_package/comparator"):
+        file = folder / f"{name}.py"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(STRANGE.format(mark=str(mark)))
+    monkeypatch.chdir(folder)
+
+    def call(compare, *words, actor=""):
+        for name in [one for one in sys.modules if one.startswith("strange_")]:
+            del sys.modules[name]
+        mark.unlink(missing_ok=True)
+        more = f'\n[aspects.pose]\ncompare = "{compare}"\n'
+        more += f'[actors.one]\nclass = "{actor}:Actor"\n' if actor else ""
+        (folder / "cell.toml").write_text(cell_file.read_text() + more)
+        return enact("world", "diff", "online", "online", "--aspect", "pose", *words), mark.exists()
+
+    return call
+
+
+def test_comparator_in_a_strangers_folder_does_not_run(strangers):
+    """To look at a cell runs nothing but what its actors are made of, unless that is asked for."""
+    done, ran = strangers("strange_comparator:compare")
+    assert (done.status, ran) == (2, False)
+    assert "[aspects.pose] compare = 'strange_comparator:compare'" in done.err
+    assert "--trust" in done.err
+    for other in ("strange_comparator2", "other.strange_comparator"):
+        assert strangers("strange_comparator:compare", actor=other)[1] is False
+
+    assert strangers("strange_comparator:compare", "--tolerance", "pose=1")[1] is False
+    assert strangers("strange_comparator:compare", "--trust") == (ANY, True)
+
+
+def test_comparator_beside_an_actor_runs(strangers):
+    """In the actor's module or package, which the cell's program is anyway."""
+    assert strangers("strange_comparator:compare", actor="strange_comparator")[1]
+    assert strangers("strange_package.comparator:compare", actor="strange_package.camera")[1]
+
+
+def test_file_of_the_working_folder_hides_no_installed_module(strangers, tmp_path):
+    """The folder comes last on the path: its `numpy.py` is not the one that is imported."""
+    (tmp_path / "theirs" / "mcap.py").write_text("raise SystemExit('hidden')")
+    strangers("strange_comparator:compare", "--trust")
+
+    assert sys.path[-1] == str(tmp_path / "theirs")
+    assert sys.path[0] != str(tmp_path / "theirs")
