@@ -35,9 +35,16 @@ def add_to(verbs: argparse._SubParsersAction[Verb]) -> None:
         " may be registered with other types",
         run=run_forget,
         example="enact shard forget surface --cell cell.toml\n"
-        "enact shard forget surface contact_count --cell cell.toml --yes",
+        "enact shard forget surface contact_count --cell cell.toml --yes\n"
+        "enact shard forget --unused --cell cell.toml --dry-run",
     )
-    verb.add_argument("aspects", metavar="ASPECT", nargs="+", help="name of an aspect")
+    verb.add_argument("aspects", metavar="ASPECT", nargs="*", help="name of an aspect")
+    verb.add_argument(
+        "--unused",
+        action="store_true",
+        help="forget all aspects and world contexts without data; forks and what the cell.toml"
+        " names stay",
+    )
     add_cell(verb, file_only=True)
     verb.add_argument(
         "--store",
@@ -71,25 +78,40 @@ def run_forget(arguments: argparse.Namespace) -> int:
 
     config = cell_config(arguments)
     folders, elsewhere = _folders(config, pairs(arguments.store, "--store"), arguments)
+    if not arguments.aspects and not arguments.unused:
+        raise ConfigError("name the aspects to forget, or --unused for all without data")
+    if arguments.unused and len(folders) < sum(s.folder is not None for s in config.shards):
+        raise ConfigError(
+            f"--unused looks at the data of all shards, and {'; '.join(elsewhere) or 'not all'}:"
+            " name the folders of the others with --store"
+        )
+    unused = config.worlds if arguments.unused else None
     told = _Told(as_json=arguments.json, goes="goes" if arguments.yes else "would go")
     if not folders:
         raise ConfigError(f"no shard of {config.path} has its data here: {'; '.join(elsewhere)}")
     try:
         if arguments.yes:
-            found = forget(folders, arguments.aspects, now_ns=time.time_ns(), progress=told)
+            found = forget(
+                folders,
+                arguments.aspects,
+                now_ns=time.time_ns(),
+                unused=unused,
+                progress=told,
+            )
         else:
-            found = look(folders, arguments.aspects, progress=told)
+            found = look(folders, arguments.aspects, unused=unused, progress=told)
     finally:
         told.line.end()
     if arguments.json:
         print_json(_facts(found, elsewhere, done=arguments.yes))
-    elif arguments.yes and (found.going or found.resumed):
+    elif arguments.yes and (found.going or found.resumed or found.worlds):
         print(_end(found))
     for line in elsewhere:
         print(f"enact: {line}", file=sys.stderr)
-    if arguments.yes or arguments.dry_run or not (found.going or found.resumed):
+    if arguments.yes or arguments.dry_run or not (found.going or found.resumed or found.worlds):
         return DONE
-    words = _command(found.aspects or found.done, arguments.shard)
+    named = ["--unused"] if arguments.unused else found.aspects or found.done
+    words = _command(named, arguments.shard)
     print(f"enact: nothing was changed; to let it go: {words}", file=sys.stderr)
     return FAILED
 
@@ -140,6 +162,7 @@ def _facts(found: Forgotten, elsewhere: list[str], *, done: bool) -> dict[str, A
         "done": done,
         "resumed": found.resumed,
         "aspects": found.aspects,
+        "worlds": found.worlds,
         "forgotten_before": found.done,
         "going": [each._asdict() for each in found.going],
         "elsewhere": elsewhere,
@@ -149,6 +172,10 @@ def _facts(found: Forgotten, elsewhere: list[str], *, done: bool) -> dict[str, A
 def _end(found: Forgotten) -> str:
     slots, versions = sum(g.slots for g in found.going), sum(g.versions for g in found.going)
     names = ", ".join(found.aspects or found.done)
+    worlds = f"{len(found.worlds)} world contexts without data" if found.worlds else ""
+    if not names:
+        return f"forgot {worlds}; the shards may start"
+    names += f", and {worlds}" if worlds else ""
     return (
         f"forgot {names}: {slots} slots with {versions} versions; the shards may start, and take"
         " whatever type is registered next"
@@ -185,6 +212,12 @@ class _Told:
             print(f"a run that had forgotten {', '.join(found.done)} was cut off at its end")
         if found.resumed and (found.aspects or not found.done):
             print("an earlier run was cut off; this is what it had left")
+        if found.worlds:
+            more = f" and {len(found.worlds) - 10} more" if len(found.worlds) > 10 else ""
+            print(
+                f"{self._goes}: {len(found.worlds)} world contexts without data:"
+                f" {', '.join(found.worlds[:10])}{more}"
+            )
         if not found.aspects:
             return
         print_table(

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from enact_dist.core.messages import AspectEntry, Finish, Item, Prepare, WriteItem
     from enact_dist.core.stamps import Stamps
 
+WORLDS_TOLD_MAX: Final = 100
+"""World contexts that a refusal names: a text has at most 64 KiB."""
 NO_PAYLOAD: Final = "no_payload"
 """The code of a refusal that leaves the lock as it is: named bytes are not here, send them."""
 
@@ -69,7 +71,7 @@ def wrong_name(kind: str, name: str, *, slashes: bool) -> Refused | None:
 
 def unknown_world(name: str, worlds: Iterable[str]) -> Refused:
     """Refuse a world context that is not here, naming those that are."""
-    known = ", ".join(sorted(worlds)) or "none"
+    known = ", ".join(sorted(worlds)[:WORLDS_TOLD_MAX]) or "none"
     return Refused("unknown_world", f"no world context {name!r} here; known: {known}")
 
 

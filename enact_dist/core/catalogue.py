@@ -1,29 +1,60 @@
-"""The catalogue of one shard: its world contexts, its aspects and how much history these retain."""
+"""The catalogue of one shard: its world contexts, its aspects and how much history these retain.
+
+Every hello is answered with all of it, so it is bounded: whatever clients register, a `Welcome`
+stays below 4 MiB.  A store may hold more, from a release that had no bound: then the shard serves
+it, shows of it what has room, and takes nothing new until some of it has gone.
+"""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
 from enact_dist.core.datum_types import successions, type_conflict, with_type_of
 from enact_dist.core.history import Policy
+from enact_dist.core.messages import Refused
+from enact_dist.core.pages import bytes_in_frame
 from enact_dist.core.retaining import covers, limits_of, with_larger
 from enact_dist.terms import Durability
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Callable, Iterable, Iterator, Mapping
 
     from enact_dist.core.messages import AspectEntry, WorldEntry
+
+E = TypeVar("E")
+
+
+WORLDS_MAX: Final = 4096
+ASPECTS_MAX: Final = 4096
+FINGERPRINT_CHARACTERS_MAX: Final = 4096
+"""Twice as much as `wire.fingerprint` makes of any type."""
+CATALOGUE_BYTES_MAX: Final = 3 << 20
+"""Bytes of all world contexts and aspects in a `Welcome`, which has 1 MiB left for the rest."""
+REMEDY: Final = (
+    "`enact world drop` takes away world contexts, `enact shard forget` aspects, `enact shard"
+    " forget --unused`, while the cell is stopped, all that have no data"
+)
+
+
+class Shown(NamedTuple):
+    """What a `Welcome` shows of a catalogue, and how much it leaves out."""
+
+    worlds: tuple[str, ...]
+    aspects: tuple[AspectEntry, ...]
+    forks: tuple[WorldEntry, ...]
+    left_out: int
 
 
 class Catalogue:
     """World contexts and aspects that this shard knows.
 
     Attributes:
+        worlds: The world contexts by name; changed by `add_world` and `drop_world` alone.
         policies: How much of its history each aspect retains.
         successions: How often the type of some aspect has been succeeded by a newer one.
     """
 
-    __slots__ = ("_configured", "aspects", "policies", "successions", "worlds")
+    __slots__ = ("_configured", "_shown", "aspects", "bytes", "policies", "successions", "worlds")
 
     def __init__(
         self,
@@ -37,16 +68,20 @@ class Catalogue:
         self.policies: dict[str, Policy] = {}
         self.worlds: dict[str, WorldEntry] = {}
         self.successions = 0
+        self.bytes = 0
+        self._shown: Shown | None = None
         for world in worlds:
             # That it is a fork is known of a context which is also named elsewhere.
             if world.source or world.name not in self.worlds:
-                self.worlds[world.name] = world
+                self.add_world(world)
         for entry in recovered:
             self._set(self._with_configured(entry))
 
     def _set(self, entry: AspectEntry) -> None:
         before = self.aspects.get(entry.name)
         self.successions += len(entry.older) - (len(before.older) if before is not None else 0)
+        self.bytes += bytes_in_frame(entry) - (bytes_in_frame(before) if before is not None else 0)
+        self._shown = None
         self.aspects[entry.name] = entry
         stored = entry.durability != Durability.VOLATILE.value
         self.policies[entry.name] = Policy(limits_of(entry), stored)
@@ -83,10 +118,81 @@ class Catalogue:
         self._set(now)
         return now, True
 
+    def add_world(self, world: WorldEntry) -> None:
+        """Add a world context, or say that one is a fork."""
+        self.drop_world(world.name)
+        self.worlds[world.name] = world
+        self.bytes += _world_bytes(world)
+
+    def drop_world(self, name: str) -> None:
+        """Take away a world context, if it is there."""
+        world = self.worlds.pop(name, None)
+        self.bytes -= _world_bytes(world) if world is not None else 0
+        self._shown = None
+
+    def refusal(self, worlds: int, before: Mapping[str, AspectEntry], size: int) -> Refused | None:
+        """Return why what was registered just now is too much, None where it is not.
+
+        Args:
+            worlds: How many world contexts are new.
+            before: The aspects as they were.
+            size: `bytes` as it was.
+        """
+        for what, count, new, most in (
+            ("world contexts", len(self.worlds), worlds, WORLDS_MAX),
+            ("aspects", len(self.aspects), len(self.aspects) - len(before), ASPECTS_MAX),
+            ("bytes of both", self.bytes, self.bytes - size, CATALOGUE_BYTES_MAX),
+        ):
+            if new > 0 and count > most:
+                return _too_much(f"{new} {what} to the {count - new} that are here; at most {most}")
+        for entry in self.aspects.values() if self.aspects != before else ():
+            known = before.get(entry.name)
+            length = len(entry.fingerprint)
+            changed = known is None or known.fingerprint != entry.fingerprint
+            if changed and length > FINGERPRINT_CHARACTERS_MAX:
+                return _too_much(
+                    f"aspect {entry.name!r} with a fingerprint of {length} characters; at most"
+                    f" {FINGERPRINT_CHARACTERS_MAX}"
+                )
+        return None
+
+    def room_for_world(self, world: WorldEntry) -> Refused | None:
+        """Return why a world context cannot be added, None where it can."""
+        size = self.bytes + _world_bytes(world)
+        if len(self.worlds) < WORLDS_MAX and size <= CATALOGUE_BYTES_MAX:
+            return None
+        return Refused(
+            "no_room",
+            f"asked to add {world.name!r} to the {len(self.worlds)} world contexts that are here;"
+            f" at most {WORLDS_MAX}, of {CATALOGUE_BYTES_MAX} bytes with all aspects; {REMEDY}",
+        )
+
+    def shown(self) -> Shown:
+        """Return what a `Welcome` has room for: all, where nobody has registered too much before.
+
+        Else the smallest entries: what fills a catalogue is large, or without end.
+        """
+        if self._shown is None:
+            aspects: Iterable[AspectEntry] = self.aspects.values()
+            worlds: Iterable[WorldEntry] = self.worlds.values()
+            if self.bytes > CATALOGUE_BYTES_MAX:
+                half = CATALOGUE_BYTES_MAX // 2
+                aspects = _that_fit(sorted(aspects, key=bytes_in_frame), bytes_in_frame, half)
+                worlds = _that_fit(worlds, _world_bytes, half)
+            worlds, aspects = tuple(worlds), tuple(aspects)
+            self._shown = Shown(
+                tuple(world.name for world in worlds),
+                aspects,
+                tuple(world for world in worlds if world.source),
+                len(self.worlds) + len(self.aspects) - len(worlds) - len(aspects),
+            )
+        return self._shown
+
     def put_back(self, aspects: Mapping[str, AspectEntry]) -> None:
         """Undo registrations that came to nothing."""
         for name in [name for name in self.aspects if name not in aspects]:
-            del self.aspects[name], self.policies[name]
+            self.bytes -= bytes_in_frame(self.aspects.pop(name))
+            del self.policies[name]
         for entry in aspects.values():
             self._set(entry)
         self.successions = successions(self.aspects.values())
@@ -103,13 +209,26 @@ class Catalogue:
         entry = self.aspects.get(aspect)
         return entry if entry is not None and entry.older else None
 
-    def forks(self) -> tuple[WorldEntry, ...]:
-        """Return the world contexts that are forks."""
-        return tuple(world for world in self.worlds.values() if world.source)
-
     def durability(self, aspect: str) -> Durability:
         """Return what a commit of this (registered) aspect survives."""
         return _DURABILITIES[self.aspects[aspect].durability]
+
+
+def _world_bytes(world: WorldEntry) -> int:
+    return bytes_in_frame(world.name) + (bytes_in_frame(world) if world.source else 0)
+
+
+def _that_fit(entries: Iterable[E], bytes_of: Callable[[E], int], most: int) -> Iterator[E]:
+    """Yield the first entries, as many as have so many bytes."""
+    for entry in entries:
+        most -= bytes_of(entry)
+        if most < 0:
+            return
+        yield entry
+
+
+def _too_much(what: str) -> Refused:
+    return Refused("overload", f"asked to add {what}; {REMEDY}")
 
 
 _DURABILITIES: Final = {durability.value: durability for durability in Durability}

@@ -16,10 +16,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
-from enact_dist.core.records import AspectForgotten, KeptRecord
+from enact_dist.core.records import AspectForgotten, KeptRecord, WorldDropped
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Collection, Iterable, Iterator, Mapping
 
     from enact_dist.core.records import PreparedRecord, Record, Recovered, SlotRecord
 
@@ -170,6 +170,46 @@ def _labels_without(stored: Recovered, aspects: set[str]) -> Iterator[KeptRecord
         left = tuple(one for one in record.versions if one.slot.aspect not in aspects)
         if len(left) < len(record.versions):
             yield KeptRecord(record.label, left)
+
+
+# ---------------------------------------------------------------- what has no data
+
+
+def unused_aspects(stores: Mapping[str, Recovered]) -> tuple[str, ...]:
+    """Return the aspects that are registered and of which no shard has any state."""
+    used = {record.slot.aspect for stored in stores.values() for record in _all_states(stored)} | {
+        aspect for stored in stores.values() for one in stored.prepared for aspect in _named_by(one)
+    }
+    names = (entry.name for stored in stores.values() for entry in stored.aspects)
+    return tuple(name for name in dict.fromkeys(names) if name not in used)
+
+
+def unused_worlds(stores: Mapping[str, Recovered], named: Collection[str]) -> tuple[str, ...]:
+    """Return the world contexts without any state, but for forks and those that are `named`."""
+    used = {record.slot.context for stored in stores.values() for record in _all_states(stored)}
+    for stored in stores.values():
+        used |= {world.name for world in stored.worlds if world.source}
+        used |= {item.context for one in stored.prepared for item in one.items}
+    names = (world.name for stored in stores.values() for world in stored.worlds)
+    return tuple(name for name in dict.fromkeys(names) if name not in used and name not in named)
+
+
+def world_drops(
+    stores: Mapping[str, Recovered], worlds: Collection[str]
+) -> dict[str, tuple[Record, ...]]:
+    """Return by shard the records by which it lets world contexts without data go."""
+    drops: dict[str, tuple[Record, ...]] = {}
+    for shard, stored in stores.items():
+        before = {record.name: record for record in stored.dropped}
+        here = [world.name for world in stored.worlds if world.name in set(worlds)]
+        if here:
+            drops[shard] = tuple(before.get(name, WorldDropped(name, 0)) for name in here)
+    return drops
+
+
+def _all_states(stored: Recovered) -> Iterator[SlotRecord]:
+    yield from stored.slots
+    yield from stored.history
 
 
 # ---------------------------------------------------------------- what is in the way

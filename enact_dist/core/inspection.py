@@ -113,8 +113,8 @@ def sessions(state: ShardState, message: ListSessions) -> Sessions:
         state.slots.count,
         state.slots.bytes,
         told,
-        () if begin else tuple(state.catalogue.worlds),
-        () if begin else tuple(state.catalogue.aspects.values()),
+        () if begin else state.catalogue.shown().worlds,
+        () if begin else state.catalogue.shown().aspects,
         tuple(Counter(name, count) for name, count in sorted(counted(state).items())),
         more,
     )
@@ -161,6 +161,7 @@ def counted(state: ShardState) -> dict[str, int]:
     history = state.slots.history
     others = {
         "alarms": state.audit.alarms,
+        "catalogue_left_out": state.catalogue.shown().left_out,
         "draining": int(state.draining),
         "retained_bytes": history.bytes,
         "retained_dropped": history.dropped,

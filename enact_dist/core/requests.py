@@ -37,7 +37,10 @@ class Hello:
 
 @dataclass(frozen=True, slots=True)
 class Register:
-    """Create world contexts and register aspects, idempotently.  Answer: `Registered`."""
+    """Create world contexts and register aspects, idempotently.  Answer: `Registered`.
+
+    What would be more than a catalogue holds (`core.catalogue`) is refused as "overload".
+    """
 
     session: str
     worlds: tuple[str, ...]

@@ -84,6 +84,7 @@ class SessionDesk:
         )
         self._state.shortest_ttl_ns = min(self._state.shortest_ttl_ns, session.ttl_ns)
         self._state.sessions.end_grace_if_all_acknowledged(self._state.now_ns)
+        shown = self._state.catalogue.shown()
         welcome = Welcome(
             self._state.settings.name,
             self._state.epoch,
@@ -92,11 +93,11 @@ class SessionDesk:
             self._state.wall_ns,
             self._state.commits.notice_number,
             self._state.settings.placement,
-            tuple(self._state.catalogue.worlds),
-            tuple(self._state.catalogue.aspects.values()),
+            shown.worlds,
+            shown.aspects,
             self._state.settings.shared,
             self._state.settings.shared_nonce,
-            self._state.catalogue.forks(),
+            shown.forks,
         )
         if unrecorded and session.session not in self._recording:
             # A session that a restart would not know could lose its grants without the grace, so
@@ -147,7 +148,10 @@ class SessionDesk:
     def on_register(self, message: Register, reply_to: int) -> Iterator[Effect]:
         """Create world contexts and register aspects, all or none."""
         catalogue = self._state.catalogue
-        before = dict(catalogue.aspects)
+        if self._state.sessions.known(message.session) is None:
+            yield Reply(reply_to, EpochChanged(self._state.epoch))
+            return
+        before, size = dict(catalogue.aspects), catalogue.bytes
         missing = [name for name in message.worlds if name not in catalogue.worlds]
         for name in missing:
             wrong = wrong_name("world context", name, slashes=False) or self._state.busy_world(name)
@@ -166,6 +170,16 @@ class SessionDesk:
                 return
             if registered[1]:
                 records.append(AspectRecord(registered[0]))
+        for name in missing:
+            catalogue.add_world(WorldEntry(name))
+        refusal = catalogue.refusal(len(missing), before, size)
+        if refusal is not None:
+            for name in missing:
+                catalogue.drop_world(name)
+            catalogue.put_back(before)
+            self._state.count("overloads")
+            yield Reply(reply_to, refusal)
+            return
         succeeded = [
             record.entry
             for record in records
@@ -177,10 +191,7 @@ class SessionDesk:
             self._state.count("types_succeeded")
             told = f"aspect {entry.name!r} has the datum type {entry.fingerprint} from now on"
             yield Story("aspect.type", f"{told}, which succeeds {entry.older[-1]}")
-        catalogue.worlds.update((name, WorldEntry(name)) for name in missing)
-        answer = Registered(
-            tuple(catalogue.worlds), tuple(catalogue.aspects.values()), catalogue.forks()
-        )
+        answer = Registered(*catalogue.shown()[:3])
         yield from self.answer_when_durable(reply_to, answer, tuple(records))
 
     def on_keep_alive(self, message: KeepAlive, reply_to: int) -> Iterator[Effect]:

@@ -110,8 +110,8 @@ class ShardState:
             # Contexts that were only configured once have data, which must stay in reach.
             worlds=(
                 *map(WorldEntry, settings.worlds),
-                *(WorldEntry(r.name, r.source, r.at_ns) for r in recovered.worlds),
                 *map(WorldEntry, dict.fromkeys(r.slot.context for r in recovered.slots)),
+                *(WorldEntry(r.name, r.source, r.at_ns) for r in recovered.worlds),
             ),
         )
         self.stamps = Stamps(newest_stamp(recovered)[0])

@@ -151,6 +151,9 @@ class WorldDesk:
         if message.at_ns <= 0:
             text = f"{message.source!r} was to be forked as of stamp {message.at_ns}, which is none"
             return Refused("protocol", text)
+        full = state.catalogue.room_for_world(WorldEntry(*_fork_of(message)))
+        if full is not None:
+            return full
         if state.stamps.too_far_ahead(message.at_ns, wall_ns=state.wall_ns):
             ahead_s = (message.at_ns - state.wall_ns) / 1e9
             return Refused(
@@ -237,7 +240,7 @@ class WorldDesk:
             yield from self._told(act, answer)
             return
         state, world = self._state, message.world
-        del state.catalogue.worlds[world]
+        state.catalogue.drop_world(world)
         state.busy_worlds[world] = "being dropped"
         dropped = WorldDropped(world, state.slots.version_base(world))
         yield self._persist(act, (dropped, *self._labels_without(world)))
@@ -294,7 +297,7 @@ class WorldDesk:
         message, state = act.message, self._state
         self._end(act)
         if isinstance(message, Fork):
-            state.catalogue.worlds[message.world] = WorldEntry(*_fork_of(message))
+            state.catalogue.add_world(WorldEntry(*_fork_of(message)))
             for slot, content in act.made:
                 state.slots.set(slot, content)
             state.count("worlds_forked")

@@ -102,6 +102,11 @@ OF_A_SHARD: Final[dict[str, Counter]] = {
     ),
     "alarms": Counter("of these, those that nobody has settled yet", "enact lock audit", now=True),
     # This process and its host
+    "catalogue_left_out": Counter(
+        "world contexts and aspects that the catalogue has no room to show",
+        "stop the cell and run enact shard forget --unused",
+        now=True,
+    ),
     "draining": Counter("1 while this shard ends and grants nothing new", now=True),
     "stalls": Counter("times this host stood still; no lease paid for it", _BUSY),
     "disk_stalls": Counter(

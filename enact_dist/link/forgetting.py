@@ -16,7 +16,7 @@ from __future__ import annotations
 from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
-from enact_dist.core.forgetting import planned
+from enact_dist.core.forgetting import planned, unused_aspects, unused_worlds, world_drops
 from enact_dist.core.records import Persist
 from enact_dist.errors import MisuseError, StoreError
 from enact_dist.link.folder_marks import mark, under_way, unmark
@@ -24,7 +24,7 @@ from enact_dist.link.store import open_store, read_store
 from enact_dist.terms import Durability
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Collection, Iterable, Iterator, Mapping
     from pathlib import Path
 
     from enact_dist.core.forgetting import Going, Plan
@@ -62,6 +62,7 @@ class Forgotten(NamedTuple):
         resumed: Whether an earlier run was cut off; a shard that had let an aspect go has it no
             more, and what is there of it has come since.
         done: The aspects of one that every shard has let go already.
+        worlds: The world contexts without data that were let go, or would be.
     """
 
     aspects: tuple[str, ...]
@@ -69,16 +70,22 @@ class Forgotten(NamedTuple):
     going: list[Going]
     resumed: bool
     done: tuple[str, ...] = ()
+    worlds: tuple[str, ...] = ()
 
 
 def look(
-    folders: Mapping[str, Path], aspects: Iterable[str], *, progress: Progress | None = None
+    folders: Mapping[str, Path],
+    aspects: Iterable[str],
+    *,
+    unused: Collection[str] | None = None,
+    progress: Progress | None = None,
 ) -> Forgotten:
     """Return what `forget` would let go, and change nothing.
 
     Args:
         folders: The folder of each shard.
         aspects: Names of the aspects.
+        unused: As for `forget`.
         progress: Told what would go.
 
     Raises:
@@ -90,7 +97,7 @@ def look(
         for name, folder in folders.items():
             with _of_shard(name):
                 stored[name] = open_folders.enter_context(read_store(folder))
-        found, _ = _plan(folders, stored, aspects, now_ns=0)
+        found, _ = _plan(folders, stored, aspects, now_ns=0, unused=unused)
     (progress or _Nobody()).found(found)
     _refuse_unknown(found)
     return found
@@ -101,6 +108,7 @@ def forget(
     aspects: Iterable[str],
     *,
     now_ns: int,
+    unused: Collection[str] | None = None,
     progress: Progress | None = None,
 ) -> Forgotten:
     """Let aspects go, with everything that these shards have of them.
@@ -109,6 +117,8 @@ def forget(
         folders: The folder of each shard.
         aspects: Names of the aspects.
         now_ns: The wall clock, nanoseconds since 1970.
+        unused: If given, all aspects and world contexts without data go as well, but for these
+            contexts, and forks.
         progress: Told what goes and how far it is.
 
     Raises:
@@ -126,7 +136,7 @@ def forget(
                 opened = open_store(folder, unix_s=now_ns // 1_000_000_000, moving=True)
             stores[name], stored[name] = opened
             undo.callback(stores[name].close)
-        found, plan = _plan(folders, stored, aspects, now_ns=now_ns)
+        found, plan = _plan(folders, stored, aspects, now_ns=now_ns, unused=unused)
         progress.found(found)
         _refuse_unknown(found)
         if plan.records:
@@ -139,6 +149,9 @@ def forget(
             progress.act(f"unlink on {name}")
             stores[name].rest()
         unmark(folders, progress.act)
+        for name, dropped in world_drops(stored, found.worlds).items():
+            progress.act(f"drop on {name}")
+            stores[name].write([Persist(0, dropped, Durability.DURABLE)])
     return found
 
 
@@ -148,6 +161,7 @@ def _plan(
     aspects: Iterable[str],
     *,
     now_ns: int,
+    unused: Collection[str] | None,
 ) -> tuple[Forgotten, Plan]:
     """Return what goes and how; aspects of a run that was cut off go as well.
 
@@ -155,12 +169,16 @@ def _plan(
         StoreError: Something is in the way.
     """
     begun = _begun(folders)
+    worlds: tuple[str, ...] = ()
+    if unused is not None:
+        aspects = dict.fromkeys((*aspects, *unused_aspects(stored)))
+        worlds = unused_worlds(stored, unused)
     plan = planned(stored, aspects, now_ns=now_ns, begun=begun)
     if plan.obstacles:
         more = f"; and {len(plan.obstacles) - 3} more" if len(plan.obstacles) > 3 else ""
         raise StoreError(f"nothing was forgotten: {'; '.join(plan.obstacles[:3])}{more}")
     known = plan.known | begun.keys()  # a restore may have left nothing of what was begun
-    return Forgotten(plan.names, known, plan.going, bool(begun), plan.done), plan
+    return Forgotten(plan.names, known, plan.going, bool(begun), plan.done, worlds), plan
 
 
 def _begun(folders: Mapping[str, Path]) -> dict[str, int]:

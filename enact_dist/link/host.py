@@ -29,6 +29,7 @@ from contextlib import ExitStack
 from typing import TYPE_CHECKING, Final, cast
 
 from enact_dist.core import owners
+from enact_dist.core.catalogue import REMEDY
 from enact_dist.core.epochs import state_of, unkept_epoch
 from enact_dist.core.messages import (
     Acquire,
@@ -120,6 +121,10 @@ def open_host(
             refuse_far_stamps(folder, recovered, wall_ns=wall_ns)
             undo.pop_all()
     shard = Shard(settings, recovered, now_ns=clock.monotonic_ns(), wall_ns=wall_ns)
+    left_out = shard.state.catalogue.shown().left_out
+    if left_out:
+        what = "world contexts and aspects are more than clients can be shown"
+        _log.warning("shard %s: %d %s; %s", settings.name, left_out, what, REMEDY)
     return ShardHost(
         shard,
         store=store,

@@ -415,8 +415,10 @@ class SessionClient:
         if missing:
             request = Register(self.core.session, worlds, aspects)
             epochs = {shard: self.core.epoch(shard) for shard in missing}
-            calls = [(shard, request) for shard in missing]
-            for answer in self.call_all(calls, timeout_s=timeout_s):
+            found = self.ask_each(missing, lambda *_: request, timeout_s=timeout_s)
+            for shard, answer in found.items():
+                if answer is None:
+                    raise self.unreachable(shard, timeout_s or self.patience_s)
                 if isinstance(answer, Refused):
                     raise error_of(answer)
             restarted = [shard for shard in missing if self.core.epoch(shard) != epochs[shard]]

@@ -6,6 +6,9 @@ import numpy as np
 import pytest
 
 from enact_dist import Aspect, Durability, Entity, Lock, Write, local
+from enact_dist.core.messages import AspectEntry
+from enact_dist.core.records import AspectRecord, Persist, WorldRecord
+from enact_dist.errors import LinkError
 from enact_dist.link.store import open_store
 
 NUMBER, CLOUD = Aspect("number", int), Aspect("cloud", np.ndarray, Durability.OS)
@@ -115,6 +118,44 @@ def test_one_shard_alone_forgets(enact, stopped):
     left = enact("shard", "forget", "number", "--cell", stopped, "--dry-run", "--json").json
     assert [one["shard"] for one in left["going"]] == ["left"]
     assert "has no shard 'middle'" in enact(*words, "--shard", "middle").err
+
+
+def test_what_has_no_data_goes_at_once(enact, stopped):
+    """A client of an earlier release had filled the catalogue: the shard opens, and says so."""
+    store, _ = open_store(stopped.parent / "data" / "left", unix_s=1)
+    fat = [AspectRecord(AspectEntry(f"fat{n}", "x" * 60_000, "os")) for n in range(60)]
+    worlds = [WorldRecord(f"w{n}") for n in range(5_000)]
+    store.write([Persist(0, (*worlds, *fat), Durability.DURABLE)])
+    store.close()
+    with local(stopped.parent / "data" / "left") as cell:
+        assert cell.aspects()["number"] == ("int", "durable")
+        assert cell.shards()[0].counters["catalogue_left_out"] > 0
+        with pytest.raises(LinkError, match=r"world contexts.* at most 4096; .*forget --unused"):
+            cell.create_world("lab")
+
+    said = enact("shard", "forget", "--unused", "--cell", stopped)
+    done = enact("shard", "forget", "--unused", "--cell", stopped, "--yes")
+    again = enact("shard", "forget", "--unused", "--cell", stopped, "--yes", "--json")
+
+    assert said.status == 1
+    assert "would go: 5000 world contexts without data: w0, w1" in said.out
+    assert "to let it go: enact shard forget --unused --yes" in said.err
+    assert done.status == 0, done.err
+    assert "and 5000 world contexts without data" in done.out
+    assert (again.json["aspects"], again.json["worlds"]) == ([], [])
+    with local(stopped.parent / "data" / "left") as cell:
+        assert "catalogue_left_out" not in cell.shards()[0].counters
+        cell.create_world("lab")
+        assert [info.version for info in cell.world("online").survey("**")] == [2, 2]
+        assert sorted(cell.aspects()) == ["cloud", "number"]
+
+
+def test_unused_wants_all_shards_and_nothing_named_is_refused(enact, stopped):
+    """What one shard has no data of another may be full of."""
+    told = enact("shard", "forget", "--unused", "--cell", stopped, "--shard", "left")
+    assert (told.status, "--unused looks at the data of all shards" in told.err) == (2, True)
+    told = enact("shard", "forget", "--cell", stopped)
+    assert (told.status, "or --unused for all without data" in told.err) == (2, True)
 
 
 @pytest.mark.slow

@@ -23,7 +23,6 @@ from enact_dist.core.messages import (
     Commit,
     EpochChanged,
     Reached,
-    Register,
     TakeView,
     Viewed,
     Waiting,
@@ -55,7 +54,7 @@ class Pair:
         bench = ShardBench()
         for name, durability in DURABILITY.items():
             entry = AspectEntry(name, "int", durability, RETENTION[name])
-            bench.ask(Register("admin", (), (entry,)))
+            bench.register(entry)
         self._base, self._settings = bench, bench.settings
         self.shard = bench.shard
         self.now_ns, self.wall_ns = bench.now_ns, bench.wall_ns

@@ -18,6 +18,7 @@ from enact_dist.core.messages import (
     Answer,
     AspectEntry,
     Commit,
+    Goodbye,
     Granted,
     Hello,
     Item,
@@ -115,10 +116,17 @@ class ShardBench:
         self.identity = ""
         self._boot(recovered or Recovered(1))
         if register and recovered is None:
-            self.ask(Register("admin", (), ASPECTS))
+            self.register(*ASPECTS)
 
     def _boot(self, recovered: Recovered) -> None:
         self.shard = Shard(self.settings, recovered, now_ns=self.now_ns, wall_ns=self.wall_ns)
+
+    def register(self, *aspects: AspectEntry) -> Answer | None:
+        """Register aspects by a session that leaves nothing behind."""
+        self.ask(Hello("admin", 0, TTL_NS, "admin", "host", 1, observer=True))
+        answer = self.ask(Register("admin", (), aspects))
+        self.ask(Goodbye("admin"))
+        return answer
 
     # ---------------------------------------------------------------- messages
 

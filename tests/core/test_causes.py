@@ -20,7 +20,6 @@ from enact_dist.core.messages import (
     KeepVersions,
     ListHistory,
     Refused,
-    Register,
     SlotVersion,
     WriteItem,
 )
@@ -269,7 +268,7 @@ def test_each_version_is_explained_as_it_is_listed():
     """Retained, kept beyond that, replaced within the last two seconds, the newest."""
     bench = ShardBench()
     bench.hello("ann")
-    bench.ask(Register("admin", (), (AspectEntry("mask", "int", "durable", 4),)))
+    bench.register(AspectEntry("mask", "int", "durable", 4))
     where = slot(aspect="mask")
     for seq in range(1, 12):
         committed(bench, (where, str(seq)), seq=seq)

@@ -14,6 +14,8 @@ from enact_dist.core import history, sessions, tenures
 from enact_dist.core.client import Client
 from enact_dist.core.messages import (
     Commit,
+    Goodbye,
+    Hello,
     PlacementMap,
     Prepare,
     Register,
@@ -51,7 +53,9 @@ class FastCell:
             for name in ("a", "b")
         }
         for name in self.shards:
+            self.ask(name, Hello("admin", 0, TTL_NS, "admin", "host", 1, observer=True))
             self.ask(name, Register("admin", (), ASPECTS))
+            self.ask(name, Goodbye("admin"))
 
     def ask(self, name: str, request: Request) -> Answer | None:
         """Return the answer that comes at once; every effect is carried out."""

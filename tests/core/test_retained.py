@@ -16,7 +16,6 @@ from enact_dist.core.messages import (
     Item,
     ListSessions,
     Refused,
-    Register,
     Registered,
     Release,
     Sessions,
@@ -42,7 +41,7 @@ LARGE = INLINE_BYTES_MAX + 1
 def cameras() -> ShardBench:
     """A shard whose frames retain three versions, with two sessions."""
     bench = ShardBench()
-    bench.ask(Register("admin", (), (AspectEntry("mask", "int", "volatile", KEPT),)))
+    bench.register(AspectEntry("mask", "int", "volatile", KEPT))
     bench.hello("ann", "bob")
     return bench
 
@@ -85,7 +84,7 @@ def test_last_versions_are_found_by_their_capture_stamp(cameras):
 
 def test_aspect_that_retains_nothing_shows_only_its_newest_version(cameras):
     """Whoever says so gets no history."""
-    cameras.ask(Register("admin", (), (AspectEntry("frame", "int", "volatile", 1),)))
+    cameras.register(AspectEntry("frame", "int", "volatile", 1))
     for seq in (1, 2):
         grant = cameras.granted(lock_id("ann", 1, seq), item(W, "cam", "frame"))
         write = WriteItem(slot("cam", "frame"), Datum(b"t", b"x", 1, 100 * seq))
@@ -221,17 +220,15 @@ def test_survey_lists_what_is_retained_oldest_first(cameras):
 def test_largest_retention_that_anybody_asks_for_counts(cameras):
     """Whoever needs fewer versions does not take away those of another."""
     for asked, counts in ((2, KEPT), (5, 5), (0, 5)):
-        answer = cameras.ask(
-            Register("admin", (), (AspectEntry("mask", "int", "volatile", asked),))
-        )
+        answer = cameras.register(AspectEntry("mask", "int", "volatile", asked))
         assert isinstance(answer, Registered)
         assert retained(cameras) == counts
 
 
 def test_larger_retention_outlives_a_restart(cameras):
     """Whoever asked for more versions does not ask again: the shard has kept it."""
-    cameras.ask(Register("admin", (), (AspectEntry("mask", "int", "volatile", 5),)))
-    cameras.ask(Register("admin", (), (AspectEntry("mask", "int", "volatile", 4),)))
+    cameras.register(AspectEntry("mask", "int", "volatile", 5))
+    cameras.register(AspectEntry("mask", "int", "volatile", 4))
 
     cameras.restart()
 
@@ -243,7 +240,7 @@ def test_retention_that_is_none_is_refused(cameras, figures):
     """No figure means *no limit*, and the limits of the shard come before all of them."""
     entry = AspectEntry("other", "int", "volatile", *figures)
 
-    answer = cameras.ask(Register("admin", (), (entry,)))
+    answer = cameras.register(entry)
 
     assert isinstance(answer, Refused)
     assert str(NO_LIMIT) in answer.text
@@ -263,11 +260,11 @@ def test_retention_shows_in_the_counters(cameras):
 def test_aspect_of_which_nothing_was_said_retains_less_once_somebody_says_so():
     """What was retained by default goes with the next commit, in memory and on the disk."""
     bench = ShardBench()
-    bench.ask(Register("admin", (), (AspectEntry("mask", "int", "durable"),)))
+    bench.register(AspectEntry("mask", "int", "durable"))
     bench.hello("ann")
     for seq in range(1, 5):
         capture(bench, seq, stamp_ns=100 - seq)
-    bench.ask(Register("admin", (), (AspectEntry("mask", "int", "durable", 1),)))
+    bench.register(AspectEntry("mask", "int", "durable", 1))
 
     capture(bench, 5, stamp_ns=95)
     bench.wait(TTL_NS // 2, keep=("ann",))
@@ -280,11 +277,11 @@ def test_aspect_of_which_nothing_was_said_retains_less_once_somebody_says_so():
 def test_restart_forgets_what_an_aspect_retains_no_more():
     """Nothing wrote to the slot between: its rows would stay on the disk for ever."""
     bench = ShardBench()
-    bench.ask(Register("admin", (), (AspectEntry("mask", "int", "durable"),)))
+    bench.register(AspectEntry("mask", "int", "durable"))
     bench.hello("ann")
     for seq in range(1, 5):
         capture(bench, seq, stamp_ns=100 - seq)
-    bench.ask(Register("admin", (), (AspectEntry("mask", "int", "durable", 1),)))
+    bench.register(AspectEntry("mask", "int", "durable", 1))
     assert len(bench.recovered(2).history) == 3
 
     bench.restart()

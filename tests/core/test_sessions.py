@@ -167,6 +167,7 @@ class TestEnd:
 class TestCatalogue:
     def test_registration_is_answered_when_it_is_durable(self, bench):
         """What one client was told to exist exists after a crash (simulation seed 3303)."""
+        bench.hello("ann")
         bench.disk_is_done = False
         request = Register("ann", ("lab",), (AspectEntry("new", "int", "os"),))
         first, again = bench.send(request), bench.send(request)
@@ -182,6 +183,7 @@ class TestCatalogue:
 
     def test_refused_registration_leaves_nothing(self, bench):
         """All or none: a type that differs takes the new aspects beside it down."""
+        bench.hello("ann")
         wrong = (AspectEntry("new", "int", "os"), AspectEntry("count", "float", "durable"))
         answer = bench.ask(Register("ann", (), wrong))
 
@@ -191,6 +193,7 @@ class TestCatalogue:
 
     def test_same_registration_again_is_fine(self, bench):
         """Registering is idempotent; unsaid durability takes what is there."""
+        bench.hello("ann")
         answer = bench.ask(Register("ann", ("online",), (AspectEntry("note", "int", ""),)))
 
         assert isinstance(answer, Registered)
@@ -198,6 +201,7 @@ class TestCatalogue:
 
     def test_world_with_a_wrong_name_is_refused(self, bench):
         """Names are checked where they are made."""
+        bench.hello("ann")
         assert isinstance(bench.ask(Register("ann", ("a/b",), ())), Refused)
 
     def test_request_placed_by_another_map_is_sent_back(self, bench):

@@ -50,7 +50,7 @@ class WorldJudge:
                 self._made(host, world, picture)
             elif isinstance(answer, Dropped) and answer.world in picture.worlds:
                 self._dropped(host, answer.world, picture)
-        for world in host.shard.state.catalogue.forks():
+        for world in host.shard.state.catalogue.shown().forks:
             if picture.worlds.get(world.name) != world:
                 self._fail("a fork is there when it is told", host.name, world)
 
