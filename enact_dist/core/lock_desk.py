@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.core import quotas
 from enact_dist.core.admission import unknown_world, wrong_access
-from enact_dist.core.datum import Datum, LockId
+from enact_dist.core.datum import Column, Datum, LockId
 from enact_dist.core.messages import (
     Acquire,
     Answer,
@@ -33,8 +33,10 @@ if TYPE_CHECKING:
 
 ITEMS_MAX: Final = 4096
 """Requests in one lock or view."""
-WAITERS_MAX: Final = 100_000
+LOCKS_MAX: Final = 100_000
 """Locks, granted or waiting, at one shard."""
+LOOKED_MAX: Final = 1_000_000
+"""Slots that the patterns of one lock or view may have to look at, if there are several."""
 NEWER_TYPE: Final = "newer_type"
 """The code of a refusal until the client has looked at the types of the shard's aspects again."""
 DAMAGED: Final = "damaged"
@@ -80,6 +82,10 @@ class LockDesk:
                 return
             if self._has_its_share(session):
                 bound = f"{quotas.WAITERS_MAX} locks held or awaited"
+                yield from state.quotas.refuse(reply_to, session.identity, bound)
+                return
+            if self._too_much_waits(session):
+                bound = f"{quotas.ITEMS_WAITING_MAX} requests in locks that wait"
                 yield from state.quotas.refuse(reply_to, session.identity, bound)
                 return
             if state.pins or lock.session in state.tenures.by_session:
@@ -143,11 +149,14 @@ class LockDesk:
             return WrongShard(self._state.settings.placement)
         if len(items) > ITEMS_MAX:
             return Refused("value", f"{len(items)} requests in one lock; at most {ITEMS_MAX}")
-        if len(self._state.tenures.by_lock) >= WAITERS_MAX:
-            return Refused("overload", f"{WAITERS_MAX} locks are held or awaited here")
+        if len(self._state.tenures.by_lock) >= LOCKS_MAX:
+            return Refused("overload", f"{LOCKS_MAX} locks are held or awaited here")
         wrong = wrong_access(items)
         if wrong is not None:
             return wrong
+        too_much = self._too_much_to_look_at(items)
+        if too_much is not None:
+            return too_much
         worlds, aspects = self._state.catalogue.worlds, self._state.catalogue.aspects
         for item in items:
             if item.context not in worlds:
@@ -156,6 +165,24 @@ class LockDesk:
                 # Of what nobody has registered there is only null to be read, which is no fault.
                 return Refused("unknown_aspect", f"aspect {item.aspect!r} is not registered here")
         return None
+
+    def _too_much_to_look_at(self, items: tuple[Item, ...]) -> Refused | None:
+        """Refuse many patterns over many slots: everybody else waits while they are matched."""
+        column = self._state.slots.of_column
+        columns = [Column(i.context, i.aspect) for i in items if ACCESSES[i.access].each]
+        looked = sum([len(column(one)) for one in columns]) if len(columns) > 1 else 0
+        if looked <= LOOKED_MAX:
+            return None
+        return Refused(
+            "value",
+            f"{len(columns)} patterns in one lock would look at {looked} slots; at most"
+            f" {LOOKED_MAX}; ask for the entities by name, or with fewer patterns",
+        )
+
+    def _too_much_waits(self, session: Session) -> bool:
+        """Whether the locks of an identity that wait have as many requests as they may."""
+        items = self._state.tenures.items_waiting(session.identity)
+        return bool(session.identity) and items >= quotas.ITEMS_WAITING_MAX
 
     def on_fetch(self, message: Fetch, reply_to: int) -> Iterator[Effect]:
         """Hand out a part of a large datum that a lock pins, or that is current."""

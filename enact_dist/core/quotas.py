@@ -23,6 +23,8 @@ SESSIONS_MAX: Final = 256
 """Sessions of one identity: a process needs one for each cell that it has open."""
 WAITERS_MAX: Final = 2_048
 """Locks of one identity, granted or waiting: twice as many as a session has threads."""
+ITEMS_WAITING_MAX: Final = 65_536
+"""Requests in the locks of one identity that wait."""
 TOLD_MAX: Final = 1_000
 """So many identities the log names, each once, until the shard starts again."""
 

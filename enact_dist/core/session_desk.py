@@ -82,7 +82,6 @@ class SessionDesk:
             ttl_ns=ttl_ns,
             now_ns=self._state.now_ns,
         )
-        self._state.shortest_ttl_ns = min(self._state.shortest_ttl_ns, session.ttl_ns)
         self._state.sessions.end_grace_if_all_acknowledged(self._state.now_ns)
         shown = self._state.catalogue.shown()
         welcome = Welcome(

@@ -11,6 +11,7 @@ deadline moves by as much (`stalled`).
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field
 from itertools import islice
 from typing import TYPE_CHECKING, Final
@@ -108,9 +109,21 @@ class Session:
 
 
 class SessionTable:
-    """All sessions of one shard, and the grace after a restart."""
+    """All sessions of one shard, and the grace after a restart.
 
-    __slots__ = ("_of_identity", "_retired", "_tokens", "by_id", "grace_end_ns")
+    Attributes:
+        shortest_ttl_ns: Of the sessions that there are; None where there is none.
+    """
+
+    __slots__ = (
+        "_of_identity",
+        "_retired",
+        "_tokens",
+        "_ttls",
+        "by_id",
+        "grace_end_ns",
+        "shortest_ttl_ns",
+    )
 
     def __init__(
         self,
@@ -123,13 +136,17 @@ class SessionTable:
         self._tokens: dict[tuple[str, str], None] = {}
         self._retired: dict[str, _Retired] = {}
         self._of_identity: dict[str, set[str]] = {}
+        self._ttls: Counter[int] = Counter()
+        self.shortest_ttl_ns: int | None = None
         for record in recovered:
-            self.by_id[record.session] = Session(
-                record.session,
-                record.ttl_ns,
-                renewed_ns=now_ns,
-                durable=True,
-                identity=record.identity,
+            self._add(
+                Session(
+                    record.session,
+                    record.ttl_ns,
+                    renewed_ns=now_ns,
+                    durable=True,
+                    identity=record.identity,
+                )
             )
             self._of_identity.setdefault(record.identity, set()).add(record.session)
         for outcome in outcomes:
@@ -142,6 +159,11 @@ class SessionTable:
             lanes[outcome.lock.lane] = Lane(top=outcome.lock.seq, outcome=outcome)
         longest_ns = max((session.ttl_ns for session in self.by_id.values()), default=0)
         self.grace_end_ns = now_ns + longest_ns * (100 + 2 * DRIFT_PER_CENT) // 100
+
+    def _add(self, session: Session) -> None:
+        self.by_id[session.session] = session
+        self._ttls[session.ttl_ns] += 1
+        self.shortest_ttl_ns = min(self.shortest_ttl_ns or session.ttl_ns, session.ttl_ns)
 
     def __iter__(self) -> Iterator[Session]:
         return iter(self.by_id.values())
@@ -194,7 +216,7 @@ class SessionTable:
             retired = self._retired.pop(message.session, None)
             if retired is not None:
                 session.lanes, session.act = retired.lanes, retired.act
-            self.by_id[message.session] = session
+            self._add(session)
         bound = bool(identity) and not session.identity
         if bound:
             self._disown(session)
@@ -270,6 +292,11 @@ class SessionTable:
         if found is None:
             return
         self._disown(found)
+        self._ttls[found.ttl_ns] -= 1
+        if not self._ttls[found.ttl_ns]:
+            del self._ttls[found.ttl_ns]
+            if found.ttl_ns == self.shortest_ttl_ns:
+                self.shortest_ttl_ns = min(self._ttls, default=None)
         if found.token_present:
             self._expect(session, found.identity)
         if found.lanes or found.act[0]:

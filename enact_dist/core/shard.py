@@ -370,7 +370,7 @@ class Shard:
 
     def biggest(self, count: int) -> list[tuple[str, int]]:
         """Return the slots whose newest data are the largest, with their bytes; for messages."""
-        return self.state.slots.biggest(count)
+        return self.state.slots.large.largest(count)
 
     def assert_invariants(self) -> None:
         """Assert I1, I8, I10, I11 and the bookkeeping of all parts.  For tests and simulation."""

@@ -86,7 +86,6 @@ class ShardState:
         pins: Data that a view without a lock keeps fetchable.
         busy_worlds: What is being done to the context of a name, which is not to be used meanwhile.
         by_hand: The last lock that people have broken, and the last aborted: asked and answered.
-        shortest_ttl_ns: Of all sessions; bounds how often the shard must look at the time.
         draining: The shard is about to stop and grants nothing.
     """
 
@@ -125,9 +124,6 @@ class ShardState:
         )
         self.slots.recover_history(recovered.history, recovered.kept)
         self.sessions = SessionTable(recovered.sessions, outcomes=recovered.outcomes, now_ns=now_ns)
-        self.shortest_ttl_ns = min(
-            (session.ttl_ns for session in self.sessions), default=settings.ttl_ns_max
-        )
         self.tenures = Tenures(
             epoch=self.epoch, slots=self.slots, sessions=self.sessions, count=self.count
         )
@@ -184,6 +180,11 @@ class ShardState:
         session = self.sessions.by_id.get(message.session)
         if session is not None and session.act[0] == message.count:
             session.act = (message.count, answer)
+
+    @property
+    def shortest_ttl_ns(self) -> int:
+        """Of all sessions; bounds how often the shard must look at the time."""
+        return self.sessions.shortest_ttl_ns or self.settings.ttl_ns_max
 
     @property
     def grants(self) -> bool:

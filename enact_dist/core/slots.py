@@ -8,13 +8,13 @@ comparable within one epoch of the shard.
 
 from __future__ import annotations
 
-import heapq
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from enact_dist.core.bases import AspectBases, Bases
 from enact_dist.core.datum import Column, Datum, Slot
 from enact_dist.core.history import History
+from enact_dist.core.large_slots import LARGE_BYTES, LargeSlots
 from enact_dist.core.messages import Cause, Forgotten, SlotState, SlotVersion
 from enact_dist.core.payload_names import PayloadNames
 from enact_dist.patterns import pattern_matches
@@ -73,6 +73,9 @@ class SlotMap:
         answer_bytes_max: So many bytes of small data travel with one answer.
         dropped: The contexts that were dropped, and above which versions theirs start now.
         forgotten: The aspects that were forgotten, likewise.
+
+    Attributes:
+        large: Which slots have the largest data.
     """
 
     __slots__ = (
@@ -86,6 +89,7 @@ class SlotMap:
         "bytes",
         "count",
         "history",
+        "large",
     )
 
     def __init__(
@@ -106,6 +110,7 @@ class SlotMap:
         self._lost: set[Slot] = set()
         self.count = 0
         self.bytes = 0
+        self.large = LargeSlots()
         self._payloads = PayloadNames()
         self.history = History({} if policies is None else policies, self._payloads)
         for record in recovered:
@@ -156,7 +161,9 @@ class SlotMap:
         for slot, content in gone:
             self._lost.discard(slot)
             self._payloads.count(content.datum, stays=-1)
-            self.bytes -= content.datum.size if content.datum is not None else 0
+            size = content.datum.size if content.datum is not None else 0
+            self.bytes -= size
+            self.large.change(slot, before=size, after=0)
         for column in [column for column in self._columns if column.context == context]:
             del self._columns[column]
         self.count -= len(gone)
@@ -293,16 +300,6 @@ class SlotMap:
         may_go = [state.datum for found in self.history for state in found.states]
         self._payloads.assert_counts(stay, may_go)
 
-    def biggest(self, count: int) -> list[tuple[str, int]]:
-        """Return the slots whose newest data are the largest, with their bytes."""
-        sizes = (
-            (content.datum.size, str(Slot(column.context, entity, column.aspect)))
-            for column, contents in self._columns.items()
-            for entity, content in contents.items()
-            if content.datum is not None
-        )
-        return [(name, size) for size, name in heapq.nlargest(count, sizes)]
-
     def set(self, slot: Slot, content: Content) -> Content:
         """Put a new committed state in place of the old one, which is returned."""
         context, entity, aspect = slot
@@ -310,6 +307,10 @@ class SlotMap:
         if column is None:
             column = self._columns[Column(context, aspect)] = {}
         old: Content = column.get(entity, NOTHING)
+        before = old.datum.size if old.datum is not None else 0
+        after = content.datum.size if content.datum is not None else 0
+        if max(before, after) >= LARGE_BYTES:
+            self.large.change(slot, before=before, after=after)
         if old is NOTHING:
             self.count += 1
         elif old.datum is not None:

@@ -19,6 +19,7 @@ Rules a change must keep
 from __future__ import annotations
 
 import heapq
+from collections import Counter
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
@@ -58,6 +59,7 @@ class Tenure:
         alone: It holds and views nothing at other shards: its commit decides in one step.
         committing: The store works on its commit, its preparation or its end.
         prepared: What another shard decides about.
+        owner: The identity of its session (see `core.owners`).
     """
 
     lock: LockId
@@ -72,6 +74,7 @@ class Tenure:
     committing: bool = False
     prepared: PreparedRecord | None = None
     parked: int | None = None
+    owner: str = ""
     pins: dict[tuple[Slot, int], Datum] = field(default_factory=dict)
 
     @property
@@ -125,6 +128,7 @@ class Tenures:
         "_parked_ends",
         "_sessions",
         "_slots",
+        "_waiting",
         "by_lock",
         "by_session",
         "count",
@@ -142,6 +146,7 @@ class Tenures:
         self._granted = 0
         self._hold_ends: list[tuple[int, LockId]] = []
         self._parked_ends: list[tuple[int, int, LockId]] = []
+        self._waiting: dict[str, int] = {}
         self.table = LockTable()
         self.by_lock: dict[LockId, Tenure] = {}
         self.by_session: dict[str, dict[LockId, Tenure]] = {}
@@ -160,9 +165,23 @@ class Tenures:
         tenure = Tenure(message.lock, claim, message.items, hold_ns, asked_ns=now_ns)
         tenure.alone = message.alone
         self._add(tenure)
+        self._count_waiting(tenure, 1)
         return tenure
 
+    def items_waiting(self, owner: str) -> int:
+        """Return how many requests the waiting locks of an identity have."""
+        return self._waiting.get(owner, 0)
+
+    def _count_waiting(self, tenure: Tenure, change: int) -> None:
+        items = self.items_waiting(tenure.owner) + change * len(tenure.items)
+        if items:
+            self._waiting[tenure.owner] = items
+        else:
+            self._waiting.pop(tenure.owner, None)
+
     def _add(self, tenure: Tenure) -> None:
+        session = self._sessions.by_id.get(tenure.lock.session)
+        tenure.owner = session.identity if session is not None else ""
         self.by_lock[tenure.lock] = tenure
         self.by_session.setdefault(tenure.lock.session, {})[tenure.lock] = tenure
 
@@ -212,6 +231,7 @@ class Tenures:
         """Grant whatever may be granted; to be called after each change, outside the grace."""
         for claim in self.table.take_ready():
             tenure = self.by_lock[claim.lock]
+            self._count_waiting(tenure, -1)
             self._granted += 1
             tenure.token = Token(self._epoch, self._granted)
             tenure.granted_ns = now_ns
@@ -255,6 +275,8 @@ class Tenures:
         """End a tenure; who waited for it becomes ready (see `grant_ready`)."""
         if tenure.parked is not None:
             yield self.waiting(tenure, now_ns)
+        if tenure.token is None:
+            self._count_waiting(tenure, -1)
         self.table.remove(tenure.lock)
         del self.by_lock[tenure.lock]
         of_session = self.by_session[tenure.lock.session]
@@ -313,6 +335,11 @@ class Tenures:
         """Assert I1, I8 and the bookkeeping over all tenures.  For tests and simulation."""
         self.table.assert_invariants()
         assert self.by_lock.keys() == self.table.claims.keys()
+        waiting = Counter[str]()
+        for tenure in self.by_lock.values():
+            waiting[tenure.owner] += 0 if tenure.token is not None else len(tenure.items)
+        waiting = +waiting
+        assert waiting == self._waiting
         tokens = [tenure.token for tenure in self.by_lock.values() if tenure.token is not None]
         assert len(tokens) == len(set(tokens))
         for tenure in self.by_lock.values():

@@ -84,8 +84,6 @@ _TOLD_LATER: Final = (Publish, Story)
 _THAT_MAY_WAIT: Final = (Acquire, AwaitStamp)
 PARKED_MAX: Final = 100_000
 """Requests that may wait for their answers at one time."""
-BIGGEST_NS: Final = 1_000_000_000
-"""How long it counts which slots are the largest: a shard may have a million."""
 JOIN_S: Final = 0.5
 """How long a closing host waits for its timer; a drain has to be over within 2 s."""
 
@@ -162,7 +160,6 @@ class ShardHost:
         self._shard = shard
         self._clock: Clock = clock or SystemClock()
         self._on_failure = on_failure
-        self._named_biggest = 0, ""
         self._payloads = PayloadDesk(
             shared,
             half_of(shared) if shared is None or payload_bytes_max is None else payload_bytes_max,
@@ -290,15 +287,11 @@ class ShardHost:
             counters[name] = counters.get(name, 0) + amount
 
     def _biggest(self) -> str:
-        """Name the slots with the largest data, for people; looked for once in a while."""
-        until_ns, text = self._named_biggest
-        if self._clock.monotonic_ns() >= until_ns:
-            with self._mutex:
-                found = self._shard.biggest(3)
-            names = ", ".join(f"{name} {size}" for name, size in found)
-            text = f"; the largest: {names}" if names else ""
-            self._named_biggest = self._clock.monotonic_ns() + BIGGEST_NS, text
-        return text
+        """Name the slots with the largest data, for people."""
+        with self._mutex:
+            found = self._shard.biggest(3)
+        names = ", ".join(f"{name} {size}" for name, size in found)
+        return f"; the largest: {names}" if names else ""
 
     def call_with(self, call: Callable[[str, Request], None]) -> None:
         """Let `call(shard, request)` carry requests to other shards; it must not wait."""

@@ -66,7 +66,6 @@ class ReferenceSessions:
             for fact in facts:
                 self.recall(fact)
         ttls = [person.ttl_ns for person in self.people.values()]
-        self.shortest_ttl_ns = min(ttls, default=60_000 * MS)
         self.grace_end_ns = now_ns + max(ttls, default=0) * GRACE_PER_CENT // 100
         self.restored()
 
@@ -77,6 +76,11 @@ class ReferenceSessions:
             self.people[name] = Person(self.ttls[name], self.now_ns, False, durable=True)
         elif kind == "session over":
             self.people.pop(name, None)
+
+    @property
+    def shortest_ttl_ns(self) -> int:
+        """Of the people that there are."""
+        return min((person.ttl_ns for person in self.people.values()), default=60_000 * MS)
 
     def restored(self) -> None:
         """All records are read."""
@@ -161,7 +165,6 @@ class ReferenceSessions:
                 person.token, person.seen_ns = True, self.now_ns
         person.renewed_ns = max(person.renewed_ns, self.now_ns)
         person.acknowledged |= m.known_epoch == self.epoch
-        self.shortest_ttl_ns = min(self.shortest_ttl_ns, person.ttl_ns)
         self.end_grace_early()
         welcome = (handle, "welcome", self.epoch, not self.in_grace)
         if not person.durable and m.session not in self.recording:

@@ -7,17 +7,23 @@ from collections import Counter
 
 import pytest
 from prepare_parts import FAR_TOKEN, W, prepare_of, prepared
-from shard_bench import MS, S, ShardBench, item, lock_id
+from shard_bench import MS, S, ShardBench, item, lock_id, slot
 
 from enact_dist.core.datum import Position
 from enact_dist.core.messages import (
+    Answer,
     AwaitStamp,
     EpochChanged,
     Finish,
+    Hello,
+    Item,
     KeepAlive,
     Reached,
+    Refused,
+    Release,
     TakeView,
     Viewed,
+    Waiting,
 )
 from enact_dist.core.parked import OF_A_SESSION_MAX
 from enact_dist.core.records import Drain, Tick
@@ -70,8 +76,6 @@ def parked_by_many(bench: ShardBench, count: int) -> None:
 
 
 def handle(bench: ShardBench, session: str) -> None:
-    from enact_dist.core.messages import Hello
-
     send(bench, Hello(session, 0, 2 * S, session, "host", 1, True))
 
 
@@ -191,3 +195,41 @@ def test_drain_answers_everybody_who_waits(bench):
 
     assert set(asked) <= bench.answers.keys()
     assert not bench.ask(AwaitStamp(far_ns(bench), S, "ann", 1)).reached
+
+
+def waiting(bench: ShardBench, session: str, number: int, *items: Item) -> Answer | None:
+    """Ask for a lock in a lane of its own."""
+    return bench.acquire(lock_id(session, number), *items, wait_ns=0)
+
+
+def test_requests_of_one_identity_that_wait_are_bounded(bench, monkeypatch):
+    """A few locks of thousands of requests each are as bad as thousands of locks."""
+    monkeypatch.setattr("enact_dist.core.quotas.ITEMS_WAITING_MAX", 5)
+    for session in ("dora", "dan"):
+        bench.ask_as("d", Hello(session, 0, 2 * S, session, "host", 1, False))
+    holder = bench.granted(lock_id("ann", 9), item(W))
+    several = [item(W, f"e{number}") for number in range(4)]
+
+    first = [waiting(bench, session, 0, item(W), *several) for session in ("dora", "dan")]
+    other = waiting(bench, "bob", 0, item(W), *several)
+
+    assert [type(answer).__name__ for answer in first] == ["Waiting", "Refused"]
+    assert "d has 5 requests in locks that wait at this shard" in first[1].text
+    assert isinstance(other, Waiting)
+    bench.ask(Release(holder.lock))
+    bench.event(Tick())
+    assert isinstance(waiting(bench, "dan", 1, item(W)), Waiting)
+
+
+def test_many_patterns_over_many_slots_are_refused(bench, monkeypatch):
+    """Each is matched with every slot while everybody waits; one pattern alone is always looked at."""
+    monkeypatch.setattr("enact_dist.core.lock_desk.LOOKED_MAX", 5)
+    for number in range(6):
+        bench.write("bob", number + 1, "1", to=slot(f"e{number}"))
+    one = item(Access.VIEW_EACH, "*")
+
+    answer = bench.ask(TakeView(ANN, 1, 1, 5, (one, item(Access.VIEW_EACH, "e*")), 0))
+
+    assert isinstance(answer, Refused)
+    assert "2 patterns in one lock would look at 12 slots; at most 5" in answer.text
+    assert len(bench.ask(TakeView(ANN, 1, 1, 5, (one,), 0)).states) == 6

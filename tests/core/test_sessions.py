@@ -38,7 +38,14 @@ from enact_dist.core.messages import (
     WriteItem,
     WrongShard,
 )
-from enact_dist.core.records import Drain, SessionDied, SessionEnded, SessionSeen, WorldRecord
+from enact_dist.core.records import (
+    Drain,
+    SessionDied,
+    SessionEnded,
+    SessionSeen,
+    Tick,
+    WorldRecord,
+)
 from enact_dist.terms import Access
 
 R, W, V = Access.READ, Access.WRITE, Access.VIEW
@@ -359,6 +366,41 @@ class TestWaitingForStamps:
         bench.wait(600 * MS)
 
         assert not bench.answers[handle].reached
+
+
+class TestShortestLease:
+    def test_short_visit_leaves_no_trace(self, bench):
+        """The shard looks at the time as rarely as before, and a pause of 0.3 s is no stall."""
+        bench.hello("ann")
+        before_ns = bench.shard.next_deadline_ns() - bench.now_ns
+        bench.hello("guest", ttl_ns=100 * MS)
+        during_ns = bench.shard.next_deadline_ns() - bench.now_ns
+        bench.ask(Goodbye("guest"))
+
+        assert bench.shard.next_deadline_ns() - bench.now_ns == before_ns > during_ns
+        bench.now_ns += 300 * MS
+        bench.event(Tick())
+        assert bench.counter("stalls") == 0
+
+    def test_session_that_stays_away_counts_until_it_is_forgotten(self, bench):
+        """Its lease may have to end in time; then the longest lease there may be counts again."""
+        bench.hello("guest", ttl_ns=100 * MS)
+        assert bench.shard.state.shortest_ttl_ns == 100 * MS
+        for _ in range(30):
+            bench.now_ns += 20 * MS
+            bench.event(Tick())
+        assert bench.shard.state.shortest_ttl_ns == bench.settings.ttl_ns_max
+
+    def test_shortest_of_those_that_are_here(self, bench):
+        """Two of one length count until both have gone."""
+        for name, ttl_s in (("a", 4), ("b", 1), ("c", 1), ("d", 3)):
+            bench.hello(name, ttl_ns=ttl_s * S)
+        found = []
+        for name in "bcda":
+            bench.ask(Goodbye(name))
+            found.append(bench.shard.state.shortest_ttl_ns // S)
+
+        assert found == [1, 3, 4, 60]
 
 
 class TestDrain:
