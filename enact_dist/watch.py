@@ -5,6 +5,9 @@ skipped, a number that a keep-alive knows and no notice brought, or a new epoch 
 were missed: the watch then lists the slots again and yields one change per slot that moved, whose
 `gap` says how many versions were skipped.
 
+A shard that is added to the cell is listed as soon as this client knows of it.  What was known of
+entities that have moved there stays known: a state that moved unchanged is no change.
+
 Versions that a restarted shard did not keep begin anew, so its new epoch makes each of its states a
 new one: the next number follows nothing, and nobody knows what was lost with the old ones.
 """
@@ -32,7 +35,9 @@ if TYPE_CHECKING:
     from enact_dist.link.client import CellClient
 
 POLL_S: Final = 0.1
-"""How often a quiet watch looks whether it missed the last notices; also how soon `close` acts."""
+"""How often a watch looks whether notices that it lacks have come."""
+QUIET_S: Final = 0.5
+"""How often a quiet watch looks whether it lacks any: as often as the keep-alives tell."""
 RESYNC_S: Final = 1.0
 """How long one attempt to list the slots of a shard again may take."""
 VANISHED: Final = (0, 0)
@@ -105,6 +110,7 @@ class Watch(Following[Change]):
         self._interest = Interest(self._survey)
         self._known: dict[Slot, _Known] = {}
         self._following: dict[str, _Following] = {}
+        self._placement = client.core.placement
         self._pending: deque[Change] = deque()
         self._closed = threading.Event()
         self._missed = 0
@@ -138,8 +144,9 @@ class Watch(Following[Change]):
         while not self._closed.is_set():
             if self._pending:
                 return self._pending.popleft()
-            left_s = POLL_S if deadline_s is None else deadline_s - time.monotonic()
-            notice = self._feed.get(timeout_s=max(0.0, min(POLL_S, left_s)))
+            pause_s = POLL_S if any(one.behind for one in self._following.values()) else QUIET_S
+            left_s = pause_s if deadline_s is None else deadline_s - time.monotonic()
+            notice = self._feed.get(timeout_s=max(0.0, min(pause_s, left_s)))
             if notice is not None:
                 self._account_for(notice)
                 continue
@@ -166,6 +173,7 @@ class Watch(Following[Change]):
             self._take(notice)
 
     def _take(self, notice: Notice) -> None:
+        self._follow_placement()
         following = self._following.get(notice.shard)
         if following is None:
             return
@@ -197,8 +205,20 @@ class Watch(Following[Change]):
         ):
             following.number = skipped.number
 
+    def _follow_placement(self) -> None:
+        """Follow the shards that the cell has now; one that was added is behind until listed."""
+        placement = self._client.core.placement
+        if placement is self._placement:
+            return
+        self._placement, before = placement, self._following
+        # Whatever a newcomer has was written while this watch was open.
+        self._following = {
+            shard: before.get(shard) or _Following(listed=True) for shard in self._client.shards()
+        }
+
     def _look_for_missed_tail(self) -> None:
         """Compare with what the keep-alives know; they come every quarter of a TTL."""
+        self._follow_placement()
         for shard, following in self._following.items():
             known = (following.epoch, following.number)
             behind = following.behind
@@ -233,15 +253,30 @@ class Watch(Following[Change]):
         self._following[shard] = _Following(answer.epoch, answer.notice_number, listed=True)
 
     def _note_vanished(self, shard: str, epoch: int, listed: set[Slot]) -> None:
-        """Tell of slots that the shard lists no more: it kept them in memory and restarted."""
-        for slot, known in list(self._known.items()):
-            gone = slot not in listed and known.state != VANISHED
-            if not gone or self._client.shard_of(slot.entity) != shard:
-                continue
+        """Tell of slots that the shard lists no more: it kept them in memory and restarted.
+
+        Those that have moved to another shard meanwhile are listed there.
+        """
+        gone = self._gone_from(shard, listed)
+        if gone and epoch != self._following[shard].epoch:
+            # It may have restarted with other shards beside it, which its welcome tells.
+            self._client.call_once([(shard, self._client.core.hello(shard))])
+            gone = self._gone_from(shard, listed)
+        for slot, known in gone:
             if known.told:
                 self._note(shard, slot, _Known(epoch, VANISHED), null=True)
             else:
                 del self._known[slot]
+
+    def _gone_from(self, shard: str, listed: set[Slot]) -> list[tuple[Slot, _Known]]:
+        """Return the known slots that a shard should list and does not, and that are no news."""
+        return [
+            (slot, known)
+            for slot, known in self._known.items()
+            if slot not in listed
+            and known.state != VANISHED
+            and self._client.shard_of(slot.entity) == shard
+        ]
 
     def _note(
         self, shard: str, slot: Slot, state: _Known, *, null: bool, captured: int = 0
