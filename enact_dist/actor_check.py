@@ -1,6 +1,6 @@
 """Static check of a cell's actors: who reads and writes what, before any of them runs.
 
-Reported are (error: `enact up` refuses; warning: it starts):
+Reported are (error: `enact up` refuses; warning: it says so and starts; advice: it starts):
 
 =======  ===================  ===================================================================
 level    kind                 what
@@ -21,7 +21,10 @@ warning  unwritten trigger    a trigger that no actor writes: only a write from 
 warning  unwritten read       a reading request for data that no actor writes
 warning  set not retained     an aspect of a `Together` has no history (retention = 1): a set is
                               gone as soon as one of its slots moves on
+warning  set without stamps   a datum of a `Together` that no actor writes with a capture stamp
 warning  unused aspect        `cell.toml` configures an aspect that no actor names: misspelt?
+advice   durable stream       data that are written ten times a second or more, each forced to the
+                              disk as nothing says how durable they are
 =======  ===================  ===================================================================
 
 World contexts and aspects are checked only against a list that is given, types against each other:
@@ -32,11 +35,13 @@ pattern says.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
-from enact_dist.actor import narrowed, same_data, stands_for_trigger
+from enact_dist.actor_flows import streams, unstamped_sets
 from enact_dist.actor_load import check_every_s, load_class, read_options
+from enact_dist.actor_uses import ActorDeclaration as ActorDeclaration  # noqa: PLC0414
+from enact_dist.actor_uses import Finding as Finding  # noqa: PLC0414 - both are found here, too
+from enact_dist.actor_uses import uses_of
 from enact_dist.config_table import suggestion
 from enact_dist.core.datum_types import newest, type_conflict
 from enact_dist.core.messages import AspectEntry
@@ -49,86 +54,8 @@ from enact_dist.user_code import raised
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
-    from enact_dist.actor import Actor, Declared
+    from enact_dist.actor_uses import Use
     from enact_dist.config_types import CellConfig
-
-Level = Literal["error", "warning"]
-
-
-@dataclass(frozen=True, slots=True)
-class ActorDeclaration:
-    """One actor of a cell: under which name it runs, its class, what its roles are bound to.
-
-    `worlds` None binds each role to the world context of the same name, as running it does;
-    `entity` is the one that it works on, None where it has no such.
-    """
-
-    name: str
-    actor_class: type[Actor]
-    worlds: Mapping[str, str] | None = None
-    entity: Entity | None = None
-
-    @property
-    def unsaid(self) -> bool:
-        """Whether it works on one entity, and which is not said."""
-        declaration = self.actor_class.declaration
-        return self.entity is None and declaration.per_entity and not declaration.triggers
-
-    def world_of(self, role: str) -> str | None:
-        """Return the world context that a role is bound to."""
-        return role if self.worlds is None else self.worlds.get(role)
-
-
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """One thing that is wrong, or likely so, with the actors of a cell.
-
-    Attributes:
-        level: "error" or "warning".
-        kind: As in the table of this module.
-        actors: Names of the actors concerned.
-        text: What was found and what to do.
-    """
-
-    level: Level
-    kind: str
-    actors: tuple[str, ...]
-    text: str
-
-    def __str__(self) -> str:
-        return f"{self.level}: {self.kind}: {self.text}"
-
-
-@dataclass(frozen=True, slots=True)
-class _Use:
-    """One declared request of one actor, its role bound."""
-
-    actor: ActorDeclaration
-    name: str
-    request: Declared
-    world: str
-
-    @property
-    def unsaid(self) -> bool:
-        """Whether it is of one entity, and nobody says of which."""
-        return self.actor.unsaid and stands_for_trigger(self.request)
-
-    @property
-    def named(self) -> Declared:
-        """What the request can name in this actor."""
-        return narrowed(self.request, self.actor.entity)
-
-    @property
-    def shared(self) -> bool:
-        return self.request in self.actor.actor_class.declaration.shared
-
-    def meets(self, other: _Use) -> bool:
-        return self.world == other.world and same_data(self.named, other.named)
-
-    def __str__(self) -> str:
-        _, entity, aspect = self.named.address
-        access = type(self.request).__name__
-        return f"{self.actor.name}.{self.name} ({access} {self.world}/{entity} {aspect})"
 
 
 def check_actors(
@@ -149,7 +76,7 @@ def check_actors(
     Returns:
         Errors first, each kind in the order of `actors`.
     """
-    uses = [use for actor in actors for use in _uses_of(actor)]
+    uses = list(uses_of(actors))
     findings = [
         *_roles(actors, worlds),
         *_entities(actors),
@@ -158,6 +85,7 @@ def check_actors(
         *_own_triggers(uses),
         *_writers(uses),
         *_unwritten(uses, initial),
+        *unstamped_sets(uses),
     ]
     return _ordered(findings)
 
@@ -179,7 +107,9 @@ def check_cell(config: CellConfig, *, initial: Collection[str] = ()) -> tuple[Fi
         try:
             actor_class = load_class(actor.class_path)
             only = Entity(actor.entity) if actor.entity else actor_class.only_entity
-            actors.append(ActorDeclaration(actor.name, actor_class, actor.worlds or None, only))
+            actors.append(
+                ActorDeclaration(actor.name, actor_class, actor.worlds or None, only, actor.every_s)
+            )
             read_options(actor_class, actor.options)
             if actor.every_s is not None:
                 check_every_s(actor_class, actor.every_s)
@@ -191,6 +121,9 @@ def check_cell(config: CellConfig, *, initial: Collection[str] = ()) -> tuple[Fi
             text = f"actor {actor.name} ({actor.class_path}): {raised(error.__cause__ or error)}"
             findings.append(Finding("error", "broken module", (actor.name,), text))
     findings += check_actors(actors, worlds=config.worlds, initial=initial)
+    findings += streams(
+        list(uses_of(actors)), {one.name for one in config.aspects if one.durability}
+    )
     findings += _sets(actors, {entry.name: entry for entry in config.aspect_entries()})
     named = {
         request.aspect.name
@@ -234,14 +167,8 @@ def _sets(
 
 
 def _ordered(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    return tuple(sorted(findings, key=lambda finding: finding.level != "error"))
-
-
-def _uses_of(actor: ActorDeclaration) -> Iterator[_Use]:
-    for name, request in actor.actor_class.declaration.requests.items():
-        world = actor.world_of(request.world.name)
-        if world is not None:
-            yield _Use(actor, name, request, world)
+    levels = ("error", "warning", "advice")
+    return tuple(sorted(findings, key=lambda finding: levels.index(finding.level)))
 
 
 def _roles(actors: Iterable[ActorDeclaration], worlds: Collection[str]) -> Iterator[Finding]:
@@ -286,7 +213,7 @@ def _entities(actors: Iterable[ActorDeclaration]) -> Iterator[Finding]:
             yield Finding("warning" if unsaid else "error", kind, (actor.name,), text)
 
 
-def _aspects(uses: Iterable[_Use], aspects: Collection[str]) -> Iterator[Finding]:
+def _aspects(uses: Iterable[Use], aspects: Collection[str]) -> Iterator[Finding]:
     for use in uses:
         aspect = use.request.aspect.name
         if aspects and aspect not in aspects:
@@ -299,12 +226,12 @@ def _aspects(uses: Iterable[_Use], aspects: Collection[str]) -> Iterator[Finding
             )
 
 
-def _types(uses: Sequence[_Use]) -> Iterator[Finding]:
+def _types(uses: Sequence[Use]) -> Iterator[Finding]:
     """Yield the uses of an aspect with a type that does not go with the newest one written."""
     from enact_dist.wire.fingerprint import fingerprint
 
-    known: dict[str, tuple[_Use, AspectEntry]] = {}
-    entries: list[tuple[_Use, AspectEntry]] = []
+    known: dict[str, tuple[Use, AspectEntry]] = {}
+    entries: list[tuple[Use, AspectEntry]] = []
     for use in uses:
         aspect, reads = use.request.aspect, not use.request.access.writes
         entry = AspectEntry(aspect.name, fingerprint(aspect.datum_type), "", reads=reads)
@@ -325,7 +252,7 @@ def _types(uses: Sequence[_Use]) -> Iterator[Finding]:
             )
 
 
-def _own_triggers(uses: Sequence[_Use]) -> Iterator[Finding]:
+def _own_triggers(uses: Sequence[Use]) -> Iterator[Finding]:
     for use in uses:
         if use.request not in use.actor.actor_class.declaration.triggers:
             continue
@@ -340,7 +267,7 @@ def _own_triggers(uses: Sequence[_Use]) -> Iterator[Finding]:
                 )
 
 
-def _writers(uses: Sequence[_Use]) -> Iterator[Finding]:
+def _writers(uses: Sequence[Use]) -> Iterator[Finding]:
     writes = [use for use in uses if use.request.access.writes]
     for index, one in enumerate(writes):
         for other in writes[index + 1 :]:
@@ -358,7 +285,7 @@ def _writers(uses: Sequence[_Use]) -> Iterator[Finding]:
             )
 
 
-def _unwritten(uses: Sequence[_Use], initial: Collection[str]) -> Iterator[Finding]:
+def _unwritten(uses: Sequence[Use], initial: Collection[str]) -> Iterator[Finding]:
     writes = [use for use in uses if use.request.access.writes]
     for use in uses:
         request = use.request

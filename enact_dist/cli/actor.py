@@ -372,9 +372,9 @@ def check_actors(arguments: argparse.Namespace) -> int:
     wrong = any(finding.level == "error" for finding in findings)
     if arguments.json:
         print_json(findings)
-    elif not findings:
-        print(f"ok: {len(config.actors)} actors of cell {config.name} fit together")
     else:
         for finding in findings:
             print(finding)
+        if all(finding.level == "advice" for finding in findings):
+            print(f"ok: {len(config.actors)} actors of cell {config.name} fit together")
     return FAILED if wrong else DONE

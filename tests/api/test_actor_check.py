@@ -248,8 +248,9 @@ def cell_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_check_cell_warns_when_an_aspect_of_the_file_is_used_by_nobody(cell_file: Path):
     """A misspelt aspect would silently keep its default durability."""
-    found = only(check_cell(load_config(cell_file)))
+    found, advice = check_cell(load_config(cell_file))
 
+    assert (advice.level, advice.kind) == ("advice", "durable stream")
     assert (found.level, found.kind) == ("warning", "unused aspect")
     assert "did you mean 'cloud'" in found.text
 

@@ -202,17 +202,25 @@ def test_check_goes_by_the_entity_that_a_class_says(module, enact, write_cell):
     alone = enact("actor", "check", "--cell", write_cell(own))
     both = enact("actor", "check", "--cell", write_cell(CAMERAS + own), "--json")
 
-    assert (alone.status, alone.out) == (0, "ok: 1 actors of cell clitest fit together\n")
+    assert alone.status == 0
+    assert alone.out.splitlines()[-1] == "ok: 1 actors of cell clitest fit together"
     assert [(each["kind"], each["actors"]) for each in both.json] == [
-        ("two writers", ["camera-1", "own"])
+        ("two writers", ["camera-1", "own"]),
+        ("durable stream", ["camera-0"]),
     ]
 
 
 def test_check_accepts_actors_that_fit(module, enact, write_cell):
-    """Two actors that read and write past each other are fine."""
+    """Two actors that read and write past each other are fine; advice does not change that."""
     result = enact("actor", "check", "--cell", write_cell(ACTORS))
+    said = '\n[aspects.count]\ndurability = "volatile"\n'
+    quiet = enact("actor", "check", "--cell", write_cell(ACTORS + said))
 
-    assert (result.status, result.out) == (0, "ok: 2 actors of cell clitest fit together\n")
+    advice, ok = result.out.splitlines()
+    assert advice.startswith("advice: durable stream: beat.count (Write online/beat count) may be")
+    assert "10 times a second" in advice
+    assert (result.status, ok) == (0, "ok: 2 actors of cell clitest fit together")
+    assert (quiet.status, quiet.out) == (0, "ok: 2 actors of cell clitest fit together\n")
 
 
 def test_check_reports_two_writers_with_status_1(module, enact, write_cell):
