@@ -13,6 +13,7 @@ from __future__ import annotations
 import itertools
 import logging
 import random
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.backoff import CALLED_NS_MAX, CALLED_NS_MIN, Backoff
@@ -21,9 +22,11 @@ from enact_dist.core.messages import (
     OUTCOME_COMMITTED,
     OUTCOME_PENDING,
     OUTCOME_UNSEEN,
+    Commit,
     Explain,
     Outcome,
     OutcomeIs,
+    Prepare,
     Refused,
     Release,
     Versions,
@@ -40,14 +43,16 @@ from enact_dist.link.session_client import (
     SessionClient,
 )
 from enact_dist.link.staging import drop_staged, stage
+from enact_dist.wire.limits import COMMIT_BYTES_MAX
 
 if TYPE_CHECKING:
     import threading
     from collections.abc import Iterable, Mapping, Sequence
 
     from enact_dist.core.datum import Position
-    from enact_dist.core.messages import DatumRead, Item, SlotVersion, WriteItem
+    from enact_dist.core.messages import DatumRead, Item, Request, SlotVersion, WriteItem
 
+_WITH_DATA: Final = (Commit, Prepare)
 INTERRUPTIBLE_SLICE_NS: Final = 120_000_000
 """How long one call of a lock that may be told to stop waiting is parked."""
 RESTARTS_AT_ONCE: Final = 1
@@ -187,6 +192,7 @@ class CellClient(SessionClient):
                     self._wait_until(lock, wait_until_ns, returns, interrupt)
                     continue
                 returns = self._pauses.returns
+                calls = [(shard, self._sendable(shard, request)) for shard, request in calls]
                 answers = self._send(calls)
                 with self._mutex:
                     for (shard, request), answer in zip(calls, answers, strict=True):
@@ -215,6 +221,15 @@ class CellClient(SessionClient):
             interrupted = interrupt is not None and interrupt.is_set()
             if interrupted or self._pauses.returns != returns or self._now_ns() >= until_ns:
                 return
+
+    def _sendable(self, shard: str, request: Request) -> Request:
+        """Return a request as it can travel: data that a shard has lost are brought once more."""
+        if not isinstance(request, _WITH_DATA) or self.carrier.inside:
+            return request
+        if bytes_with([request.writes]) <= COMMIT_BYTES_MAX:
+            return request
+        named = stage(self, {shard: request.writes}, self.check_usable)
+        return replace(request, writes=tuple(named[shard]))
 
     def _say_farewell(self, lock: MultiLock) -> None:
         """Send the releases of a lock that rests; the keep-alives repair what gets lost."""

@@ -152,11 +152,8 @@ class PayloadDesk:
         with self._mutex:
             if file in self._over:
                 return Staged(file, total, False)  # a late copy: nobody waits for it
-        if not PAYLOAD_BYTES_MIN < total <= BODY_BYTES_MAX:
-            return Refused(
-                "protocol",
-                f"a payload of {total} bytes; from {PAYLOAD_BYTES_MIN} to {BODY_BYTES_MAX}",
-            )
+        if not 0 < total <= BODY_BYTES_MAX:
+            return Refused("protocol", f"a payload of {total} bytes; at most {BODY_BYTES_MAX}")
         draft: _Draft | Refused | None = self._drafts.get(file)
         if draft is None:
             # Slices of one draft may come by several threads.
@@ -196,10 +193,11 @@ class PayloadDesk:
 
     def _opened(self, session: str, file: str, total: int) -> _Draft | Refused | None:
         """Return a new draft; None where its name was used up meanwhile."""
-        shared = self._folder is not None and self._has_room(total)
-        if self._folder is not None and not shared and self._firm:
+        small = total <= PAYLOAD_BYTES_MIN  # many of these together, each read with its grant
+        shared = self._folder is not None and not small and self._has_room(total)
+        if self._folder is not None and not shared and not small and self._firm:
             return self._refused(session, total, self._bytes, self._bytes_max)
-        if self._folder is not None and not shared:
+        if self._folder is not None and not shared and not small:
             self._travels(f"its cap of {self._bytes_max} bytes is reached")
         memory = self._in_folder(self._folder, file, total) if shared else None
         if memory is None:

@@ -10,10 +10,10 @@ from __future__ import annotations
 import logging
 import socket
 import threading
-from typing import TYPE_CHECKING, Final, cast
+from typing import TYPE_CHECKING, Final
 
-from enact_dist.core.messages import Answer, Outcome, Refused, Request, Survey
-from enact_dist.core.owners import SESSION_OF, named_session, not_yours
+from enact_dist.core.messages import Answer, Outcome, Refused, Survey
+from enact_dist.core.owners import named_session, not_yours
 from enact_dist.errors import LinkError, ProtocolError
 from enact_dist.link.notices import Interest
 from enact_dist.link.senders import encoded, size_of
@@ -28,7 +28,7 @@ from enact_dist.link.socket_frames import (
 )
 from enact_dist.link.socket_peers import Peer
 from enact_dist.link.socket_watcher import SocketWatcher
-from enact_dist.wire.frames import decode_frame
+from enact_dist.wire.frames import decode_frame, decode_request
 
 if TYPE_CHECKING:
     from enact_dist.link.socket_service import SocketService
@@ -143,9 +143,7 @@ class SocketConnection:
                     return
                 raise ProtocolError(f"a frame of kind {kind} came in place of a request")
             try:
-                message = decode_frame(header, payload)
-                if type(message) not in SESSION_OF:
-                    raise ProtocolError(f"{type(message).__name__} is no request")
+                message = decode_request(header, payload)
             except ProtocolError as error:
                 host.count("frames_refused")
                 self.step = step = step + 1
@@ -156,7 +154,7 @@ class SocketConnection:
                 self.step = step = step + 1
                 self._send(not_yours(session, "another connection", self.identity))
                 continue
-            host.submit(cast("Request", message), self._take, self.identity)
+            host.submit(message, self._take, self.identity)
             self.step = step = step + 1
             self._send_answer()
 

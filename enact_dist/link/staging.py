@@ -6,7 +6,7 @@ shards of the commit at once; each is told its place, so that it may come twice,
 order, and a transfer goes on where a network was cut.
 
 What was staged ends with its session at the shard, or when the shard is told to drop it.  A shard
-that has lost it all the same asks for the bytes with the commit itself (`no_payload`).
+that has lost it all the same says so (`no_payload`), and it is brought once more.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.datum import Datum
-from enact_dist.core.messages import EpochChanged, Refused, Stage, Staged
+from enact_dist.core.messages import EpochChanged, Refused, Stage, Staged, WriteItem
 from enact_dist.errors import EnactError, LeaseLostError, ProtocolError, ShardUnreachableError
 from enact_dist.link.calls import CALL_S
 from enact_dist.link.refusals import error_of
@@ -28,11 +28,12 @@ from enact_dist.wire.limits import PAYLOAD_BYTES_MIN
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
-    from enact_dist.core.messages import Answer, WriteItem
+    from enact_dist.core.messages import Answer
     from enact_dist.link.session_client import SessionClient
 
 INLINE_BYTES_MAX: Final = 1 << 20
-"""Data that have no more than this together travel with their commit: one slice costs as much."""
+"""Data that have no more than this together travel with their commit: one slice costs as much.
+What is beyond goes ahead of it, the largest first."""
 _NOTHING: Final = Datum(b"", b"", 0)
 
 _log = logging.getLogger("enact.link")
@@ -75,18 +76,19 @@ def stage(
 
 def _named(client: SessionClient, writes: Sequence[WriteItem]) -> Sequence[WriteItem]:
     """Give each large datum of one shard's writes a name; return `writes` where none travels so."""
-    inline = sum(w.datum.size for w in writes if w.datum is not None and not w.datum.file)
-    if inline <= INLINE_BYTES_MAX or client.carrier.inside:
+    inline = [(n, w.datum) for n, w in enumerate(writes) if w.datum and not w.datum.file]
+    left = sum(datum.size for _, datum in inline)
+    if left <= INLINE_BYTES_MAX or client.carrier.inside:
         return writes
-    session = client.core.session
-    return [
-        write._replace(
-            datum=replace(write.datum, file=f"{session}-{next(client.staged_numbers):x}")
-        )
-        if write.datum is not None and not write.datum.file and write.datum.size > PAYLOAD_BYTES_MIN
-        else write
-        for write in writes
-    ]
+    named = list(writes)
+    inline.sort(key=lambda one: one[1].size, reverse=True)
+    for number, datum in inline:
+        if datum.size <= PAYLOAD_BYTES_MIN and left <= INLINE_BYTES_MAX:
+            break
+        left -= datum.size
+        file = f"{client.core.session}-{next(client.staged_numbers):x}"
+        named[number] = WriteItem(writes[number].slot, replace(datum, file=file))
+    return named
 
 
 def drop_staged(client: SessionClient, writes: Mapping[str, Sequence[WriteItem]]) -> None:

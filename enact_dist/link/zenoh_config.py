@@ -38,15 +38,15 @@ import zenoh
 from enact_dist.errors import ConfigError, LinkError, MisuseError
 from enact_dist.link.carrier import FORKED_REMEDY
 from enact_dist.link.zenoh_links import LinkWatch
-from enact_dist.wire.limits import BODY_BYTES_MAX, HEADER_BYTES_MAX
+from enact_dist.wire.limits import FRAME_BYTES_MAX
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
 QUEUED_MAX: Final = 65_536
 """Messages in a channel between Zenoh and Python: the network thread must not wait for Python."""
-MESSAGE_BYTES_MAX: Final = BODY_BYTES_MAX + HEADER_BYTES_MAX + (1 << 20)
-"""Longest message: the largest datum with its header."""
+MESSAGE_BYTES_MAX: Final = FRAME_BYTES_MAX + (64 << 10)
+"""Longest message: a frame with its key.  Of a longer one Zenoh keeps nothing."""
 RETRY_MS, RETRY_MS_MAX, RETRY_FACTOR = 50, 1_000, 1.25
 """Pauses between two attempts to connect to a place where nobody listens: they grow from the first
 to the second figure, or to a part of it that each session draws."""

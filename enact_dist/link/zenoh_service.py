@@ -13,7 +13,7 @@ from __future__ import annotations
 import logging
 import queue
 import threading
-from typing import TYPE_CHECKING, Final, cast
+from typing import TYPE_CHECKING, Final
 
 import zenoh
 
@@ -25,13 +25,13 @@ from enact_dist.core.messages import (
     Request,
     Stage,
 )
-from enact_dist.core.owners import SESSION_OF, named_session
+from enact_dist.core.owners import named_session
 from enact_dist.core.records import SessionSeen
 from enact_dist.errors import ProtocolError
 from enact_dist.link.recycling import recycle_blocks
 from enact_dist.link.senders import Senders, encoded, size_of
 from enact_dist.link.zenoh_config import QUEUED_MAX, keep_after_fork
-from enact_dist.wire.frames import decode_frame, encode_frame
+from enact_dist.wire.frames import decode_request, encode_frame
 from enact_dist.wire.keys import (
     ANY,
     notice_key,
@@ -130,12 +130,10 @@ class ZenohService:
     def _take(self, query: zenoh.Query) -> None:
         header, payload = query.attachment, query.payload
         try:
-            message = decode_frame(
+            message = decode_request(
                 bytes(header) if header is not None else b"",
                 bytes(payload) if payload is not None else b"",
             )
-            if type(message) not in SESSION_OF:
-                raise ProtocolError(f"{type(message).__name__} is no request")
             cell, shard, verb, identity = parse_request_key(str(query.key_expr))
             if verb != verb_of(message):
                 raise ProtocolError(f"a {verb_of(message)} came on the key of a {verb}")
@@ -160,7 +158,7 @@ class ZenohService:
         if type(message) is Stage:
             self._stage_later(message, call, identity)
         else:
-            self._submit(cast("Request", message), call, identity)
+            self._submit(message, call, identity)
 
     def _stage_later(self, message: Stage, call: _Call, identity: str) -> None:
         size = message.body.size

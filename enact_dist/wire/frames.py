@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import reprlib
 from functools import partial
-from typing import Any, Final, get_args
+from typing import Any, Final, cast, get_args
 
 import msgpack
 
@@ -22,7 +22,9 @@ from enact_dist.core import messages as m
 from enact_dist.errors import ProtocolError
 from enact_dist.wire.bodies import BodyReader, BodyWriter
 from enact_dist.wire.limits import (
+    COMMIT_BYTES_MAX,
     ENTRIES_MAX,
+    FRAME_BYTES_MAX,
     FRAME_VERSION,
     HEADER_BYTES_MAX,
     PAYLOAD_BYTES_MAX,
@@ -147,6 +149,12 @@ def encode_parts(message: m.Message) -> tuple[bytes, list[bytes | memoryview]]:
             f"{type(message).__name__} has a header of {len(header)} bytes; at most"
             f" {HEADER_BYTES_MAX}; ask for less at once"
         )
+    size = len(header) + sum(map(len, bodies.parts))
+    if size > FRAME_BYTES_MAX:
+        raise FrameTooLongError(
+            f"{type(message).__name__} has {size} bytes; at most {FRAME_BYTES_MAX}; ask for, or"
+            " write, less at once"
+        )
     return header, bodies.parts
 
 
@@ -199,6 +207,24 @@ def decode_frame(header: bytes, payload: bytes | memoryview = b"") -> m.Message:
     return message
 
 
+def decode_request(header: bytes, payload: bytes | memoryview = b"") -> m.Request:
+    """Return the request of a frame.
+
+    Raises:
+        ProtocolError: As `decode_frame`; it is no request, or a commit that carries too much.
+    """
+    message = decode_frame(header, payload)
+    kind = type(message)
+    if kind not in _REQUESTS:
+        raise ProtocolError(f"{kind.__name__} is no request")
+    if len(payload) > COMMIT_BYTES_MAX and kind in _COMMITS:
+        raise ProtocolError(
+            f"a {kind.__name__} carries {len(payload)} bytes of data; at most {COMMIT_BYTES_MAX}"
+            " travel with it, send what is more ahead of it in slices (Stage)"
+        )
+    return cast("m.Request", message)
+
+
 def _check_version(header: bytes) -> None:
     """Look at the version alone: what follows may mean anything in another version."""
     first = header[0] if header else 0
@@ -214,6 +240,8 @@ def _check_version(header: bytes) -> None:
 
 
 _writers: Final = {cls: (code, values_of(cls), writers_of(cls)) for cls, code in CODES.items()}
+_REQUESTS: Final = frozenset(get_args(m.Request))
+_COMMITS: Final = frozenset((m.Commit, m.Prepare))
 _OF_EVERY_LOCK: Final = frozenset(
     (
         m.Acquire,

@@ -27,8 +27,14 @@ HEADER_BYTES_MAX: Final = 16 << 20
 """Longest frame header: 100,000 surveyed slots, or 4096 writes with whole encodings."""
 BODY_BYTES_MAX: Final = 1 << 30
 """Largest body of one datum."""
-PAYLOAD_BYTES_MAX: Final = BODY_BYTES_MAX + (16 << 20)
-"""Longest frame payload: one largest body, or many small ones with their padding."""
+FRAME_BYTES_MAX: Final = 24 << 20
+"""Longest frame: what one client can make a shard hold by one message.  Larger data travel in
+slices of at most 4 MiB."""
+PAYLOAD_BYTES_MAX: Final = 16 << 20
+"""Longest frame payload: a grant carries small data of 8 MiB together."""
+COMMIT_BYTES_MAX: Final = 2 << 20
+"""Most bytes of data that travel with their commit; a client sends what is more ahead of it, in
+slices, from 1 MiB on."""
 
 PAYLOAD_NAME: Final = re.compile(r"[0-9A-Za-z_]{1,64}-[0-9a-f]{1,16}\Z")
 """What a payload is called at its shard: the session that made it and a number, never used again;

@@ -24,6 +24,7 @@ from enact_dist.core.messages import (
     PlacementMap,
     Register,
     ShardEntry,
+    Stage,
     WriteItem,
 )
 from enact_dist.core.shard_state import ShardSettings
@@ -85,6 +86,18 @@ class Peer:
     def write(self, entity, body):
         """Lock, write and release one datum; return the answer to the commit."""
         return self.commit(self.acquire(entity), entity, body)
+
+    def write_in_slices(self, entity, body, *, slice_bytes=1 << 20):
+        """As `write`, of data that are too large for a commit."""
+        granted = self.acquire(entity)
+        file = f"{self.session}-{granted.lock.seq:x}"
+        for offset in range(0, len(body), slice_bytes):
+            part = body[offset : offset + slice_bytes]
+            slice_ = Datum(b"", part, len(part))
+            self.call(self.shard, Stage(self.session, file, offset, len(body), slice_))
+        named = Datum(b"\x01", b"", len(body), file=file)
+        write = WriteItem(Slot(WORLD, entity, ASPECT), named)
+        return self.call(self.shard, Commit(granted.lock, granted.token, (write,), 0))
 
     def goodbye(self):
         return self.call(self.shard, Goodbye(self.session))

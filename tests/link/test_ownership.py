@@ -5,11 +5,13 @@ import zenoh
 
 from enact_dist.core import messages as m
 from enact_dist.core.datum import Datum, LockId, Position
-from enact_dist.errors import PermissionDeniedError
+from enact_dist.errors import PermissionDeniedError, ProtocolError
 from enact_dist.link.refusals import error_of
-from enact_dist.link.zenoh_config import close_session, open_session
+from enact_dist.link.zenoh_carrier import wait_connected
+from enact_dist.link.zenoh_config import MESSAGE_BYTES_MAX, close_session, open_session
 from enact_dist.wire.frames import decode_frame, encode_frame
 from enact_dist.wire.keys import request_key, verb_of
+from enact_dist.wire.limits import COMMIT_BYTES_MAX, FRAME_BYTES_MAX
 
 both = pytest.mark.parametrize("carry", ["zenoh", "socket"], indirect=True)
 
@@ -125,3 +127,44 @@ def test_connection_speaks_for_its_own_session_only(raw, make_peer):
     assert isinstance(welcome, m.Welcome)
     assert {answer.code for answer in (*forged, finish)} == {"permission"}
     assert [session.session for session in sessions.sessions] == ["yours"]
+
+
+@both
+def test_commit_that_carries_more_than_it_may_is_refused_and_the_lock_stays(
+    daemon, carry, make_peer, endpoint
+):
+    """By name, with what to do; up to the bound it is taken, and beyond it in slices."""
+    daemon(endpoint)
+    peer = peer_over(carry(endpoint), make_peer)
+    granted = peer.acquire("cup")
+
+    refused = peer.commit(granted, "cup", bytes(COMMIT_BYTES_MAX + 1))
+    taken = peer.commit(granted, "cup", bytes(COMMIT_BYTES_MAX))
+    large = peer.write_in_slices("cup", bytes(COMMIT_BYTES_MAX + 1))
+
+    assert isinstance(refused, m.Refused)
+    assert (refused.code, "in slices (Stage)" in refused.text) == ("protocol", True)
+    assert isinstance(taken, m.Committed)
+    assert isinstance(large, m.Committed)
+
+
+def test_frame_beyond_the_bound_is_not_kept_and_the_next_one_served(daemon, endpoint, stranger):
+    """A client cannot even send one; what somebody else sends Zenoh does not keep."""
+    daemon(endpoint)
+    assert isinstance(stranger(m.Ping(), "eve@h:1"), m.Pong)
+    with pytest.raises(ProtocolError, match="in one message; write fewer at once"):
+        slice_ = Datum(b"", bytes(FRAME_BYTES_MAX), FRAME_BYTES_MAX)
+        encode_frame(m.Stage("s", "s-1", 0, FRAME_BYTES_MAX, slice_))
+    session = open_session(connect=(endpoint,), lease_s=30.0)
+    wait_connected(session, 30.0)
+    replies = session.get(
+        request_key("cell", "s0", "ping", "eve@h:1"),
+        attachment=encode_frame(m.Ping())[0],
+        payload=bytes(MESSAGE_BYTES_MAX + 1),
+        timeout=1.0,
+    )
+    answered = [reply for reply in replies if reply.ok is not None]
+    close_session(session)
+
+    assert not answered
+    assert isinstance(stranger(m.Ping(), "eve@h:1"), m.Pong)

@@ -266,7 +266,7 @@ def test_daemon_acknowledges_nothing_and_ends_with_status_1_when_its_disk_is_ful
     started = process(endpoint, tmp_path, first=FULL_DISK, log="json", durability="durable")
     peer = speak(carry(endpoint), make_peer, durability="durable")
 
-    answer = peer.write("cup", bytes(3_000_000))
+    answer = peer.write_in_slices("cup", bytes(3_000_000))
     status = started.wait(60)
 
     lines = [json.loads(line) for line in started.stderr]
@@ -310,7 +310,7 @@ def test_daemon_delays_no_other_client_when_one_is_stopped_with_50_mb_in_flight(
     """A stopped reader of 50 MB adds less than 50 ms (p99) and 150 ms (max) to anybody else."""
     process(endpoint)
     writer = speak(carry(endpoint), make_peer)
-    until(lambda: isinstance(writer.write("cloud", bytes(50_000_000)), Committed))
+    until(lambda: isinstance(writer.write_in_slices("cloud", bytes(50_000_000)), Committed))
 
     def attempt():
         calm = _latencies_s(writer, 1000)

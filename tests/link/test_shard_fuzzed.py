@@ -151,7 +151,7 @@ def test_shard_hears_on_after_a_frame_that_breaks_the_decoder(daemon, endpoint, 
             raise RecursionError("nested without end")
         return decode_frame(header, payload)
 
-    monkeypatch.setattr("enact_dist.link.zenoh_service.decode_frame", broken)
+    monkeypatch.setattr("enact_dist.link.zenoh_service.decode_request", broken)
     refused, answered = raw((b"breaks", b""), (encode_frame(m.ListLocks())[0], b""))
 
     assert answer_of(refused) == m.Refused("protocol", "nested without end")

@@ -227,7 +227,7 @@ def test_request_that_was_read_is_handled_before_the_tick(raw, monkeypatch):
         assert go_on.wait(30)  # as if the interpreter let others run first
         return decode(*frame)
 
-    monkeypatch.setattr(socket_connection, "decode_frame", decode_slowly)
+    monkeypatch.setattr(socket_connection, "decode_request", decode_slowly)
     monkeypatch.setattr(socket_service, "DRAIN_ROUNDS", 5000)
     send_frame(raw(), encode_frame(ListLocks())[0])
     assert decoding.wait(30)

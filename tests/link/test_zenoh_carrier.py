@@ -107,7 +107,7 @@ def test_carrier_moves_large_data_in_slices_byte_for_byte(daemon, carry, make_pe
     carrier = carry(endpoint)
     peer = speak(carrier, make_peer)
     body = os.urandom(9_000_000)
-    assert isinstance(peer.write("cup", body), Committed)
+    assert isinstance(peer.write_in_slices("cup", body), Committed)
 
     granted = peer.acquire("cup")
     state = granted.states[0]
