@@ -39,6 +39,7 @@ from enact_dist.link.store_batch import Batch
 from enact_dist.link.store_database import Database, DatabaseRow
 from enact_dist.link.store_errors import store_error
 from enact_dist.link.store_folder import (
+    ACCEPT_LOSS_FILE,
     BLOB_FOLDER,
     DATABASE_FILE,
     check_log,
@@ -196,6 +197,7 @@ class Store:
         changes.update(dict.fromkeys(self._outcomes.expired(wall_ns)))
         self._commit(changes, forced=True)
         self._mark = MarkFile.open(self._folder, self._batch)
+        (self._folder / ACCEPT_LOSS_FILE).unlink(missing_ok=True)
         sync_folder(self._folder)
         sync_folder(self._folder.parent)
         self._blobs.sweep(blob.name for blob in self._states.blobs.values())

@@ -16,7 +16,7 @@ from enact_dist.core.moving import NAMED_MAX, strangers
 from enact_dist.core.stamps import AHEAD_NS_MAX, STAMP_NS_MAX, newest_stamp
 from enact_dist.errors import StoreError
 from enact_dist.link.folder_lock import FORMAT_FILE
-from enact_dist.link.store_mark import Mark, read_mark
+from enact_dist.link.store_mark import MARK_FILE, Mark, read_mark
 from enact_dist.link.wal_check import check_wal
 
 if TYPE_CHECKING:
@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 DATABASE_FILE: Final = "store.db"
 LOG_FILE: Final = "store.db-wal"
 BLOB_FOLDER: Final = "blobs"
+ACCEPT_LOSS_FILE: Final = "accept-loss"
+"""Made by an operator, taken away by the start that it was made for."""
 MOVING_FILE: Final = "moving"
 REBALANCE: Final = "rebalance"
 FORGET: Final = "forget"
@@ -49,6 +51,8 @@ class Found(NamedTuple):
     is_new: bool
     power_cut: bool
     """Whether the system has started anew since the store was last opened."""
+    accepts_loss: bool = False
+    """Whether an operator says that the shard is to start though commits may be missing."""
 
     @property
     def is_first(self) -> bool:
@@ -180,6 +184,7 @@ def look_at(folder: Path) -> Found:
         OSError: As the system reports it.
     """
     mark = read_mark(folder)
+    accepted = (folder / ACCEPT_LOSS_FILE).exists()
     database = folder / DATABASE_FILE
     is_new = not database.exists() or database.stat().st_size == 0
     if is_new:
@@ -188,7 +193,24 @@ def look_at(folder: Path) -> Found:
         has_mark = mark is not None and not mark.is_first
         if has_mark or has_log or has_blobs(folder):
             refuse(database, "is missing or empty, but the folder has been in use")
-    return Found(mark, is_new, mark is not None and not mark.same_boot)
+    elif mark is None and not accepted:
+        # A new folder has its mark before its database, so one was there.
+        path = folder / MARK_FILE
+        refuse(
+            path,
+            f"{'cannot be read' if path.exists() else 'is missing'}, and without it nothing tells"
+            " whether commits that were acknowledged are missing at the end",
+            _accept(folder, "with what can be read"),
+        )
+    return Found(mark, is_new, mark is not None and not mark.same_boot, accepted)
+
+
+def _accept(folder: Path, what: str, first: str = "") -> str:
+    """Return how to start a shard in spite of a loss."""
+    return (
+        f"restore the whole folder from a backup; or, to go on {what}, keep a copy of the folder,"
+        f" {first}make an empty file '{folder / ACCEPT_LOSS_FILE}', and start the shard"
+    )
 
 
 def holds_store(folder: Path) -> bool:
@@ -224,9 +246,11 @@ def check_log(folder: Path, *, power_cut: bool) -> None:
     refuse(
         log,
         f"is damaged at byte {verdict.damaged_at}, and commits that were acknowledged follow",
-        "restore the whole folder from a backup; or, to go on without what was written from there"
-        f" on, keep a copy of the folder, delete its file 'mark', and cut the log with 'truncate -s"
-        f" {verdict.damaged_at} {log}'",
+        _accept(
+            folder,
+            "without what was written from there on",
+            f"cut the log with 'truncate -s {verdict.damaged_at} {log}', ",
+        ),
     )
 
 
@@ -242,17 +266,27 @@ def check_reach(folder: Path, found: Found, *, batch: int) -> None:
         StoreError: Batches are missing that were acknowledged.
         OSError: As the system reports it.
     """
-    if found.mark is None or batch >= found.mark.needed():
+    needed = found.mark.needed() if found.mark is not None else None
+    if found.is_new or (needed is not None and batch >= needed):
         return
     log = folder / LOG_FILE
+    if found.accepts_loss:
+        missing = "an unknown number of" if needed is None else needed - batch
+        _log.critical(
+            "%s says to start all the same: the last batch that can be read is %d, and %s batches"
+            " of commits that were acknowledged may be lost",
+            folder / ACCEPT_LOSS_FILE,
+            batch,
+            missing,
+        )
+        return
     readable = check_wal(log)
     if log.exists() and log.stat().st_size:
         # Closing the database cuts the log to what SQLite could read; the whole is evidence.
         shutil.copyfile(log, log.with_name(log.name + _REFUSED_SUFFIX))
     refuse(
         log,
-        f"is cut or damaged from byte {readable.end} on: batch {found.mark.needed()} was"
+        f"is cut or damaged from byte {readable.end} on: batch {needed} was"
         f" acknowledged, the last one that can be read is {batch}",
-        "restore the whole folder from a backup; or, to go on without the missing commits, keep a"
-        f" copy of the folder and delete {folder / 'mark'}",
+        _accept(folder, "without the missing commits"),
     )

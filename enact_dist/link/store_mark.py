@@ -7,6 +7,8 @@ it does not.  It answers two questions that the database cannot answer about its
 - Is something acknowledged missing at the end (a cut log, a deleted log, an older copy)?  In the
   same boot nothing may be, else nothing that was forced to the disk.
 - Can the system have gone down since?  Only then may unforced writes have gone in any order.
+
+So a store whose mark is missing or damaged is refused: it may have less than was acknowledged.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ from enact_dist.core.datum import Slot
 from enact_dist.core.records import SlotRecord
 from enact_dist.errors import StoreError
 from enact_dist.link import store_mark
-from enact_dist.link.store import open_store
+from enact_dist.link.store import open_store, read_store
 from enact_dist.link.store_folder import DATABASE_FILE
 from enact_dist.link.store_mark import MARK_FILE
 from enact_dist.terms import Durability, NullReason
@@ -115,14 +115,45 @@ def test_flipped_bit_in_the_last_frame_of_an_os_batch_is_refused_in_the_same_boo
 
 
 def test_named_way_out_of_a_damaged_log_works(crashed):
-    """Cutting the log and deleting the mark, as the message says, opens with what came before."""
+    """Cutting the log and accepting the loss, as the message says, opens with what came before."""
     log = crashed / "store.db-wal"
     number = frames_of(crashed) // 2
     flip(log, frame_offset(number) + 100)
-    refusal(crashed)
+    assert f"make an empty file '{crashed / 'accept-loss'}'" in str(refusal(crashed))
     log.write_bytes(log.read_bytes()[: frame_offset(number)])
-    (crashed / "mark").unlink()
+    assert "batch 9 was acknowledged" in str(refusal(crashed))
+    (crashed / "accept-loss").touch()
     assert 0 < len(reopened(crashed).slots) < 8
+    assert not (crashed / "accept-loss").exists()
+
+
+@pytest.mark.parametrize("mark", [None, b"", b"?"])
+def test_cut_log_without_its_mark_is_refused_until_the_loss_is_accepted(crashed, caplog, mark):
+    """A shard must not start with less than was acknowledged and say nothing."""
+    log = crashed / "store.db-wal"
+    log.write_bytes(log.read_bytes()[: frame_offset(frames_of(crashed) // 2)])
+    (crashed / "mark").unlink()
+    if mark is not None:
+        (crashed / "mark").write_bytes(mark)
+
+    found = refusal(crashed)
+    with pytest.raises(StoreError, match="mark"), read_store(crashed):
+        pass
+    (crashed / "accept-loss").touch()
+    with caplog.at_level("CRITICAL"):
+        left = reopened(crashed).slots
+
+    assert found.path == str(crashed / "mark")
+    assert ("is missing" if mark is None else "cannot be read") in str(found)
+    assert "restore the whole folder from a backup; or, to go on with what can be read" in str(
+        found
+    )
+    assert 0 < len(left) < 8
+    assert "unknown number of batches of commits that were acknowledged may be lost" in caplog.text
+    caplog.clear()
+    assert len(reopened(crashed).slots) == len(left)
+    assert caplog.text == ""
+    assert not (crashed / "accept-loss").exists()
 
 
 def test_flipped_bit_in_the_last_frame_is_refused(crashed):
@@ -373,6 +404,7 @@ def test_database_in_use_by_another_program_is_refused_as_such(closed):
 def test_mark_that_cannot_be_read_excuses_nothing(crashed):
     """Without a mark nothing proves a power cut: a hole in the log is damage."""
     (crashed / "mark").write_bytes(b"?")
+    (crashed / "accept-loss").touch()
     assert len(reopened(crashed).slots) == 8
     store, _ = open_store(crashed, unix_s=1)
     for version in range(1, 6):
@@ -381,6 +413,7 @@ def test_mark_that_cannot_be_read_excuses_nothing(crashed):
     shutil.copytree(crashed, copy)
     store.close()
     (copy / "mark").unlink()
+    (copy / "accept-loss").touch()
     flip(copy / "store.db-wal", frame_offset(2))
     assert "is damaged at byte" in str(refusal(copy))
 
