@@ -123,9 +123,14 @@ def replace_file(path: Path, content: bytes, *, mode: int = 0o644) -> None:
     """
     draft = path.with_name(path.name + ".tmp")
     descriptor = os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, mode)
+    left = memoryview(content)
     try:
-        os.write(descriptor, content)
+        while left:  # a disk that is nearly full takes a part
+            left = left[os.write(descriptor, left) :]
         os.fsync(descriptor)
+    except BaseException:
+        draft.unlink(missing_ok=True)
+        raise
     finally:
         os.close(descriptor)
     draft.rename(path)

@@ -56,34 +56,36 @@ class ServiceManager:
 
     def ready(self, status: str = "") -> None:
         """Say that this process serves."""
-        self._tell(f"READY=1\n{self._status_line(status)}MAINPID={os.getpid()}")
+        if self._tell(f"READY=1\n{_status_line(status)}MAINPID={os.getpid()}"):
+            self._status = status
 
     def stopping(self, status: str = "") -> None:
         """Say that this process was told to end."""
-        self._tell(f"STOPPING=1\n{self._status_line(status)}")
+        if self._tell(f"STOPPING=1\n{_status_line(status)}"):
+            self._status = status
 
     def alive(self, status: str = "") -> None:
         """Show a sign of life of the calling thread, and a status that has changed.
 
-        May be called as often as one likes: pings are as rare as they may be.  Never blocks.
+        May be called as often as one likes: pings are as rare as they may be.  Never blocks; what
+        the manager had no room for is sent with the next call.
         """
         if not self._address:
             return
-        line = self._status_line(status) if status != self._status else ""
+        line = _status_line(status) if status != self._status else ""
         now_s = time.monotonic()
-        if self.ping_s and now_s >= self._ping_at_s:
-            self._ping_at_s = now_s + self.ping_s
+        pings = bool(self.ping_s) and now_s >= self._ping_at_s
+        if pings:
             line += "WATCHDOG=1"
-        if line:
-            self._tell(line, wait_s=0.0)
+        if line and self._tell(line, wait_s=0.0):
+            self._status = status
+            if pings:
+                self._ping_at_s = now_s + self.ping_s
 
-    def _status_line(self, status: str) -> str:
-        self._status = status
-        return f"STATUS={' '.join(status.split())}\n" if status else ""
-
-    def _tell(self, text: str, *, wait_s: float = TELL_S) -> None:
+    def _tell(self, text: str, *, wait_s: float = TELL_S) -> bool:
+        """Send a message; return whether the manager has it."""
         if not self._address:
-            return
+            return False
         try:
             with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as line:
                 line.settimeout(wait_s)
@@ -93,5 +95,10 @@ class ServiceManager:
                 self._failed = True
                 where = self._address.replace("\0", "@", 1)
                 _log.warning("the service manager at %s does not listen: %s", where, error)
-        else:
-            self._failed = False
+            return False
+        self._failed = False
+        return True
+
+
+def _status_line(status: str) -> str:
+    return f"STATUS={' '.join(status.split())}\n" if status else ""

@@ -16,7 +16,7 @@ import struct
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 from enact_dist.errors import LinkError
@@ -91,10 +91,14 @@ def process_of(connected: socket.socket) -> int | None:
 
 @dataclass(slots=True)
 class _Watched:
-    """One session's process, how many connections it has, and until when it is still watched."""
+    """One session: its process, its connections, and until when it is watched without any.
 
-    process: int
-    connections: int = 1
+    The kernel may have had no descriptor of the process (-1) when it connected; the next
+    connection asks again.
+    """
+
+    process: int = -1
+    connections: set[socket.socket] = field(default_factory=set)
     until_s: float = 0.0
 
 
@@ -120,11 +124,11 @@ class Deaths:
     def connected(self, session: str, connection: socket.socket) -> None:
         """Note one more connection of a session's process."""
         with self._mutex:
-            watched = self._watched.get(session)
-            if watched is not None:
-                watched.connections += 1
+            if self._closed:
                 return
-            process = process_of(connection) if not self._closed else None
+            watched = self._watched.setdefault(session, _Watched())
+            watched.connections.add(connection)
+            process = process_of(connection) if watched.process < 0 else None
             if process is None:
                 return
             try:
@@ -133,17 +137,17 @@ class Deaths:
                 os.close(process)
                 _log.warning("the process of session %s is not watched: %s", session[:8], error)
                 return
-            self._watched[session] = _Watched(process)
+            watched.process = process
             self._session_of[process] = session
 
-    def disconnected(self, session: str) -> None:
-        """Note that one connection has ended; after the last one it is watched a little longer."""
+    def disconnected(self, session: str, connection: socket.socket) -> None:
+        """Note that a connection has ended; after the last one it is watched a little longer."""
         with self._mutex:
             watched = self._watched.get(session)
             if watched is None:
                 return
-            watched.connections -= 1
-            if not watched.connections:
+            watched.connections.discard(connection)
+            if not watched.connections and not self._closed:
                 watched.until_s = time.monotonic() + LINGER_S
                 os.eventfd_write(self._bell, 1)
 
@@ -182,9 +186,10 @@ class Deaths:
 
     def _forget(self, session: str) -> None:
         watched = self._watched.pop(session)
-        del self._session_of[watched.process]
-        self._poll.unregister(watched.process)
-        os.close(watched.process)
+        if watched.process >= 0:
+            del self._session_of[watched.process]
+            self._poll.unregister(watched.process)
+            os.close(watched.process)
 
     def close(self) -> None:
         """Watch nobody any more; twice is harmless."""

@@ -157,7 +157,7 @@ class SocketService:
                 del self._processes[connection.peer]
             if not mine:
                 self._connections.pop(session, None)
-        self._deaths.disconnected(session)
+        self._deaths.disconnected(session, connection.connected)
 
     def _died(self, session: str) -> None:
         self.host.event(SessionDied(session))

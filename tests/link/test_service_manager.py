@@ -94,6 +94,24 @@ def test_a_full_queue_never_delays_a_ping(manager):
     assert len(told(heard)) < 4000
 
 
+def test_what_a_full_queue_had_no_room_for_is_sent_with_the_next_call(manager):
+    """Else a manager that was slow once kills a process that lives."""
+    heard, path = manager
+    mine = ServiceManager({"NOTIFY_SOCKET": path, "WATCHDOG_USEC": "3600000000"})
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as other:
+        other.settimeout(0.0)
+        with pytest.raises(BlockingIOError):
+            while True:
+                other.sendto(b"noise", path.replace("@", "\0", 1))
+        mine.alive("open")
+        assert set(told(heard)) == {"noise"}
+
+    mine.alive("open")
+    mine.alive("open")
+
+    assert told(heard) == ["STATUS=open", "WATCHDOG=1"]
+
+
 def test_a_hung_dispatcher_is_not_pinged_for(manager, daemon, endpoint):
     """Whoever holds the shard's mutex for ever stops the pings; when it goes on, so do they."""
     heard, path = manager

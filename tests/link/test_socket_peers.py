@@ -10,6 +10,7 @@ from socket_parts import COUNT, CUP, add_one, counters
 
 from enact_dist import Entity, Lock, Write, connect
 from enact_dist.errors import LinkError
+from enact_dist.link import socket_peers
 from enact_dist.link.socket_peers import Deaths, check_peer, peer_of
 
 pytestmark = pytest.mark.carrier("socket")
@@ -171,7 +172,7 @@ def test_process_is_watched_until_it_ends(program, tmp_path, until):
     process.stdout.readline()
     connected.close()
     process.stdout.readline()
-    deaths.disconnected("a")
+    deaths.disconnected("a", connected)
     assert died == []
 
     process.kill()
@@ -179,3 +180,39 @@ def test_process_is_watched_until_it_ends(program, tmp_path, until):
     until(lambda: died == ["a"])
     deaths.close()
     listener.close()
+
+
+def test_process_is_watched_while_any_of_its_connections_is_open(
+    program, tmp_path, until, monkeypatch
+):
+    """The kernel had no descriptor left when the first one came; the order of their ends is any."""
+    monkeypatch.setattr(socket_peers, "LINGER_S", 0.0)
+    listener = socket.socket(socket.AF_UNIX)
+    listener.bind(str(tmp_path / "s"))
+    listener.listen()
+    died = []
+    deaths = Deaths(died.append)
+    text = (
+        "import socket, sys; many = [socket.socket(socket.AF_UNIX) for _ in range(3)];"
+        "[s.connect(sys.argv[1]) for s in many]; print(flush=True); sys.stdin.read()"
+    )
+    process = program(text, tmp_path / "s")
+    first, second, third = (listener.accept()[0] for _ in range(3))
+    with monkeypatch.context() as full:
+        full.setattr(socket_peers, "process_of", lambda _: None)
+        deaths.connected("a", first)
+    deaths.connected("a", second)
+    deaths.connected("a", third)
+    deaths.disconnected("a", second)
+    deaths.disconnected("a", third)
+    deaths.disconnected("a", third)
+    deaths.connected("b", second)
+    deaths.disconnected("b", second)
+    until(lambda: "b" not in deaths._watched)  # it has swept since
+
+    process.kill()
+
+    until(lambda: died == ["a"])
+    deaths.close()
+    for opened in (listener, first, second, third):
+        opened.close()
