@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import unicodedata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
 
 TEXT_SHOWN_MAX: Final = 400
 """Characters of a text that are printed; the rest is counted."""
+_HIDDEN: Final = frozenset(("LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI"))
+"""Unicode's bidirectional classes of characters that turn the text beside them round."""
 VALUES_SHOWN_MAX: Final = 16
 """Arrays up to this many elements are printed whole."""
 
@@ -25,7 +28,7 @@ def lines(datum: object, name: str = "", indent: str = "") -> Iterator[str]:
     """Yield a datum as lines for people; arrays are summarised."""
     head = f"{indent}{name}: " if name else indent
     if isinstance(datum, dict):
-        title = str(datum.get("__type__", "")) if "__type__" in datum else ""
+        title = visible(str(datum.get("__type__", "")))
         fields = {key: value for key, value in datum.items() if key != "__type__"}
         below = indent
         if name or title:
@@ -34,7 +37,7 @@ def lines(datum: object, name: str = "", indent: str = "") -> Iterator[str]:
         if not fields:
             yield f"{below}{{}}"
         for key, value in fields.items():
-            yield from lines(value, str(key), below)
+            yield from lines(value, visible(str(key)), below)
     elif isinstance(datum, list | tuple) and any(_is_long(each) for each in datum):
         yield f"{head}{len(datum)} elements"
         for index, value in enumerate(datum):
@@ -47,8 +50,10 @@ def one_line(datum: object) -> str:
     """Return a datum as one line, as YAML writes it: ``Part {x_mm: 1.5, y_mm: 2.0}``."""
     if isinstance(datum, dict):
         named = {key: value for key, value in datum.items() if key != "__type__"}
-        fields = ", ".join(f"{key}: {one_line(value)}" for key, value in named.items())
-        return f"{datum.get('__type__', '')} {{{fields}}}".lstrip()
+        fields = ", ".join(
+            f"{visible(str(key))}: {one_line(value)}" for key, value in named.items()
+        )
+        return f"{visible(str(datum.get('__type__', '')))} {{{fields}}}".lstrip()
     if isinstance(datum, list | tuple) and any(_is_long(each) for each in datum):
         return f"[{', '.join(map(one_line, datum))}]"
     return summary(datum)
@@ -64,9 +69,26 @@ def summary(value: object) -> str:
         return _array_summary(value)
     if isinstance(value, bytes):
         return f"{len(value)} bytes {value[:16].hex(' ')}{' …' if len(value) > 16 else ''}"
-    text = value if isinstance(value, str) else repr(value)
+    text = visible(value) if isinstance(value, str) else repr(value)
     more = len(text) - TEXT_SHOWN_MAX
     return text if more <= 0 else f"{text[:TEXT_SHOWN_MAX]}… ({more} more characters)"
+
+
+def visible(text: str) -> str:
+    """Return a text with its control characters as escapes, but for tabs and ends of lines.
+
+    Whoever writes a datum must not clear the screen of whoever looks at it.
+    """
+    if text.isprintable():
+        return text
+    return "".join(
+        ascii(each)[1:-1] if _steers(each) and each not in "\n\t" else each for each in text
+    )
+
+
+def _steers(character: str) -> bool:
+    is_control = unicodedata.category(character) in {"Cc", "Cs"}
+    return is_control or unicodedata.bidirectional(character) in _HIDDEN
 
 
 def _array_summary(array: NDArray[Any]) -> str:

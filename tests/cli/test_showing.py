@@ -85,3 +85,13 @@ def test_save_is_refused_when_the_format_cannot_hold_it(datum, name, reason, tmp
     with pytest.raises(ConfigError, match=reason):
         showing.save(datum, str(tmp_path / name))
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("hostile", ["\x1b[2J", "\x9b1m", "\r", "\u202e", "\x07"])
+def test_a_text_steers_no_terminal(hostile):
+    """Neither as a datum nor as a key, however deep; its lines and letters stay what they are."""
+    datum = {hostile: [f"a{hostile}\tb\nü"], "__type__": hostile}
+    for shown in (*showing.lines(datum), showing.one_line(datum), *showing.lines(hostile)):
+        assert hostile not in shown
+    assert showing.visible(f"a{hostile}") == "a" + ascii(hostile)[1:-1]
+    assert showing.visible("ü\ttab\nline") == "ü\ttab\nline"
