@@ -258,9 +258,11 @@ class _Line:
         deadline_s = time.monotonic() + timeout_s
         self._thread.join(max(0.0, timeout_s))
         if self._presence is not None:
-            self._presence.join(max(0.0, deadline_s - time.monotonic()))
+            self._presence.close(max(0.0, deadline_s - time.monotonic()))
 
     def _close_session(self) -> None:
+        if self._presence is not None:
+            self._presence.close(0.0)
         session = self._session
         if session is not None:
             close_session(session)

@@ -408,13 +408,14 @@ class ZenohCarrier:
         pumps = [pump for pumps in self._feeds.values() for pump in pumps]
         for feed in list(self._feeds):
             feed.close()
+        for presence in list(self._presences.values()):
+            presence.close(JOIN_S)
         for link in self._links:
             link.bulk.close()
+            link.token.undeclare()  # type: ignore[no-untyped-call]  # as in Zenoh's stub
             close_session(link.session)
         for pump in pumps:
             pump.thread.join(JOIN_S)
-        for presence in list(self._presences.values()):
-            presence.join(JOIN_S)
         # A thread that comes back from Zenoh while the interpreter ends would abort the process.
         self._inside.wait_empty(JOIN_S)
 
