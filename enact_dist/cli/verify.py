@@ -25,12 +25,19 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
         "enact verify --seed 17\n"
         "enact verify --recovery\n"
         "enact verify --chaos --minutes 5\n"
-        "enact verify --floods --json",
+        "enact verify --floods --json\n"
+        "enact verify --frames --minutes 10",
     )
     add_simulation(verify)
     add_recovery(verify)
     add_chaos(verify)
     add_floods(verify)
+    verify.add_argument(
+        "--frames",
+        action="store_true",
+        help="send the core and the store every kind of message with hostile values in each field"
+        " (takes --seconds or --minutes, else a minute; --seeds, --first, --seed)",
+    )
     verify.add_argument("--json", action="store_true", help="print one JSON object")
 
 
@@ -142,6 +149,10 @@ def run_verify(arguments: argparse.Namespace) -> int:
         from enact_dist.verify.floods import command as floods
 
         return floods.run(arguments)
+    if arguments.frames:
+        from enact_dist.verify.frames import command as frames
+
+        return frames.run(arguments)
     if arguments.recovery:
         from enact_dist.verify import recovery
 
