@@ -177,6 +177,10 @@ OF_A_SHARD: Final[dict[str, Counter]] = {
         "payloads that are no file of the shared folder: it is full",
         "enlarge the folder: mount -o remount,size=…; docker run --shm-size=…",
     ),
+    "drafts_displaced": Counter(
+        "large data on their way that were given up for a client with less than its share",
+        "see who stages much and commits nothing: enact actor ls; or raise shared_bytes_max",
+    ),
     "drafts_swept": Counter("drafts whose client went or gave them up", _DYING),
 }
 

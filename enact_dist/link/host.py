@@ -272,7 +272,7 @@ class ShardHost:
         elif message.total and message.session not in sessions.by_id:
             reply(EpochChanged(self.epoch))
         else:
-            reply(self._payloads.stage(message))
+            reply(self._payloads.stage(message, identity))
 
     def event(self, event: Event) -> None:
         """Hand an event to the shard (a session's token appeared, for example)."""

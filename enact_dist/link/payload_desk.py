@@ -26,6 +26,7 @@ import logging
 import os
 import threading
 import weakref
+from collections import Counter
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Final, TypeVar
@@ -55,6 +56,8 @@ FULL_NS: Final = 100_000_000
 """So long after a payload did not fit, none that is as large is made room for."""
 DRAFT_BYTES_MAX: Final = 2 << 30
 """Bytes of drafts that wait in plain memory for their commits."""
+SHARES: Final = 4
+"""Of the room for drafts one client has a quarter in any case; more only while others want none."""
 ROOM_S: Final = 1.0
 """How long a new draft waits for files that are on their way out."""
 SILENT_NS: Final = 60_000_000_000
@@ -70,6 +73,7 @@ class _Draft:
     """A payload that no commit has named yet."""
 
     session: str
+    owner: str
     size: int
     memory: Pages | Plain
     shared: bool
@@ -141,8 +145,13 @@ class PayloadDesk:
 
     # ---------------------------------------------------------------- drafts
 
-    def stage(self, message: Stage) -> Staged | Refused:
-        """Open a draft, take a slice of one, or give one up."""
+    def stage(self, message: Stage, owner: str = "") -> Staged | Refused:
+        """Open a draft, take a slice of one, or give one up.
+
+        Args:
+            message: A slice, or the question for room.
+            owner: Whose share of the room it takes; the session's own unless it is said.
+        """
         file, total = message.file, message.total
         if not PAYLOAD_NAME.match(file) or not file.startswith(f"{message.session}-"):
             return Refused("protocol", f"{file[:80]!r} is no payload of session {message.session}")
@@ -158,7 +167,9 @@ class PayloadDesk:
         if draft is None:
             # Slices of one draft may come by several threads.
             with self._opening[hash(file) % len(self._opening)]:
-                draft = self._drafts.get(file) or self._opened(message.session, file, total)
+                draft = self._drafts.get(file) or self._opened(
+                    message.session, owner or message.session, file, total
+                )
         if draft is None:
             return Staged(file, total, False)
         if isinstance(draft, Refused):
@@ -191,25 +202,28 @@ class PayloadDesk:
             draft.add(offset, end)
             return Staged(file, draft.have, draft.shared)
 
-    def _opened(self, session: str, file: str, total: int) -> _Draft | Refused | None:
+    def _opened(self, session: str, owner: str, file: str, total: int) -> _Draft | Refused | None:
         """Return a new draft; None where its name was used up meanwhile."""
         small = total <= PAYLOAD_BYTES_MIN  # many of these together, each read with its grant
         shared = self._folder is not None and not small and self._has_room(total)
-        if self._folder is not None and not shared and not small and self._firm:
-            return self._refused(session, total, self._bytes, self._bytes_max)
+        if not shared and self._folder is not None and not small and self._firm:
+            shared = self._displaced(owner, total, shared=True) and self._reserved(total)
+            if not shared:
+                return self._refused(session, total, self._bytes, self._bytes_max)
         if self._folder is not None and not shared and not small:
             self._travels(f"its cap of {self._bytes_max} bytes is reached")
         memory = self._in_folder(self._folder, file, total) if shared else None
         if memory is None:
             drafted = self._drafted()
-            if drafted + total > self._draft_bytes_max:
+            full = drafted + max(total, PAYLOAD_BYTES_MIN) > self._draft_bytes_max
+            if full and not self._displaced(owner, total, shared=False):
                 return self._refused(session, total, drafted, self._draft_bytes_max)
         try:
             found = memory or plain_memory(total, ended=partial(self._ended, file, None, 0))
         except OSError as error:
             self._count("payloads_refused")
             return Refused(NO_ROOM, f"{total} bytes for a payload cannot be had: {error.strerror}")
-        draft = _Draft(session, total, found, memory is not None, self._clock.monotonic_ns())
+        draft = _Draft(session, owner, total, found, memory is not None, self._clock.monotonic_ns())
         with self._mutex:
             if file in self._over:
                 return None
@@ -247,10 +261,43 @@ class PayloadDesk:
             self._files += 1
             return True
 
-    def _drafted(self) -> int:
-        """Return the bytes of drafts in plain memory."""
+    def _displaced(self, owner: str, total: int, *, shared: bool) -> bool:
+        """Give up drafts of those beyond their share for one who stays within; say whether any.
+
+        A client that stages on and on and commits nothing would else leave the others no room.
+        Whoever loses a draft that it wanted after all is told so at its commit, and stages again.
+        """
+        share = (self._bytes_max if shared else self._draft_bytes_max) // SHARES
+        staged: Counter[str] = Counter()
+        given_up, freed = [], 0
         with self._mutex:
-            return sum(draft.size for draft in self._drafts.values() if not draft.shared)
+            drafts = [
+                (file, draft.owner, draft.size)
+                for file, draft in self._drafts.items()
+                if draft.shared == shared
+            ]
+            for _, other, size in drafts:
+                staged[other] += size
+            if staged[owner] + total > share:
+                return False
+            for file, other, size in drafts:
+                if freed < total and staged[other] > share:
+                    staged[other] -= size
+                    freed += size
+                    given_up.append(file)
+            for file in given_up:
+                self.drop(file)
+        if not given_up:
+            return False
+        self._count("drafts_displaced", len(given_up))
+        leftovers().wait(ROOM_S)
+        return freed >= total
+
+    def _drafted(self) -> int:
+        """Return the bytes of drafts in plain memory; a small one costs more than it has."""
+        with self._mutex:
+            plain = [draft.size for draft in self._drafts.values() if not draft.shared]
+        return sum(max(size, PAYLOAD_BYTES_MIN) for size in plain)
 
     def _refused(self, session: str, total: int, used: int, most: int) -> Refused:
         self._count("payloads_refused")

@@ -75,6 +75,36 @@ def test_draft_is_a_whole_file_that_clients_may_fill(folder):
     assert found.st_blocks * 512 >= SIZE
 
 
+@pytest.mark.parametrize("where", ["file", "memory"])
+def test_client_beyond_its_share_gives_way_to_one_within(folder, where):
+    """Staged on and on and never committed: the oldest drafts go, and their commits are told."""
+    desk = PayloadDesk(folder if where == "file" else None, 8 * SIZE)
+    for number in range(8):
+        assert isinstance(stage(desk, f"hog-{number:x}", body=bytes(SIZE)), Staged)
+    beyond = stage(desk, "hog-8")
+    modest = [stage(desk, f"modest-{number:x}", body=bytes(SIZE)) for number in range(3)]
+
+    assert isinstance(beyond, Refused)
+    assert [type(answer) for answer in modest] == [Staged, Staged, Refused]
+    assert desk.figures()["drafts_displaced"] == 2
+    assert not adopted(desk, "hog-0", session="hog").body
+    assert len(adopted(desk, "hog-7", session="hog").body) == SIZE
+    assert len(adopted(desk, "modest-1", session="modest").body) == SIZE
+
+
+def test_share_is_that_of_the_client_and_not_of_each_of_its_sessions(folder):
+    """Many sessions of one client take one share."""
+    desk = PayloadDesk(folder, 8 * SIZE)
+    for number in range(8):
+        file = f"s{number}-1"
+        message = Stage(f"s{number}", file, 0, SIZE, Datum(b"", bytes(SIZE), SIZE))
+        assert isinstance(desk.stage(message, "hog@h:1"), Staged)
+    more = Stage("s9", "s9-1", 0, SIZE, NOTHING)
+
+    assert isinstance(desk.stage(more, "hog@h:1"), Refused)
+    assert isinstance(desk.stage(more, "modest@h:2"), Staged)
+
+
 def test_draft_that_is_asked_for_again_is_the_same(desk):
     """The answer to the first request may be lost."""
     stage(desk, body=b"x" * 1000)
