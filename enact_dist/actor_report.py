@@ -243,12 +243,13 @@ def percentile(ascending: list[int], part: float) -> int:
 def encode_reports(reports: list[ActorStatistics]) -> bytes:
     """Return the reports of all actors of one session as msgpack, short enough to be listed.
 
-    Where there are too many for whole reports, errors are shortened and blank fields left out, then
-    only names and states stay, and at last the actors that are left are only counted.
+    Where there are too many for whole reports, what they declare to write is left out, then errors
+    are shortened and blank fields left out, then only names and states stay, and at last the actors
+    that are left are only counted.
     """
     rows = [{name: getattr(report, name) for name in _NAMES} for report in reports]
     encoded = _packed(rows)
-    for shorten in (_brief, _named):
+    for shorten in (_without_writes, _brief, _named):
         if len(encoded) > REPORT_BYTES_MAX:
             rows = [shorten(row) for row in rows]
             encoded = _packed(rows)
@@ -262,6 +263,10 @@ def encode_reports(reports: list[ActorStatistics]) -> bytes:
 def _packed(rows: list[dict[str, Any]], **more: int) -> bytes:
     encoded: bytes = msgpack.packb({"version": REPORT_VERSION, "actors": rows, **more})
     return encoded
+
+
+def _without_writes(row: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in row.items() if name != "writes"}
 
 
 def _brief(row: dict[str, Any]) -> dict[str, Any]:

@@ -120,6 +120,16 @@ def test_reports_come_back_equal_when_encoded_and_decoded():
 ENDLESS = b"\x81\xa6actors\x91\x81\xa7updates\xcb\x7f\xf0" + bytes(6)
 
 
+def test_long_declarations_cost_no_figures():
+    """What an actor writes is left out first; how it does stays."""
+    writes = tuple(f"online:part/{number}/{'x' * 200}" for number in range(64))
+    (found,) = decode_reports(encode_reports([ActorStatistics("fusion", updates=7, writes=writes)]))
+    (short,) = decode_reports(encode_reports([ActorStatistics("fusion", writes=writes[:2])]))
+
+    assert (found.updates, found.writes) == (7, ())
+    assert short.writes == writes[:2]
+
+
 @pytest.mark.parametrize(
     "report",
     [b"\xc1", b"\x93\x01\x02\x03", b"{}", b"\x81\xa6actors\x01", ENDLESS, b"\x91" * 500 + b"\x01"],
