@@ -7,6 +7,7 @@ measured on a loopback, against up to a quarter of a TTL until the next keep-ali
 from __future__ import annotations
 
 import contextlib
+import threading
 from typing import TYPE_CHECKING, cast
 
 import zenoh
@@ -34,6 +35,8 @@ class ShardPresence:
 
     def __init__(self, session: zenoh.Session, key: str, returned: Callable[[], None]) -> None:
         self._returned = returned
+        self._mutex = threading.Lock()
+        self._closed = False
         self._querier = session.declare_querier(key)
         # As it is; Zenoh's stub says otherwise.
         self.here = cast("zenoh.MatchingStatus", self._querier.matching_status).matching
@@ -49,6 +52,9 @@ class ShardPresence:
 
     def close(self, wait_s: float) -> None:
         """End it; wait so long for the end of what calls `returned`.  Twice is harmless."""
-        with contextlib.suppress(zenoh.ZError):  # the session is closed, or this is
-            self._querier.undeclare()  # type: ignore[no-untyped-call]  # as in Zenoh's stub
+        with self._mutex:  # Zenoh's binding raises where two threads do this at once
+            if not self._closed:
+                self._closed = True
+                with contextlib.suppress(zenoh.ZError):  # the session is closed
+                    self._querier.undeclare()  # type: ignore[no-untyped-call]  # as in its stub
         self._events.join(wait_s)
