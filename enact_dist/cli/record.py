@@ -241,6 +241,7 @@ def run_replay(arguments: argparse.Namespace) -> int:
             loop=arguments.loop,
             tell=lambda so_far: line.show(_replayed_line(so_far)),
             warn=warn,
+            show=warn,
         )
     line.end()
     if arguments.json:

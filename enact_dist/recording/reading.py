@@ -2,8 +2,9 @@
 
 A recording that was cut off, by `kill -9` or a power cut, has no index and may end anywhere in a
 record; one of a disk that lost power may end in zeros.  So the file is read from its begin, each
-record against the file's length and each chunk against its checksum, and what follows the first
-record that is not whole is counted as missing.
+record against the file's length and each chunk against its checksum (`chunks`), and what follows
+the first record that is not whole is counted as missing.  A recording may come from anywhere: what
+it claims takes no memory, and its names are checked before anybody is told them.
 """
 
 from __future__ import annotations
@@ -18,13 +19,18 @@ import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.reader import SeekingReader
-from mcap.records import Channel, Chunk, Message, Metadata
-from mcap.stream_reader import CRCValidationError, breakup_chunk
+from mcap.records import Channel, Metadata
 
 from enact_dist.errors import ConfigError, ProtocolError
+from enact_dist.recording.chunks import (
+    CHANNEL_BYTES_MAX,
+    CHANNELS_BYTES_MAX,
+    Chunk,
+    DamagedChunkError,
+)
 from enact_dist.recording.exact import FORMAT, decode_recorded
 from enact_dist.recording.file import BEGIN_RECORD, END_RECORD, EXACT_TOPIC
+from enact_dist.terms import checked_name
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -33,10 +39,11 @@ if TYPE_CHECKING:
     from enact_dist.recording.exact import Recorded
 
 MAGIC: Final = b"\x89MCAP0\r\n"
+METADATA_BYTES_MAX: Final = 16 << 20
 _RECORD_HEAD: Final = struct.Struct("<BQ")
 _DAMAGES: Final = (
+    DamagedChunkError,
     McapError,
-    CRCValidationError,
     struct.error,
     UnicodeDecodeError,
     RuntimeError,  # of lz4
@@ -94,7 +101,9 @@ class Recording:
         self.chunks = self.missing_bytes = 0
         self.whole = False
         self._channels: dict[int, Channel] = {}
-        for _ in self._records(until_begin=True):
+        self._exact: set[int] = set()
+        self._channels_bytes = 0
+        for _ in self._chunks(until_begin=True):
             pass
         if not self.facts:
             raise ConfigError(f"{self.path} is an MCAP file, but no recording made by enact record")
@@ -108,14 +117,14 @@ class Recording:
         """Yield the commits in the order of the file, as far as it is whole.
 
         Raises:
-            ProtocolError: A whole chunk holds what this version cannot read.
+            ProtocolError: A whole chunk holds what this version cannot read, or does not read.
         """
         self.chunks = self.missing_bytes = 0
-        for chunk in self._records():
+        for chunk in self._chunks():
             versions: list[Recorded] = []
             log_ns = 0
-            for message in chunk:
-                recorded = decode_recorded(message.data)
+            for message in chunk.messages(self._exact):
+                recorded = self._checked(decode_recorded(message.data))
                 begins = versions and recorded.commit != versions[-1].commit
                 if begins:
                     yield Commit(versions[0].commit, log_ns, tuple(versions))
@@ -125,6 +134,24 @@ class Recording:
             if versions:
                 yield Commit(versions[0].commit, log_ns, tuple(versions))
 
+    def _checked(self, recorded: Recorded) -> Recorded:
+        """Return a version whose names no shard, log or terminal has to fear.
+
+        Raises:
+            ProtocolError: One of them can be no name.
+        """
+        context, entity, aspect = recorded.slot
+        self._check_names(context, aspect, entity)
+        return recorded
+
+    def _check_names(self, context: str, aspect: str, entity: str = "e") -> None:
+        try:
+            checked_name("world context", context, slashes=False)
+            checked_name("entity", entity, slashes=True)
+            checked_name("aspect", aspect, slashes=False)
+        except ValueError as error:
+            raise ProtocolError(f"{self.path}: {error}") from None
+
     def look_through(self) -> frozenset[str]:
         """Learn of all aspects in the file and return the world contexts that it has versions of.
 
@@ -132,7 +159,7 @@ class Recording:
         """
         indexed = self._indexed()
         if indexed is None:
-            for _ in self._records():
+            for _ in self._chunks():
                 pass
             indexed = list(self._channels.values())
         for channel in indexed:
@@ -144,24 +171,19 @@ class Recording:
         """Return the channels that the index of the file names, None where it has no index."""
         try:
             with self.path.open("rb") as stream:
-                stream.seek(-len(MAGIC), os.SEEK_END)
-                if stream.read() != MAGIC:
-                    return None
-                stream.seek(0)
-                summary = SeekingReader(stream).get_summary()
+                return list(_summary_channels(stream))
         except (OSError, *_DAMAGES):
             return None
-        return list(summary.channels.values()) if summary is not None else None
 
-    def _records(self, *, until_begin: bool = False) -> Iterator[list[Message]]:
-        """Yield the exact messages of each whole chunk; learn from what stands between."""
+    def _chunks(self, *, until_begin: bool = False) -> Iterator[Chunk]:
+        """Yield each whole chunk; learn from what stands between, and of its channels."""
         try:
             with self.path.open("rb") as stream:
                 yield from self._read(stream, until_begin=until_begin)
         except OSError as error:
             raise ConfigError(f"cannot read {self.path}: {error.strerror}") from error
 
-    def _read(self, stream: BinaryIO, *, until_begin: bool) -> Iterator[list[Message]]:
+    def _read(self, stream: BinaryIO, *, until_begin: bool) -> Iterator[Chunk]:
         size = self.path.stat().st_size
         if stream.read(len(MAGIC)) != MAGIC:
             raise ConfigError(f"{self.path} is no MCAP file")
@@ -174,53 +196,84 @@ class Recording:
             opcode, length = _RECORD_HEAD.unpack(head)
             if opcode == 0 or length > size - good - len(head):
                 break
-            content = stream.read(length) if opcode in _WANTED else b""
-            if opcode not in _WANTED:
-                stream.seek(length, 1)
             try:
-                messages = self._take(opcode, content)
+                chunk = self._take(opcode, stream, length)
             except _DAMAGES:
                 break
+            if chunk is not None:
+                self.chunks += 1
+                yield chunk
             good += len(head) + length
-            if messages:
-                yield messages
+            stream.seek(good)
             self.whole = opcode == Opcode.DATA_END
             if until_begin and self.facts:
                 return
         if not self.whole:
             self.missing_bytes = size - good
 
-    def _take(self, opcode: int, content: bytes) -> list[Message]:
-        """Take one record; return the exact messages in it, if it is a chunk."""
-        stream = ReadDataStream(BytesIO(content))
+    def _take(self, opcode: int, stream: BinaryIO, length: int) -> Chunk | None:
+        """Take one record; return it, if it is a chunk with anything in it."""
         if opcode == Opcode.METADATA:
-            record = Metadata.read(stream)
+            if length > METADATA_BYTES_MAX:
+                raise DamagedChunkError(f"a metadata record of {length} bytes")
+            record = Metadata.read(ReadDataStream(BytesIO(stream.read(length))))
             if record.name == BEGIN_RECORD:
                 self.facts = record.metadata
             elif record.name == END_RECORD:
                 self.end = record.metadata
         elif opcode == Opcode.CHUNK:
-            chunk = Chunk.read(stream)
-            records = breakup_chunk(chunk, validate_crc=True)
-            for each in records:
-                if isinstance(each, Channel):
-                    self._learn(each)
-            self.chunks += 1
-            exact = [each for each in records if isinstance(each, Message)]
-            return [each for each in exact if self._is_exact(each)]
-        return []
+            chunk = Chunk(stream, length, f"the chunk at byte {stream.tell()} of {self.path}")
+            for content in chunk.channels():
+                channel = Channel.read(ReadDataStream(BytesIO(content)))
+                if channel.id not in self._channels:
+                    self._channels_bytes += len(content)
+                if self._channels_bytes > CHANNELS_BYTES_MAX:
+                    raise ProtocolError(
+                        f"{self.path} has channels of more than {CHANNELS_BYTES_MAX} bytes"
+                    )
+                self._learn(channel)
+            return chunk
+        return None
 
     def _learn(self, channel: Channel) -> None:
         self._channels[channel.id] = channel
+        self._exact.discard(channel.id)
         facts = channel.metadata
-        if "exact" in facts and "type" in facts:
-            self.aspects[facts["aspect"]] = AspectFacts(facts["type"], facts["durability"])
+        if not channel.topic.startswith(EXACT_TOPIC) or "exact" not in facts:
+            return
+        self._exact.add(channel.id)
+        if not {"world", "aspect"} <= facts.keys():
+            raise ProtocolError(f"{self.path} has a channel of no world context or aspect")
+        self._check_names(facts["world"], facts["aspect"])
+        if not facts.get("type", "").isprintable():
+            raise ProtocolError(f"{self.path} has an aspect of the type {facts['type']!r:.80}")
+        if "type" in facts:
+            durability = facts.get("durability", "")
+            self.aspects[facts["aspect"]] = AspectFacts(facts["type"], durability)
 
-    def _is_exact(self, message: Message) -> bool:
-        channel = self._channels.get(message.channel_id)
-        if channel is None:
-            raise ProtocolError(f"{self.path} has a message of no channel")
-        return channel.topic.startswith(EXACT_TOPIC) and "exact" in channel.metadata
+
+def _summary_channels(stream: BinaryIO) -> Iterator[Channel]:
+    """Yield the channels that the index at the end of a file names.
+
+    Raises:
+        DamagedChunkError: The file has no end, or no index.
+    """
+    end = stream.seek(0, os.SEEK_END) - len(MAGIC) - _FOOTER.size - _RECORD_HEAD.size
+    stream.seek(max(0, end))
+    opcode, _ = _RECORD_HEAD.unpack(stream.read(_RECORD_HEAD.size))
+    at, _, _ = _FOOTER.unpack(stream.read(_FOOTER.size))
+    if opcode != Opcode.FOOTER or not at or stream.read() != MAGIC:
+        raise DamagedChunkError("the file has no index")
+    left = CHANNELS_BYTES_MAX
+    while at < end and left > 0:
+        stream.seek(at)
+        opcode, length = _RECORD_HEAD.unpack(stream.read(_RECORD_HEAD.size))
+        if opcode == Opcode.CHANNEL:
+            if length > CHANNEL_BYTES_MAX:
+                raise DamagedChunkError(f"a channel has a record of {length} bytes")
+            left -= length
+            yield Channel.read(ReadDataStream(BytesIO(stream.read(length))))
+        at += _RECORD_HEAD.size + length
 
 
-_WANTED: Final = (Opcode.METADATA, Opcode.CHUNK)
+_FOOTER: Final = struct.Struct("<QQI")

@@ -161,6 +161,7 @@ class Replay:
         loop: bool = False,
         tell: Callable[[ReplaySummary], None] = lambda _: None,
         warn: Callable[[str], None] | None = None,
+        show: Callable[[str], None] = lambda _: None,
     ) -> ReplaySummary:
         """Commit all that was chosen, or until `stop` is set; a commit is made whole or not at all.
 
@@ -170,6 +171,7 @@ class Replay:
             tell: Called after each commit.
             warn: Called with a sentence for each slot that somebody else writes, too; None: a
                 warning of the log.
+            show: Called with a line on the recording and on what is to be set, before anything is.
 
         Raises:
             ConfigError: The recording has no such aspect.
@@ -179,7 +181,7 @@ class Replay:
             DatumTypeError: The cell knows an aspect with another type; no world context is made.
         """
         stop = stop or threading.Event()
-        self._check()
+        show(self._told(self._check()))
         self._others = OtherWriters(warn) if warn is not None else OtherWriters()
         self._others.look_at_actors(self._cell, self._slots)
         self.summary.other_writers = self._others.found
@@ -298,8 +300,20 @@ class Replay:
 
     # ---------------------------------------------------------------- before anything is made
 
-    def _check(self) -> None:
-        """Refuse what cannot be replayed while the cell is as it was."""
+    def _told(self, worlds: Iterable[str]) -> str:
+        """Return a line on the recording and on what of it is to be set."""
+        recording, aspects = self.recording, self._aspects or self.recording.aspects.keys()
+        called = [f"{old} as {self._worlds.get(old, old)}" for old in sorted(worlds)]
+        entities = "" if self._entities == "**" else f" of entities {self._entities}"
+        return (
+            f"{recording.path}: {recording.path.stat().st_size} bytes of cell"
+            f" {recording.facts.get('cell', '?')!r}; sets in cell {self._cell.name!r}:"
+            f" {', '.join(called) or 'nothing'}; aspects {', '.join(sorted(aspects)) or 'none'}"
+            f"{entities}"
+        )
+
+    def _check(self) -> Iterable[str]:
+        """Refuse what cannot be replayed while the cell is as it was; return its contexts."""
         names = self.recording.look_through()
         aspects = self.recording.aspects
         for name in sorted(self._aspects - aspects.keys()):
@@ -325,6 +339,7 @@ class Replay:
                     f" {types[name][0]} in cell {self._cell.name!r}: nobody there could read what"
                     " a replay sets"
                 )
+        return names
 
     def _refuse_data(self, world: WorldContext) -> None:
         if self._overwrite:

@@ -43,9 +43,12 @@ def test_record_and_replay(enact, cell_file, put, tmp_path):
     assert [(slot["entity"], slot["version"]) for slot in found] == [
         ("a", 1), ("b", 1), ("c", 1), ("d", 1),
     ]  # fmt: skip
+    assert f"{out}: {out.stat().st_size} bytes of cell 'clitest'" in done.err
+    assert "sets in cell 'clitest': one as two; aspects count" in done.err
     again = enact(*words)
     assert again.status == 1
     assert "--overwrite" in again.err
+    assert "sets in" not in again.err
     again = enact(*words, "--overwrite")
     assert "4 data" in again.out
 
