@@ -104,7 +104,7 @@ class BoundActor:
         *,
         wait_s: float | None = None,
         stop: threading.Event | None = None,
-        captured_ns: int = 0,
+        members: tuple[int, ...] = (),
         tick_ns: int = 0,
     ) -> ActorLock:
         """Return the lock of one update, not yet taken.
@@ -114,7 +114,7 @@ class BoundActor:
                 works on its `only_entity`, if it has one.
             wait_s: How long to wait for it; None: as long as the actor says.
             stop: Ends the waiting once it is set.
-            captured_ns: Capture stamp of the set that triggered it; 0 without one.
+            members: Capture stamps of the set that triggered it, as `Trigger`; nothing without one.
             tick_ns: The tick of a source that it is for; 0 of anything else.
         """
         entity = entity or self.only
@@ -125,7 +125,7 @@ class BoundActor:
             hold_s=self.actor.hold_s,
             stop=stop,
             together=self.declaration.together,
-            captured_ns=captured_ns,
+            members=members,
             tick_ns=tick_ns,
             triggers=self.declaration.triggers,
         )
@@ -171,11 +171,7 @@ class BoundActor:
         together = self.declaration.together
         if together is None:
             return None
-        views = self.set_views()
-        first = views[0].entity
-        assert isinstance(first, Entity)
-        names = [str(slot_of(view)) for view in views]
-        return PendingSets(names, entity=first, open_max=together.open_max)
+        return together.pending([str(slot_of(view)) for view in self.set_views()])
 
     def covers(self, entity: Entity) -> bool:
         """Say whether a change of `entity` is one that the actor can be updated for."""

@@ -133,7 +133,7 @@ class SetInbox(_Box[PendingSets]):
     def start(self, versions: Sequence[Sequence[Captured]]) -> None:
         """Take what there is when the actor starts."""
         with self._filled:
-            self._pending.start(versions)
+            self._pending.start(versions, monotonic_ns())
 
     def misses(self, member: int, version: int) -> bool:
         """Whether versions before this one were not seen."""
@@ -143,12 +143,18 @@ class SetInbox(_Box[PendingSets]):
     def captured(self, member: int, versions: Sequence[Captured]) -> None:
         """Take versions of one member of the set, oldest first."""
         with self._filled:
-            before = self._pending.incomplete
-            if self._pending.captured(member, versions):
+            before, unstamped = self._pending.incomplete, self._pending.unstamped_from
+            if self._pending.captured(member, versions, monotonic_ns()):
                 self._filled.notify_all()
             given_up = self._pending.incomplete - before
             told = list(self._pending.told)[-given_up:] if given_up else []
             counts = [self._count("", incomplete) for incomplete in told]
+            news = [one for one in self._pending.unstamped_from if one not in unstamped]
+        for name in news:
+            log.warning(
+                "%s comes without a capture stamp, so no set can have it; its writer has to give"
+                " one: lock.put(…, stamp_ns=…)", name
+            )  # fmt: skip
         for incomplete, count in zip(told, counts, strict=True):
             _tell(f"incomplete {incomplete}", count)
 

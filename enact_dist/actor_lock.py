@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 from enact_dist.core.datum import Slot
 from enact_dist.lock import Lock
 from enact_dist.reading import slot_of
-from enact_dist.terms import Entity, LockRequest, World
+from enact_dist.terms import Entity, LockRequest, View, World
 from enact_dist.together import Together
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ class ActorLock(Lock):
         hold_s: As for `Lock`.
         stop: Ends the waiting for the lock within 0.2 s once it is set.
         together: The set that triggers the actor, if one does.
-        captured_ns: Its capture stamp.
+        members: The capture stamp of each of its data, 0 of those that are missing.
         tick_ns: The tick of `every_s` that it is for, 0 if it is for none.
         triggers: The declared requests that trigger the actor.
     """
@@ -51,7 +51,7 @@ class ActorLock(Lock):
         hold_s: float,
         stop: threading.Event | None = None,
         together: Together[Any] | None = None,
-        captured_ns: int = 0,
+        members: Sequence[int] = (),
         tick_ns: int = 0,
         triggers: Sequence[LockRequest[Any]] = (),
     ) -> None:
@@ -60,18 +60,24 @@ class ActorLock(Lock):
         self._entity = entity
         self._bound = bound
         self._together = together
-        self._captured_ns = captured_ns
+        self._captured_ns = min(filter(None, members), default=0)
         self._tick_ns = tick_ns
         self._triggers = triggers
-        views = together.requests if together is not None else ()
-        self._in_set: dict[Any, None] = {bound[view]: None for view in views}
+        stamps = together.stamps(members) if together is not None else {}
+        self._in_set: dict[Any, int] = {bound[view]: stamp for view, stamp in stamps.items()}
 
     def _item_of(self, request: LockRequest[Any]) -> Item:
-        captured_ns = self._captured_ns if request in self._in_set else 0
-        return self._session.item_of(request, captured_ns)
+        return self._session.item_of(request, self._in_set.get(request, 0))
 
-    def missing(self) -> list[int]:
-        """Return which data of the set were outside retention at the grant, by their index."""
+    @property
+    def missing(self) -> tuple[View[Any], ...]:
+        """The data of the actor's set that it runs without, as declared; see `Together`."""
+        if self._together is None:
+            return super().missing
+        return tuple(self._together.requests[index] for index in self.absent())
+
+    def absent(self) -> list[int]:
+        """Return which data of the set are null at the grant, by their index."""
         return [index for index, view in enumerate(self._in_set) if self._is_null(slot_of(view))]
 
     def _stamp(self, stamp_ns: int | None) -> int:
@@ -112,7 +118,13 @@ class ActorLock(Lock):
         if isinstance(request, Together) and request == self._together:
             self._use()
             self._readings.fetch(slot_of(view) for view in self._in_set)  # all are asked for
-            return tuple([super(ActorLock, self).__getitem__(view) for view in self._in_set])
+            absent = set(self.absent())
+            return tuple(
+                [
+                    None if index in absent else super(ActorLock, self).__getitem__(view)
+                    for index, view in enumerate(self._in_set)
+                ]
+            )
         return super().__getitem__(request)
 
     def stamp_ns(self, request: LockRequestOne[Any] | Together[Any]) -> int:

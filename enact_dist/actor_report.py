@@ -65,6 +65,9 @@ class ActorStatistics:
         late: Data whose set was over when they came.
         unstamped: Data that could be in no set, because their writer gave no stamp.
         writes: What it declares to write, as ``world:entities/aspect``; at most `WRITES_MAX`.
+        unstamped_from: Which data these are.
+        partial: Sets that ran without some of their data, as `Together(…, least=…)` allows.
+        last_partial: The newest of them: its stamp and what was missing.
         updating_s: How long the update that runs has taken so far; 0 between updates.
         interrupted: Versions that an actor with `once` found taken by a process that is gone.
         last_interrupted: The newest of these.
@@ -90,6 +93,9 @@ class ActorStatistics:
     late: int = 0
     unstamped: int = 0
     writes: tuple[str, ...] = ()
+    unstamped_from: str = ""
+    partial: int = 0
+    last_partial: str = ""
     updating_s: float = 0.0
     lock_lost: bool = False
     interrupted: int = 0

@@ -189,6 +189,9 @@ class ActorRun:
             last_incomplete=str(sets.told[-1])[:ERROR_LENGTH_MAX] if sets.told else "",
             late=sets.late,
             unstamped=sets.unstamped,
+            unstamped_from=", ".join(sets.unstamped_from)[:ERROR_LENGTH_MAX],
+            partial=sets.partial,
+            last_partial=sets.last_partial[:ERROR_LENGTH_MAX],
         )
 
     def run(self, *, on_ready: Callable[[], None] | None = None) -> ActorStatistics:
@@ -287,7 +290,7 @@ class ActorRun:
             while not self._stop.is_set():
                 trigger = changes.take(STOP_LOOK_S)
                 if trigger is not None:
-                    error_ = self._attempt(None, captured_ns=trigger.captured_ns)
+                    error_ = self._attempt(None, members=trigger.members)
                     if isinstance(error_, REFUSALS):
                         pause_s = self._pause_s(trigger.refused)
                         inbox.postpone(trigger, monotonic_ns() + round(pause_s * 1e9))
@@ -317,7 +320,7 @@ class ActorRun:
             refused += 1
 
     def _attempt(
-        self, entity: Entity | None, *, captured_ns: int = 0, tick_ns: int = 0
+        self, entity: Entity | None, *, members: tuple[int, ...] = (), tick_ns: int = 0
     ) -> Exception | None:
         """Run `update` once under its lock; return what ended it early."""
         asked_ns, granted_ns = monotonic_ns(), 0
@@ -328,12 +331,13 @@ class ActorRun:
                 entity,
                 wait_s=self._wait_s,
                 stop=self._stop,
-                captured_ns=captured_ns,
+                members=members,
                 tick_ns=tick_ns,
             )
             with lock:
                 granted_ns = monotonic_ns()
-                missing = lock.missing()
+                absent = lock.absent()
+                missing = [] if self._sets is None or self._sets.sets.enough(absent) else absent
                 seen = self._seen(lock)
                 if not missing:
                     self._warn_of_repetition(entity)
@@ -357,7 +361,7 @@ class ActorRun:
         else:
             ended_ns = monotonic_ns()
             if missing and self._sets is not None:
-                self._sets.gone(captured_ns, missing)
+                self._sets.gone(min(filter(None, members)), missing)
             else:
                 took_ns = ended_ns - granted_ns
                 self._record.updated(took_ns=took_ns, now_ns=ended_ns, wall_ns=wall_ns())

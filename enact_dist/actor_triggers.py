@@ -33,7 +33,8 @@ class Trigger:
     """One run to do: for which entity, and how often in a row it was refused before.
 
     `states` are the changes that it stands for: (index of the trigger request, entity) → state.
-    `captured_ns` is the capture stamp of the set that it stands for, 0 if it is none.
+    `captured_ns` is the capture stamp of the set that it stands for, 0 if it is none; `members` the
+    stamp of each datum of that set, 0 of one that is missing.
     """
 
     key: str
@@ -41,6 +42,7 @@ class Trigger:
     refused: int = 0
     states: dict[tuple[int, str], Hashable] = field(default_factory=dict)
     captured_ns: int = 0
+    members: tuple[int, ...] = ()
 
 
 class PendingTriggers:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from enact_dist.errors import MisuseError
 
 if TYPE_CHECKING:
     from enact_dist.newer import Newer
-    from enact_dist.terms import Entity
+    from enact_dist.terms import Entity, View
 
 
 class Triggered:
@@ -42,6 +42,15 @@ class Triggered:
         if not self._tick_ns:
             raise MisuseError(f"{self!r} was not made for a tick of every_s, so it has no tick_ns")
         return self._tick_ns
+
+    @property
+    def missing(self) -> tuple[View[Any], ...]:
+        """The data that an actor's set with `least` runs without, as declared; see `Together`.
+
+        Raises:
+            MisuseError: No set triggered the update.
+        """
+        raise MisuseError(f"{self!r} was not made by a Together, so nothing of a set is missing")
 
     @property
     def newer(self) -> Newer:

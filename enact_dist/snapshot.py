@@ -11,7 +11,7 @@ from enact_dist.moments import Moment
 from enact_dist.reading import EachData, Readings, check_requested, slot_of
 from enact_dist.session import session_of, unknown_aspect
 from enact_dist.terms import Aspect, Entity, NullReason, View
-from enact_dist.together import Together, captured_versions, newest_set_ns
+from enact_dist.together import Together, captured_versions
 from enact_dist.wire.limits import ITEMS_MAX
 from enact_dist.wire.payload import decode_untyped
 
@@ -50,8 +50,9 @@ def take_snapshot(
     prepared = session.prepare(requests) if register else 0
     for attempt in range(1, VIEWS_MAX + 1):
         try:
-            captured_ns = _newest_set_ns(session, together) if together is not None else 0
-            items = _items(session, requests, moment, together, captured_ns)
+            members = _newest_set(session, together) if together is not None else ()
+            captured_ns = min(filter(None, members), default=0)
+            items = _items(session, requests, moment, together, members)
             readings = take_readings(session, items, past_ns=moment.at_ns)
             if register:
                 session.check_shown(readings.readings(), requests, prepared)
@@ -93,13 +94,13 @@ def _items(
     requests: tuple[LockRequest[Any], ...],
     moment: Moment,
     together: Together[Any] | None,
-    set_ns: int,
+    members: tuple[int, ...],
 ) -> list[Item]:
     """Return the protocol's lines for all requests; those of a set ask for its capture stamp."""
-    in_set = together.requests if together is not None else ()
+    in_set: Mapping[Any, int] = together.stamps(members) if together is not None else {}
     items: list[Item] = []
     for request in requests:
-        captured_ns = set_ns if request in in_set else moment.captured_ns
+        captured_ns = in_set.get(request, moment.captured_ns)
         if captured_ns and request.access.each:
             items += _items_of_each(session, request, moment)
         else:
@@ -151,11 +152,11 @@ def _spread(
     return (sets[0] if sets else None), tuple(requests)
 
 
-def _newest_set_ns(session: Session, together: Together[Any]) -> int:
-    """Return the capture stamp of the newest complete set."""
+def _newest_set(session: Session, together: Together[Any]) -> tuple[int, ...]:
+    """Return the capture stamps of the data of the newest set that may run; 0 of those missing."""
     versions = captured_versions(session, together.requests)
-    captured_ns = newest_set_ns(versions)
-    if not captured_ns:
+    members = together.newest(versions)
+    if not members:
         found = "; ".join(
             f"{slot_of(request)} has {sorted({one.captured_ns for one in each})[-3:] or 'none'}"
             for request, each in zip(together.requests, versions, strict=True)
@@ -166,7 +167,7 @@ def _newest_set_ns(session: Session, together: Together[Any]) -> int:
             " versions as are under way at once",
             reason=NullReason.OUTSIDE_RETENTION.value,
         )
-    return captured_ns
+    return members
 
 
 def take_readings(
@@ -205,10 +206,12 @@ class Snapshot:
         self.captured_ns = captured_ns
 
     def has_set(self) -> bool:
-        """Whether no datum of the `Together` is null."""
-        requests = self._together.requests if self._together is not None else ()
-        states = [self._readings.state(slot_of(request)) for request in requests]
-        return all(state is not None and not state.null_reason for state in states)
+        """Whether so many data of the `Together` are not null as it asks for."""
+        if self._together is None:
+            return True
+        states = [self._readings.state(slot_of(view)) for view in self._together.requests]
+        there = sum(state is not None and not state.null_reason for state in states)
+        return there >= self._together.least
 
     @overload
     def __getitem__(self, request: Together[T]) -> tuple[T, ...]: ...
@@ -224,7 +227,8 @@ class Snapshot:
             NotRequestedError: The view did not ask for it.
         """
         if isinstance(request, Together):
-            return tuple(self[one] for one in request.requests)
+            whole = request.least == len(request.requests)
+            return tuple(self[one] if whole else self.get(one) for one in request.requests)
         check_requested(request, self._requests, "view")
         if request.access.each:
             return EachData(self._readings, request)

@@ -27,7 +27,7 @@ from enact_dist.actor_doing import Doing
 from enact_dist.actor_once import Once
 from enact_dist.actor_triggers import PendingTriggers, tick_before
 from enact_dist.connecting import local
-from enact_dist.link.clock import wall_ns
+from enact_dist.link.clock import monotonic_ns, wall_ns
 from enact_dist.session import session_of
 from enact_dist.together import captured_versions
 
@@ -190,20 +190,22 @@ def _update_sets(actor: Actor, bound: BoundActor) -> int:
     session = session_of(views)
     pending: PendingSets | None = vars(actor).get("_pending_in_test")
     versions = captured_versions(session, views)
+    clock = _clocks.get(bound.cell)
+    now_ns = clock.monotonic_ns() if clock is not None else monotonic_ns()
     if pending is None:
         pending = bound.pending_sets()
         assert pending is not None
         vars(actor)["_pending_in_test"] = pending
-        pending.start(versions)
+        pending.start(versions, now_ns)
     else:
-        pending.captured_all(versions)
+        pending.captured_all(versions, now_ns)
     updates = 0
-    while trigger := pending.take(0):
-        lock = bound.lock(None, captured_ns=trigger.captured_ns)
+    while trigger := pending.take(now_ns):
+        lock = bound.lock(None, members=trigger.members)
         with lock:
-            missing = lock.missing()
-            if missing:
-                pending.gone(trigger.captured_ns, missing)
+            absent = lock.absent()
+            if not pending.enough(absent):
+                pending.gone(trigger.captured_ns, absent)
                 continue
             bound.actor.update(lock)
         updates += 1

@@ -311,10 +311,12 @@ def _losses(report: ActorStatistics) -> Iterator[str]:
     """Yield what an actor has lost and the table does not show; nothing where it lost nothing."""
     last = f", the newest a {report.last_incomplete}" if report.last_incomplete else ""
     never = f", the newest {report.last_interrupted}: how far they came is not known"
+    remedy = ": this actor waits for data of one stamp, give it with lock.put(…, stamp_ns=…)"
     lost = (
         (report.incomplete, f"incomplete sets{last}"),
         (report.late, "data too late for their set"),
-        (report.unstamped, "data without a capture stamp, which no set can have"),
+        (report.partial, f"sets ran without some data, the newest a {report.last_partial}"),
+        (report.unstamped, f"data without a capture stamp, from {report.unstamped_from}{remedy}"),
         (report.missed, "ticks missed"),
         (report.interrupted, f"versions taken and never ended{never}; written anew they are done"),
         (report.unknown, "commits never answered, which may stand (see its log)"),

@@ -77,7 +77,7 @@ CALLS: dict[str, Callable[[ActorLock], Any]] = {
     "stamp_ns": lambda lock: lock.stamp_ns(Meshing.cloud) == 11,
 }
 WITHOUT_REQUEST = {
-    "check", "entity", "newer", "running", "statistics", "tick_ns", "token", "valid"
+    "check", "entity", "missing", "newer", "running", "statistics", "tick_ns", "token", "valid"
 }  # fmt: skip
 INDEXING = {"__getitem__", "__setitem__", "__delitem__"}
 

@@ -327,7 +327,7 @@ def test_set_of_large_data_is_fetched_at_once(cell, monkeypatch):
         with Lock(write := Write(online, entity, cloud)) as lock:
             lock.put(write, np.full(100_000, 7, np.uint8), stamp_ns=5)
     actor = Look()
-    with BoundActor(actor, cell).lock(None, captured_ns=5) as lock:
+    with BoundActor(actor, cell).lock(None, members=(5, 5)) as lock:
         fetched, fetch = [], lock._readings._fetched
 
         def counted(slots):
