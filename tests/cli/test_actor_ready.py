@@ -55,7 +55,7 @@ def module(tmp_path):
         (("Beat", "--world", "onlin=online"), 2, "Beat has no role 'onlin'; it has online"),
         (("Beat", "--world", "online=offline"), 1, "no world context 'offline'"),
         (("NoUpdate",), 2, "NoUpdate of my_actors is no actor that can run"),
-        (("Blind",), 1, "RuntimeError: no camera"),
+        (("Blind",), 1, "RuntimeError at my_actors.py:17: no camera"),
         (("Misfit",), 1, "registered"),
     ],
 )

@@ -32,6 +32,7 @@ from enact_dist.core.messages import (
     ListLocks,
     ListSessions,
     Outcome,
+    Ping,
     Prepare,
     Register,
     Resolve,
@@ -245,7 +246,7 @@ def catalogue_and_people(cell: RepeatingCell) -> None:
     assert lock.position is not None
     ann.call("s0", AwaitStamp(lock.position.stamp_ns, 0))
     ann.call("s0", AwaitStamp(WALL_NS + 100 * S, 0))
-    for request in (Survey((), (), ()), ListLocks(), ListSessions(), ListAudit("")):
+    for request in (Ping(), Survey((), (), ()), ListLocks(), ListSessions(), ListAudit("")):
         ann.call("s0", request)
 
 

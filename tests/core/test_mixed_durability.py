@@ -11,7 +11,6 @@ from enact_dist.core.records import DecisionRecord, PreparedEnded, PreparedRecor
 from enact_dist.terms import Access, Durability
 
 ANN = lock_id("ann")
-LATE_NS = 1_800_000_100 * S
 
 
 @pytest.fixture
@@ -63,7 +62,7 @@ class TestEveryStepIsForced:
         """Once told that it has finished, the primary may forget."""
         prepare(bench, aspect)
         bench.disk_is_done = False
-        handle = bench.send(Finish(ANN, Position(LATE_NS, "far")))
+        handle = bench.send(Finish(ANN, Position(bench.wall_ns + S, "far")))
 
         (persist,) = bench.pending
         assert isinstance(persist.records[-1], PreparedEnded)

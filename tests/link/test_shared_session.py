@@ -71,7 +71,8 @@ def test_catalogue_settles_nothing_by_what_is_known_no_more():
 
     catalogue.learn("s0", Registered(("online",), Interrupted((), look)))
 
-    assert seen == [True]
+    assert seen
+    assert all(seen)
     assert not catalogue.settled((COUNT,), ONE_SHARD)
 
 
@@ -374,25 +375,26 @@ def test_aspect_that_was_used_is_found_while_another_thread_uses_one(session):
 def test_aspects_are_registered_again_while_another_thread_registers_one(session, monkeypatch):
     """After a shard has forgotten them."""
     client, wanted = session.client, []
-    item = SimpleNamespace(aspect="count")
-    plan = SimpleNamespace(locks=[("shard", (item,))], views=[])
-    code = SimpleNamespace(code="unknown_aspect")
-    refused = SimpleNamespace(plan=plan, phase=None, refusal=code)
 
     class Name(str):
         __slots__ = ()
         __hash__ = str.__hash__
 
         def __eq__(self, other):
-            client._registered["new"] = COUNT
+            client._catalogue.wants([COUNT._replace(name="new")])
             return str.__eq__(self, other)
 
-    client._registered = {Name("count"): COUNT}
+    item = SimpleNamespace(aspect=Name("count"))
+    plan = SimpleNamespace(locks=[("shard", (item,))], views=[])
+    code = SimpleNamespace(code="unknown_aspect")
+    refused = SimpleNamespace(plan=plan, phase=None, refusal=code)
+    client._catalogue.wants([COUNT])
     monkeypatch.setattr(client, "register", lambda **named: wanted.append(named["aspects"]))
     monkeypatch.setattr("enact_dist.link.client.Refused", SimpleNamespace)
 
     assert client._begins_anew(refused, 0)
     assert wanted == [[COUNT]]
+    assert {entry.name for entry in client._catalogue.wanted({"count", "new"})} == {"count", "new"}
 
 
 def test_own_commits_are_noted_while_nobody_settles_others(session, monkeypatch):

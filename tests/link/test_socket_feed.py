@@ -55,7 +55,7 @@ def no_feed_is_left():
 def test_feed_comes_back_to_the_socket(daemon, carry, make_peer, endpoint, monkeypatch, until):
     """At a sign of life, no notice is lost or comes twice; without one it stays with Zenoh."""
     daemon(endpoint)
-    carrier = carry(endpoint)
+    carrier = carry(endpoint, session="a" * 32)
     peer = speak(carrier, make_peer, "a" * 32)
     queue, feed = fallen_feed(carrier, monkeypatch)
     peer.write("cup", b"1")
@@ -84,7 +84,7 @@ def test_feed_that_comes_back_waits_for_what_zenoh_still_brings(
 ):
     """What is on its way there when the socket brings its first notice is not passed over."""
     daemon(endpoint)
-    carrier = carry(endpoint)
+    carrier = carry(endpoint, session="a" * 32)
     peer = speak(carrier, make_peer, "a" * 32)
     queue, feed = fallen_feed(carrier, monkeypatch)
     late, put, arrived = [], queue.put, threading.Event()
@@ -122,7 +122,7 @@ def test_feed_that_comes_back_waits_for_what_zenoh_still_brings(
 def test_feed_is_closed_while_it_comes_back(daemon, carry, make_peer, endpoint, monkeypatch, until):
     """Its thread, which waits for a first notice, and its connection end with it."""
     daemon(endpoint)
-    carrier = carry(endpoint)
+    carrier = carry(endpoint, session="a" * 32)
     peer = speak(carrier, make_peer, "a" * 32)
     queue, feed = fallen_feed(carrier, monkeypatch)
     connection = until(lambda: coming(carrier, peer, feed))

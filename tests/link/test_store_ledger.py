@@ -110,6 +110,7 @@ def prepared(draw):
 
 LOCKED = st.sampled_from(LOCKS)
 NAMES = st.sampled_from(("x", "y"))
+OLDER = st.sampled_from(((), ("x",), ("y", "x")))
 BASES = st.sampled_from(((), (("a", 3),), (("a", 0), ("b", 7))))
 STARTS = st.sampled_from(((), (("a", 3, 0),), (("a", 0, 5), ("b", 7, 1 << 62))))
 RECORDS = st.one_of(
@@ -127,7 +128,12 @@ RECORDS = st.one_of(
     st.builds(EntitiesMoved, st.sampled_from((("a",), ("b",), ("a", "b"), ("c",)))),
     st.builds(SessionRecord, NAMES, STAMPS),
     st.builds(SessionEnded, NAMES, STAMPS),
-    st.builds(AspectRecord, st.builds(AspectEntry, NAMES, NAMES, NAMES, STAMPS, STAMPS, STAMPS)),
+    st.builds(
+        AspectRecord,
+        st.builds(
+            AspectEntry, NAMES, NAMES, NAMES, STAMPS, STAMPS, STAMPS, OLDER, reads=st.just(False)
+        ),
+    ),
     st.builds(OutcomeRecord, LOCKED, st.builds(Position, STAMPS, NAMES), MANY_VERSIONS),
     st.builds(DecisionRecord, LOCKED, st.builds(Position, STAMPS, NAMES), st.just(("s1",))),
     st.builds(DecisionDone, LOCKED),
