@@ -148,12 +148,14 @@ class Committed:
 class Staged:
     """So much of a payload has come in slices, from its begin on, without a hole.
 
-    `shared` says that it is a file in the shard's folder, to be filled there, too.
+    `shared` says that it is a file in the shard's folder, to be filled there, too.  Until its
+    commit it is called `draft` there ("": `file`), which nobody else is told.
     """
 
     file: str
     have: int
     shared: bool
+    draft: str = ""
 
 
 @dataclass(frozen=True, slots=True)

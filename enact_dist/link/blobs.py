@@ -12,7 +12,7 @@ import os
 import zlib
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from enact_dist.link.folder_lock import sync_folder
+from enact_dist.link.folder_lock import file_mode, sync_folder
 from enact_dist.link.memory import body_of, map_file
 
 if TYPE_CHECKING:
@@ -56,12 +56,13 @@ class BlobFolder:
         epoch: The shard's new epoch; makes the names of this run unique.
     """
 
-    __slots__ = ("_count", "_epoch", "folder")
+    __slots__ = ("_count", "_epoch", "_mode", "folder")
 
     def __init__(self, folder: Path, *, epoch: int) -> None:
         self.folder = folder
         self._epoch = epoch
         self._count = 0
+        self._mode = file_mode(folder)
 
     def write(self, body: bytes | memoryview, *, durable: bool) -> Blob:
         """Write a body to a new file; durable ones need `sync_names` before the row's commit.
@@ -73,7 +74,7 @@ class BlobFolder:
         self._count += 1
         name = f"{self._epoch:x}-{self._count:x}{_SUFFIX}"
         draft = self.folder / (name + _DRAFT_SUFFIX)
-        descriptor = os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+        descriptor = os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, self._mode)
         try:
             crc = _write_all(descriptor, flat)
             if durable:

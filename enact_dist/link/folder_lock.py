@@ -37,6 +37,15 @@ _FORMAT_WORDS: Final = "enact-dist store"
 _LOCK_BYTES_MAX: Final = 512
 
 
+def file_mode(folder: Path) -> int:
+    """Return the mode of new files in a folder: nobody's but ours, or as wide as the folder is.
+
+    Raises:
+        OSError: As the system reports it.
+    """
+    return 0o600 | folder.stat().st_mode & 0o066
+
+
 class FolderLock:
     """The exclusive lock on a data folder, held from construction to `close`.
 
@@ -52,7 +61,8 @@ class FolderLock:
     def __init__(self, folder: Path) -> None:
         path = folder / LOCK_FILE
         try:
-            self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+            mode = file_mode(folder)
+            self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, mode)
         except OSError as failure:
             raise StoreError(
                 f"cannot open {path}: {failure.strerror}; the data folder must belong to the user"
@@ -110,18 +120,19 @@ def sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
-def replace_file(path: Path, content: bytes, *, mode: int = 0o644) -> None:
+def replace_file(path: Path, content: bytes, *, mode: int | None = None) -> None:
     """Put `content` in place of the file at `path`, durably, whole or not at all.
 
     Args:
         path: Whether it is there or not.
         content: All of it.
-        mode: Who may read and write it, as far as the umask lets them.
+        mode: Who may read and write it, as far as the umask lets them; None: as `file_mode` says.
 
     Raises:
         OSError: As the system reports it; the file before stands then.
     """
     draft = path.with_name(path.name + ".tmp")
+    mode = file_mode(path.parent) if mode is None else mode
     descriptor = os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, mode)
     left = memoryview(content)
     try:

@@ -33,7 +33,7 @@ from enact_dist.link.memory import (
 from enact_dist.link.payload_desk import NO_ROOM
 from enact_dist.link.refusals import error_of
 from enact_dist.link.shared_folder import OpenedFolder, open_shared
-from enact_dist.wire.limits import PAYLOAD_BYTES_MIN
+from enact_dist.wire.limits import DRAFT_NAME, PAYLOAD_BYTES_MIN
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -200,13 +200,18 @@ class SharedPayloads:
         answer = self._call(shard, Stage(self._session, file, 0, size, NOTHING))
         if isinstance(answer, Refused) and answer.code == NO_ROOM:
             raise error_of(answer)
-        if not isinstance(answer, Staged) or not answer.shared:
+        if (
+            not isinstance(answer, Staged)
+            or not answer.shared
+            or not DRAFT_NAME.match(answer.draft)
+        ):
             self._count("payload_fallbacks")
             if isinstance(answer, Staged):
                 self.drop(shard, file)
             return None
         try:
-            return Draft(shard, file, size, self._opened(shared, file, size, os.O_RDWR))
+            name = answer.draft or file
+            return Draft(shard, file, size, self._opened(shared, name, size, os.O_RDWR))
         except OSError as error:
             # A folder that can be read only, most likely.
             self._count("payload_fallbacks")

@@ -16,14 +16,19 @@ Rules that a change must keep:
   is ever read.
 - What is counted against the cap is counted until the file is gone, and before it is made.
 - A client that still has a draft mapped for writing could change it after the commit.  Ours hands
-  out read-only arrays then and cuts itself off some milliseconds later; a hostile one runs as
-  the same user or group, who could do worse.
+  out read-only arrays then and cuts itself off some milliseconds later; a hostile one of the same
+  user could do worse.
+- In a folder of a group, whose users may write what the shard makes for them, a draft has a name
+  that its client alone is told, and nobody can list; it gets that of its payload when it is
+  read-only.  What is left there: a hostile client can change its own payload after the commit, and
+  a user of the group can read payloads whose names he knows, as he can by asking the shard.
 """
 
 from __future__ import annotations
 
 import logging
 import os
+import secrets
 import threading
 import weakref
 from collections import Counter
@@ -136,6 +141,7 @@ class PayloadDesk:
         self._mutex = threading.RLock()  # reentrant: a destructor may run anywhere
         self._opening = tuple(threading.Lock() for _ in range(16))
         self._drafts: dict[str, _Draft] = {}
+        self._names: dict[str, str] = {}
         self._files = 0
         self._adopted: dict[str, weakref.ref[Pages | Plain]] = {}
         self._over = UsedNames()
@@ -157,7 +163,7 @@ class PayloadDesk:
             return Refused("protocol", f"{file[:80]!r} is no payload of session {message.session}")
         if not total:
             self.drop(file)
-            return Staged(file, 0, False)
+            return Staged(file, 0, shared=False)
         with self._mutex:
             if file in self._over:
                 return Staged(file, total, False)  # a late copy: nobody waits for it
@@ -189,7 +195,7 @@ class PayloadDesk:
             if self._drafts.get(file) is not draft:
                 return Staged(file, draft.size, False)  # meanwhile: a late copy, as in `stage`
             if not slice_.size or end <= draft.have:
-                return Staged(file, draft.have, draft.shared)
+                return Staged(file, draft.have, draft.shared, self._names.get(file, ""))
             draft.writing += 1
         try:
             body_of(draft.memory)[offset:end] = slice_.body
@@ -200,7 +206,7 @@ class PayloadDesk:
         with self._mutex:
             draft.writing -= 1
             draft.add(offset, end)
-            return Staged(file, draft.have, draft.shared)
+            return Staged(file, draft.have, draft.shared, self._names.get(file, ""))
 
     def _opened(self, session: str, owner: str, file: str, total: int) -> _Draft | Refused | None:
         """Return a new draft; None where its name was used up meanwhile."""
@@ -331,7 +337,10 @@ class PayloadDesk:
 
     def _file_memory(self, folder: SharedFolder, file: str, total: int) -> Pages:
         flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
-        made = os.open(file, flags, 0o600, dir_fd=folder.descriptor)
+        name = file
+        if folder.access.group is not None:
+            name = self._names[file] = f"draft-{secrets.token_hex(16)}"
+        made = os.open(name, flags, 0o600, dir_fd=folder.descriptor)
         try:
             os.fchmod(made, folder.access.draft_mode)
             # Never a hole: a page that cannot be had later kills whoever touches it.
@@ -340,7 +349,8 @@ class PayloadDesk:
                 made, total, writable=True, ended=partial(self._ended, file, folder, total)
             )
         except BaseException:
-            os.unlink(file, dir_fd=folder.descriptor)
+            os.unlink(name, dir_fd=folder.descriptor)
+            self._names.pop(file, None)
             raise
         finally:
             os.close(made)
@@ -395,8 +405,12 @@ class PayloadDesk:
             self._adopted[file] = weakref.ref(draft.memory, partial(self._unadopted, file))
             self._over.add(file)
         if draft.shared and self._folder is not None:
+            name, descriptor = self._names.get(file, file), self._folder.descriptor
             try:
-                os.chmod(file, self._folder.access.file_mode, dir_fd=self._folder.descriptor)
+                os.chmod(name, self._folder.access.file_mode, dir_fd=descriptor)
+                if name != file:
+                    os.rename(name, file, src_dir_fd=descriptor, dst_dir_fd=descriptor)
+                    del self._names[file]
             except OSError as error:  # somebody has cleared the folder
                 _log.warning("payload %s is lost: %s", file, error.strerror)
                 return None
@@ -407,7 +421,7 @@ class PayloadDesk:
         """Nobody looks at a payload any more: remove it, then stop counting its bytes."""
         if folder is not None and folder.descriptor >= 0:
             try:
-                os.unlink(file, dir_fd=folder.descriptor)
+                os.unlink(self._names.pop(file, file), dir_fd=folder.descriptor)
             except OSError as error:  # the folder went first
                 _log.info("payload %s: %s", file, error)
         with self._mutex:

@@ -15,6 +15,7 @@ Rules that a change must keep:
   as it lives; whoever gets that lock may sweep the folder away.
 - The nonce is written after the lock was taken and before anybody is told the name.
 - Nobody but its owner, root and the group of a root that was given on purpose gets in.
+- The group may not list the folder, so that nobody finds a draft whose name he was not told.
 """
 
 from __future__ import annotations
@@ -69,8 +70,8 @@ class Access:
 
     @property
     def folder_mode(self) -> int:
-        """Mode of a folder: files in it take over its group."""
-        return 0o700 if self.group is None else 0o2750
+        """Mode of a folder: files in it take over its group, which may not list them."""
+        return 0o700 if self.group is None else 0o2710
 
     @property
     def socket_mode(self) -> int:
@@ -267,7 +268,8 @@ def open_shared(name: str, nonce: bytes, *, root: Path | None = None) -> OpenedF
     path = root / name
     above, access = _open_root(root, make=False)
     try:
-        flags = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
+        # It need not be readable: what is in there is known by name.
+        flags = os.O_PATH | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
         opened = os.open(name, flags, dir_fd=above)
     except FileNotFoundError:
         raise LinkError(

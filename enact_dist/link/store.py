@@ -26,7 +26,9 @@ stays one when it is replaced.  Rules that a change must keep:
 
 from __future__ import annotations
 
+import logging
 import sqlite3
+import stat
 from contextlib import closing, contextmanager
 from typing import TYPE_CHECKING, Final
 
@@ -64,8 +66,11 @@ if TYPE_CHECKING:
 
     from enact_dist.core.records import Persist
 
+_log = logging.getLogger("enact.store")
 LOG_BYTES: Final = 8 << 20
 """About so much is written to the log before it is carried into the database."""
+FOLDER_MODE: Final = 0o700
+"""A new data folder is for nobody else; one that is there stays as its owner has made it."""
 _ROW_LOG_BYTES: Final = 8 << 10
 
 
@@ -84,7 +89,7 @@ def open_store(folder: Path, *, unix_s: int, moving: bool = False) -> tuple[Stor
         StoreError: The folder is in use, of another format, damaged, or cannot be written.
     """
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(mode=FOLDER_MODE, parents=True, exist_ok=True)
         lock = FolderLock(folder)
     except OSError as failure:
         raise store_error(folder, failure) from failure
@@ -132,7 +137,7 @@ def _read_locked(folder: Path) -> tuple[Database, Contents]:
         sync_folder(folder)
     database, contents = open_database(folder, found)
     try:
-        (folder / BLOB_FOLDER).mkdir(exist_ok=True)
+        (folder / BLOB_FOLDER).mkdir(mode=folder.stat().st_mode & 0o777 | 0o700, exist_ok=True)
         blobs = BlobFolder(folder / BLOB_FOLDER, epoch=contents.recovered.epoch)
         read_blobs(contents, blobs, power_cut=found.power_cut)
         put_together(contents, folder / DATABASE_FILE)
@@ -144,6 +149,10 @@ def _read_locked(folder: Path) -> tuple[Database, Contents]:
 
 def _open_locked(folder: Path, lock: FolderLock, unix_s: int) -> tuple[Store, Recovered]:
     database, contents = _read_locked(folder)
+    mode = stat.S_IMODE(folder.stat().st_mode)
+    if mode & stat.S_IRWXO:
+        text = "%s is open to every user of this host (mode %o): chmod 700, unless that is wanted"
+        _log.warning(text, folder, mode)
     let_go_of_killed(folder)
     try:
         epoch = contents.recovered.epoch = max(contents.recovered.epoch + 1, unix_s)

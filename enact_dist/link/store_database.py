@@ -11,8 +11,11 @@ Rules that a change must keep:
 from __future__ import annotations
 
 import contextlib
+import os
 import sqlite3
 from typing import TYPE_CHECKING, Final, NamedTuple
+
+from enact_dist.link.folder_lock import file_mode
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -53,6 +56,7 @@ class Database:
         path: The database file; made if it does not exist.
 
     Raises:
+        OSError: The file cannot be opened.
         sqlite3.Error: In every method, as SQLite reports it; `is_damage` tells damage from
             errors of the system.
     """
@@ -60,6 +64,8 @@ class Database:
     __slots__ = ("_connection", "_forced")
 
     def __init__(self, path: Path) -> None:
+        # SQLite gives a new file, and the log beside it, the mode of an empty one that is there.
+        os.close(os.open(path, os.O_RDONLY | os.O_CREAT | os.O_CLOEXEC, file_mode(path.parent)))
         self._connection = sqlite3.connect(
             path, isolation_level=None, check_same_thread=False, timeout=0.0
         )

@@ -20,6 +20,8 @@ import zlib
 from pathlib import Path
 from typing import Final, NamedTuple, Self
 
+from enact_dist.link.folder_lock import file_mode
+
 MARK_FILE: Final = "mark"
 _LAYOUT: Final = struct.Struct("<8s16sQQ")
 _UNKNOWN_BOOT: Final = bytes(16)
@@ -99,7 +101,8 @@ class MarkFile:
     @classmethod
     def open(cls, folder: Path, batch: int) -> Self:
         """Say durably that this boot has opened the store, and that `batch` is on the disk."""
-        descriptor = os.open(folder / MARK_FILE, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC
+        descriptor = os.open(folder / MARK_FILE, flags, file_mode(folder))
         mark = cls(descriptor, boot_id())
         try:
             mark.note(batch, forced=True)

@@ -39,6 +39,8 @@ slices, from 1 MiB on."""
 PAYLOAD_NAME: Final = re.compile(r"[0-9A-Za-z_]{1,64}-[0-9a-f]{1,16}\Z")
 """What a payload is called at its shard: the session that made it and a number, never used again;
 both ends check it, since it becomes the name of a file."""
+DRAFT_NAME: Final = re.compile(r"(draft-[0-9a-f]{32})?\Z")
+"""What a payload may be called before its commit, where its own name could be guessed."""
 PAYLOAD_BYTES_MIN: Final = 64 << 10
 """Data up to this size travel with their commit and their grant, never as a payload."""
 NAME_CHARACTERS_MAX: Final = NAME_LENGTH_MAX

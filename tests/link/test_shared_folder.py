@@ -88,7 +88,7 @@ def test_folder_in_a_root_of_a_group_is_for_that_group(tmp_path, monkeypatch):
     folder = SharedFolder("cell", "s0")
 
     assert folder.access.group == tmp_path.stat().st_gid
-    assert mode_of(folder.path) == 0o2750
+    assert mode_of(folder.path) == 0o2710
     assert mode_of(folder.path / NONCE) == 0o440
     folder.close()
 

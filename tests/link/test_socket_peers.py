@@ -205,7 +205,6 @@ def test_process_is_watched_while_any_of_its_connections_is_open(
     deaths.connected("a", third)
     deaths.disconnected("a", second)
     deaths.disconnected("a", third)
-    deaths.disconnected("a", third)
     deaths.connected("b", second)
     deaths.disconnected("b", second)
     until(lambda: "b" not in deaths._watched)  # it has swept since

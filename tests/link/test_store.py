@@ -2,6 +2,7 @@
 
 import os
 import sqlite3
+import stat
 import subprocess
 import sys
 
@@ -339,3 +340,42 @@ def test_folder_that_is_a_file_is_named_with_the_remedy(tmp_path, place):
 
     assert "start the shard again" not in str(refused.value)
     assert (tmp_path / "file").read_text() == "notes"
+
+
+@pytest.mark.parametrize(
+    ("given", "folder_mode", "file_mode"),
+    [(None, 0o700, 0o600), (0o750, 0o750, 0o640), (0o2770, 0o2770, 0o660)],
+)
+def test_files_are_for_their_user_or_as_wide_as_the_folder_is(
+    tmp_path, given, folder_mode, file_mode
+):
+    """Data at rest are nobody else's, but where somebody has opened the folder to a group."""
+    folder = tmp_path / "data" / "s0"
+    if given is not None:
+        folder.mkdir(parents=True)
+        folder.chmod(given)
+    before = os.umask(0)
+    try:
+        store, _ = open_store(folder, unix_s=1)
+        store.write([persist(slot_record("a", 1, size=100_000))])
+        found = {path.name: stat.S_IMODE(path.stat().st_mode) for path in folder.rglob("*")}
+    finally:
+        os.umask(before)
+    store.close()
+
+    blobs = found.pop("blobs")
+    assert (stat.S_IMODE(folder.stat().st_mode), blobs & 0o777) == (
+        folder_mode,
+        folder_mode & 0o777,
+    )
+    assert {"lock", "mark", "format", "store.db", "store.db-wal"} < found.keys()
+    assert set(found.values()) == {file_mode}
+
+
+def test_folder_that_everybody_may_read_is_told_of(tmp_path, caplog):
+    """An earlier release made it so."""
+    tmp_path.chmod(0o755)
+    store, _ = open_store(tmp_path, unix_s=1)
+    store.close()
+
+    assert f"{tmp_path} is open to every user of this host (mode 755): chmod 700" in caplog.text

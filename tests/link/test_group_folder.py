@@ -1,0 +1,105 @@
+"""A folder that users of one group share: who may write a payload, and who may not find it."""
+
+import os
+import stat
+
+import numpy as np
+import pytest
+from test_payload_desk import FILE, SIZE, adopted, names, stage
+
+from enact_dist import Aspect, Durability, Entity, Lock, View, Write, connect
+from enact_dist.link.payload_desk import PayloadDesk
+from enact_dist.link.shared_folder import SharedFolder
+
+STRANGER = 65534
+
+
+@pytest.fixture
+def folder(shared_root, monkeypatch):
+    """A shard's folder in a root that a group may write to."""
+    monkeypatch.setenv("ENACT_SHARED_FOLDER", str(shared_root))
+    shared_root.chmod(0o2770)
+    made = SharedFolder("cell", "s0")
+    yield made
+    made.close()
+
+
+def mode_of(path):
+    return stat.S_IMODE(path.stat().st_mode)
+
+
+def found(act):
+    try:
+        return type(act()).__name__
+    except OSError as error:
+        return type(error).__name__
+
+
+def tried(folder, *files):
+    """Return what another user of the group gets of a folder and of files by their names."""
+    if os.geteuid() == 0:
+        os.seteuid(STRANGER)
+    try:
+        told = [found(lambda: list(folder.path.iterdir()))]
+        for file in files:
+            for access in (os.O_RDWR, os.O_RDONLY):
+                told.append(found(lambda: os.close(os.open(folder.path / file, access))))  # noqa: B023
+    finally:
+        if os.geteuid() == STRANGER:
+            os.seteuid(0)
+    return told
+
+
+def test_draft_has_a_name_that_its_client_alone_is_told(folder):
+    """Who maps it before the commit could change what all read after it."""
+    desk = PayloadDesk(folder, 10 * SIZE)
+    told, other = stage(desk), stage(desk, "d4-1")
+
+    assert len({told.draft, other.draft, FILE}) == 3
+    assert names(folder) == sorted((told.draft, other.draft))
+    assert mode_of(folder.path / told.draft) == 0o660
+    assert mode_of(folder.path) == 0o2710
+    (folder.path / told.draft).write_bytes(b"x" * SIZE)
+
+    datum = adopted(desk)
+
+    assert (datum.file, bytes(datum.body)) == (FILE, b"x" * SIZE)
+    assert names(folder) == sorted((FILE, other.draft))
+    assert mode_of(folder.path / FILE) == 0o440
+    stage(desk, "d4-1", total=0)
+    del datum
+    assert names(folder) == []
+
+
+def test_another_user_of_the_group_finds_no_draft_and_writes_no_payload(folder):
+    """He may know sessions and their numbers: these stand in listings."""
+    desk = PayloadDesk(folder, 10 * SIZE)
+    told = stage(desk)
+    (folder.path / told.draft).write_bytes(b"x" * SIZE)
+    before = tried(folder, FILE)
+    datum = adopted(desk)
+    after = tried(folder, FILE, told.draft)
+
+    if os.geteuid() == 0:  # else the other user is this one
+        assert before == ["PermissionError", "FileNotFoundError", "FileNotFoundError"]
+        assert after[:3] == ["PermissionError", "PermissionError", "NoneType"]
+    assert before[-2:] == ["FileNotFoundError", "FileNotFoundError"]
+    assert after[-2:] == ["FileNotFoundError", "FileNotFoundError"]
+    assert datum.size == SIZE
+
+
+@pytest.mark.carrier("socket", "zenoh")
+def test_large_data_go_through_a_folder_of_a_group_without_a_copy(folder, daemon, endpoint):
+    """What may not be listed is written and mapped by its name all the same."""
+    shard = daemon(endpoint)
+    with connect(endpoint) as writer, connect(endpoint) as reader:
+        cloud = Aspect("cloud", np.ndarray, Durability.VOLATILE)
+        with Lock(request := Write(writer.world("online"), Entity("arm"), cloud)) as lock:
+            lock[request] = np.arange(SIZE)
+        request = View(online := reader.world("online"), Entity("arm"), cloud)
+        assert online.view(request)[request].sum() == sum(range(SIZE))
+        assert "payload_fallbacks" not in writer.statistics()
+        assert "maps_failed" not in reader.statistics()
+
+    assert shard.host._payloads.figures()["payloads_adopted"] == 1
+    assert mode_of(shard._shared.path) == 0o2710
