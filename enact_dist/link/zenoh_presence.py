@@ -50,7 +50,7 @@ class ShardPresence:
         if event.matching:
             self._returned()
 
-    def close(self, wait_s: float) -> None:
+    def close(self, wait_s: float = 0.0) -> None:
         """End it; wait so long for the end of what calls `returned`.  Twice is harmless."""
         with self._mutex:  # Zenoh's binding raises where two threads do this at once
             if not self._closed:
