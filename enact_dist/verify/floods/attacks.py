@@ -42,6 +42,7 @@ ATTACKS: Final = (
     Attack("nothing", overloads.nothing, frozenset()),
     Attack("parked questions", overloads.parked, OVERLOAD),
     Attack("sessions", overloads.sessions, OVERLOAD),
+    Attack("sessions of many names", overloads.nameless_sessions, frozenset()),
     Attack("socket sessions", overloads.socket_sessions, OVERLOAD | {"connection refused"}),
     Attack("reports", overloads.reports, OVERLOAD),
     Attack("registrations", overloads.registrations, OVERLOAD),

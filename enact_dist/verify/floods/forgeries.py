@@ -19,16 +19,20 @@ from enact_dist.core.messages import (
     KeepAlive,
     LaneView,
     ListLocks,
+    ListSessions,
     Locks,
     Prepare,
     Release,
     Resolve,
+    Sessions,
     WriteItem,
 )
 from enact_dist.terms import Access
 from enact_dist.verify.floods.attacker import FIRST, SECOND, line_of
-from enact_dist.verify.floods.raw import RawSocket, hello
+from enact_dist.verify.floods.raw import ACTOR, RawSocket, hello
+from enact_dist.verify.floods.victim import ACTOR as VICTIM
 from enact_dist.verify.floods.victim import COUNT, HELD, KEPT, WORLD
+from enact_dist.wire.keys import identity_of, token_key
 from enact_dist.wire.limits import INTEGER_MAX
 
 if TYPE_CHECKING:
@@ -111,6 +115,14 @@ def forged_decisions(attacker: Attacker) -> None:
     attacker.zenoh.drain()
 
 
+def _identities(attacker: Attacker) -> list[str]:
+    """Return the victim's identity, as the shard tells it to everybody, and the attacker's."""
+    told = attacker.zenoh.ask(FIRST, ListSessions())
+    sessions = told.sessions if isinstance(told, Sessions) else ()
+    victims = [identity_of(one.actor, one.host, one.pid) for one in sessions if one.actor == VICTIM]
+    return [ACTOR, *victims]
+
+
 def stranger(attacker: Attacker) -> None:
     """Answer as the shard, hear everybody, publish forged notices, declare the victim's token.
 
@@ -118,6 +130,7 @@ def stranger(attacker: Attacker) -> None:
     and every call of every client ended in an error.
     """
     cell, session = attacker.config.name, attacker.zenoh.session
+    identities = _identities(attacker)
     heard = attacker.heard
 
     def answer(query: Any) -> None:
@@ -130,8 +143,8 @@ def stranger(attacker: Attacker) -> None:
         for key in (f"enact/{cell}/{FIRST}/**", "**")
     ]
     tokens: list[Any] = [
-        session.liveliness().declare_token(f"enact/{cell}/@sessions/{attacker.victim}"),
-        session.liveliness().declare_token(f"enact/{cell}/@sessions/attacker/{attacker.victim}"),
+        session.liveliness().declare_token(token_key(cell, identity, attacker.victim))
+        for identity in identities
     ]
     end_s = time.monotonic() + 2.0
     while time.monotonic() < end_s:

@@ -91,6 +91,14 @@ def sessions(attacker: Attacker) -> None:
     attacker.zenoh.drain()
 
 
+def nameless_sessions(attacker: Attacker) -> None:
+    """Open each session under a name of its own, so that no bound of one client holds."""
+    for _ in range(12_000):
+        session = fresh_session()
+        attacker.zenoh.post(FIRST, hello(session, actor=session), actor=session)
+    attacker.zenoh.drain()
+
+
 def socket_sessions(attacker: Attacker) -> None:
     """Open a connection and a session again and again, up to 1,200 at once."""
     for _ in range(1500):

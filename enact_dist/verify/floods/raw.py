@@ -121,16 +121,19 @@ class RawZenoh:
         self._count(answers)
         return answers[0] if answers else None
 
-    def post(self, shard: str, message: Request, *, parked: bool = False) -> None:
+    def post(
+        self, shard: str, message: Request, *, actor: str = ACTOR, parked: bool = False
+    ) -> None:
         """Send a message; wait for no answer, but while `WINDOW` others are under way.
 
         Args:
             shard: Where to.
             message: What to send.
+            actor: The identity in its key.
             parked: It takes no place in the window: its answer may take `PARKED_S`.
         """
         header, payload = encode_frame(message)
-        key = self.key(shard, verb_of(message))
+        key = self.key(shard, verb_of(message), actor)
         self.post_frame(key, header, payload or b"", parked=parked)
 
     def post_frame(

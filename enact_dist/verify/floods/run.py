@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from enact_dist.connecting import connect
-from enact_dist.errors import EnactError, LinkError
+from enact_dist.errors import EnactError
 from enact_dist.lock import Lock
 from enact_dist.terms import View
 from enact_dist.verify.daemons import CellProcesses
@@ -89,15 +89,13 @@ def measure(attack: Attack, *, carrier: str, updates: int = UPDATES) -> Figures:
     shards = (FIRST, SECOND)[: attack.shards]
     with (
         tempfile.TemporaryDirectory(prefix="enact-flood-") as folder,
-        CellProcesses(
-            Path(folder), shards, pins={"**": FIRST}, ttl_s=TTL_S, carrier=carrier
-        ) as cell,
+        CellProcesses(Path(folder), shards, pins={"**": FIRST}, ttl_s=TTL_S) as cell,
     ):
         for shard in shards:
             cell.start_shard(shard)
         try:
             _flood(attack, cell, figures, updates)
-        except LinkError as error:
+        except (EnactError, OSError) as error:
             figures.problems.append(str(error))
         try:
             _restart(cell, figures)
@@ -107,7 +105,7 @@ def measure(attack: Attack, *, carrier: str, updates: int = UPDATES) -> Figures:
 
 
 def _flood(attack: Attack, cell: CellProcesses, figures: Figures, updates: int) -> None:
-    victim = cell.start_client(VICTIM, str(updates))
+    victim = cell.start_client(VICTIM, str(updates), figures.carrier)
     session = victim.expect("held")
     attacker = cell.start_client(ATTACKER, attack.name, session)
     attacker.expect("begun")

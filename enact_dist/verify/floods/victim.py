@@ -1,4 +1,4 @@
-"""The honest client of a flood: `victim CELL UPDATES`.
+"""The honest client of a flood: `victim CELL UPDATES CARRIER`.
 
 It counts a number up under a lock, each time from what it counted to itself, while another thread
 holds a second lock; both are in plain sight of the attacker.  What it is told, and what it says:
@@ -13,6 +13,7 @@ end       ``kept yes`` if the second lock, held all the time, commits; then it e
 from __future__ import annotations
 
 import json
+import os
 import sys
 import threading
 import time
@@ -167,4 +168,5 @@ class Victim:
 
 
 if __name__ == "__main__":
+    os.environ["ENACT_CARRIER"] = sys.argv[3]
     Victim(sys.argv[1], int(sys.argv[2])).run()
