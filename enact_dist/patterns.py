@@ -14,7 +14,10 @@ from __future__ import annotations
 
 import re
 from itertools import groupby
-from typing import Final
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
 
 LENGTH_MAX: Final = 200
 """Longest pattern, as long as the longest name."""
@@ -22,6 +25,9 @@ STARS_MAX: Final = 8
 """Most stars in one segment of a pattern."""
 DEEP_MAX: Final = 4
 """Most segments ``**`` in one pattern."""
+
+PATTERNS_MAX: Final = 256
+"""Most patterns with stars in one lock, view or listing."""
 
 _SEGMENT = re.compile(r"(?:\*\*|(?!.*\*\*)[A-Za-z0-9_*][A-Za-z0-9_.\-*]*)\Z")
 _compiled: dict[str, re.Pattern[str]] = {}
@@ -56,6 +62,46 @@ def checked_pattern(pattern: object) -> str:
             f"pattern {pattern!r} has {segments.count('**')} segments '**'; at most {DEEP_MAX}"
         )
     return pattern
+
+
+def checked_patterns(patterns: Iterable[str]) -> None:
+    """Raise if one of the patterns is none, or if they are too many to be matched at once.
+
+    A name without a star matches itself alone and does not count.
+
+    Raises:
+        ValueError: As `checked_pattern`, or more than `PATTERNS_MAX` of them have a star.
+    """
+    several = frozenset(patterns)
+    starred = sum("*" in pattern for pattern in several)
+    if starred > PATTERNS_MAX:
+        raise ValueError(
+            f"{starred} patterns of entities at once; at most {PATTERNS_MAX}: ask with fewer, or in"
+            " several questions"
+        )
+    for pattern in several:
+        checked_pattern(pattern)
+
+
+class Patterns:
+    """Several patterns at once: which names one of them covers.  None at all cover every name.
+
+    Attributes:
+        starred: Those that have to be tried one by one; the others are names, which are looked up.
+    """
+
+    __slots__ = ("_names", "starred")
+
+    def __init__(self, patterns: Iterable[str]) -> None:
+        several = frozenset(patterns)
+        self.starred = tuple(pattern for pattern in several if "*" in pattern)
+        self._names = several.difference(self.starred)
+
+    def cover(self, name: str) -> bool:
+        """Say whether one of them covers the entity name `name`."""
+        if name in self._names or not (self._names or self.starred):
+            return True
+        return any(pattern_matches(pattern, name) for pattern in self.starred)
 
 
 def pattern_matches(pattern: str, name: str) -> bool:

@@ -13,7 +13,7 @@ from enact_dist.core.message_parts import READS_MAX
 from enact_dist.core.messages import Commit, Refused
 from enact_dist.core.retaining import NO_LIMIT
 from enact_dist.core.stamps import AHEAD_NS_MAX
-from enact_dist.patterns import checked_pattern
+from enact_dist.patterns import checked_patterns
 from enact_dist.terms import Access, Durability, checked_name
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ _ACCESSES_BY_STAMP: Final = (Access.VIEW, Access.READ)
 _DURABILITIES: Final = ("", *(durability.value for durability in Durability))
 
 
-def wrong_access(items: Iterable[Item]) -> Refused | None:
+def wrong_access(items: Collection[Item]) -> Refused | None:
     """Refuse an access or a pattern that there is not, and a write of what was captured when."""
     for item in items:
         if item.captured_ns and item.access not in _ACCESSES_BY_STAMP:
@@ -43,18 +43,13 @@ def wrong_access(items: Iterable[Item]) -> Refused | None:
             return _refused(f"{item.entity}/{item.aspect} was asked nearest to no stamp")
         if item.access not in _ACCESSES:
             return _refused(f"access {item.access} was asked; there are {sorted(_ACCESSES)}")
-        if item.access in _ACCESSES_EACH:
-            wrong = wrong_patterns((item.entity,))
-            if wrong is not None:
-                return wrong
-    return None
+    return wrong_patterns(item.entity for item in items if item.access in _ACCESSES_EACH)
 
 
 def wrong_patterns(patterns: Iterable[str]) -> Refused | None:
-    """Refuse a pattern that no client makes; matching one must stay cheap."""
+    """Refuse patterns that no client makes; to match them must stay cheap."""
     try:
-        for pattern in patterns:
-            checked_pattern(pattern)
+        checked_patterns(patterns)
     except ValueError as error:
         return _refused(str(error))
     return None

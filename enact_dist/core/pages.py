@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Final, TypeVar
 
 from enact_dist.core.datum import Slot
 from enact_dist.core.message_parts import START, Cursor
-from enact_dist.patterns import pattern_matches
+from enact_dist.patterns import Patterns
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -33,6 +33,8 @@ PAGE_BYTES_MAX: Final = 8 << 20
 """Bytes of one page: half of what a header may have, so that an entry may be large, too."""
 WORK_MAX: Final = 2_000
 """Slots, versions and causes that are looked at for one page: about 5 ms."""
+PATTERNS_WORK: Final = 8
+"""So many patterns are tried in the time that it takes to look at one slot."""
 HOLDER_WORK: Final = 10
 """What it takes to describe a lock, which looks for those that are in its way."""
 
@@ -78,17 +80,26 @@ def over_slots(
         version_of: Returns the version of an entry.
         bytes_of: Returns at least how many bytes it takes in an answer.
     """
+    contexts, aspects, patterns = map(
+        frozenset, (asked.contexts, asked.aspects, asked.patterns) if asked else ((), (), ())
+    )
+    entities = Patterns(patterns)
+    work_each = 1 + len(entities.starred) // PATTERNS_WORK
     for column in sorted(slots.columns()):
         here = column == after.names
-        if column < after.names or (asked is not None and not _wanted(asked, *column)):
+        wanted = (not contexts or column.context in contexts) and (
+            not aspects or column.aspect in aspects
+        )
+        if column < after.names or not wanted:
             continue
         begin = max(0, after.number) if here else 0
         column_slots = islice(slots.of_column(column).items(), begin, None)
         for number, (entity, content) in enumerate(column_slots, begin):
             found: Sequence[E] = ()
-            work = 1
-            if asked is None or not asked.patterns or _matches(asked.patterns, entity):
+            work = work_each
+            if entities.cover(entity):
                 found, work = listed(Slot(column.context, entity, column.aspect), content)
+                work += work_each
             if here and number == begin and after.version:
                 found = [entry for entry in found if version_of(entry) > after.version]
             for entry in found[:-1]:
@@ -96,16 +107,6 @@ def over_slots(
             last = found[-1] if found else None
             size = bytes_of(last) if last is not None else 0
             yield last, size, work, Cursor(epoch, column, number + 1)
-
-
-def _wanted(asked: Survey | ListHistory, context: str, aspect: str) -> bool:
-    return not (asked.contexts and context not in asked.contexts) and not (
-        asked.aspects and aspect not in asked.aspects
-    )
-
-
-def _matches(patterns: Iterable[str], entity: str) -> bool:
-    return any(pattern_matches(pattern, entity) for pattern in patterns)
 
 
 def bytes_in_frame(value: object) -> int:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 
 from enact_dist.core.messages import Notice
 from enact_dist.errors import EnactError
-from enact_dist.patterns import pattern_matches
+from enact_dist.patterns import Patterns
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -50,10 +50,12 @@ class Interest:
         wanted: The listing that shows them all.
     """
 
-    __slots__ = ("_known", "wanted")
+    __slots__ = ("_aspects", "_contexts", "_entities", "_known", "wanted")
 
     def __init__(self, wanted: Survey) -> None:
         self.wanted = wanted
+        self._contexts, self._aspects = frozenset(wanted.contexts), frozenset(wanted.aspects)
+        self._entities = Patterns(wanted.patterns)
         self._known: dict[Slot, bool] = {}
 
     def covers(self, notice: Notice) -> bool:
@@ -64,14 +66,10 @@ class Interest:
         """Whether a slot is one of them."""
         known = self._known.get(slot)
         if known is None:
-            wanted = self.wanted
             known = (
-                (not wanted.contexts or slot.context in wanted.contexts)
-                and (not wanted.aspects or slot.aspect in wanted.aspects)
-                and (
-                    not wanted.patterns
-                    or any(pattern_matches(pattern, slot.entity) for pattern in wanted.patterns)
-                )
+                (not self._contexts or slot.context in self._contexts)
+                and (not self._aspects or slot.aspect in self._aspects)
+                and self._entities.cover(slot.entity)
             )
             if len(self._known) >= KNOWN_MAX:
                 self._known.clear()

@@ -28,6 +28,7 @@ from enact_dist.link.socket_frames import (
 )
 from enact_dist.link.socket_peers import Peer
 from enact_dist.link.socket_watcher import SocketWatcher
+from enact_dist.patterns import checked_patterns
 from enact_dist.wire.frames import decode_frame, decode_request
 
 if TYPE_CHECKING:
@@ -219,11 +220,15 @@ def _interest(header: bytes) -> Interest | None:
     """Return what a watcher watches; None for everything.
 
     Raises:
-        ProtocolError: The header is something else.
+        ProtocolError: The header is something else, or names patterns that nobody may.
     """
     if not header:
         return None
     wanted = decode_frame(header, b"")
     if not isinstance(wanted, Survey):
         raise ProtocolError(f"{type(wanted).__name__} came to say what is watched")
+    try:
+        checked_patterns(wanted.patterns)
+    except ValueError as error:
+        raise ProtocolError(str(error)) from None
     return Interest(wanted)

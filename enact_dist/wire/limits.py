@@ -51,6 +51,8 @@ REPORT_BYTES_MAX: Final = 64 << 10
 """Longest report of an actor: each keep-alive carries it."""
 ITEMS_MAX: Final = 4096
 """Most lines of one lock and most writes of one commit: a shard serves them in one step."""
+KEPT_VERSIONS_MAX: Final = 1 << 14
+"""Most versions that one request keeps; a shard keeps no more than 10,000 in all."""
 ENTRIES_MAX: Final = 1 << 18
 """Most entries of any other list of a header; the header's length bounds them earlier."""
 INTEGER_MAX: Final = (1 << 63) - 1

@@ -60,7 +60,7 @@ def _checked(cls: type[Any], raw: str, lines: list[str], names: dict[str, Any]) 
     if not fields:
         return f"{_named(cls, names)}()"
     lines.append(f"    {', '.join(found)}, = {raw}")
-    lengths = dict(lengths_of(fields))
+    lengths = dict(lengths_of(cls))
     conditions = [
         condition
         for index, (one, (_, kind)) in enumerate(zip(found, fields, strict=True))

@@ -76,6 +76,19 @@ def test_pattern_that_no_client_makes_is_refused(bench, pattern):
     assert free(bench)
 
 
+def test_more_patterns_than_a_shard_matches_at_once_are_refused(bench):
+    """4,096 of them in one lock, each against each slot, kept a shard for seconds."""
+    patterns = [f"*{index}*a*" for index in range(4096)]
+    each = tuple(item(Access.READ_EACH, pattern) for pattern in patterns)
+    views = tuple(item(Access.VIEW_EACH, pattern) for pattern in patterns)
+
+    refused(bench.acquire(ANN, *each), "at most 256")
+    refused(bench.ask(TakeView(ANN, 1, 1, 5, views, 0)), "at most 256")
+    refused(bench.ask(Survey((), tuple(patterns), ())), "at most 256")
+    refused(bench.ask(ListHistory((), tuple(patterns), ())), "at most 256")
+    assert free(bench)
+
+
 @pytest.mark.parametrize("parties", [("nosuch",), ("s0",), ("far", "s0"), ("",)])
 def test_commit_with_participants_that_cannot_be_told_is_refused(bench, parties):
     """An unknown shard, and this one itself; else the decision would be kept for ever."""

@@ -91,6 +91,16 @@ def test_page_ends_after_some_work_though_nothing_was_found(
     assert len(listed) >= max(2, count // 4)
 
 
+def test_page_with_many_patterns_ends_after_fewer_slots(bench, monkeypatch):
+    """Each pattern is tried against each slot: 64 of them are the work of eight slots more."""
+    monkeypatch.setattr(pages, "WORK_MAX", 20)
+    few, many = ("none/*",), tuple(f"none/{number}/*" for number in range(64))
+
+    asked = [sum(1 for _ in pages_of(bench, Survey((), some, ()))) for some in (few, many)]
+
+    assert asked == [1, 5]
+
+
 def test_cursor_of_an_earlier_epoch_is_refused(bench):
     """A restart may have ordered the slots anew: whoever lists begins again."""
     bench.restart()

@@ -9,7 +9,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from enact_dist.patterns import pattern_matches, patterns_overlap
+from enact_dist.patterns import (
+    PATTERNS_MAX,
+    Patterns,
+    checked_patterns,
+    pattern_matches,
+    patterns_overlap,
+)
 from enact_dist.terms import Entities, Entity
 
 NAME_SEGMENT = st.text("ab", min_size=1, max_size=3)
@@ -179,3 +185,22 @@ def test_wrong_pattern_is_refused(pattern):
     """A pattern that could match nothing is refused where it is made."""
     with pytest.raises(ValueError, match=r"pattern"):
         Entities(pattern)
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(PATTERN, max_size=4), NAME)
+def test_several_patterns_cover_what_one_of_them_covers(patterns, name):
+    """Names among them are looked up, patterns tried; none at all cover everything."""
+    covered = not patterns or any(pattern_matches(pattern, name) for pattern in patterns)
+
+    assert Patterns(patterns).cover(name) == covered
+
+
+def test_more_patterns_than_can_be_matched_at_once_are_refused():
+    """Names and repeated patterns do not count: they cost a look-up."""
+    names = [f"arm/{index}" for index in range(4000)]
+    most = [f"arm/{index}/*" for index in range(PATTERNS_MAX)]
+    checked_patterns(names + 3 * most)
+
+    with pytest.raises(ValueError, match="257 patterns of entities at once; at most 256"):
+        checked_patterns([*most, "**"])
