@@ -6,14 +6,30 @@ msgpack's):
 **Frame**: one message.  A header and, where the message holds data, a payload (in Zenoh: the
 attachment and the payload of a query, reply or put).  The header is one msgpack array::
 
-    [version = 2, code, field, field, …]
+    [version = 7, code, field, field, …]
 
-`frames.CODES` lists the codes; the fields are those of the class in `core.messages`, in order.  A
-NamedTuple is the array of its fields, a tuple an array, None is nil.  A datum is the array
-``[encoding: bin, offset: int, size: int, stamp_ns: int]``; its body is the `size` bytes at
-`offset` of the payload.  Bodies follow one another in the order of the header, each at the next
-multiple of 64, zeros between, nothing after the last; an empty body has offset 0.  A reader refuses
-another version, an unknown code, one field too many, an integer over 2^63 - 1.
+The code says which message it is; the fields are those of the class in `core.messages`, in order.
+A NamedTuple is the array of its fields, a tuple an array, None is nil.  A datum is the array
+``[encoding: bin, offset: int, size: int, stamp_ns: int, file: str]``; its body is the `size` bytes
+at `offset` of the payload.  Bodies follow one another in the order of the header, each at the next
+multiple of 64, zeros between, nothing after the last; an empty body has offset 0.  Where `file` is
+not empty, it names a payload of the shard, no byte of the body stands in the frame, and the offset
+is 0.  A reader refuses another version, an unknown code, one field too many, an integer over
+2^63 - 1.
+
+========  ========================================================================================
+requests  Hello 1, Register 2, Acquire 3, TakeView 4, Fetch 5, KeepAlive 6, Commit 7, Outcome 8,
+          Validate 9, Release 10, Goodbye 11, AwaitStamp 12, Survey 13, ListLocks 14,
+          ListSessions 15, Break 16, Prepare 17, Finish 18, Resolve 19, ForceAbort 20,
+          ListAudit 21, Stage 22, ListHistory 23, Explain 24, FindEffects 25, Fork 26,
+          DropWorld 27, KeepVersions 28, Ping 29
+answers   Welcome 33, Registered 34, Granted 35, Waiting 36, Stale 37, Viewed 38, Slice 39, Gone 40,
+          Alive 41, Committed 42, Fenced 43, OutcomeIs 44, Valid 45, Released 46, Reached 47,
+          Surveyed 48, Locks 49, Sessions 50, Broken 51, EpochChanged 52, WrongShard 53,
+          Refused 54, Changed 55, Prepared 56, Finished 57, Resolved 58, Audited 59, Staged 60,
+          Versions 61, Forgotten 62, Forked 63, Dropped 64, Kept 65, Pong 66
+notices   Notice 97
+========  ========================================================================================
 
 **Datum**: `encoding` is two msgpack objects, the version 1 and a tree; `body` is raw bytes that the
 tree refers to by offset and length.  Plain values stand in the tree as themselves (int, float64,
