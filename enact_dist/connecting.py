@@ -7,7 +7,7 @@ import secrets
 import socket
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from enact_dist.arguments import check_seconds
 from enact_dist.cell import Cell
@@ -64,13 +64,15 @@ def connect(
     name, ttl_s = "", TTL_S
     carrier = carrier_of(os.environ)
     endpoints: tuple[str, ...] = (str(target),)
+    expected: tuple[ShardEntry, ...] = ()
     if not _is_endpoint(target):
         from enact_dist.config import load_config
 
         _refuse_no_file(target)
         config = load_config(Path(target))
         name, ttl_s, carrier = config.name, config.ttl_s, config.carrier
-        endpoints = tuple(e for entry in config.placement_map().shards for e in entry.endpoints)
+        expected = config.placement_map().shards
+        endpoints = tuple(e for entry in expected for e in entry.endpoints)
     client = _client(actor, ttl_s=ttl_s, observer=observer)
     cell_name, cell_client, welcome = join(
         name,
@@ -79,6 +81,7 @@ def connect(
         timeout_s=timeout_s,
         open_s=min(OPEN_S, patience_s),
         carrier=carrier,
+        expected=expected,
     )
     cell_client.patience_s = patience_s
     try:
@@ -128,7 +131,7 @@ def local(
     try:
         client = _client(actor, ttl_s=config.ttl_s if config else TTL_S, observer=False)
         carrier = EmbeddedCarrier(host, client.session)
-        options = {} if clock is None else {"now_ns": clock.monotonic_ns}
+        options: dict[str, Any] = {} if clock is None else {"now_ns": clock.monotonic_ns}
         cell_client = CellClient(carrier, client, keep_alive=False, **options)
         welcome = cell_client.call(LOCAL_SHARD, client.hello(LOCAL_SHARD))
         if not isinstance(welcome, Welcome):

@@ -240,7 +240,7 @@ def _cell(
 ) -> Generator[Finding, None, frozenset[str]]:
     """Check the cell; return the names of the shards that keep data in a folder now."""
     from enact_dist.connecting import connect
-    from enact_dist.doctor_cell import differences
+    from enact_dist.doctor_cell import differences, namesakes
 
     kept: frozenset[str] = frozenset()
     try:
@@ -249,7 +249,9 @@ def _cell(
             kept = frozenset(one.name for one in shards if one.reachable and is_kept(one.epoch))
             for shard in shards:
                 yield from _shard(shard)
-            yield from differences(config, shards, cell.welcomes())
+            welcomes = cell.welcomes()
+            yield from namesakes(cell.name, config, welcomes)
+            yield from differences(config, shards, welcomes)
     except ShardUnreachableError as error:
         if config is None:
             yield _unreachable("cell", target)

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from enact_dist.core.answers import Welcome
     from enact_dist.core.message_parts import PlacementMap
 
+ASK_S: Final = 0.5
+"""How long each place at which a shard is expected may take to say which daemon serves it."""
 DISK_BYTES_WARN: Final = 1_000_000_000
 DISK_BYTES_FAIL: Final = 50_000_000
 
@@ -62,6 +64,31 @@ def differences(
         if shard.name in running:
             yield from _folder(shard, kept=is_kept(running[shard.name].epoch))
     yield from _catalogue(config, welcomes)
+
+
+def namesakes(
+    cell: str, config: CellConfig | None, welcomes: Mapping[str, Welcome]
+) -> Iterator[Finding]:
+    """Name the shards that several daemons serve, at any place where somebody expects them.
+
+    Args:
+        cell: The cell's name.
+        config: The file; None where there is none.
+        welcomes: What the shards that answer say of the cell.
+    """
+    from enact_dist.link.namesakes import serving, two_daemons
+
+    entries = [entry for welcome in welcomes.values() for entry in welcome.placement.shards]
+    if config is not None:
+        entries += config.placement_map().shards
+    places: dict[str, dict[str, None]] = {}
+    for entry in entries:
+        places.setdefault(entry.name, {}).update(dict.fromkeys(entry.endpoints))
+    for shard, endpoints in places.items():
+        found = serving(cell, shard, endpoints, timeout_s=ASK_S) if len(endpoints) > 1 else ()
+        if len(found) > 1:
+            wrong, _, remedy = two_daemons(cell, shard, found).partition("; ")
+            yield Finding(Level.FAIL, f"shard {shard}", wrong, remedy)
 
 
 def folders(config: CellConfig, kept: Collection[str]) -> Iterator[Finding]:

@@ -140,7 +140,7 @@ def run_shard(arguments: argparse.Namespace) -> int:
         if found:
             environment[variable_of(arguments.name, key)] = found
     # The name comes first: an override for a shard that is not there would blame the override.
-    load_config(target).shard(arguments.name)
+    written = load_config(target).shard(arguments.name)
     config = load_config(target, environment=environment)
     shard = config.shard(arguments.name)
     drain_s = shard.drain_s if arguments.drain_s is None else arguments.drain_s
@@ -155,6 +155,7 @@ def run_shard(arguments: argparse.Namespace) -> int:
             carrier=config.carrier,
             shared_bytes_max=config.shared_bytes_max,
             metrics=shard.metrics,
+            written=written.advertise,
             drain_s=shard_daemon.DRAIN_S if drain_s is None else drain_s,
         )
     )

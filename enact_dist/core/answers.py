@@ -253,7 +253,8 @@ class Reached:
 class Pong:
     """This shard is there: since when, and whether it grants locks (`state` as in `core.epochs`).
 
-    It stays this small whatever the shard holds.
+    It stays this small whatever the shard holds.  Every start of a daemon has another `start`, by
+    which two daemons under one name are told apart.
     """
 
     shard: str
@@ -261,6 +262,7 @@ class Pong:
     open: bool
     state: str
     uptime_ns: int
+    start: int = 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -153,6 +153,7 @@ def pong(state: ShardState) -> Pong:
         state.grants,
         epochs.state_of(grants=state.grants, draining=state.draining),
         state.now_ns - state.born_ns,
+        state.settings.start,
     )
 
 

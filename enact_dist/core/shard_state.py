@@ -63,6 +63,7 @@ class ShardSettings:
         fetch_bytes_max: Largest part of a datum in one answer.
         shared: Name of this start's folder of shared memory ("": it shares none).
         shared_nonce: What stands in there for a client to find.
+        start: A random number of this start.
     """
 
     name: str
@@ -73,6 +74,7 @@ class ShardSettings:
     fetch_bytes_max: int = FETCH_BYTES_MAX
     shared: str = ""
     shared_nonce: bytes = b""
+    start: int = 0
 
 
 class ShardState:

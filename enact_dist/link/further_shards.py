@@ -6,13 +6,14 @@ import logging
 import threading
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.errors import ConfigError
+from enact_dist.errors import ConfigError, LinkError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from enact_dist.core.messages import PlacementMap
     from enact_dist.link.carrier import Carrier
+    from enact_dist.link.namesakes import Doubts
 
 PAUSE_NS: Final = 1_000_000_000
 """How long after a failure nothing is tried: each try may open a session."""
@@ -31,6 +32,7 @@ class FurtherShards:
         linked: The placement whose shards need no connecting.
         now_ns: The session's clock.
         count: Called with the name of what is to be counted.
+        doubts: Told where the shards of a placement are; None where there can be no doubt.
     """
 
     def __init__(
@@ -39,8 +41,10 @@ class FurtherShards:
         linked: PlacementMap,
         now_ns: Callable[[], int],
         count: Callable[[str], None],
+        doubts: Doubts | None = None,
     ) -> None:
         self._carrier, self._linked = carrier, linked
+        self._doubts = doubts
         self._now_ns, self._count = now_ns, count
         self._mutex = threading.Lock()
         self._not_before_ns: int | None = None
@@ -57,6 +61,7 @@ class FurtherShards:
             if self._not_before_ns is not None and self._now_ns() < self._not_before_ns:
                 return
             if placement != self._linked:
+                self._hear(placement)
                 self._carrier.add_endpoints(placement.shards)
             self._linked, self._not_before_ns = placement, None
         except ConfigError as error:  # an endpoint that never can be reached is told once
@@ -69,3 +74,18 @@ class FurtherShards:
             _log.warning("not every shard of the cell is connected, trying again: %s", error)
         finally:
             self._mutex.release()
+
+    def _hear(self, placement: PlacementMap) -> None:
+        for text in self._doubts.hear(placement.shards) if self._doubts is not None else ():
+            self._count("shards_doubted")
+            _log.error("%s", text)
+
+    def check(self, shard: str) -> None:
+        """Raise if a shard is not to be trusted.
+
+        Raises:
+            LinkError: More than one daemon serves it; the message names them.
+        """
+        text = self._doubts.about(shard) if self._doubts is not None else ""
+        if text:
+            raise LinkError(text)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 from enact_dist.core.messages import Welcome
 from enact_dist.errors import LinkError
 from enact_dist.link.client import CellClient
+from enact_dist.link.namesakes import Doubts
 from enact_dist.link.socket_carrier import SocketCarrier
 from enact_dist.link.zenoh_carrier import POLL_S, ZenohCarrier
 from enact_dist.link.zenoh_config import OPEN_S
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from enact_dist.core.client import Client
+    from enact_dist.core.messages import ShardEntry
     from enact_dist.link.carrier import Carrier
 
 HELLO_S: Final = 1.0
@@ -32,6 +34,7 @@ def join(
     timeout_s: float,
     open_s: float = OPEN_S,
     carrier: str = "auto",
+    expected: Sequence[ShardEntry] = (),
 ) -> tuple[str, CellClient, Welcome]:
     """Return the cell's name, a client with its carrier open, and a shard's welcome.
 
@@ -42,6 +45,7 @@ def join(
         timeout_s: How long to wait for a first answer.
         open_s: How long a shard has to answer a connection.
         carrier: How messages travel, one of `CARRIERS`.
+        expected: The shards of the `cell.toml`, and where it says that they are.
 
     Raises:
         LinkError: Another cell answers, or the socket is asked for and no shard has one to use;
@@ -77,7 +81,7 @@ def join(
     except BaseException:
         way.close()
         raise
-    return found, CellClient(way, client), welcome
+    return found, CellClient(way, client, doubts=Doubts(found, expected)), welcome
 
 
 def _first_usable(

@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     from enact_dist.core.messages import Request, Survey, WorldEntry
     from enact_dist.errors import ShardUnreachableError
     from enact_dist.link.carrier import Begun, Carrier, NoticeFeed
+    from enact_dist.link.namesakes import Doubts
 
 FINISH_S: Final = 10.0
 """How long calls are made again before their shard counts as unreachable, unless said otherwise."""
@@ -90,6 +91,7 @@ class SessionClient:
         *,
         now_ns: Callable[[], int] = boottime_ns,
         keep_alive: bool = True,
+        doubts: Doubts | None = None,
     ) -> None:
         self.carrier = carrier
         self.core = client
@@ -111,7 +113,7 @@ class SessionClient:
             self.count,
             inside=carrier.inside,
         )
-        self._further = FurtherShards(carrier, client.placement, now_ns, self.count)
+        self._further = FurtherShards(carrier, client.placement, now_ns, self.count, doubts)
         self._renewer: threading.Thread | None = None
         if keep_alive:
             self._renewer = threading.Thread(
@@ -296,6 +298,8 @@ class SessionClient:
         return self.call_once([(shard, request)])[0]
 
     def _send(self, calls: Sequence[tuple[str, Request]]) -> list[Answer | None]:
+        for shard, _ in calls:
+            self._further.check(shard)
         if len(calls) == 1:
             shard, request = calls[0]
             return [self.carrier.request(shard, request, timeout_s=patience_s(request))]

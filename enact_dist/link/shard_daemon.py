@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import gc
 import logging
+import secrets
 import sys
 import threading
 from contextlib import ExitStack
@@ -23,6 +24,7 @@ from enact_dist.errors import ConfigError, EnactError, LinkError
 from enact_dist.link.endpoints import somebody_listens
 from enact_dist.link.host import open_host
 from enact_dist.link.log import READY, TEXT, JsonLines, Log, say
+from enact_dist.link.namesakes import moved_places, serving, told_places, two_daemons
 from enact_dist.link.service_manager import ServiceManager
 from enact_dist.link.shard_calls import ShardCalls
 from enact_dist.link.shared_folder import SharedFolder
@@ -71,6 +73,7 @@ class DaemonSettings:
             system there has, and plain memory beyond; 0 shares none.
         drain_s: How long holders may still finish after a signal.
         metrics: Host and port at which Prometheus may ask, see `link.metrics`; None: nowhere.
+        written: Where `cell.toml` says that the shard is, whatever replaces that for this start.
     """
 
     cell: str
@@ -83,6 +86,7 @@ class DaemonSettings:
     shared_bytes_max: int | None = None
     drain_s: float = DRAIN_S
     metrics: tuple[str, int] | None = None
+    written: tuple[str, ...] = ()
 
 
 class RunningShard:
@@ -94,7 +98,7 @@ class RunningShard:
         self._stopping = threading.Lock()
         self._stopped = False
         self._shared = _shared_folder(settings)
-        shard = settings.shard
+        shard = replace(settings.shard, start=secrets.randbits(62))
         if self._shared is not None:
             shard = replace(shard, shared=self._shared.name, shared_nonce=self._shared.nonce)
         with ExitStack() as undo:
@@ -241,27 +245,42 @@ def start_shard(settings: DaemonSettings) -> RunningShard:
 def refuse_second_daemon(settings: DaemonSettings, *, probe_s: float = PROBE_S) -> None:
     """Raise if a daemon already serves this shard where its clients look for it.
 
+    The other shards of the cell that run are asked where they expect it.
+
     Args:
         settings: Of the shard.
         probe_s: How long who listens there may take to say what it is.
 
     Raises:
-        LinkError: One does.
+        LinkError: One does, or another shard of the cell runs twice.
         ConfigError: An endpoint cannot be read.
     """
-    name = settings.shard.name
+    name, cell = settings.shard.name, settings.cell
     shards = settings.shard.placement.shards
-    advertised = [
-        endpoint for shard in shards if shard.name == name for endpoint in shard.endpoints
-    ]
-    endpoints = list(dict.fromkeys(map(to_reach, (*settings.listen, *advertised))))
-    listening = [endpoint for endpoint in endpoints if somebody_listens(endpoint)]
+    expected = {entry.name: entry.endpoints for entry in shards}
+    ours = (*settings.listen, *expected.get(name, ()), *settings.written)
+    listening = [place for place in dict.fromkeys(map(to_reach, ours)) if somebody_listens(place)]
     found = find_shards(listening, timeout_s=probe_s) if listening else ()
-    if FoundShard(settings.cell, name) in found:
+    if FoundShard(cell, name) in found:
         raise LinkError(
-            f"shard {name} of cell {settings.cell} already runs at {' or '.join(listening)}; two"
-            " daemons must not serve one shard: stop the other, or give this one another name"
+            f"shard {name} of cell {cell} already runs at {' or '.join(listening)}; two daemons"
+            " must not serve one shard: stop the other, or give this one another name"
         )
+    others = [entry for entry in shards if entry.name != name]
+    moved: dict[str, list[str]] = {}
+    for told in told_places(cell, others, timeout_s=probe_s) if others else ():
+        moved |= moved_places(expected, told)
+    for shard, places in moved.items():
+        daemons = serving(cell, shard, places, timeout_s=probe_s)
+        if shard == name and daemons:
+            raise LinkError(
+                f"shard {name} of cell {cell} already runs at {daemons[0]}, where other shards of"
+                f" the cell expect it, and this start would listen at {', '.join(settings.listen)};"
+                " two daemons must not serve one shard: stop the other first, and let the cell.toml"
+                " of every shard name the same endpoint"
+            )
+        if len(daemons) > 1:
+            raise LinkError(two_daemons(cell, shard, daemons))
 
 
 def run_shard(settings: DaemonSettings) -> int:

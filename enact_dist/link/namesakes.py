@@ -1,0 +1,167 @@
+"""Two daemons under one name: who serves a shard at each of the places where it is said to be.
+
+A shard that runs twice, from two folders at two places, is two shards: what one client reads
+another never wrote.  Nobody sees that from one place alone, so whoever hears of a second place
+asks at both.  A daemon is told from another by the random number of its start, not by its epoch:
+two folders may be in the same one, and a restart at the same place is one daemon after another.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.core.messages import Hello, Ping, Pong, Welcome
+from enact_dist.link.endpoints import somebody_listens
+from enact_dist.link.zenoh_config import to_reach
+from enact_dist.link.zenoh_discovery import FoundShard, ask_shards
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+
+    from enact_dist.core.messages import ShardEntry
+
+LOOKER: Final = Hello("0" * 32, 0, 1_000_000_000, "enact", "", 0, observer=True)
+"""The greeting of somebody who only wants to know which shards a shard knows."""
+
+
+@dataclass(frozen=True, slots=True)
+class Serving:
+    """A daemon that serves a shard.
+
+    Attributes:
+        endpoint: Where it answers.
+        start: The random number of its start.
+        epoch: The epoch that it is in.
+        uptime_s: For how long it has run.
+    """
+
+    endpoint: str
+    start: int
+    epoch: int
+    uptime_s: float
+
+    def __str__(self) -> str:
+        return f"{self.endpoint} (epoch {self.epoch}, up {self.uptime_s:.0f} s)"
+
+
+def serving(
+    cell: str, shard: str, endpoints: Iterable[str], *, timeout_s: float
+) -> tuple[Serving, ...]:
+    """Ask place by place who serves a shard there; return each daemon once.
+
+    Args:
+        cell: Name of the cell.
+        shard: Name of the shard.
+        endpoints: The places.
+        timeout_s: How long each may take to answer.
+
+    Raises:
+        ConfigError: An endpoint cannot be read.
+        ProtocolError: An answer cannot be read.
+    """
+    found: dict[int, Serving] = {}
+    wanted = FoundShard(cell, shard)
+    for endpoint in dict.fromkeys(map(to_reach, endpoints)):
+        if not somebody_listens(endpoint):
+            continue
+        answer = ask_shards([endpoint], [wanted], Ping(), timeout_s=timeout_s).get(wanted)
+        if isinstance(answer, Pong):
+            one = Serving(endpoint, answer.start, answer.epoch, answer.uptime_ns / 1e9)
+            found.setdefault(answer.start, one)
+    return tuple(found.values())
+
+
+def told_places(
+    cell: str, shards: Sequence[ShardEntry], *, timeout_s: float
+) -> list[tuple[ShardEntry, ...]]:
+    """Ask shards of a cell where they expect each shard; return what each of them says.
+
+    Args:
+        cell: Name of the cell.
+        shards: Whom to ask, and where.
+        timeout_s: How long they may take together; those that take longer are left out.
+
+    Raises:
+        ConfigError: An endpoint cannot be read.
+        ProtocolError: An answer cannot be read.
+    """
+    endpoints = dict.fromkeys(to_reach(place) for entry in shards for place in entry.endpoints)
+    listening = [endpoint for endpoint in endpoints if somebody_listens(endpoint)]
+    asked = [FoundShard(cell, entry.name) for entry in shards]
+    answers = ask_shards(listening, asked, LOOKER, timeout_s=timeout_s) if listening else {}
+    return [one.placement.shards for one in answers.values() if isinstance(one, Welcome)]
+
+
+def moved_places(
+    known: Mapping[str, Iterable[str]], told: Iterable[ShardEntry]
+) -> dict[str, list[str]]:
+    """Return the shards that somebody expects elsewhere than is known, with all their places.
+
+    One that has a place in common is the same shard with another address beside.
+    """
+    return {
+        shard: list(dict.fromkeys((*known[shard], *places)))
+        for shard, places in told
+        if known.get(shard) and places and not set(known[shard]) & set(places)
+    }
+
+
+def two_daemons(cell: str, shard: str, found: Sequence[Serving]) -> str:
+    """Return what is said of a shard that several daemons serve."""
+    return (
+        f"{len(found)} daemons serve shard {shard} of cell {cell}, each with data of its own:"
+        f" {' and '.join(map(str, found))}; stop all but the one whose data count, and let every"
+        " cell.toml name its endpoint; a shard of another cell needs another cell name"
+    )
+
+
+class Doubts:
+    """The shards of one session that more than one daemon serves; neither is trusted.
+
+    Args:
+        cell: Name of the cell.
+        expected: The shards as the session's user knows them, with their places.
+    """
+
+    ASK_S: Final = 0.5
+    """How long each place may take to answer."""
+    AGAIN_S: Final = 2.0
+    """After so long it is asked again whether the doubt is over."""
+
+    def __init__(self, cell: str, expected: Iterable[ShardEntry] = ()) -> None:
+        self._cell = cell
+        self._known = {entry.name: list(entry.endpoints) for entry in expected}
+        self._doubted: dict[str, tuple[list[str], str, float]] = {}
+
+    def hear(self, shards: Iterable[ShardEntry]) -> list[str]:
+        """Take where a shard says that all are; return what is wrong with those found twice.
+
+        Raises:
+            EnactError: A place cannot be asked.
+        """
+        shards = tuple(shards)
+        moved = moved_places(self._known, shards)
+        wrong = [text for shard, places in moved.items() if (text := self._ask(shard, places))]
+        for shard, told in shards:
+            known = self._known.setdefault(shard, [])
+            known += [place for place in told if place not in known]
+        return wrong
+
+    def _ask(self, shard: str, places: list[str]) -> str:
+        found = serving(self._cell, shard, places, timeout_s=self.ASK_S)
+        if len(found) < 2:
+            self._doubted.pop(shard, None)
+            return ""
+        text = two_daemons(self._cell, shard, found)
+        self._doubted[shard] = places, text, time.monotonic() + self.AGAIN_S
+        return text
+
+    def about(self, shard: str) -> str:
+        """Return why a shard is not to be trusted now; empty where it is."""
+        doubt = self._doubted.get(shard)
+        if doubt is None:
+            return ""
+        places, text, until_s = doubt
+        return text if time.monotonic() < until_s else self._ask(shard, places)

@@ -1,0 +1,145 @@
+"""Two daemons under one shard's name: the later one, clients and the doctor see it."""
+
+from types import SimpleNamespace
+
+import pytest
+
+from enact_dist import Aspect, Entity, Lock, Write, connect
+from enact_dist.core.messages import Pin, PlacementMap, ShardEntry
+from enact_dist.core.shard_state import ShardSettings
+from enact_dist.doctor_cell import namesakes
+from enact_dist.errors import LinkError
+from enact_dist.link.namesakes import Doubts, moved_places, serving
+from enact_dist.link.shard_daemon import DaemonSettings, start_shard
+
+COUNT = Aspect("count", int)
+ASK_S = 10.0
+"""A machine with much other work is waited for; the product has other clients to serve."""
+
+
+@pytest.fixture
+def begin(tmp_path, monkeypatch, carrier):
+    """Start shards of a cell: `begin(name, listen, left=…, right=…)`; stopped after the test."""
+    monkeypatch.setattr("enact_dist.link.shard_daemon.PROBE_S", ASK_S)
+    monkeypatch.setattr(Doubts, "ASK_S", ASK_S)
+    monkeypatch.setattr(Doubts, "AGAIN_S", 0.0)
+    running = []
+
+    def start(name, listen, **places):
+        entries = tuple(ShardEntry(shard, (place,)) for shard, place in places.items())
+        pins = (Pin("left/**", "left"), Pin("right/**", "right"))
+        settings = ShardSettings(name, PlacementMap(1, entries, pins), worlds=("online",))
+        folder = tmp_path / f"{name}-{len(running)}"
+        daemon = DaemonSettings("cell", settings, (listen,), folder, carrier=carrier)
+        running.append(start_shard(daemon))
+        return running[-1]
+
+    yield start
+    for shard in running:
+        shard.stop(drain_s=0.0)
+
+
+def put(cell, entity, number):
+    """Commit a number."""
+    with Lock(write := Write(cell.world("online"), Entity(entity), COUNT), wait_s=30.0) as lock:
+        lock[write] = number
+
+
+def test_later_daemon_is_refused_where_other_shards_expect_the_first_one(begin, free):
+    """It has another folder and another endpoint; no client would know which one it talks to."""
+    first, second, right = free(), free(), free()
+    begin("left", first, left=first, right=right)
+    begin("right", right, left=first, right=right)
+
+    with pytest.raises(LinkError, match=r"shard left of cell cell already runs") as refused:
+        begin("left", second, left=second, right=right)
+
+    assert first in str(refused.value)
+    assert second in str(refused.value)
+
+
+def test_shard_is_refused_beside_another_one_that_runs_twice(begin, free):
+    """Nobody listened at that time who could have told the second one."""
+    first, second, right = free(), free(), free()
+    begin("left", first, left=first, right=right)
+    begin("left", second, left=second, right=right)
+    third = free()
+    begin("third", third, left=second, right=right, third=third)
+
+    with pytest.raises(LinkError, match=r"2 daemons serve shard left") as refused:
+        begin("right", right, left=first, right=right, third=third)
+
+    assert first in str(refused.value)
+    assert second in str(refused.value)
+
+
+def test_daemon_started_elsewhere_than_its_file_says_finds_the_one_there(begin, free):
+    """A cell of one shard has nobody else to ask but its own `cell.toml`."""
+    first, second = free(), free()
+    begin("left", first, left=first)
+    settings = ShardSettings("left", PlacementMap(1, (ShardEntry("left", (second,)),), ()))
+
+    with pytest.raises(LinkError, match="already runs"):
+        start_shard(DaemonSettings("cell", settings, (second,), written=(first,)))
+
+
+def test_same_daemon_at_another_address_is_no_second_one(begin, free):
+    """A restart at another address, and a host with two, go on as before."""
+    first, right = free(), free()
+    other = first.replace("127.0.0.1", "localhost")
+    begin("left", first, left=first, right=right)
+    begin("right", right, left=other, right=right)
+    with connect(first) as cell:
+        put(cell, "left/a", 1)
+        put(cell, "right/a", 1)
+        put(cell, "left/a", 2)
+        assert "shards_doubted" not in cell.statistics()
+        assert list(namesakes("cell", None, cell.welcomes())) == []
+    assert len(serving("cell", "left", (first, other), timeout_s=ASK_S)) == 1
+
+
+def test_client_that_hears_of_a_second_daemon_trusts_neither(begin, free):
+    """Its error names both and what to do; once one of them is gone the other is trusted."""
+    first, second, right = free(), free(), free()
+    begin("left", first, left=first, right=right)
+    impostor = begin("left", second, left=second, right=right)
+    begin("right", right, left=second, right=right)
+    with connect(first) as cell:
+        with pytest.raises(LinkError, match=r"2 daemons serve shard left") as refused:
+            for number in range(3):  # the first one brings the welcome of the other shard
+                put(cell, "right/a", number)
+                put(cell, "left/a", number)
+        assert first in str(refused.value)
+        assert second in str(refused.value)
+        assert cell.statistics()["shards_doubted"] == 1
+        (finding,) = namesakes("cell", None, cell.welcomes())
+        assert (finding.subject, first in finding.text, second in finding.text) == (
+            "shard left",
+            True,
+            True,
+        )
+        put(cell, "right/a", 7)  # the other shards go on
+
+        impostor.stop(drain_s=0.0)
+
+        put(cell, "left/a", 8)
+
+
+def test_doctor_asks_at_each_place_that_file_and_shards_name(begin, free):
+    """A copy of the cell with another endpoint is seen by whoever has its file."""
+    first, second = free(), free()
+    begin("left", first, left=first)
+    begin("left", second, left=second)
+    file = SimpleNamespace(
+        placement_map=lambda: PlacementMap(1, (ShardEntry("left", (second,)),), ())
+    )
+    with connect(first) as cell:
+        (finding,) = namesakes("cell", file, cell.welcomes())
+    assert "stop all but the one whose data count" in finding.remedy
+
+
+def test_only_places_that_share_nothing_are_looked_into():
+    """A shard with an address in common is the same one."""
+    known = {"a": ["x"], "b": ["x", "y"], "c": ["x"], "d": [], "e": ["x"]}
+    told = {"a": ["z"], "b": ["y", "z"], "c": [], "d": ["x"], "f": ["x"]}
+    assert moved_places(known, told.items()) == {"a": ["x", "z"]}
