@@ -63,11 +63,12 @@ ENCODING = b"e" * (limits.ENCODING_BYTES_MAX + 1)
          commit(WRITE._replace(datum=Datum(ENCODING + b"e", b"", 0)))),
         (commit(WRITE._replace(datum=Datum(b"", b"", 0, limits.INTEGER_MAX))),
          commit(WRITE._replace(datum=Datum(b"", b"", 0, limits.INTEGER_MAX + 1)))),
-        (m.Survey(("a",) * limits.ENTRIES_MAX, (), ()),
-         m.Survey(("a",) * (limits.ENTRIES_MAX + 1), (), ())),
+        (m.Registered(("a",) * limits.ENTRIES_MAX, ()),
+         m.Registered(("a",) * (limits.ENTRIES_MAX + 1), ())),
+        (m.Survey(("a",) * limits.ITEMS_MAX, (), ()), m.Survey(("a",) * (limits.ITEMS_MAX + 1), (), ())),
     ],
     ids=["items", "writes", "context", "entity", "aspect", "session", "lock session", "text",
-         "wide text", "report", "integer", "encoding", "stamp", "entries"],
+         "wide text", "report", "integer", "encoding", "stamp", "entries", "contexts"],
 )  # fmt: skip
 def test_message_at_its_limit_passes_and_one_over_is_refused(at, over):
     """The limit itself is allowed; beyond it ProtocolError names what was too much."""
