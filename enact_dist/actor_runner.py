@@ -402,7 +402,9 @@ class ActorRun:
 
     def _refused(self, entity: Entity | None, error: Exception) -> None:
         self._record.refused(error, unknown=isinstance(error, CommitUnknownError))
-        log.warning("%s%s: refused: %s", self.name, _about(entity), error)
+        recovers = isinstance(error, LeaseLostError) and error.restarted
+        level = logging.DEBUG if recovers else logging.WARNING
+        log.log(level, "%s%s: refused: %s", self.name, _about(entity), error)
 
     def _failed(self, entity: Entity | None, error: Exception) -> None:
         self._record.failed(error)

@@ -28,6 +28,11 @@
 
 from __future__ import annotations
 
+from typing import Final
+
+SHARD_RESTARTED: Final = "its shard restarted"
+"""How the cause begins of a lock that was lost with its shard's epoch."""
+
 
 class EnactError(Exception):
     """Base of all errors of enact_dist; raised only through its subclasses."""
@@ -149,6 +154,11 @@ class LeaseLostError(EnactError):
     def __init__(self, message: str, *, cause: str = "") -> None:
         super().__init__(message)
         self.cause = cause
+
+    @property
+    def restarted(self) -> bool:
+        """Whether its shard restarted: taken again, the lock is granted as before."""
+        return self.cause.startswith(SHARD_RESTARTED)
 
 
 class CommitUnknownError(EnactError):

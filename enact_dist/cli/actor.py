@@ -166,7 +166,7 @@ def _run(run: ActorRun, ready: Callable[[], None]) -> ActorStatistics:
     """Run an actor to its end.
 
     Raises:
-        EnactError: Its `start` or `stop` raised something of its own: it may do better next time.
+        MisuseError: Its `start` or `stop` raised something of its own.
     """
     try:
         return run.run(on_ready=ready)
@@ -174,7 +174,7 @@ def _run(run: ActorRun, ready: Callable[[], None]) -> ActorStatistics:
         raise
     except Exception as error:
         method = "start" if run.statistics().state == "starting" else "stop"
-        raise EnactError(f"{method} of actor {run.name} failed: {raised(error)}") from error
+        raise MisuseError(f"{method} of actor {run.name} failed: {raised(error)}") from error
 
 
 def _bound(

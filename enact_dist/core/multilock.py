@@ -56,6 +56,7 @@ from enact_dist.core.messages import (
 )
 from enact_dist.core.phase import Phase
 from enact_dist.core.placement import shard_of
+from enact_dist.errors import SHARD_RESTARTED
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -486,7 +487,7 @@ class MultiLock:
         elif answer.epoch == finishing.token.epoch:
             finishing.ask_outcome = False  # it never arrived: send it (again)
         else:
-            self.cause = "its shard restarted before the commit arrived"
+            self.cause = f"{SHARD_RESTARTED} before the commit arrived"
             self._end(Phase.LOST)
 
     def _committed(self, position: Position, versions: tuple[SlotVersion, ...]) -> None:

@@ -18,7 +18,13 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.datum import Datum
 from enact_dist.core.messages import EpochChanged, Refused, Stage, Staged, WriteItem
-from enact_dist.errors import EnactError, LeaseLostError, ProtocolError, ShardUnreachableError
+from enact_dist.errors import (
+    SHARD_RESTARTED,
+    EnactError,
+    LeaseLostError,
+    ProtocolError,
+    ShardUnreachableError,
+)
 from enact_dist.link.calls import CALL_S
 from enact_dist.link.refusals import error_of
 from enact_dist.link.session_client import FIRST_STAGED
@@ -129,7 +135,7 @@ def _check_staged(shard: str, file: str, answer: Answer) -> None:
         raise LeaseLostError(
             f"shard {shard} has restarted, or ended this session, while data were on their way to"
             " it: the lock is lost and nothing was written; take it again and redo the work",
-            cause="its shard restarted",
+            cause=SHARD_RESTARTED,
         )
     if isinstance(answer, Refused):
         raise error_of(answer)

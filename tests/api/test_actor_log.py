@@ -13,6 +13,7 @@ from enact_dist.actor_log import KINDS_MAX, PAUSE_NS_MAX, PAUSE_NS_MIN, Repeated
 from enact_dist.actor_runner import run_actor
 from enact_dist.actor_sets import PendingSets
 from enact_dist.connecting import local
+from enact_dist.errors import SHARD_RESTARTED, LeaseLostError
 from enact_dist.terms import Aspect, Entity, World, Write
 from enact_dist.together import Captured
 
@@ -125,3 +126,27 @@ def test_dead_camera_is_one_line_and_a_count(caplog):
         "incomplete set",
         "19 more incomplete sets, the newest a set",
     ]
+
+
+@pytest.mark.parametrize(
+    ("cause", "lines"), [(f"{SHARD_RESTARTED} before the commit arrived", 0), ("lease expired", 1)]
+)
+def test_a_shard_that_was_started_again_is_no_line_of_an_actor(caplog, cause, lines):
+    """The update runs again by itself; what is counted and shown by actor ls is all there is."""
+
+    class Unlucky(Actor):
+        count = Write(World("online"), Entity("unlucky"), Aspect("count", int))
+        tries = 0
+
+        def update(self, lock):
+            self.tries += 1
+            if self.tries == 1:
+                raise LeaseLostError("lost", cause=cause)
+            lock[self.count] = self.tries
+
+    caplog.set_level(logging.INFO, logger="enact.actor")
+    with local(worlds=["online"]) as cell:
+        statistics = run_actor(Unlucky(), cell, stop=threading.Event())
+
+    assert (statistics.updates, statistics.refused) == (1, 1)
+    assert len([line for line in caplog.messages if "refused" in line]) == lines
