@@ -95,7 +95,8 @@ class Lock(Triggered):
 
     Args:
         requests: What to read, write and view; of one cell, of any of its contexts and shards.
-            Writes on several shards become visible all or none, whatever crashes.
+            Writes on several shards become visible all or none, whatever crashes.  At most 4,096
+            requests, and at most 4,096 written data.
         wait_s: How long to wait for the grant.
         hold_s: How long it may be held at most after the grant.
 
@@ -123,8 +124,9 @@ class Lock(Triggered):
             raise MisuseError("a lock of nothing: name at least one request")
         if len(requests) > ITEMS_MAX:
             raise MisuseError(
-                f"a lock of {len(requests)} requests; at most {ITEMS_MAX}: name a pattern"
-                " (ReadEach, WriteEach, ViewEach) instead"
+                f"a lock of {len(requests)} requests; at most {ITEMS_MAX}: a pattern (ReadEach,"
+                " WriteEach, ViewEach) is one request and shows all that match, of which one lock"
+                f" writes at most {ITEMS_MAX}"
             )
         check_seconds("wait_s", wait_s)
         check_seconds("hold_s", hold_s)

@@ -40,7 +40,10 @@ def take_snapshot(
     if not requests:
         raise MisuseError("a view of nothing: name at least one View or ViewEach")
     if len(requests) > ITEMS_MAX:
-        raise MisuseError(f"a view of {len(requests)} requests; at most {ITEMS_MAX}: use ViewEach")
+        raise MisuseError(
+            f"a view of {len(requests)} requests; at most {ITEMS_MAX}: a ViewEach is one"
+            " request and shows all that match"
+        )
     session = session_of(requests, view=True)
     session.client.check_usable()
     for request in requests:

@@ -124,7 +124,10 @@ class Writing:
         old = self.data.get(slot)
         size += self._bytes - (old.size if old else 0)
         if slot not in self.data and len(self.data) >= ITEMS_MAX:
-            raise MisuseError(f"one lock writes at most {ITEMS_MAX} data; use several locks")
+            raise MisuseError(
+                f"one lock writes at most {ITEMS_MAX} data, of patterns too; use several locks,"
+                " each atomic by itself, or keep what belongs together in one datum"
+            )
         if size > BODY_BYTES_MAX:
             raise MisuseError(
                 f"the writes of one lock have {size} bytes; at most {BODY_BYTES_MAX}: use several"

@@ -5,7 +5,7 @@ import threading
 import msgpack
 import pytest
 
-from enact_dist import connect
+from enact_dist import Aspect, Durability, Entities, Entity, Lock, WriteEach, connect
 from enact_dist.core import pages
 from enact_dist.core.datum import LockId, Position, Slot
 from enact_dist.core.messages import (
@@ -19,7 +19,9 @@ from enact_dist.core.messages import (
     Welcome,
 )
 from enact_dist.core.records import Reply
+from enact_dist.errors import MisuseError
 from enact_dist.link.shard_health import of_endpoint
+from enact_dist.wire import frames
 
 SESSIONS = 300
 both = pytest.mark.carrier("socket", "zenoh")
@@ -99,3 +101,24 @@ def test_answer_that_cannot_be_sent_is_refused_by_name(
     assert found.code == "too_long"
     assert "OutcomeIs has a header of" in found.text
     assert host._shard.counters["answers_refused"] == 1
+
+
+@both
+def test_lock_that_shows_more_than_an_answer_holds_is_refused_and_held_by_nobody(
+    daemon, endpoint, monkeypatch
+):
+    """The shard has granted it: the refusal must give it back."""
+    count = Aspect("count", int, Durability.VOLATILE)
+    daemon(endpoint)
+    with connect(endpoint) as cell:
+        online = cell.world("online")
+        for number in range(60):
+            online.init(Entity(f"tray/{number:0100}"), count, number)
+        with monkeypatch.context() as short:
+            short.setattr(frames, "HEADER_BYTES_MAX", 5_000)
+            with pytest.raises(
+                MisuseError, match=r"Granted has a header of .* ask for less at once"
+            ):
+                Lock(WriteEach(online, Entities("tray/*"), count), wait_s=30.0).__enter__()
+
+        assert cell.locks() == ()
