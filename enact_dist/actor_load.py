@@ -1,7 +1,8 @@
 """`MODULE:CLASS` and options, as a command line or `cell.toml` writes them, made into an actor.
 
-An option is a keyword parameter of the class's `__init__`; its annotation says how the text is
-read.  Everything wrong is a `ConfigError` that names the parameter, the text and what was wanted.
+An option is a keyword parameter of the class's `__init__`, or an attribute that the class annotates
+and gives a value; its annotation says how the text is read.  Everything wrong is a `ConfigError`
+that names the parameter, the text and what was wanted.
 """
 
 from __future__ import annotations
@@ -160,8 +161,12 @@ def make_actor(actor_class: type[Actor], options: Mapping[str, object]) -> Actor
         ConfigError: An unknown, missing or unreadable option, or `__init__` refused a value.
     """
     arguments = read_options(actor_class, options)
+    changeable = attributes_of(actor_class)
+    at_start = inspect.signature(actor_class).parameters
     try:
-        return actor_class(**arguments)
+        actor = actor_class(**{key: arguments[key] for key in arguments if key in at_start})
+        for key in arguments.keys() & changeable.keys() - at_start.keys():
+            setattr(actor, key, arguments[key])
     except ValueError as error:
         name = actor_class.__name__
         raise ConfigError(f"actor {name} refuses its options {dict(options)}: {error}") from error
@@ -170,10 +175,38 @@ def make_actor(actor_class: type[Actor], options: Mapping[str, object]) -> Actor
             f"{name}.__init__ called sys.exit({error.code!r}) at {place_of(error)}; it has to"
             " return, or to raise what is wrong"
         ) from error
+    return actor
+
+
+def attributes_of(actor_class: type[Actor]) -> dict[str, object]:
+    """Return the parameters of a class that are attributes: name to annotation.
+
+    They stand in the class, or in one between it and `Actor`, with an annotation and a value::
+
+        class Camera(Actor):
+            gain: float = 0.5
+    """
+    found: dict[str, object] = {}
+    for one in reversed(actor_class.__mro__):
+        if not issubclass(one, Actor) or one is Actor:
+            continue
+        hints = typing.get_type_hints(one)
+        for name in inspect.get_annotations(one):
+            readable = not name.startswith("_") and not hasattr(Actor, name)
+            if readable and hasattr(one, name) and _is_option(hints[name]):
+                found[name] = hints[name]
+    return found
+
+
+def _is_option(annotation: object) -> bool:
+    if typing.get_origin(annotation) in (typing.Union, types.UnionType):
+        kinds = [kind for kind in typing.get_args(annotation) if kind is not type(None)]
+        return len(kinds) == 1 and kinds[0] in _WANTED
+    return annotation in _WANTED
 
 
 def read_options(actor_class: type[Actor], options: Mapping[str, object]) -> dict[str, Option]:
-    """Read options by the annotations of an actor class's `__init__`.
+    """Read options by the annotations of an actor class's `__init__`, and of its attributes.
 
     Raises:
         ConfigError: An unknown, missing or unreadable option.
@@ -184,11 +217,13 @@ def read_options(actor_class: type[Actor], options: Mapping[str, object]) -> dic
         if parameter.kind in (parameter.POSITIONAL_OR_KEYWORD, parameter.KEYWORD_ONLY)
     }
     name = actor_class.__name__
+    attributes = attributes_of(actor_class)
+    known = dict.fromkeys((*parameters, *attributes))
     for option in options:
-        if option not in parameters:
+        if option not in known:
             raise ConfigError(
                 f"actor {name} has no option {option!r}; it has"
-                f" {', '.join(parameters) or 'none'}{suggestion(option, parameters)}"
+                f" {', '.join(known) or 'none'}{suggestion(option, known)}"
             )
     missing = [
         option
@@ -197,7 +232,7 @@ def read_options(actor_class: type[Actor], options: Mapping[str, object]) -> dic
     ]
     if missing:
         raise ConfigError(f"actor {name} needs the option {', '.join(missing)}")
-    hints = typing.get_type_hints(actor_class.__init__)
+    hints = attributes | typing.get_type_hints(actor_class.__init__)
     return {
         option: read_option(f"option {option} of actor {name}", value, hints.get(option, str))
         for option, value in options.items()

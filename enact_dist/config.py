@@ -74,7 +74,11 @@ shared_bytes_max       none           cap of each shard's large data in the memo
 [actors.NAME]          none           an actor process
   class                required       ``package.module:Class``
   worlds               {}             role of the class = world context of the cell
-  options              {}             keyword arguments of the class
+  args                 {}             parameters of the class: of its `__init__`, or attributes that
+                                      the class annotates and gives a value; `enact actor set`
+                                      changes attributes while the actor runs
+  options              {}             the older name for those of `__init__`
+  env                  {}             environment variables of its process, texts
   every_s              the class's    period of a source, seconds
   entity               all            the one entity that it works on, of those that the patterns
                                       of its class match: one class for several cameras
@@ -136,6 +140,7 @@ __all__ = [
     "parse_config",
 ]
 
+_VARIABLE: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
 _EXAMPLE: Final = "tcp/127.0.0.1:7447"
 _DOTTED_NAME: Final = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*\Z")
 
@@ -380,7 +385,9 @@ def _retention(table: Table) -> Retention | None:
 
 
 def _actor(name: str, table: Table, worlds: tuple[str, ...]) -> ActorConfig:
-    table.refuse_unknown("class", "worlds", "options", "every_s", "entity", "host", "drain_s")
+    table.refuse_unknown(
+        "class", "worlds", "args", "options", "env", "every_s", "entity", "host", "drain_s"
+    )
     _check_title(name, "actor", table)
     class_path = table.take_str("class")
     if not _DOTTED_NAME.match(class_path):
@@ -392,12 +399,28 @@ def _actor(name: str, table: Table, worlds: tuple[str, ...]) -> ActorConfig:
         name=name,
         class_path=class_path,
         worlds=_roles(table.take_table("worlds"), worlds),
-        options=MappingProxyType(dict(table.take_table("options").values)),
+        options=_args(table),
+        env=_env(table.take_table("env")),
         every_s=every_s,
         entity=_entity(table),
         host=_host(table),
         drain_s=_drain_s(table),
     )
+
+
+def _args(table: Table) -> Mapping[str, object]:
+    args, options = table.take_table("args"), table.take_table("options")
+    for name in args.values:
+        if name in options.values:
+            args.refuse(name, f"{name!r} stands in args and in options of {table.title}")
+    return MappingProxyType({**options.values, **args.values})
+
+
+def _env(table: Table) -> Mapping[str, str]:
+    for name in table.values:
+        if not _VARIABLE.match(name):
+            table.refuse(name, f"{name!r} is no name of a variable of the environment")
+    return MappingProxyType({name: table.take_str(name, "") for name in table.values})
 
 
 def _entity(table: Table) -> str:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.config_shows import GUESSED, Shows
@@ -86,7 +86,8 @@ class ActorConfig:
         name: Its name in the cell.
         class_path: ``package.module:Class``.
         worlds: Role of the actor class to world context of the cell.
-        options: Keyword arguments of the class, as TOML gives them.
+        options: Parameters of the class (`args`), as TOML gives them.
+        env: Environment variables of its process.
         every_s: Period in seconds that replaces the one of a source, or ``None``.
         entity: The one entity that it works on, of those that its patterns match; empty: all.
         host: Host name of the machine it runs on; empty: wherever `enact up` is called.
@@ -102,6 +103,7 @@ class ActorConfig:
     entity: str = ""
     host: str = ""
     drain_s: float | None = None
+    env: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)

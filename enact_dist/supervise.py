@@ -24,8 +24,8 @@ import sys
 import termios
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Final
 
 from enact_dist.errors import EnactError
@@ -57,12 +57,14 @@ class Task:
         kind: "shard" or "actor"; decides the order of start and end.
         command: What to run.
         drain_s: How long it was told to wait for others before it ends.
+        env: Environment variables that it has beside those of the supervisor.
     """
 
     name: str
     kind: str
     command: tuple[str, ...]
     drain_s: float = 0.0
+    env: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def end_s(self) -> float:
@@ -115,7 +117,12 @@ class _Child:
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             bufsize=0,
-            env={**os.environ, SUPERVISOR_VARIABLE: str(os.getpid()), "PYTHONUNBUFFERED": "1"},
+            env={
+                **os.environ,
+                **self.task.env,
+                SUPERVISOR_VARIABLE: str(os.getpid()),
+                "PYTHONUNBUFFERED": "1",
+            },
             process_group=0,  # Ctrl-C on the terminal is the supervisor's to pass on, in order
         )
         threading.Thread(target=self._read, args=(self._process,), daemon=True).start()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import socket
+import sys
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -47,7 +48,7 @@ from enact_dist.user_code import raised
 
 if TYPE_CHECKING:
     import argparse
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Mapping
 
     from enact_dist.actor import Actor
     from enact_dist.actor_report import ActorStatistics
@@ -250,6 +251,7 @@ def _made(arguments: argparse.Namespace) -> tuple[Actor, str, dict[str, str] | N
             )
         if options:
             raise ConfigError(f"the options of {entry.name} stand in {config.path}; leave --option")
+        _begin_with(entry.env)
         actor = configured_actor(entry)
         name = entry.name
         drain_s = entry.drain_s if drain_s is None else drain_s
@@ -265,6 +267,16 @@ def _made(arguments: argparse.Namespace) -> tuple[Actor, str, dict[str, str] | N
         raise ConfigError(str(error)) from None
     name = arguments.name or name or name_of(actor)
     return actor, name, worlds, DRAIN_S if drain_s is None else drain_s
+
+
+def _begin_with(env: Mapping[str, str]) -> None:
+    """Begin this process anew with these variables, unless it has them.
+
+    Libraries read some when they are loaded, which they are by now.
+    """
+    if any(os.environ.get(name) != value for name, value in env.items()):
+        command = [sys.executable, *sys.orig_argv[1:]]
+        os.execve(command[0], command, {**os.environ, **env})  # noqa: S606 - itself
 
 
 def _cell_file(arguments: argparse.Namespace) -> Path | None:

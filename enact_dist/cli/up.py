@@ -6,6 +6,7 @@ import json
 import socket
 import sys
 import time
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.cli.output import coloured
@@ -17,11 +18,13 @@ from enact_dist.cli.verbs import (
     cell_config,
     see_modules,
 )
+from enact_dist.config_table import suggestion
 from enact_dist.errors import ConfigError, LinkError
 from enact_dist.link.signals import StopSignals
 
 if TYPE_CHECKING:
     import argparse
+    from collections.abc import Sequence
 
     from enact_dist.cli.verbs import Verb
     from enact_dist.config_types import CellConfig, ShardConfig
@@ -40,7 +43,8 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
         "up",
         "run every shard and actor of a cell on this machine until Ctrl-C",
         run=run_up,
-        example="enact up cell.toml\nenact up cell.toml --no-actors",
+        example="enact up cell.toml\nenact up cell.toml --no-actors\n"
+        "enact up cell.toml --without camera planner",
     )
     up.add_argument(
         "cell",
@@ -50,6 +54,14 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
     )
     up.add_argument("--host", metavar="NAME", help="act as this machine (default: its host name)")
     up.add_argument("--no-actors", action="store_true", help="run the shards only")
+    for option, what in (("--only", "run these"), ("--without", "run all but these")):
+        up.add_argument(
+            option,
+            nargs="+",
+            default=[],
+            metavar="NAME",
+            help=f"{what} shards and actors of this machine",
+        )
     add_log(up)
 
 
@@ -60,18 +72,23 @@ def run_up(arguments: argparse.Namespace) -> int:
     config = cell_config(arguments)
     see_modules(config.path)
     host = arguments.host or socket.gethostname()
-    shards = [shard for shard in config.shards if shard.host in {"", host}]
-    actors = [actor for actor in config.actors if actor.host in {"", host}]
+    chosen = _chosen(config, arguments)
+    shards = [one for one in config.shards if one.host in {"", host} and one.name in chosen]
+    actors = [one for one in config.actors if one.host in {"", host} and one.name in chosen]
     actors = [] if arguments.no_actors else actors
     if not shards and not actors:
         raise ConfigError(f"no shard and no actor of {config.path} runs on host {host!r}")
+    _refuse_homeless(config, shards, host)
     if actors:
         _refuse_misfits(config)
     for shard in shards:
         _refuse_second(config, shard)
     tasks = [
         *(_task(config, "shard", shard.name, arguments.log, shard.drain_s) for shard in shards),
-        *(_task(config, "actor", actor.name, arguments.log, actor.drain_s) for actor in actors),
+        *(
+            replace(_task(config, "actor", one.name, arguments.log, one.drain_s), env=one.env)
+            for one in actors
+        ),
     ]
     say: Say = _Log([task.name for task in tasks])
     if arguments.log == "json":
@@ -81,6 +98,49 @@ def run_up(arguments: argparse.Namespace) -> int:
         status = Supervisor(tasks, say).run(stop.event, count=lambda: stop.count)
     say("", "down")
     return status
+
+
+def _chosen(config: CellConfig, arguments: argparse.Namespace) -> set[str]:
+    """Return the names of the shards and actors that are to run, wherever they belong.
+
+    Raises:
+        ConfigError: The cell has none of a name that was given.
+    """
+    known = {one.name for one in config.shards} | {one.name for one in config.actors}
+    for name in (*arguments.only, *arguments.without):
+        if name not in known:
+            raise ConfigError(
+                f"{config.path} has no shard and no actor {name!r}{suggestion(name, known)} (it has"
+                f" {', '.join(sorted(known))})"
+            )
+    return (set(arguments.only) or known) - set(arguments.without)
+
+
+def _refuse_homeless(config: CellConfig, shards: Sequence[ShardConfig], host: str) -> None:
+    """Refuse to start shards that say nowhere where they run, in a cell of several machines.
+
+    Raises:
+        ConfigError: Each machine would start them; the message says what to write.
+    """
+    from enact_dist.link.endpoints import is_of_this_host
+
+    hosts = {one.host for one in config.shards} | {one.host for one in config.actors}
+    named = sorted(hosts - {""})
+    for shard in shards:
+        if shard.host:
+            continue
+        where = f"[shards.{shard.name}] of {config.path}"
+        if named:
+            raise ConfigError(
+                f"{where} names no host, and the cell has machines ({', '.join(named)}): `enact up`"
+                f' would start the shard on each; write host = "{host}" there if it runs here'
+            )
+        strange = [endpoint for endpoint in shard.listen if not is_of_this_host(endpoint)]
+        if strange:
+            raise ConfigError(
+                f"shard {shard.name} listens at {strange[0]}, which is no address of this machine;"
+                f" name the machine that runs it as `host` in {where}"
+            )
 
 
 def _refuse_misfits(config: CellConfig) -> None:
@@ -113,7 +173,8 @@ def _refuse_second(config: CellConfig, shard: ShardConfig) -> None:
     """
     from enact_dist.link.endpoints import somebody_listens
 
-    if not any(somebody_listens(endpoint) for endpoint in shard.listen):
+    elsewhere = [endpoint for endpoint in shard.advertise if endpoint not in shard.listen]
+    if not any(somebody_listens(endpoint) for endpoint in (*shard.listen, *elsewhere)):
         return
     from enact_dist.link.shard_daemon import DRAIN_S, DaemonSettings, refuse_second_daemon
     from enact_dist.supervise import END_S
@@ -126,7 +187,13 @@ def _refuse_second(config: CellConfig, shard: ShardConfig) -> None:
     while True:
         try:
             refuse_second_daemon(settings, probe_s=ANSWER_S)
-        except LinkError:
+        except LinkError as error:
+            if not shard.host and not any(somebody_listens(one) for one in shard.listen):
+                raise LinkError(
+                    f"{error}; if that is another machine, name it as `host` in"
+                    f" [shards.{shard.name}] of {config.path}, so that `enact up` starts the shard"
+                    " there alone"
+                ) from error
             if time.monotonic() > end_s:
                 raise
             if not told:

@@ -5,6 +5,7 @@ Nothing of Zenoh is loaded here.
 
 from __future__ import annotations
 
+import errno
 import queue
 import socket
 import threading
@@ -40,6 +41,27 @@ def somebody_listens(endpoint: str) -> bool:
     except (OSError, ValueError):
         return False
     return True
+
+
+def is_of_this_host(endpoint: str) -> bool:
+    """Say whether this host may listen at an endpoint; so it is where nobody can tell."""
+    protocol, host, port = split_endpoint(endpoint)
+    if protocol != "tcp" or not port.isdecimal():
+        return True
+    try:
+        found = socket.getaddrinfo(host.strip("[]"), 0, type=socket.SOCK_STREAM)
+    except (OSError, ValueError):
+        return True
+    for family, kind, protocol_number, _, address in found:
+        try:
+            with socket.socket(family, kind, protocol_number) as probe:
+                probe.bind(address)
+        except OSError as error:
+            if error.errno != errno.EADDRNOTAVAIL:
+                return True
+        else:
+            return True
+    return False
 
 
 def unknown_hosts(endpoints: Sequence[str]) -> list[str]:
