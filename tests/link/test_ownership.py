@@ -1,11 +1,16 @@
 """Over either carrier: nobody speaks for another's session, and each message comes on its own key."""
 
+import re
+from pathlib import Path
+
 import pytest
 import zenoh
 
 from enact_dist.core import messages as m
+from enact_dist.core import parked, quotas, sessions
 from enact_dist.core.datum import Datum, LockId, Position
 from enact_dist.errors import PermissionDeniedError, ProtocolError
+from enact_dist.link import payload_desk, socket_service
 from enact_dist.link.refusals import error_of
 from enact_dist.link.zenoh_carrier import wait_connected
 from enact_dist.link.zenoh_config import MESSAGE_BYTES_MAX, close_session, open_session
@@ -13,6 +18,7 @@ from enact_dist.wire.frames import decode_frame, encode_frame
 from enact_dist.wire.keys import request_key, verb_of
 from enact_dist.wire.limits import COMMIT_BYTES_MAX, FRAME_BYTES_MAX
 
+PAGE = Path(__file__).parents[2] / "enact_dist" / "docs" / "security.md"
 both = pytest.mark.parametrize("carry", ["zenoh", "socket"], indirect=True)
 
 
@@ -168,3 +174,22 @@ def test_frame_beyond_the_bound_is_not_kept_and_the_next_one_served(daemon, endp
 
     assert not answered
     assert isinstance(stranger(m.Ping(), "eve@h:1"), m.Pong)
+
+
+def test_page_on_security_says_the_bounds_that_hold():
+    """Each figure of its table is that of the code."""
+    rows = dict(re.findall(r"^\| ([^|]+) \| ([^|]+) \|", PAGE.read_text("utf-8"), re.MULTILINE))
+    held = {
+        "sessions": quotas.SESSIONS_MAX,
+        "sessions of a shard": sessions.SESSIONS_MAX,
+        "locks held or awaited": quotas.WAITERS_MAX,
+        "socket connections": socket_service.PROCESS_CONNECTIONS_MAX,
+        "questions that wait": parked.OF_A_SESSION_MAX,
+        "one message": FRAME_BYTES_MAX >> 20,
+        "data that travel with their commit": COMMIT_BYTES_MAX >> 20,
+    }
+    said = {what: int(rows[what].split()[0].replace(",", "")) for what in held}
+
+    assert said == held
+    assert f"{socket_service.KEPT_FREE} of {socket_service.CONNECTIONS_MAX:,} are free" in str(rows)
+    assert payload_desk.SHARES == 4
