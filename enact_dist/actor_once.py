@@ -220,12 +220,16 @@ class Once:
             lock.end()
             raise
 
-    def sweep(self) -> None:
-        """Record what an earlier run of this actor has left as taken, whatever triggers now.
+    def sweep(self) -> bool:
+        """Record what earlier runs of this actor have left as taken, whatever triggers now.
+
+        Returns:
+            Whether nothing is left: no session of such a run lives any more.
 
         Raises:
-            LinkError: A shard does not answer; what is triggered is looked at all the same.
+            LinkError: A shard does not answer.
         """
+        left = False
         declared = self._bound.declaration.outcome
         assert declared is not None
         context = self._bound.contexts[declared.world.name]
@@ -234,8 +238,11 @@ class Once:
             view = View(context, info.entity, declared.aspect)
             last = context.view(view).get(view)
             if last is not None and last.state == "taken":
-                with contextlib.suppress(TakenError):
+                try:
                     self._close(Write(context, info.entity, declared.aspect), last)
+                except TakenError:
+                    left = True
+        return not left
 
     def _request(self, lock: OnceLock) -> Write[Outcome]:
         declared = self._bound.declaration.outcome

@@ -26,6 +26,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import math
 import random
 import threading
 from collections.abc import Callable, Mapping
@@ -70,6 +71,8 @@ STOP_LOOK_S: Final = 0.1
 """An idle actor looks at `stop` this often; an `Event` and a `Condition` cannot be awaited both."""
 
 REPORT_EVERY_NS: Final = 1_000_000_000
+SWEEP_NS: Final = 2_000_000_000
+"""How often an actor with `once` looks for what a process before it has left, until it is gone."""
 LOOK_OUT_S: Final = 1.0
 NOTHING: Final = "nothing of it was written"
 """What remains of an update that is cut off: its lock ends with its process."""
@@ -258,13 +261,13 @@ class ActorRun:
         return False
 
     def _run_triggered(self) -> None:
-        if self._once is not None:
-            try:
-                self._once.sweep()
-            except LinkError as error:
-                log.warning("%s: what was taken before is not known yet: %s", self.name, error)
+        sweep_ns: float = 0 if self._once is not None else math.inf
         with watching(self._bound, self._inbox) as changes:
             while not self._stop.is_set():
+                if self._once is not None and monotonic_ns() >= sweep_ns:
+                    sweep_ns = (
+                        monotonic_ns() + SWEEP_NS if not self._swept(self._once) else math.inf
+                    )
                 trigger = changes.take(STOP_LOOK_S)
                 if trigger is not None:
                     attempt = self._attempt if self._once is None else self._attempt_once
@@ -273,6 +276,13 @@ class ActorRun:
                         pause_s = self._pause_s(trigger.refused)
                         self._inbox.postpone(trigger, monotonic_ns() + round(pause_s * 1e9))
                 self._report()
+
+    def _swept(self, once: Once) -> bool:
+        try:
+            return once.sweep()
+        except REFUSALS as error:
+            log.warning("%s: what was taken before is not known yet: %s", self.name, error)
+            return False
 
     def _run_sets(self, inbox: SetInbox) -> None:
         """Run once per complete set: first for the newest one that there is, then as they come."""

@@ -298,6 +298,23 @@ def test_version_that_was_deleted_meanwhile_is_closed_too(cell, online):
         assert until(online, "interrupted").version == 1
 
 
+@pytest.mark.slow
+def test_version_of_a_session_that_still_seems_to_live_is_closed_when_it_is_over(two_shards):
+    """No trigger is needed for it: the actor looks again until the other's lease has ended."""
+    online = two_shards.cell.world("online")
+    other = two_shards.connect(actor="before")
+    write(online, PLAN, [1])
+    left = taken_by(online, other._client.core.session)
+    write(online, PLAN, None)
+
+    with ActorThread(Robot(), two_shards.cell) as thread:
+        while thread.statistics().state != "running":
+            pass
+        assert read(online, OUTCOME) == left
+        other.close()
+        assert until(online, "interrupted").version == 1
+
+
 def test_two_processes_of_one_actor_do_not_act_both(cell, online, caplog):
     """While the taker's session lives, the other one waits; it does not call it interrupted."""
     write(online, PLAN, [1])
