@@ -12,6 +12,8 @@ from typing import Any, TypeVar
 
 from enact_dist.errors import MisuseError
 from enact_dist.terms import Aspect, Context, Entities, Entity, wrong_argument
+from enact_dist.wire.limits import REASON_CHARACTERS_MAX
+from enact_dist.wire.texts import is_safe, shown
 
 T = TypeVar("T")
 
@@ -37,6 +39,19 @@ def check_seconds(name: str, found: object) -> None:
         raise MisuseError(f"{name} is {found!r}; it must be 0 or more seconds")
     remedy = f"; write float({found!r})" if isinstance(found, str) else ""
     raise MisuseError(f"{name} is {found!r}; it must be a number of seconds{remedy}")
+
+
+def check_reason(name: str, found: str) -> None:
+    """Raise `MisuseError` unless a text may stand in the audit and in one line of a table."""
+    if len(found) > REASON_CHARACTERS_MAX:
+        raise MisuseError(
+            f"{name} has {len(found)} characters; at most {REASON_CHARACTERS_MAX} are kept"
+        )
+    if not is_safe(found):
+        raise MisuseError(
+            f"{name} is {shown(found[:60])!r}; it may hold no line breaks and no other control"
+            " characters"
+        )
 
 
 def check_pattern(call: str, name: str, found: object) -> None:

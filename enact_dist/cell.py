@@ -11,6 +11,7 @@ import contextlib
 import time
 from typing import TYPE_CHECKING, Any
 
+from enact_dist.arguments import check_reason
 from enact_dist.asking import await_stamp
 from enact_dist.aspect_info import AspectInfo, aspect_infos
 from enact_dist.cell_info import (
@@ -304,9 +305,10 @@ class Cell(Closing):
             What the lock was, or None if no such lock is held or awaited.
 
         Raises:
-            MisuseError: The cell has no such shard.
+            MisuseError: The cell has no such shard, or the reason is too long or no one line.
             ShardUnreachableError: The shard does not answer.
         """
+        check_reason("reason", reason)
         return self._ended_by_hand(shard, Break(number, reason, self._epoch(shard)))
 
     def force_abort(self, number: int, *, shard: str, reason: str) -> LockInfo | None:
@@ -318,9 +320,10 @@ class Cell(Closing):
             What the lock was, or None if no such lock is in doubt.
 
         Raises:
-            MisuseError: The cell has no such shard.
+            MisuseError: The cell has no such shard, or the reason is too long or no one line.
             ShardUnreachableError: The shard does not answer.
         """
+        check_reason("reason", reason)
         return self._ended_by_hand(shard, ForceAbort(number, reason, self._epoch(shard)))
 
     def audit(self, shards: Iterable[str] | None = None) -> tuple[AuditInfo, ...]:
@@ -346,11 +349,12 @@ class Cell(Closing):
         """Say that somebody has seen to all alarms of a shard so far; audited by the shard.
 
         Raises:
-            MisuseError: The cell has no such shard, or `how` says nothing.
+            MisuseError: The cell has no such shard, or `how` says nothing, or too much.
             ShardUnreachableError: The shard does not answer.
         """
         if not how.strip():
             raise MisuseError("alarms are settled by saying how: how='' says nothing")
+        check_reason("how", how)
         self._check_shard(shard)
         seen = self._client.call(shard, ListAudit(""))
         stamps_ns = [e.wall_ns for e in seen.entries] if isinstance(seen, Audited) else []

@@ -16,6 +16,8 @@ from enact_dist.core.messages import PlacementMap, ShardEntry, Welcome
 from enact_dist.errors import ConfigError, LinkError, MisuseError
 from enact_dist.link.endpoints import split_endpoint
 from enact_dist.terms import checked_name
+from enact_dist.wire.limits import NAME_CHARACTERS_MAX
+from enact_dist.wire.texts import is_safe, shown
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -185,11 +187,25 @@ _ENDPOINT: Final = "an endpoint looks like 'tcp/host:7447'"
 _PROTOCOLS: Final = frozenset(("tcp", "udp", "tls", "quic", "ws", "unixsock-stream"))
 
 
+def _checked_actor(actor: str) -> str:
+    """Return a name that may stand in logs and tables of others.
+
+    Raises:
+        ConfigError: It has a character that could not, or is too long.
+    """
+    if is_safe(actor) and len(actor) <= NAME_CHARACTERS_MAX:
+        return actor
+    raise ConfigError(
+        f"an actor cannot be called {shown(actor[:60])!r}: a name has at most"
+        f" {NAME_CHARACTERS_MAX} characters, and no line breaks or other control characters"
+    )
+
+
 def _client(actor: str, *, ttl_s: float, observer: bool) -> Client:
     return Client(
         secrets.token_hex(16),
         ttl_ns=int(ttl_s * 1e9),
-        actor=actor or Path(sys.argv[0] or "python").stem or "python",
+        actor=_checked_actor(actor) or shown(Path(sys.argv[0] or "python").stem) or "python",
         host=socket.gethostname(),
         pid=os.getpid(),
         observer=observer,

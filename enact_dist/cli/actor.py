@@ -41,7 +41,7 @@ from enact_dist.errors import (
     ProtocolError,
     UnknownWorldError,
 )
-from enact_dist.link.log import READY, TEXT, JsonLines, say
+from enact_dist.link.log import READY, JsonLines, TextLines, say
 from enact_dist.link.service_manager import ServiceManager
 from enact_dist.link.signals import StopSignals
 from enact_dist.user_code import raised
@@ -138,7 +138,7 @@ def run_actor(arguments: argparse.Namespace) -> int:
     """Run one actor until it is done or a signal comes."""
     manager = ServiceManager()
     json_lines = JsonLines(process=f"actor {arguments.name or arguments.target}")
-    formatter = json_lines if arguments.log == "json" else logging.Formatter(TEXT)
+    formatter = json_lines if arguments.log == "json" else TextLines()
     _log_to_stderr(formatter)
     actor, name, worlds, drain_s = _made(arguments)  # a signal ends an import at once
     with StopSignals() as signals:

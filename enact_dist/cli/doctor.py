@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from enact_dist.cli.output import coloured, print_json
 from enact_dist.cli.verbs import DONE, FAILED, add_reader, add_verb, cell_target
 from enact_dist.errors import ConfigError
+from enact_dist.wire.texts import shown
 
 if TYPE_CHECKING:
     import argparse
@@ -39,7 +40,7 @@ def run_doctor(arguments: argparse.Namespace) -> int:
         findings.append(finding)
         if not arguments.json:
             mark = coloured(f"{finding.level.value:4}", _COLOUR_INDEX[finding.level.value])
-            print(f"{mark}  {finding.subject}: {finding.text}", flush=True)
+            print(f"{mark}  {shown(f'{finding.subject}: {finding.text}')}", flush=True)
             if finding.remedy:
                 print(f"      → {finding.remedy}", flush=True)
     if arguments.json:

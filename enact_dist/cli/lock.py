@@ -27,6 +27,7 @@ from enact_dist.cli.verbs import (
 from enact_dist.errors import ConfigError, LeaseLostError, MisuseError, ShardUnreachableError
 from enact_dist.link.signals import StopSignals
 from enact_dist.terms import Access, Entities, Entity, checked_name
+from enact_dist.wire.texts import shown
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -198,7 +199,7 @@ def _row(lock: LockInfo, known: dict[tuple[str, int], LockInfo]) -> tuple[object
 
 def who(lock: LockInfo) -> str:
     """Return the holder as people look for it: actor, host, process."""
-    return f"{lock.actor}@{lock.host} pid {lock.pid}"
+    return shown(f"{lock.actor}@{lock.host} pid {lock.pid}")
 
 
 def _blocker(number: int, lock: LockInfo | None) -> str:

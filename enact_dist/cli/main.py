@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Any, Final
 from enact_dist.cli.verbs import DONE, FAILED, UNREACHABLE, USAGE
 from enact_dist.errors import ConfigError, EnactError, ShardUnreachableError
 from enact_dist.supervise import end_with_supervisor
+from enact_dist.wire.texts import shown
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -174,7 +175,7 @@ def _run(arguments: argparse.Namespace) -> int:
 def _report(error: Exception, arguments: argparse.Namespace) -> int:
     if arguments.debug:
         raise error
-    text = " ".join((str(error) or type(error).__name__).split())
+    text = shown(" ".join((str(error) or type(error).__name__).split()))
     for line in getattr(error, "__notes__", ()):
         print(line, file=sys.stderr)
     as_json = getattr(arguments, "log", "text") == "json"

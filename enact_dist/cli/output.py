@@ -9,6 +9,8 @@ import sys
 import time
 from typing import TYPE_CHECKING, Final, Protocol
 
+from enact_dist.wire.texts import shown, shown_json
+
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
@@ -30,12 +32,12 @@ def on_terminal() -> bool:
 
 def print_json(value: object) -> None:
     """Print a value as JSON; dataclasses as objects, what JSON does not have as text."""
-    print(json.dumps(value, default=_plain, ensure_ascii=False, indent=2))
+    print(shown_json(json.dumps(value, default=_plain, ensure_ascii=False, indent=2)))
 
 
 def print_json_line(value: object) -> None:
     """Print a value as one line of JSON, at once."""
-    print(json.dumps(value, default=_plain, ensure_ascii=False), flush=True)
+    print(shown_json(json.dumps(value, default=_plain, ensure_ascii=False)), flush=True)
 
 
 def _plain(value: object) -> object:
@@ -45,8 +47,11 @@ def _plain(value: object) -> object:
 
 
 def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]], *, empty: str) -> None:
-    """Print rows under their column names, or the sentence `empty` where there are none."""
-    texts = [[str(cell) for cell in row] for row in rows]
+    """Print rows under their column names, or the sentence `empty` where there are none.
+
+    Each row stays one: control characters of its cells are shown escaped.
+    """
+    texts = [[shown(str(cell)) for cell in row] for row in rows]
     if not texts:
         print(empty)
     elif on_terminal():
@@ -105,7 +110,7 @@ def print_tree(root: Branch) -> None:
 
 
 def _plain_tree(branch: Branch, depth: int) -> None:
-    print(f"{'  ' * depth}{branch.label}")
+    print(f"{'  ' * depth}{shown(branch.label)}")
     for child in branch.children.values():
         _plain_tree(child, depth + 1)
 
@@ -117,9 +122,9 @@ def _rich_tree(root: Branch) -> None:
 
     def grow(tree: Tree, branch: Branch) -> None:
         for child in branch.children.values():
-            grow(tree.add(Text(child.label)), child)
+            grow(tree.add(Text(shown(child.label))), child)
 
-    tree = Tree(Text(root.label, style="bold"))
+    tree = Tree(Text(shown(root.label), style="bold"))
     grow(tree, root)
     Console().print(tree)
 

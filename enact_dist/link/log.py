@@ -30,7 +30,9 @@ import threading
 from contextlib import suppress
 from copy import copy
 from logging.handlers import QueueHandler
-from typing import Final
+from typing import Any, Final
+
+from enact_dist.wire.texts import shown, shown_json
 
 FORMATS: Final = ("text", "json")
 TEXT: Final = "%(asctime)s %(levelname)s %(name)s %(message)s"
@@ -45,6 +47,24 @@ LINES_MAX: Final = 10_000
 """Log lines that wait for whoever reads the log; beyond, lines are lost, never time."""
 
 _log = logging.getLogger("enact.shard")
+
+
+class TextLines(logging.Formatter):
+    """Makes lines for people; what a message holds of control characters is shown escaped.
+
+    So a line of the log is one event, whatever clients are called; a traceback has its lines.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(TEXT)
+
+    def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802 - of `logging`
+        """Return the line without a traceback."""
+        return shown(super().formatMessage(record))
+
+    def formatException(self, ei: Any) -> str:  # noqa: N802 - of `logging`
+        """Return the traceback."""
+        return shown(super().formatException(ei), lines=True)
 
 
 class JsonLines(logging.Formatter):
@@ -72,7 +92,8 @@ class JsonLines(logging.Formatter):
         }
         if record.exc_info:
             line["error"] = self.formatException(record.exc_info)
-        return json.dumps({**getattr(record, _FIELDS, {}), **line}, ensure_ascii=False)
+        text = json.dumps({**getattr(record, _FIELDS, {}), **line}, ensure_ascii=False)
+        return shown_json(text)
 
     def line(self, event: str, text: str, *, level: int = logging.INFO, **fields: object) -> str:
         """Return the line of an event that no logger tells of."""

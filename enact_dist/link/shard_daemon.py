@@ -23,7 +23,7 @@ from enact_dist.core.records import ShardReturned
 from enact_dist.errors import ConfigError, EnactError, LinkError
 from enact_dist.link.endpoints import somebody_listens
 from enact_dist.link.host import open_host
-from enact_dist.link.log import READY, TEXT, JsonLines, Log, say
+from enact_dist.link.log import READY, JsonLines, Log, TextLines, say
 from enact_dist.link.namesakes import moved_places, serving, told_places, two_daemons
 from enact_dist.link.service_manager import ServiceManager
 from enact_dist.link.shard_calls import ShardCalls
@@ -313,7 +313,7 @@ def run_shard(settings: DaemonSettings) -> int:
 def _formatter(settings: DaemonSettings) -> logging.Formatter:
     if settings.log == "json":
         return JsonLines(cell=settings.cell, process=f"shard {settings.shard.name}")
-    return logging.Formatter(TEXT)
+    return TextLines()
 
 
 def _stop(shard: RunningShard, name: str, manager: ServiceManager) -> None:

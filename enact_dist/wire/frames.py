@@ -6,7 +6,8 @@ size, stamp_ns, file]``, and its body stands in the payload at `offset`; where `
 payload of the shard, no byte of it stands in the frame.
 
 Rules to keep: a code is never used again for another message; what is received is checked whole
-(every type, every length, nothing left over) before a message exists; only `ProtocolError` leaves,
+(every type, every length, nothing left over, no control character in the texts of a request)
+before a message exists; only `ProtocolError` leaves,
 so what came is shown by `reprlib` (`repr` itself gives up on 500 nested lists).
 """
 
@@ -32,6 +33,7 @@ from enact_dist.wire.limits import (
 )
 from enact_dist.wire.message_parts import reader_of, values_of, writers_of
 from enact_dist.wire.quick_readers import quick_reader_of
+from enact_dist.wire.texts import refuse_unsafe
 
 
 class FrameTooLongError(ProtocolError):
@@ -190,12 +192,14 @@ def decode_frame(header: bytes, payload: bytes | memoryview = b"") -> m.Message:
         raise ProtocolError(f"a frame cannot be read: {error or type(error).__name__}") from error
     code = values[1] if len(values) > 1 else None
     read = _readers.get(code) if type(code) is int else None
-    if read is None:
+    if read is None or type(code) is not int:
         raise ProtocolError(
             f"a frame has the unknown code {reprlib.repr(code)}; is the peer newer?"
         )
     bodies = BodyReader(payload)
     try:
+        if code < _FIRST_ANSWER:
+            refuse_unsafe(values)
         message: m.Message = read(values[2:], bodies)
     except RecursionError as error:
         raise ProtocolError("a frame is nested too deeply") from error
@@ -239,6 +243,7 @@ def _check_version(header: bytes) -> None:
         )
 
 
+_FIRST_ANSWER: Final = CODES[m.Welcome]
 _writers: Final = {cls: (code, values_of(cls), writers_of(cls)) for cls, code in CODES.items()}
 _REQUESTS: Final = frozenset(get_args(m.Request))
 _COMMITS: Final = frozenset((m.Commit, m.Prepare))

@@ -46,6 +46,8 @@ PAYLOAD_BYTES_MIN: Final = 64 << 10
 """Data up to this size travel with their commit and their grant, never as a payload."""
 NAME_CHARACTERS_MAX: Final = NAME_LENGTH_MAX
 """Longest name of a context, entity, aspect, shard, session, actor or host."""
+REASON_CHARACTERS_MAX: Final = 500
+"""Longest reason of an act by hand: it is kept for good, and stands in one line of a table."""
 TEXT_BYTES_MAX: Final = 64 << 10
 """Longest string of a header that is no name: causes, endpoints, fingerprints, reasons."""
 REPORT_BYTES_MAX: Final = 64 << 10

@@ -29,6 +29,7 @@ from enact_dist.wire.limits import (
     ITEMS_MAX,
     KEPT_VERSIONS_MAX,
     NAME_CHARACTERS_MAX,
+    REASON_CHARACTERS_MAX,
     REPORT_BYTES_MAX,
     TEXT_BYTES_MAX,
 )
@@ -49,6 +50,8 @@ _NAMES: Final = (
 )
 LENGTHS_MAX: Final = {
     **dict.fromkeys(_NAMES, NAME_CHARACTERS_MAX),
+    "reason": REASON_CHARACTERS_MAX,
+    "settle": REASON_CHARACTERS_MAX,
     "items": ITEMS_MAX,
     "writes": ITEMS_MAX,
     "expects": ITEMS_MAX,

@@ -1,5 +1,8 @@
 """Units, tables and trees: plain into a pipe, drawn on a terminal."""
 
+import json
+from types import SimpleNamespace
+
 import pytest
 
 from enact_dist.cli import output
@@ -65,3 +68,20 @@ def test_narrow_terminal_breaks_no_word(capsys, monkeypatch):
     shown = capsys.readouterr().out
     assert position in shown
     assert "21:11:29.659" in shown
+
+
+HOSTILE = "a\nforged row\x1b[2J\u202e[bold]x[/]"
+
+
+def test_table_and_tree_show_control_characters_escaped(capsys):
+    """A row stays one row, the screen stays as it is, markup is text."""
+    output.print_table(("actor", "host"), [(HOSTILE, "h")], empty="")
+    output.print_tree(SimpleNamespace(label=HOSTILE, children={}))
+    said = capsys.readouterr().out
+
+    assert len(said.splitlines()) == 3
+    assert said.count(r"a\nforged row\x1b[2J\u202e[bold]x[/]") == 2
+    output.print_json({"actor": HOSTILE})
+    told = capsys.readouterr().out
+    assert json.loads(told) == {"actor": HOSTILE}
+    assert "\u202e" not in told

@@ -3,9 +3,10 @@
 import json
 import logging
 import socket
+import sys
 
 from enact_dist.link import log
-from enact_dist.link.log import JsonLines, Log
+from enact_dist.link.log import JsonLines, Log, TextLines
 
 
 def test_object_of_the_log_has_our_fields_whatever_a_program_adds():
@@ -46,3 +47,31 @@ def test_line_that_cannot_be_made_is_told_and_ends_no_log(monkeypatch):
     assert texts[:2] == [f"it cannot be made: {kind}" for kind in ("TypeError", "TypeError")]
     assert texts[2:] == ["and on", "2 lines of this log were lost"]
     assert found[0]["process"] == found[1]["process"] == "actor mine"
+
+
+FORGED = "a\n2026-01-01 00:00:00,000 CRITICAL enact.shard \x1b[2Jstops \u202e"
+
+
+def test_message_of_the_text_log_is_one_line():
+    """A client that is called like a line of the log forges none; a traceback keeps its lines."""
+    try:
+        raise ValueError(FORGED)
+    except ValueError:
+        record = logging.LogRecord("enact", 20, "f", 1, "%s came", (FORGED,), sys.exc_info())
+
+    first, *trace = TextLines().format(record).split("\n")
+
+    assert r"a\n2026-01-01" in first
+    assert first.endswith(r"stops \u202e came")
+    assert trace[0].startswith("Traceback")
+    assert not any(mark in line for line in (first, *trace) for mark in "\x1b\u202e")
+
+
+def test_object_of_the_log_holds_no_mark_that_acts():
+    """JSON escapes control characters by itself, marks of direction it does not."""
+    record = logging.LogRecord("enact", 20, "f", 1, FORGED, (), None)
+
+    line = JsonLines().format(record)
+
+    assert not any(mark in line for mark in "\n\x1b\u202e")
+    assert json.loads(line)["text"] == FORGED

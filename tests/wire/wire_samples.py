@@ -12,10 +12,11 @@ from hypothesis import strategies as st
 from enact_dist.core.datum import Datum
 from enact_dist.wire.frames import CODES
 from enact_dist.wire.limits import PAYLOAD_NAME
+from enact_dist.wire.texts import is_safe
 
 CLASSES = sorted(CODES, key=CODES.__getitem__)
 INTEGERS = (0, 1, 127, 128, 255, 65_536, 1 << 31, 1_763_000_000_123_456_789, (1 << 63) - 1, -1)
-TEXTS = ("", "a", "online", "tray/package/3", "größe", "名前", "x" * 200, "\x00\n")
+TEXTS = ("", "a", "online", "tray/package/3", "größe", "名前", "x" * 200, "[bold]\u00a0\\n")
 
 
 def annotated(cls):
@@ -61,7 +62,7 @@ def messages(kind):
     if kind is int:
         return st.integers(-(2**63), 2**63 - 1) | st.sampled_from(INTEGERS)
     if kind is str:
-        return st.text(max_size=20) | st.sampled_from(TEXTS)
+        return st.text(max_size=20).filter(is_safe) | st.sampled_from(TEXTS)
     if kind is bytes:
         return st.binary(max_size=100)
     if kind is bool:
