@@ -25,7 +25,16 @@ def seen(**found):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "carrier"), [("patterns", "zenoh")])
+@pytest.mark.parametrize(
+    ("name", "carrier"),
+    [
+        ("parked questions", "zenoh"),
+        ("registrations", "zenoh"),
+        ("long questions", "zenoh"),
+        ("forged socket sessions", "socket"),
+        ("stranger as a client", "zenoh"),
+    ],
+)
 def test_updates_stay_exact_beside_a_flood_that_is_refused(name, carrier):
     """Each update counts once, nobody's lock is lost, and the shard starts on its folder again."""
     figures = measure(flood(name), carrier=carrier, updates=UPDATES)
