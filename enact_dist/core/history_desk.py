@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.admission import wrong_label, wrong_patterns
@@ -12,13 +13,13 @@ from enact_dist.core.messages import (
     ListHistory,
     Refused,
 )
-from enact_dist.core.pages import over_slots
+from enact_dist.core.pages import VERSIONS_OF_A_LOOK, over_slots
 from enact_dist.core.records import KeptRecord, Persist, Reply, Story
 from enact_dist.core.version_list import bytes_of, entries_of, version_of, versions
 from enact_dist.terms import Durability
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator
 
     from enact_dist.core.datum import Slot
     from enact_dist.core.messages import Answer, SlotVersion, VersionEntry
@@ -48,15 +49,19 @@ class HistoryDesk:
         """List the known versions of slots, oldest first, without their data."""
         slots = self._state.slots
 
-        def listed(slot: Slot, _: Content) -> tuple[list[VersionEntry], int]:
-            known = list(entries_of(slots, slot))
+        def listed(slot: Slot, _: Content, above: int) -> tuple[Iterable[VersionEntry], int]:
+            history = slots.history.of(slot)
+            kept = history.kept if history is not None else {}
             found = [
-                entry
-                for entry in known
-                if not 0 < entry.until_ns <= message.since_ns and (entry.kept or not message.kept)
+                (content, until_ns)
+                for content, until_ns in slots.versions(slot)
+                if not 0 < until_ns <= message.since_ns
+                and (not message.kept or content.version in kept)
             ]
-            shown = found[-message.count_max :] if message.count_max else found
-            return shown, 1 + len(known) - len(shown)
+            begin = max(0, len(found) - message.count_max) if message.count_max else 0
+            if above:
+                begin = max(begin, bisect_right(found, above, key=lambda each: each[0].version))
+            return entries_of(slots, slot, found[begin:]), len(found) // VERSIONS_OF_A_LOOK
 
         steps = over_slots(
             slots,
@@ -91,18 +96,23 @@ class HistoryDesk:
         before = tuple(history.labels.get(label, ()))
         if not message.versions:
             history.let_go(label)
-        forgotten = tuple(version for version in message.versions if not self._keep(label, version))
+        forgotten = self._keep_each(label, message.versions)
         kept = tuple(history.labels.get(label, ()))
         if kept == before:
             return Kept(kept, forgotten), ()
         return Kept(kept, forgotten), (self._record(label), *history.take_forgotten())
 
-    def _keep(self, label: str, version: SlotVersion) -> bool:
-        """Keep a version; False where it is forgotten, or is about to be."""
-        slots = self._state.slots
-        if self._is_going(version):
-            return False
-        return slots.history.keep(label, version, slots[version.slot])
+    def _keep_each(self, label: str, versions: tuple[SlotVersion, ...]) -> tuple[SlotVersion, ...]:
+        """Keep versions; return those that are forgotten, or are about to be."""
+        undecided = [writes for _, writes in self._state.commits.undecided()]
+        undecided += [record.writes for record in self._prepares.undecided()]
+        changing = {write.slot for writes in undecided for write in writes}
+        slots, forgotten = self._state.slots, []
+        for version in versions:
+            going = version.slot in changing and self._is_going(version)
+            if going or not slots.history.keep(label, version, slots[version.slot]):
+                forgotten.append(version)
+        return tuple(forgotten)
 
     def _record(self, label: str) -> KeptRecord:
         """Return what a restart must know of a label: nothing of what it would not find."""
@@ -124,16 +134,12 @@ class HistoryDesk:
         )
 
     def _is_going(self, version: SlotVersion) -> bool:
-        """Whether a commit under way replaces this version, and the store does not keep it."""
+        """Whether a commit under way on its slot replaces it, and the store does not keep it."""
         newest = self._state.slots[version.slot]
         if newest.version != version.version:
             return False
         history = self._state.slots.history
-        if history.will_hold(version.slot, newest) or not history.is_stored(version.slot):
-            return False
-        undecided = [writes for _, writes in self._state.commits.undecided()]
-        undecided += [record.writes for record in self._prepares.undecided()]
-        return any(write.slot == version.slot for writes in undecided for write in writes)
+        return history.is_stored(version.slot) and not history.will_hold(version.slot, newest)
 
     # ---------------------------------------------------------------- what goes
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from itertools import islice
 from typing import TYPE_CHECKING, Final
 
@@ -23,7 +24,13 @@ from enact_dist.core.messages import (
     Survey,
     Surveyed,
 )
-from enact_dist.core.pages import HOLDER_WORK, bytes_in_frame, over_slots, page_of
+from enact_dist.core.pages import (
+    HOLDER_WORK,
+    VERSIONS_OF_A_LOOK,
+    bytes_in_frame,
+    over_slots,
+    page_of,
+)
 from enact_dist.core.slots import state_of
 
 if TYPE_CHECKING:
@@ -173,10 +180,12 @@ def counted(state: ShardState) -> dict[str, int]:
 def surveyed(state: ShardState, message: Survey, *, stamp_ns: int) -> Surveyed:
     """List the slots that match, null ones too, without their data; retained versions if asked."""
 
-    def listed(slot: Slot, newest: Content) -> tuple[list[SlotState], int]:
+    def listed(slot: Slot, newest: Content, above: int) -> tuple[Iterator[SlotState], int]:
         replaced = state.slots.history.of(slot) if message.retained else None
         contents = [*replaced.retained(), newest] if replaced is not None else [newest]
-        return [state_of(slot, content, with_datum=False) for content in contents], 1
+        begin = bisect_right(contents, above, key=lambda content: content.version) if above else 0
+        shown = (state_of(slot, content, with_datum=False) for content in contents[begin:])
+        return shown, len(contents) // VERSIONS_OF_A_LOOK
 
     steps = over_slots(
         state.slots,

@@ -9,12 +9,12 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.messages import Cursor, Explain, FindEffects, Refused
-from enact_dist.core.pages import over_slots
+from enact_dist.core.pages import VERSIONS_OF_A_LOOK, over_slots
 from enact_dist.core.records import Reply
 from enact_dist.core.version_list import bytes_of, entries_of, version_of, versions
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator
 
     from enact_dist.core.datum import Slot
     from enact_dist.core.message_parts import Cause, VersionEntry
@@ -44,7 +44,8 @@ class LineageDesk:
         begin, slots = max(0, message.after.number), self._state.slots
         for number, (slot, version) in enumerate(message.versions[begin:], begin + 1):
             after = Cursor(self._state.epoch, number=number)
-            found = entries_of(slots, slot, version=version or slots[slot].version)
+            one = slots.versions(slot, version=version or slots[slot].version)
+            found = entries_of(slots, slot, one)
             entry = next(found, None)
             yield entry, bytes_of(entry) if entry is not None else 0, 1, after
 
@@ -74,15 +75,17 @@ class LineageDesk:
                 known[id(cause)] = found
             return found
 
-        def listed(slot: Slot, newest: Content) -> tuple[list[VersionEntry], int]:
+        def listed(slot: Slot, newest: Content, above: int) -> tuple[Iterable[VersionEntry], int]:
             nonlocal looked
-            found: list[VersionEntry] = []
-            looked = 1
-            if newest.stamp_ns >= since_ns and any(
-                is_effect(content.cause) for content, _ in slots.versions(slot)
-            ):
-                found = [entry for entry in entries_of(slots, slot) if is_effect(entry.cause)]
-            return found, looked
+            looked = 0
+            if newest.stamp_ns < since_ns:
+                return (), 0
+            found = [
+                (content, until_ns)
+                for content, until_ns in slots.versions(slot)
+                if content.version > above and is_effect(content.cause)
+            ]
+            return entries_of(slots, slot, found), looked // VERSIONS_OF_A_LOOK
 
         return over_slots(
             slots,

@@ -24,7 +24,7 @@ from enact_dist.core.message_parts import START, Cursor
 from enact_dist.patterns import Patterns
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Iterator
 
     from enact_dist.core.requests import ListHistory, Survey
     from enact_dist.core.slots import Content, SlotMap
@@ -35,6 +35,8 @@ WORK_MAX: Final = 2_000
 """Slots, versions and causes that are looked at for one page: about 5 ms."""
 PATTERNS_WORK: Final = 8
 """So many patterns are tried in the time that it takes to look at one slot."""
+VERSIONS_OF_A_LOOK: Final = 16
+"""So many versions of one slot are passed over in that time."""
 HOLDER_WORK: Final = 10
 """What it takes to describe a lock, which looks for those that are in its way."""
 
@@ -63,7 +65,7 @@ def over_slots(
     slots: SlotMap,
     asked: Survey | ListHistory | None,
     after: Cursor,
-    listed: Callable[[Slot, Content], tuple[Sequence[E], int]],
+    listed: Callable[[Slot, Content, int], tuple[Iterable[E], int]],
     *,
     epoch: int,
     version_of: Callable[[E], int],
@@ -75,7 +77,8 @@ def over_slots(
         slots: All slots.
         asked: Which of them; None: all.
         after: Where the page begins.
-        listed: Returns the entries of one slot, oldest version first, and what that took.
+        listed: Returns the entries of one slot above a version, oldest first, and what it took to
+            find the first one; the others are made as they are asked for.
         epoch: In which the cursors are good.
         version_of: Returns the version of an entry.
         bytes_of: Returns at least how many bytes it takes in an answer.
@@ -95,16 +98,18 @@ def over_slots(
         begin = max(0, after.number) if here else 0
         column_slots = islice(slots.of_column(column).items(), begin, None)
         for number, (entity, content) in enumerate(column_slots, begin):
-            found: Sequence[E] = ()
+            last: E | None = None
             work = work_each
             if entities.cover(entity):
-                found, work = listed(Slot(column.context, entity, column.aspect), content)
-                work += work_each
-            if here and number == begin and after.version:
-                found = [entry for entry in found if version_of(entry) > after.version]
-            for entry in found[:-1]:
-                yield entry, bytes_of(entry), 1, Cursor(epoch, column, number, version_of(entry))
-            last = found[-1] if found else None
+                above = after.version if here and number == begin else 0
+                found, more = listed(Slot(column.context, entity, column.aspect), content, above)
+                work += more
+                for entry in found:
+                    if last is not None:
+                        here_on = Cursor(epoch, column, number, version_of(last))
+                        yield last, bytes_of(last), work, here_on
+                        work = 1
+                    last = entry
             size = bytes_of(last) if last is not None else 0
             yield last, size, work, Cursor(epoch, column, number + 1)
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from enact_dist.core.datum import Slot
     from enact_dist.core.pages import Step
     from enact_dist.core.shard_state import ShardState
-    from enact_dist.core.slots import SlotMap
+    from enact_dist.core.slots import Content, SlotMap
 
 _SLOT_BYTES: Final = 48
 """A slot with its version and stamp in an answer, names left out."""
@@ -22,11 +22,13 @@ _ENTRY_BYTES: Final = 256
 """The rest of a version in an answer, with its cause, names left out."""
 
 
-def entries_of(slots: SlotMap, slot: Slot, *, version: int | None = None) -> Iterator[VersionEntry]:
-    """Yield all known versions of a slot, oldest first, or only what is known of one `version`."""
+def entries_of(
+    slots: SlotMap, slot: Slot, found: Iterable[tuple[Content, int]]
+) -> Iterator[VersionEntry]:
+    """Yield entries of versions of a slot, each with the stamp until which it was current."""
     history = slots.history.of(slot)
     kept = history.kept if history is not None else {}
-    for content, until_ns in slots.versions(slot, version=version):
+    for content, until_ns in found:
         labels = tuple(sorted(kept[content.version].labels)) if content.version in kept else ()
         shown = state_of(slot, content, with_datum=False)
         yield VersionEntry(shown, until_ns, labels, content.cause)

@@ -1,11 +1,13 @@
 """Listings come in pages: whole, in order, each short enough, each with as little work."""
 
+from dataclasses import replace
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from shard_bench import ShardBench, item, lock_id, pages_of, slot
 
-from enact_dist.core import pages
+from enact_dist.core import inspection, pages, version_list
 from enact_dist.core.messages import (
     START,
     AspectEntry,
@@ -143,3 +145,33 @@ def test_page_goes_on_in_what_has_changed_meanwhile(bench, monkeypatch):
     assert all(isinstance(page, Surveyed) for page in listed)
     slots = [state.slot for page in listed for state in page.states]
     assert len(slots) == len(set(slots)) == 15
+
+
+def test_slot_with_many_versions_is_not_listed_anew_for_each_page(monkeypatch):
+    """A page makes the entries that it shows and no others, wherever in the slot it begins."""
+    bench = ShardBench()
+    bench.hello("ann")
+    bench.ask(Register("ann", (), (AspectEntry("many", "int", "durable", 400),)))
+    for seq in range(1, 301):
+        bench.write("ann", seq, str(seq), to=slot(aspect="many"))
+    made = []
+    real = version_list.state_of
+    monkeypatch.setattr(version_list, "state_of", lambda *a, **k: made.append(1) or real(*a, **k))
+    monkeypatch.setattr(inspection, "state_of", version_list.state_of)
+    monkeypatch.setattr(pages, "WORK_MAX", 50)
+
+    for first, field in (
+        (ListHistory((), (), ()), "entries"),
+        (ListHistory((), (), (), 0, 200), "entries"),
+        (Survey((), (), (), retained=True), "states"),
+    ):
+        made.clear()
+        found, request, count = [], first, 0
+        while count == 0 or request.after != START:
+            answer = bench.ask(request)
+            found += [getattr(one, "state", one).version for one in getattr(answer, field)]
+            request, count = replace(request, after=answer.more), count + 1
+        wanted = getattr(first, "count_max", 0) or 300
+        assert found == list(range(301 - wanted, 301))
+        assert count > 3
+        assert len(made) <= wanted + 2 * count
