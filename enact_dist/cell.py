@@ -400,6 +400,11 @@ class Cell(Closing):
         answers = self._client.call_all([(shard, ListSessions()) for shard in shards])
         return actor_infos(zip(shards, answers, strict=True))
 
+    @property
+    def session(self) -> str:
+        """Identity of this process's session, as `ActorInfo.session` names it."""
+        return self._client.core.session
+
     def namesakes(self, name: str) -> tuple[ActorInfo, ...]:
         """Return the other sessions of actors of a name that are not silent.
 

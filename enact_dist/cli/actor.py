@@ -301,9 +301,8 @@ def _farewell(name: str, statistics: ActorStatistics) -> str:
 
 def list_actors(arguments: argparse.Namespace) -> int:
     """Print every session but this one; one line per reporting actor."""
-    me = socket.gethostname(), os.getpid()  # a number alone is that of others in their containers
     with open_cell(arguments) as cell:
-        infos = [info for info in cell.actors() if (info.host, info.pid) != me]
+        infos = [info for info in cell.actors() if info.session != cell.session]
     if arguments.json:
         print_json(infos)
         return DONE
