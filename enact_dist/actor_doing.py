@@ -60,13 +60,15 @@ class Doing:
 
     Attributes:
         call: What runs now; None between the calls.
+        between: Held while a method runs; whoever holds it changes the actor between two calls.
     """
 
-    __slots__ = ("_actor", "call")
+    __slots__ = ("_actor", "between", "call")
 
     def __init__(self, actor: str) -> None:
         self._actor = actor
         self.call: Call | None = None
+        self.between = threading.Lock()
 
     @contextlib.contextmanager
     def inside(
@@ -79,7 +81,8 @@ class Doing:
         """
         self.call = Call(method, about, monotonic_ns(), threading.get_ident(), lock, remains)
         try:
-            yield
+            with self.between:
+                yield
         except SystemExit as error:
             raise MisuseError(
                 f"{self._actor}.{method} called sys.exit({error.code!r}) at {place_of(error)}; an"

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.actor import Actor, check_period, check_update
+from enact_dist.actor_report import ARGS_MAX
 from enact_dist.config_table import suggestion
 from enact_dist.errors import ConfigError, EnactError, MisuseError
 from enact_dist.terms import Entity
@@ -196,6 +197,13 @@ def attributes_of(actor_class: type[Actor]) -> dict[str, object]:
             if readable and hasattr(one, name) and _is_option(hints[name]):
                 found[name] = hints[name]
     return found
+
+
+def shown_values(actor: Actor) -> tuple[str, ...]:
+    """Return the values of an actor's parameters, as far as they are attributes: ``name=value``."""
+    names = dict.fromkeys((*attributes_of(type(actor)), *inspect.signature(type(actor)).parameters))
+    shown = (f"{name}={getattr(actor, name)}"[:80] for name in names if hasattr(actor, name))
+    return tuple(shown)[:ARGS_MAX]
 
 
 def _is_option(annotation: object) -> bool:

@@ -12,10 +12,12 @@ from __future__ import annotations
 
 import dataclasses
 import reprlib
+import threading
 from array import array
 from bisect import bisect_left
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, ClassVar, Final
+from weakref import WeakKeyDictionary
 
 import msgpack
 
@@ -25,6 +27,8 @@ from enact_dist.errors import ProtocolError
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from enact_dist.cell import Cell
+
 REPORT_VERSION: Final = 1
 RATE_WINDOW_NS: Final = 5_000_000_000
 """Rates are over the last 5 s: long enough for 1 Hz sources, short enough to see a stall."""
@@ -32,6 +36,8 @@ STAMPS_MAX: Final = 512
 WAITS_MAX: Final = 512
 BRIEF_LENGTH_MAX: Final = 80
 """Longest text of an actor in the report of a process with many."""
+ARGS_MAX: Final = 32
+"""Parameters in a report."""
 ERROR_LENGTH_MAX: Final = 500
 """Longest error text in a report; the whole one is in the actor's log."""
 WRITES_MAX: Final = 64
@@ -72,6 +78,9 @@ class ActorStatistics:
         interrupted: Versions that an actor with `once` found taken by a process that is gone.
         last_interrupted: The newest of these.
         lock_lost: Whether that update has lost its lock, so that it can commit nothing.
+        args: The values of its parameters, each as ``name=value``.
+        words_in: The world context in which its process listens for words; empty: it does not.
+        word: The token of the newest word, and its answer to that.
     """
 
     name: str = ""
@@ -100,6 +109,9 @@ class ActorStatistics:
     lock_lost: bool = False
     interrupted: int = 0
     last_interrupted: str = ""
+    args: tuple[str, ...] = ()
+    words_in: str = ""
+    word: str = ""
 
 
 _NAMES: Final = [field.name for field in dataclasses.fields(ActorStatistics)]
@@ -236,6 +248,29 @@ class ActorRecord:
 
     def _keep(self, error: BaseException) -> None:
         self._last_error = f"{type(error).__name__}: {error}"[:ERROR_LENGTH_MAX]
+
+
+class ReportBoard:
+    """The newest reports of all actors that share a cell's session, by actor name."""
+
+    _boards: ClassVar[WeakKeyDictionary[Cell, ReportBoard]] = WeakKeyDictionary()
+    _making: ClassVar[threading.Lock] = threading.Lock()
+
+    def __init__(self) -> None:
+        self._posted: dict[str, ActorStatistics] = {}
+        self._guard = threading.Lock()
+
+    @classmethod
+    def of(cls, cell: Cell) -> ReportBoard:
+        """Return the board of a cell."""
+        with cls._making:
+            return cls._boards.setdefault(cell, cls())
+
+    def post(self, cell: Cell, statistics: ActorStatistics) -> None:
+        """Replace the report of one actor, and report all."""
+        with self._guard:
+            self._posted[statistics.name] = statistics
+            cell.set_report(encode_reports(list(self._posted.values())))
 
 
 def percentile(ascending: list[int], part: float) -> int:

@@ -30,13 +30,13 @@ import math
 import random
 import threading
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, ClassVar, Final
-from weakref import WeakKeyDictionary
+from typing import TYPE_CHECKING, Final
 
 from enact_dist.actor import Actor, check_period, name_of
 from enact_dist.actor_binding import BoundActor
 from enact_dist.actor_doing import Doing
 from enact_dist.actor_inbox import Inbox, SetInbox, watching
+from enact_dist.actor_load import shown_values
 from enact_dist.actor_log import Repeated, kind_of
 from enact_dist.actor_once import REFUSALS, Once, OnceInbox, TakenError
 from enact_dist.actor_report import (
@@ -44,7 +44,7 @@ from enact_dist.actor_report import (
     WRITES_MAX,
     ActorRecord,
     ActorStatistics,
-    encode_reports,
+    ReportBoard,
 )
 from enact_dist.actor_triggers import BackOff, FixedRate
 from enact_dist.errors import (
@@ -123,6 +123,7 @@ class ActorRun:
     Attributes:
         name: Name in logs and reports.
         doing: Which method of the actor runs.
+        words_in: The world context in which a process may listen for words to it.
     """
 
     def __init__(
@@ -159,6 +160,8 @@ class ActorRun:
             self._once = Once(self._bound, self.name, self.doing, stop=stop, inbox=inbox)
         self._lost: set[Entity | None] = set()
         self._warned = False
+        self.words_in = min(context.name for context in self._bound.contexts.values())
+        self._listens, self._word = False, ""
         self._reported_ns = 0
         if self._every_s is not None:
             check_period(self.name, self._every_s)
@@ -169,7 +172,11 @@ class ActorRun:
         """Return what the actor has done so far."""
         self._record.skipped = self._inbox.skipped
         statistics = dataclasses.replace(
-            self._record.snapshot(monotonic_ns()), writes=self._bound.writes()[:WRITES_MAX]
+            self._record.snapshot(monotonic_ns()),
+            writes=self._bound.writes()[:WRITES_MAX],
+            args=shown_values(self._actor),
+            words_in=self.words_in if self._listens else "",
+            word=self._word,
         )
         if (call := self.doing.call) is not None and call.method == "update":
             lasted_s, lost = (monotonic_ns() - call.since_ns) / 1e9, call.lock_lost
@@ -196,6 +203,11 @@ class ActorRun:
             partial=sets.partial,
             last_partial=sets.last_partial[:ERROR_LENGTH_MAX],
         )
+
+    def answer(self, word: str = "") -> None:
+        """Report that words are heard, and what came of the newest one."""
+        self._listens, self._word = True, word[:ERROR_LENGTH_MAX]
+        self._report(now=True)
 
     def run(self, *, on_ready: Callable[[], None] | None = None) -> ActorStatistics:
         """Run until stopped or done; see `run_actor`.
@@ -470,29 +482,6 @@ class ActorRun:
         if now or now_ns - self._reported_ns >= REPORT_EVERY_NS:
             self._reported_ns = now_ns
             self._board.post(self._bound.cell, self.statistics())
-
-
-class ReportBoard:
-    """The newest reports of all actors that share a cell's session, by actor name."""
-
-    _boards: ClassVar[WeakKeyDictionary[Cell, ReportBoard]] = WeakKeyDictionary()
-    _making: ClassVar[threading.Lock] = threading.Lock()
-
-    def __init__(self) -> None:
-        self._posted: dict[str, ActorStatistics] = {}
-        self._guard = threading.Lock()
-
-    @classmethod
-    def of(cls, cell: Cell) -> ReportBoard:
-        """Return the board of a cell."""
-        with cls._making:
-            return cls._boards.setdefault(cell, cls())
-
-    def post(self, cell: Cell, statistics: ActorStatistics) -> None:
-        """Replace the report of one actor, and report all."""
-        with self._guard:
-            self._posted[statistics.name] = statistics
-            cell.set_report(encode_reports(list(self._posted.values())))
 
 
 def _about(entity: Entity | None) -> str:

@@ -6,12 +6,15 @@ import logging
 import os
 import socket
 import sys
+import threading
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from enact_dist.actor_drain import DRAIN_S, Drain
 from enact_dist.actor_life import StopWithPulse
+from enact_dist.actor_words import ListeningForWords
+from enact_dist.cli import actor_tell
 from enact_dist.cli.output import print_json, print_table, shown_s
 from enact_dist.cli.verbs import (
     DONE,
@@ -57,6 +60,9 @@ if TYPE_CHECKING:
     from enact_dist.cell_info import ActorInfo
     from enact_dist.cli.verbs import Verb
 
+ANEW: Final = 75
+"""Exit status of an actor that was told to begin anew: what supervises it starts it again."""
+
 _log = logging.getLogger("enact.actor")
 
 
@@ -64,6 +70,7 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
     """Add the noun and its verbs."""
     verbs = verbs_of(add_noun(nouns, "actor", "run, list and check actors"))
     _add_run(verbs)
+    actor_tell.add_to(verbs)
     ls = add_verb(
         verbs,
         "ls",
@@ -151,16 +158,25 @@ def run_actor(arguments: argparse.Namespace) -> int:
                 signals.call(act)
             signals.call_again(drain.hurry)
 
+            restarts = threading.Event()
+
+            def restart() -> None:
+                restarts.set()
+                stop.set()
+                drain.begin("the word to begin anew")
+
             def ready() -> None:
+                run.answer()
                 say(formatter, "actor.ready", f"{READY} actor {name} in cell {cell.name}")
                 manager.ready()
                 _warn_of_namesakes(cell, name)
 
-            statistics = _run(run, ready)
+            with ListeningForWords(actor, run, cell, restart):
+                statistics = _run(run, ready)
         drain.over()
     counted = {key: getattr(statistics, key) for key in ("state", "updates", "failures", "refused")}
     say(formatter, "actor.end", _farewell(name, statistics), **counted)
-    return DONE
+    return ANEW if restarts.is_set() else DONE
 
 
 def _run(run: ActorRun, ready: Callable[[], None]) -> ActorStatistics:
@@ -313,6 +329,8 @@ def list_actors(arguments: argparse.Namespace) -> int:
         empty="no actor is connected",
     )  # fmt: skip
     for report in (report for info in infos for report in _reports(info)):
+        if report.args:
+            print(f"{report.name}: {', '.join(report.args)}")
         for line in _losses(report):
             print(f"{report.name}: {line}")
     return DONE

@@ -168,3 +168,30 @@ def test_module_beside_the_file_wins_over_the_working_folder(enact, beside, tmp_
     file = beside(ARGS)
 
     assert enact("actor", "check", "--cell", file).status == 0
+
+
+def test_running_actor_is_told_other_values_and_to_begin_anew(enact, beside, spawn, until):
+    """From anywhere, by its name; a wrong value is refused and changes nothing."""
+    file = beside(ARGS)
+    up = spawn("up", file)
+    until(up, "ready: actor beat")
+
+    told = enact("actor", "set", "beat", "step=3", "label=rear", "--cell", file)
+    assert (told.status, "step = 3, label = rear" in told.out) == (0, True)
+    assert "beat: step=3, label=rear, first=7" in enact("actor", "ls", "--cell", file).out
+    for wrong, said in (
+        ("step=three", "step of actor Beat is 'three'; it must be a whole number"),
+        ("first=1", "first of actor Beat cannot be changed while it runs; what can is: step"),
+    ):
+        refused = enact("actor", "set", "beat", "label=no", wrong, "--cell", file)
+        assert refused.status == 1
+        assert said in refused.out + refused.err
+    assert "step=3, label=rear" in enact("actor", "ls", "--cell", file).out
+    assert "running: beat" in enact("actor", "set", "bead", "step=1", "--cell", file).err
+    tree = enact("world", "tree", "online", "--cell", file, "--json").json
+    assert [slot["entity"] for slot in tree if not slot.get("null_reason")] == ["beat"]
+
+    again = enact("actor", "restart", "beat", "--cell", file)
+    assert again.status == 0
+    assert "actor beat runs anew at" in again.out
+    assert "beat: step=2, label=front, first=7" in enact("actor", "ls", "--cell", file).out

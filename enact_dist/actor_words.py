@@ -1,0 +1,130 @@
+"""What a person tells a running actor: other values of its attributes, or to begin anew.
+
+A word is a volatile datum of the entity `actor/SESSION` in one of the actor's world contexts.  Its
+process watches that slot, takes the word (the slot is null again), does what it says between two
+updates, and answers in its report.  Values last until the process ends: what an actor begins with
+stands in `cell.toml`.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from typing import TYPE_CHECKING, Any, Final
+
+from enact_dist.actor_load import attributes_of, read_option
+from enact_dist.errors import ConfigError, EnactError
+from enact_dist.lock import Lock
+from enact_dist.terms import Aspect, Durability, Entity, Write
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from enact_dist.actor import Actor
+    from enact_dist.actor_runner import ActorRun
+    from enact_dist.cell import Cell
+    from enact_dist.watch import Watch
+    from enact_dist.world import WorldContext
+
+WORDS: Final = Aspect("actor_words", dict, Durability.VOLATILE, retention=1)
+DONE: Final = "done"
+"""What a report says behind the token of a word that was done; else why it was not."""
+ENDS: Final = "ends, to begin anew"
+
+log = logging.getLogger("enact.actor")
+
+
+def word_of(world: WorldContext, session: str) -> Write[dict[str, Any]]:
+    """Return the request for the slot of a session's words."""
+    return Write(world, Entity(f"actor/{session}"), WORDS)
+
+
+def with_values(actor: Actor, values: dict[str, str]) -> None:
+    """Give attributes of an actor other values, all or none.
+
+    Raises:
+        ConfigError: One is no attribute that can be changed, or the text is no value of its type.
+    """
+    hints = attributes_of(type(actor))
+    name = type(actor).__name__
+    read = {}
+    for key, text in values.items():
+        if key not in hints:
+            raise ConfigError(
+                f"{key} of actor {name} cannot be changed while it runs; what can is:"
+                f" {', '.join(hints) or 'nothing'} (attributes with an annotation and a value in"
+                " the class)"
+            )
+        read[key] = read_option(f"option {key} of actor {name}", text, hints[key])
+    for key, value in read.items():
+        setattr(actor, key, value)
+
+
+class ListeningForWords:
+    """Listens for the words to one actor of this process, in a thread; a context manager.
+
+    Args:
+        actor: The actor.
+        run: Its run.
+        cell: Where it runs.
+        restart: Called when it is to begin anew.
+    """
+
+    def __init__(
+        self, actor: Actor, run: ActorRun, cell: Cell, restart: Callable[[], object]
+    ) -> None:
+        self._actor, self._run, self._restart = actor, run, restart
+        self._world = cell.world(run.words_in)
+        self._session = self._world.session.client.core.session
+        self._watch: Watch | None = None
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._listen, name="enact-words", daemon=True)
+
+    def __enter__(self) -> None:
+        self._thread.start()
+
+    def __exit__(self, *_: object) -> None:
+        self._closing.set()
+        watch = self._watch
+        if watch is not None:
+            watch.close()
+        self._thread.join(timeout=5.0)
+
+    def _listen(self) -> None:
+        while not self._closing.is_set():
+            try:
+                self._follow()
+            except EnactError as error:
+                log.info("%s: no words are heard for now: %s", self._run.name, error)
+                self._closing.wait(5.0)
+
+    def _follow(self) -> None:
+        with self._world.watch(f"actor/{self._session}", WORDS) as watch:
+            self._watch = watch
+            while not self._closing.is_set():
+                change = watch.next()
+                if change is None:
+                    return
+                if not change.null:
+                    self._take()
+
+    def _take(self) -> None:
+        request = word_of(self._world, self._session)
+        with Lock(request, wait_s=5.0) as lock:
+            word = lock.get(request, {})
+            del lock[request]
+        token = str(word.get("token", ""))
+        if word.get("restart"):
+            self._run.answer(f"{token} {ENDS}")
+            self._restart()
+            return
+        try:
+            values = {str(key): str(value) for key, value in dict(word.get("set", {})).items()}
+            with self._run.doing.between:
+                with_values(self._actor, values)
+        except (ConfigError, ValueError, TypeError, AttributeError) as error:
+            self._run.answer(f"{token} {error}")
+            return
+        told = ", ".join(f"{key} = {value}" for key, value in values.items())
+        log.info("%s: %s, as it was told", self._run.name, told)
+        self._run.answer(f"{token} {DONE}")

@@ -1,0 +1,158 @@
+"""`enact actor set|restart`: what a running actor is told, on whatever host it runs."""
+
+from __future__ import annotations
+
+import secrets
+import time
+from typing import TYPE_CHECKING, Any, Final
+
+from enact_dist.cli.verbs import (
+    DONE,
+    FAILED,
+    add_cell,
+    add_timeout,
+    add_verb,
+    open_cell,
+    pair,
+    pairs,
+)
+from enact_dist.errors import MisuseError
+
+if TYPE_CHECKING:
+    import argparse
+
+    from enact_dist.cell import Cell
+    from enact_dist.cell_info import ActorInfo
+    from enact_dist.cli.verbs import Verb
+
+LOOK_S: Final = 0.1
+ANSWER_S: Final = 10.0
+"""How long an actor may take to answer: its update ends before."""
+RETURN_S: Final = 60.0
+"""How long an actor may take to end and to be back."""
+
+
+def add_to(verbs: argparse._SubParsersAction[Verb]) -> None:
+    """Add both verbs."""
+    change = add_verb(
+        verbs,
+        "set",
+        "change attributes of a running actor, until it ends; what it begins with stands in"
+        " cell.toml",
+        run=set_values,
+        example="enact actor set camera gain=0.7 label=front",
+    )
+    restart = add_verb(
+        verbs,
+        "restart",
+        "let a running actor end its update and begin anew; what supervises it (enact up, systemd,"
+        " docker) starts it again",
+        run=restart_actor,
+        example="enact actor restart camera",
+    )
+    for verb in (change, restart):
+        verb.add_argument(
+            "name", metavar="NAME", help="name of the actor, as enact actor ls has it"
+        )
+        add_cell(verb)
+        add_timeout(verb)
+    change.add_argument(
+        "values", nargs="+", type=pair, metavar="KEY=VALUE", help="attribute and its new value"
+    )
+
+
+def set_values(arguments: argparse.Namespace) -> int:
+    """Tell each actor of the name; fail if one refuses."""
+    values = pairs(arguments.values, "set")
+    with open_cell(arguments, observer=False, actor="enact actor set") as cell:
+        status = DONE
+        for info, row in _found(cell, arguments.name):
+            token = _tell(cell, info, row, {"set": values})
+            answer = _answer(cell, info.session, arguments.name, token)
+            if answer != "done":
+                print(f"enact: actor {arguments.name} at {info.host} pid {info.pid}: {answer}")
+                status = FAILED
+                continue
+            told = ", ".join(f"{key} = {value}" for key, value in values.items())
+            print(f"actor {arguments.name} at {info.host} pid {info.pid}: {told}")
+    return status
+
+
+def restart_actor(arguments: argparse.Namespace) -> int:
+    """Tell each actor of the name, and wait until as many others run."""
+    with open_cell(arguments, observer=False, actor="enact actor restart") as cell:
+        before = _found(cell, arguments.name)
+        for info, row in before:
+            _tell(cell, info, row, {"restart": True})
+        old = {info.session for info, _ in before}
+        end_s = time.monotonic() + RETURN_S
+        while time.monotonic() < end_s:
+            rows = _rows(cell, arguments.name)
+            back = [info for info, row in rows if info.session not in old and _runs(row)]
+            if len(back) >= len(before) and not old & {info.session for info, _ in rows}:
+                for info in back:
+                    print(f"actor {arguments.name} runs anew at {info.host} pid {info.pid}")
+                return DONE
+            time.sleep(LOOK_S)
+    print(
+        f"enact: actor {arguments.name} did not come back within {RETURN_S:g} s: is it run by"
+        " enact up, systemd or docker, which start it again, and does its update end?"
+    )
+    return FAILED
+
+
+def _rows(cell: Cell, name: str) -> list[tuple[ActorInfo, dict[str, Any]]]:
+    """Return the reports of the actors of a name, with their sessions."""
+    return [
+        (info, row)
+        for info in cell.actors()
+        if not info.silent and isinstance(info.report.get("actors"), (list, tuple))
+        for row in info.report["actors"]
+        if isinstance(row, dict) and row.get("name") == name
+    ]
+
+
+def _runs(row: dict[str, Any]) -> bool:
+    return row.get("state") in ("running", "stuck")
+
+
+def _found(cell: Cell, name: str) -> list[tuple[ActorInfo, dict[str, Any]]]:
+    """Return the running actors of a name.
+
+    Raises:
+        MisuseError: There is none, or it takes no words.
+    """
+    found = _rows(cell, name)
+    if not found:
+        known = sorted({one for info in cell.actors() for one in info.names()})
+        raise MisuseError(f"no actor {name!r} runs (running: {', '.join(known) or 'none'})")
+    for info, row in found:
+        if not row.get("words_in"):
+            raise MisuseError(
+                f"actor {name} at {info.host} pid {info.pid} takes no words: it is not ready yet,"
+                " or runs inside another program and not by enact actor run or enact up"
+            )
+    return found
+
+
+def _tell(cell: Cell, info: ActorInfo, row: dict[str, Any], word: dict[str, Any]) -> str:
+    from enact_dist.actor_words import word_of
+    from enact_dist.lock import Lock
+
+    token = secrets.token_hex(4)
+    request = word_of(cell.world(str(row["words_in"])), info.session)
+    with Lock(request) as lock:
+        lock[request] = {"token": token, **word}
+    return token
+
+
+def _answer(cell: Cell, session: str, name: str, token: str) -> str:
+    """Return what an actor has answered to a word."""
+    end_s = time.monotonic() + ANSWER_S
+    while time.monotonic() < end_s:
+        for info, row in _rows(cell, name):
+            told, _, answer = str(row.get("word", "")).partition(" ")
+            if info.session == session and told == token:
+                return answer
+        time.sleep(LOOK_S)
+    return f"no answer within {ANSWER_S:g} s; a word is heard between two updates"
