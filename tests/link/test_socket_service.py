@@ -194,7 +194,7 @@ def test_place_of_a_client_that_left_before_its_greeting_was_answered_is_free(
 
     until(lambda: service._count == 0)
     assert service._connections == {}
-    assert service._deaths._watched["hasty"].connections == 0
+    assert not service._deaths._watched["hasty"].connections
 
 
 def test_kernel_that_watches_no_more_processes_costs_nobody_a_connection(raw, monkeypatch, until):
@@ -214,7 +214,7 @@ def test_kernel_that_watches_no_more_processes_costs_nobody_a_connection(raw, mo
     near.close()
 
     until(lambda: service._count == 0)
-    assert service._deaths._watched == {}
+    assert service._deaths._session_of == {}
 
 
 def test_request_that_was_read_is_handled_before_the_tick(raw, monkeypatch):
