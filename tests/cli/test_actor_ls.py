@@ -98,6 +98,20 @@ def test_only_what_was_lost_is_told_of():
     """A zero is no news."""
     assert list(_losses(ActorStatistics("camera", updates=9))) == []
     assert list(_losses(ActorStatistics("camera", missed=6))) == ["6 ticks missed"]
+    robot = ActorStatistics("robot", interrupted=1, last_interrupted="version 7 for Write(…)")
+    assert list(_losses(robot)) == [
+        (
+            "1 versions taken and never ended, the newest version 7 for Write(…): how far they came is"
+            " not known; written anew they are done"
+        )
+    ]
+    fusion = ActorStatistics("fusion", unstamped=240, unstamped_from="online:camera/1/mask")
+    assert list(_losses(fusion)) == [
+        (
+            "240 data without a capture stamp, from online:camera/1/mask: this actor waits for data of"
+            " one stamp, give it with lock.put(…, stamp_ns=…)"
+        )
+    ]
     assert list(
         _losses(ActorStatistics("fusion", incomplete=2, last_incomplete="set", unknown=1))
     ) == [
