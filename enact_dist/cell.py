@@ -9,6 +9,7 @@ from __future__ import annotations
 import atexit
 import contextlib
 import time
+import weakref
 from typing import TYPE_CHECKING, Any
 
 from enact_dist.arguments import check_reason
@@ -40,6 +41,7 @@ from enact_dist.errors import EnactError, MisuseError
 from enact_dist.forking import drop_world
 from enact_dist.history import keep_versions, kept_versions, let_go
 from enact_dist.lineage import causes_of, effects_of
+from enact_dist.link.dropped import when_dropped
 from enact_dist.lock import refuse_inside_lock
 from enact_dist.session import Session
 from enact_dist.terms import checked_name
@@ -53,14 +55,18 @@ if TYPE_CHECKING:
     from enact_dist.link.client import CellClient
     from enact_dist.terms import Aspect, Entity
 
-_open: set[Cell] = set()
-"""Held strongly: handles made by a cell work on when nobody keeps the cell itself."""
+_open: weakref.WeakKeyDictionary[CellClient, Any] = weakref.WeakKeyDictionary()
+"""The sessions of cells that were not closed, with the shard inside this process, if it has one.
+
+Handles made by a cell work on when nobody keeps the cell itself.
+"""
 
 
 class Cell(Closing):
     """A connection to a cell.  Use as a context manager, or `close` it.
 
-    A cell left open does not hang the interpreter's exit.
+    A cell left open does not hang the interpreter's exit.  One that nobody refers to any more, nor
+    anything made by it, is closed with a `ResourceWarning` that says where it was opened.
 
     A process that has connected over a network cannot hand that on to a child that it forks: there
     the cell and every `connect` raise `MisuseError`, also where the cell was closed before.
@@ -73,7 +79,8 @@ class Cell(Closing):
         self._session = Session(client)
         self._client = client
         self._host = host
-        _open.add(self)
+        self._dropped = when_dropped(client, name, host)
+        _open[client] = host
         # What is registered last runs first: before the transport's own end, over which the
         # goodbyes have to go.
         atexit.unregister(_close_all)
@@ -456,7 +463,8 @@ class Cell(Closing):
 
     def close(self) -> None:
         """Give back everything and end the connection; twice is harmless."""
-        _open.discard(self)
+        _open.pop(self._client, None)
+        self._dropped.detach()
         try:
             self._client.close()
         finally:
@@ -469,6 +477,8 @@ class Cell(Closing):
 
 
 def _close_all() -> None:
-    for cell in list(_open):
+    for client, host in list(_open.items()):
         with contextlib.suppress(EnactError):
-            cell.close()
+            client.close()
+        if host is not None and not client.forked:
+            host.close()

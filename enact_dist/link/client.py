@@ -171,12 +171,12 @@ class CellClient(SessionClient):
 
     def _pause(self, pause_s: float) -> None:
         """Wait before asking again; raises if the cell is closed meanwhile."""
-        if self._pauses.rest(pause_s):
+        if self.pauses.rest(pause_s):
             self.check_usable()
 
     def _drive(self, lock: MultiLock, *, interrupt: threading.Event | None = None) -> None:
         """Make the lock's calls until it rests."""
-        far, returns = Backoff(CALLED_NS_MIN, CALLED_NS_MAX, random.random), self._pauses.returns
+        far, returns = Backoff(CALLED_NS_MIN, CALLED_NS_MAX, random.random), self.pauses.returns
         try:
             while lock.phase.busy or interrupt is not None:
                 with self._mutex:
@@ -191,7 +191,7 @@ class CellClient(SessionClient):
                         wait_until_ns = min(max(wait_until_ns, later_ns), lock.give_up_ns)
                     self._wait_until(lock, wait_until_ns, returns, interrupt)
                     continue
-                returns = self._pauses.returns
+                returns = self.pauses.returns
                 calls = [(shard, self._sendable(shard, request)) for shard, request in calls]
                 answers = self._send(calls)
                 with self._mutex:
@@ -216,10 +216,10 @@ class CellClient(SessionClient):
             left_ns = max(1_000_000, until_ns - self._now_ns())
             if interrupt is not None:
                 left_ns = min(left_ns, lock.slice_ns)
-            if self._pauses.rest(left_ns / 1e9, returns):
+            if self.pauses.rest(left_ns / 1e9, returns):
                 self.check_usable()
             interrupted = interrupt is not None and interrupt.is_set()
-            if interrupted or self._pauses.returns != returns or self._now_ns() >= until_ns:
+            if interrupted or self.pauses.returns != returns or self._now_ns() >= until_ns:
                 return
 
     def _sendable(self, shard: str, request: Request) -> Request:

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import threading
+from typing import TYPE_CHECKING, Protocol
+
+if TYPE_CHECKING:
+    import weakref
 
 
 class Pauses:
@@ -38,3 +42,28 @@ class Pauses:
         with self._changed:
             self._over = True
             self._changed.notify_all()
+
+
+class Renewed(Protocol):
+    """What has to give signs of life."""
+
+    def next_renewal_s(self) -> float:
+        """Return how long no sign of life is due."""
+
+    def renew(self) -> None:
+        """Send those that are due; raises nothing."""
+
+
+def keep_renewing(found: weakref.ref[Renewed], pauses: Pauses) -> None:
+    """Renew a session until it is closed, or nobody uses it any more."""
+    returns = 0
+    while (session := found()) is not None:
+        pause_s = session.next_renewal_s()
+        del session  # its last user may go while this waits
+        if pauses.rest(pause_s, returns):
+            return
+        returns = pauses.returns
+        session = found()
+        if session is not None:
+            session.renew()
+        del session

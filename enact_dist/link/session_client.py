@@ -37,9 +37,10 @@ from enact_dist.link.calls import CALL_S, Calls, patience_s
 from enact_dist.link.carrier import FORKED_REMEDY
 from enact_dist.link.catalogue import CATALOGUES, KnownCatalogue
 from enact_dist.link.clock import boottime_ns
+from enact_dist.link.dropped import weakly
 from enact_dist.link.further_shards import FurtherShards
 from enact_dist.link.lanes import Lanes
-from enact_dist.link.pauses import Pauses
+from enact_dist.link.pauses import Pauses, keep_renewing
 from enact_dist.link.payload_client import SharedPayloads
 from enact_dist.link.refusals import error_of, unreachable
 from enact_dist.link.used_names import SERIES_BITS
@@ -103,21 +104,24 @@ class SessionClient:
         self.staged_numbers = itertools.count(FIRST_STAGED)
         self._now_ns = now_ns
         self._mutex = threading.RLock()
-        self._pauses = Pauses()
+        self.pauses = Pauses()
         self._signs = SignsOfLife(random.random)
         self._lanes = Lanes()
         self._catalogue = KnownCatalogue()
         self.payloads = SharedPayloads(
             client.session,
-            self._staged,
-            self.count,
+            weakly(self._staged),
+            weakly(self.count),
             inside=carrier.inside,
         )
-        self._further = FurtherShards(carrier, client.placement, now_ns, self.count, doubts)
+        self._further = FurtherShards(carrier, client.placement, now_ns, weakly(self.count), doubts)
         self._renewer: threading.Thread | None = None
         if keep_alive:
             self._renewer = threading.Thread(
-                target=self._renew, name="enact-keep-alive", daemon=True
+                target=keep_renewing,
+                args=(weakref.ref(self), self.pauses),
+                name="enact-keep-alive",
+                daemon=True,
             )
         _alive.add(self)
 
@@ -128,14 +132,14 @@ class SessionClient:
         self._take(welcome.shard, self.core.hello(welcome.shard), welcome)
         if self._renewer is not None:
             self._renewer.start()
-            self.carrier.tell_returns(self._shard_returned)
+            self.carrier.tell_returns(weakly(self._shard_returned))
 
     def close(self) -> None:
         """Say goodbye to every shard and end; twice is harmless."""
         if self.closed or self.forked:
             return
         self.closed = True
-        self._pauses.end()
+        self.pauses.end()
         if self._renewer is not None and self._renewer.is_alive():
             self._renewer.join()
         goodbyes = [(shard, Goodbye(self.core.session)) for shard in self.core.shards_in_use()]
@@ -197,7 +201,7 @@ class SessionClient:
         far = Backoff(CALLED_NS_MIN, CALLED_NS_MAX, random.random)
         while left := made.left:
             sent = [made.asked[index] for index in left]
-            epochs, returns = [self.core.epoch(shard) for shard, _ in sent], self._pauses.returns
+            epochs, returns = [self.core.epoch(shard) for shard, _ in sent], self.pauses.returns
             turned = False
             for index, answer, epoch in zip(left, self._send(sent), epochs, strict=True):
                 if answer is not None:
@@ -211,7 +215,7 @@ class SessionClient:
             elif made.left:
                 away = all(self.carrier.away(made.asked[index][0]) for index in made.left)
                 pause_ns = (far if away else near).pause_ns()
-                self._pauses.rest(min(pause_ns, left_ns) / 1e9, returns)
+                self.pauses.rest(min(pause_ns, left_ns) / 1e9, returns)
         return made.answers
 
     def _deadline_ns(self, timeout_s: float | None) -> int:
@@ -292,7 +296,7 @@ class SessionClient:
 
     def rest(self, pause_s: float) -> None:
         """Wait a little before something is asked again, but not once a shard has come back."""
-        self._pauses.rest(pause_s)
+        self.pauses.rest(pause_s)
 
     def _staged(self, shard: str, request: Request) -> Answer | None:
         return self.call_once([(shard, request)])[0]
@@ -436,30 +440,27 @@ class SessionClient:
 
     # ---------------------------------------------------------------- keep-alive
 
-    def _renew(self) -> None:
-        returns = 0
-        while True:
-            shards, usual_ns = self.core.shards_in_use(), self.core.ttl_ns // 4
-            if self._pauses.rest(
-                self._signs.pause_ns(shards, self.carrier.away, usual_ns, self._now_ns()) / 1e9,
-                returns,
-            ):
-                return
-            returns = self._pauses.returns
-            try:
+    def next_renewal_s(self) -> float:
+        """Return how long no sign of life is due."""
+        shards, usual_ns = self.core.shards_in_use(), self.core.ttl_ns // 4
+        return self._signs.pause_ns(shards, self.carrier.away, usual_ns, self._now_ns()) / 1e9
+
+    def renew(self) -> None:
+        """Send the signs of life that are due; whatever comes of it is for the log."""
+        try:
+            self.renew_once()
+            if any(self.core.needs_hello(shard) for shard in self.core.shards_in_use()):
+                # A shard restarted: the sooner it knows that we know, the sooner it grants.
                 self.renew_once()
-                if any(self.core.needs_hello(shard) for shard in self.core.shards_in_use()):
-                    # A shard restarted: the sooner it knows that we know, the sooner it grants.
-                    self.renew_once()
-            except Exception as error:  # noqa: BLE001 - a bad answer must not end the renewal
-                self.count("keep_alives_failed")
-                _log.warning("keep-alive of session %s: %s", self.core.session[:8], error)
+        except Exception as error:  # noqa: BLE001 - a bad answer must not end the renewal
+            self.count("keep_alives_failed")
+            _log.warning("keep-alive of session %s: %s", self.core.session[:8], error)
 
     def _shard_returned(self, _: str) -> None:
         """Let everybody who waits ask again at once."""
         with self._mutex:
             self.core.ask_again()
-        self._pauses.shard_returned()
+        self.pauses.shard_returned()
 
     def renew_once(self) -> None:
         """Send one keep-alive to every shard in use that is in reach, and take the answers.

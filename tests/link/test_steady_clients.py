@@ -4,7 +4,10 @@ import gc
 import threading
 from pathlib import Path
 
-from enact_dist import connect
+import pytest
+
+from enact_dist import Aspect, Durability, Entity, Lock, View, Write, connect, local
+from enact_dist.errors import StoreError
 
 CYCLES = 100
 KEPT_BYTES_MAX = 8_000
@@ -34,3 +37,53 @@ def test_connecting_and_closing_leaves_nothing_behind(process, endpoint):
     assert after[2] <= before[2]
     assert after[1] - before[1] < CYCLES
     assert after[0] - before[0] < CYCLES * KEPT_BYTES_MAX
+
+
+def dropped(users):
+    """Let nobody refer to what uses a cell."""
+    users.clear()
+    gc.collect()
+
+
+def test_cell_that_is_dropped_is_closed_and_says_where_it_was_opened(daemon, endpoint, until):
+    """Whatever was made by it keeps it; then its session and its threads end."""
+    daemon(endpoint)
+    before = threading.active_count()
+    online = connect(endpoint, timeout_s=30.0).world("online")
+    write = Write(online, Entity("part"), Aspect("number", int))
+    with Lock(write, wait_s=30.0) as lock:
+        lock[write] = 1
+    users = [online.watch("part")]
+    del online, write, lock
+    gc.collect()
+    assert users[0].next(30.0).version == 1  # in use still
+    assert threading.active_count() > before
+    users[0].close()
+
+    with pytest.warns(ResourceWarning, match=rf"opened at {__file__}:\d+") as warned:
+        dropped(users)
+
+    assert len(warned) == 1
+    until(lambda: threading.active_count() <= before)
+
+
+def test_local_cell_that_is_dropped_lets_go_of_its_folder(tmp_path, until):
+    """Another one may open the folder, and finds what was committed."""
+    aspect = Aspect("number", int, Durability.OS)
+    users = [local(tmp_path, worlds=["online"])]
+    users.append(Write(users[0].world("online"), Entity("part"), aspect))
+    with Lock(users[1]) as lock:
+        lock[users[1]] = 7
+    del lock
+    with pytest.warns(ResourceWarning, match="dropped without close"):
+        dropped(users)
+
+    def opened():
+        try:
+            return local(tmp_path)
+        except StoreError:
+            return None
+
+    with until(opened) as cell:
+        view = View(cell.world("online"), Entity("part"), aspect)
+        assert cell.world("online").view(view)[view] == 7

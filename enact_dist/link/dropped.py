@@ -1,0 +1,92 @@
+"""Sessions that nobody can use any more and nobody has closed: they are ended, with a warning.
+
+The threads of a session keep its carrier and not the session itself, which therefore goes with the
+last cell, world context, lock or watch that uses it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+import threading
+import warnings
+import weakref
+from typing import TYPE_CHECKING, Any, Final
+
+from enact_dist.core.messages import Goodbye
+from enact_dist.errors import EnactError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from types import FrameType
+
+    from enact_dist.link.client import CellClient
+
+GOODBYE_S: Final = 0.5
+"""How long the shards of a dropped session may take to answer its goodbye."""
+_PACKAGE: Final = "enact_dist."
+
+
+def weakly(method: Callable[..., Any]) -> Callable[..., Any]:
+    """Return what calls a bound method while its object lives, and returns None afterwards."""
+    found = weakref.WeakMethod(method)
+
+    def call(*arguments: Any) -> Any:
+        bound = found()
+        return bound(*arguments) if bound is not None else None
+
+    return call
+
+
+def when_dropped(client: CellClient, name: str, host: Any) -> weakref.finalize[Any, Any]:
+    """End a session, and the shard inside this process, when nobody refers to it any more.
+
+    Args:
+        client: The session.
+        name: The cell's name.
+        host: The shard inside this process; None where there is none.
+
+    Returns:
+        What `detach` of calls it off.
+    """
+    left = client.carrier, client.core, client.pauses, host
+    found = weakref.finalize(client, _dropped, os.getpid(), name, _made_at(), *left)
+    found.atexit = False  # what is open then is closed in order
+    return found
+
+
+def _made_at() -> str:
+    """Return the place outside of this package where a cell is being opened."""
+    frame: FrameType | None = sys._getframe(1)  # noqa: SLF001 - a traceback would cost a file read
+    while frame is not None and str(frame.f_globals.get("__name__")).startswith(_PACKAGE):
+        frame = frame.f_back
+    return f"{frame.f_code.co_filename}:{frame.f_lineno}" if frame is not None else "unknown"
+
+
+def _dropped(pid: int, name: str, made_at: str, carrier: Any, core: Any, *left: Any) -> None:
+    if pid != os.getpid():  # a forked child: all of it is the parent's
+        return
+    pauses, host = left
+    pauses.end()
+    ending = threading.Thread(
+        target=_end, args=(carrier, core, host), name="enact-dropped", daemon=True
+    )
+    # Not here: whoever happens to drop the last reference may hold locks that the end takes.
+    with contextlib.suppress(RuntimeError):  # the interpreter ends
+        ending.start()
+    warnings.warn(
+        f"cell {name!r} was dropped without close(), and is closed now; it was opened at {made_at};"
+        " write `with connect(…) as cell:`, or close it",
+        ResourceWarning,
+        stacklevel=2,
+    )
+
+
+def _end(carrier: Any, core: Any, host: Any) -> None:
+    goodbyes = [(shard, Goodbye(core.session)) for shard in core.shards_in_use()]
+    with contextlib.suppress(EnactError):
+        carrier.request_all(goodbyes, timeout_s=GOODBYE_S)
+    carrier.close()
+    if host is not None:
+        host.close()
