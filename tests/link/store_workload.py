@@ -306,6 +306,8 @@ class Driver:
     def hello(self):
         name = f"session{len(self.sessions)}-{self.epoch}-{self.handles}"
         self.send(Hello(name, 0, 10**10, "a", "h", 1, False))
+        # What it registers goes to the disk with its record.
+        self.shard.state.sessions.by_id[name].present = True
         aspects = tuple(AspectEntry(a, "int", durability) for a, durability in ASPECTS.items())
         self.send(Register(name, ("online", f"w{self.rng.randrange(3)}"), aspects))
         self.flush()
