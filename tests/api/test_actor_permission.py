@@ -8,7 +8,7 @@ from enact_dist import Actor, Aspect, Entity, World, Write, local
 from enact_dist.actor_runner import run_actor
 from enact_dist.errors import PermissionDeniedError
 
-pytestmark = pytest.mark.carrier("local")
+pytestmark = pytest.mark.carrier("auto")
 
 
 def test_actor_in_the_session_of_another_ends_at_once():
