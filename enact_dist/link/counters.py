@@ -186,6 +186,10 @@ OF_A_SHARD: Final[dict[str, Counter]] = {
 
 OF_A_CONNECTION: Final[dict[str, Counter]] = {
     "connects_failed": Counter("tries to connect to further shards that failed", "see the log"),
+    "shards_doubted": Counter(
+        "shards that more than one daemon serves; none of them is trusted",
+        "stop all daemons of that name but one: enact doctor",
+    ),
     "keep_alives_failed": Counter("answers to keep-alives that made no sense", "see the log"),
     "keep_alives_unanswered": Counter("keep-alives without an answer in time", _NETWORK),
     "releases_unsent": Counter("locks whose release could not be sent; the next one ends them"),
