@@ -47,7 +47,7 @@ QUEUED_MAX: Final = 65_536
 """Messages in a channel between Zenoh and Python: the network thread must not wait for Python."""
 MESSAGE_BYTES_MAX: Final = FRAME_BYTES_MAX + (64 << 10)
 """Longest message: a frame with its key.  Of a longer one Zenoh keeps nothing."""
-RETRY_MS, RETRY_MS_MAX, RETRY_FACTOR = 50, 1_000, 1.25
+RETRY_MS, RETRY_MS_MAX, RETRY_FACTOR = 50, 1_000, 1.15
 """Pauses between two attempts to connect to a place where nobody listens: they grow from the first
 to the second figure, or to a part of it that each session draws."""
 CONNECT_WAIT_MS: Final = 50
