@@ -8,10 +8,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
 CALLED_NS_MIN: Final = 1_000_000_000
-CALLED_NS_MAX: Final = 5_000_000_000
+CALLED_NS_MAX: Final = 2_000_000_000
 """Pauses of somebody who waits for a shard that is out of reach, from the first to the longest."""
 AWAY_NS_MIN: Final = 2_000_000_000
-AWAY_NS_MAX: Final = 10_000_000_000
+AWAY_NS_MAX: Final = 5_000_000_000
 """Pause between two signs of life to a shard that is out of reach; doubles up to the second figure.
 
 The carrier tells when it comes back, so these only repair what the carrier has missed.

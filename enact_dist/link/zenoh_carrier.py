@@ -196,8 +196,6 @@ class ZenohCarrier:
     def _send(
         self, shard: str, message: Request, timeout_s: float
     ) -> zenoh.Handler[zenoh.Reply] | None:
-        if self.away(shard):
-            return None  # Zenoh knows of nobody who would answer
         link = self._link_of.get(shard) or self._links[0]
         header, payload = encode_frame(message)
         priority = _CONTROL

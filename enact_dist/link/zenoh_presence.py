@@ -24,9 +24,6 @@ class ShardPresence:
 
     One that is not closed before its session leaves 15 kB behind (Zenoh 1.10).
 
-    Attributes:
-        here: Whether the shard is in reach, as far as Zenoh has noted.
-
     Args:
         session: Not closed with this.
         key: A key on which the shard takes requests.
@@ -38,16 +35,23 @@ class ShardPresence:
         self._mutex = threading.Lock()
         self._closed = False
         self._querier = session.declare_querier(key)
-        # As it is; Zenoh's stub says otherwise.
-        self.here = cast("zenoh.MatchingStatus", self._querier.matching_status).matching
         self._events: Events[zenoh.MatchingStatus] = Events(
             "enact-presence", self._querier.declare_matching_listener, self._heard
         )
         keep_after_fork(self)
 
-    def _heard(self, event: zenoh.MatchingStatus) -> None:
-        self.here = event.matching
-        if event.matching:
+    @property
+    def here(self) -> bool:
+        """Whether the shard is in reach, as far as Zenoh has noted."""
+        try:
+            # As it is; Zenoh's stub says otherwise.
+            return cast("zenoh.MatchingStatus", self._querier.matching_status).matching
+        except zenoh.ZError:  # the session is closed, or this is
+            return False
+
+    def _heard(self, _: zenoh.MatchingStatus) -> None:
+        # Of a shard that goes and comes at once the later event may be the one of its going.
+        if self.here:
             self._returned()
 
     def close(self, wait_s: float = 0.0) -> None:

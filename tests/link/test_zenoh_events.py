@@ -4,12 +4,14 @@ import os
 import queue
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import zenoh
 
 from enact_dist.link.zenoh_config import close_session, open_session
 from enact_dist.link.zenoh_events import Events
+from enact_dist.link.zenoh_presence import ShardPresence
 
 QUIET_S = 1.0
 """A thread that waits in a channel of Zenoh's wakes ten times in this."""
@@ -58,3 +60,26 @@ def test_listener_that_cannot_be_declared_raises_here(endpoint):
     close_session(session)
     with pytest.raises(zenoh.ZError):
         Events("enact-test", lambda c: session.declare_subscriber("some/key", c), print)
+
+
+def test_shard_that_goes_and_comes_at_once_is_told_whatever_event_is_the_last():
+    """Zenoh tells of both from different threads; what counts is how it is when they are heard."""
+    callbacks, returned, status = [], queue.SimpleQueue(), SimpleNamespace(matching=False)
+    querier = SimpleNamespace(
+        declare_matching_listener=callbacks.append,
+        matching_status=status,
+        undeclare=lambda: [callback.drop() for callback in callbacks],
+    )
+    session = SimpleNamespace(declare_querier=lambda _: querier)
+    presence = ShardPresence(session, "some/key", lambda: returned.put("back"))
+    try:
+        callbacks[0](SimpleNamespace(matching=False))
+        assert (presence.here, returned.empty()) == (False, True)
+
+        status.matching = True
+        callbacks[0](SimpleNamespace(matching=False))  # the later one, of its going
+
+        assert presence.here
+        assert returned.get(timeout=30) == "back"
+    finally:
+        presence.close(30.0)
