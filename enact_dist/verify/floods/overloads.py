@@ -50,6 +50,7 @@ LONG_NAME: Final = "a" * 150
 WAIT_NS: Final = 25_000_000_000
 REPORT: Final = b"\xc4\x10" + b"r" * 65_000
 FRAME_BYTES: Final = 256 << 20
+PATTERNED: Final = "patterned"
 LONG: Final = 100_000
 
 
@@ -164,23 +165,26 @@ def patterns(attacker: Attacker) -> None:
 
     As backtracking regular expressions they stopped a shard until it was killed.
     """
-    write = Item(int(Access.WRITE), WORLD, LONG_NAME, COUNT.name)
+    # An aspect of its own: a pattern locks all slots of its aspect, the victim's would wait for it.
+    attacker.post(Register(attacker.session, (), (AspectEntry(PATTERNED, "int", "volatile"),)))
+    attacker.zenoh.drain()
+    write = Item(int(Access.WRITE), WORLD, LONG_NAME, PATTERNED)
     lock = attacker.next_lock()
     attacker.zenoh.ask(FIRST, attacker.acquire((write,), lock))
     granted = attacker.zenoh.ask(FIRST, attacker.acquire((write,), lock))
     token = getattr(granted, "token", Token(1, 1))
     datum = Datum(b"\x01", b"", 0)
-    slot = Slot(WORLD, LONG_NAME, COUNT.name)
+    slot = Slot(WORLD, LONG_NAME, PATTERNED)
     attacker.zenoh.ask(FIRST, Commit(lock, token, (WriteItem(slot, datum),), 0))
     for stars in (4, 9, 30):
         pattern = "*a" * stars + "*b"
         attacker.post(Survey((), (pattern,), ()), ListHistory((), (pattern,), ()))
         attacker.post(Survey((), (pattern,) * 4000, ()))
-        each = Item(int(Access.READ_EACH), WORLD, pattern, COUNT.name)
+        each = Item(int(Access.READ_EACH), WORLD, pattern, PATTERNED)
         attacker.post(attacker.acquire((each,), attacker.next_lock()))
     for several in (4, 5, 9):
-        each = Item(int(Access.WRITE_EACH), WORLD, "**/a/" * several + "b", COUNT.name)
-        other = Item(int(Access.WRITE_EACH), WORLD, "a/**/" * several + "c", COUNT.name)
+        each = Item(int(Access.WRITE_EACH), WORLD, "**/a/" * several + "b", PATTERNED)
+        other = Item(int(Access.WRITE_EACH), WORLD, "a/**/" * several + "c", PATTERNED)
         for item in (each, other):
             attacker.post(attacker.acquire((item,), attacker.next_lock(lane=several)))
     attacker.zenoh.drain()
