@@ -244,7 +244,8 @@ class ShardHost:
         """
         kind = type(message)
         if kind is Commit or kind is Prepare:
-            message = self._payloads.with_bodies(cast("Commit", message))
+            if self._refusal(message, identity) is None:  # else nothing staged is used up by it
+                message = self._payloads.with_bodies(cast("Commit", message))
         elif kind is Stage:
             self._stage(cast("Stage", message), reply, identity)
             return
@@ -265,14 +266,22 @@ class ShardHost:
     def _stage(self, message: Stage, reply: Callable[[Answer], None], identity: str) -> None:
         if self._ended:
             return
-        sessions = self._shard.state.sessions
-        refusal = owners.refusal(message, identity, sessions, self.epoch) if identity else None
+        refusal = self._refusal(message, identity)
         if refusal is not None:
             reply(refusal)
-        elif message.total and message.session not in sessions.by_id:
+        elif message.total and message.session not in self._shard.state.sessions.by_id:
             reply(EpochChanged(self.epoch))
         else:
             reply(self._payloads.stage(message, identity))
+
+    def _refusal(self, message: Request, identity: str) -> Refused | EpochChanged | None:
+        """Return why the shard will refuse a message because of who asks, else None."""
+        sessions = self._shard.state.sessions
+        return owners.refusal(message, identity, sessions, self.epoch) if identity else None
+
+    def owner_of(self, session: str) -> str:
+        """Return the identity of a session; "" where that is not known.  Without the mutex."""
+        return self._shard.state.sessions.owner(session) or ""
 
     def event(self, event: Event) -> None:
         """Hand an event to the shard (a session's token appeared, for example)."""

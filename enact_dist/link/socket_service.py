@@ -18,6 +18,7 @@ from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from enact_dist.core.owners import not_yours
 from enact_dist.core.records import SessionDied
 from enact_dist.errors import LinkError
 from enact_dist.link.socket_connection import SocketConnection, end_socket
@@ -103,10 +104,13 @@ class SocketService:
         """Let a connection speak for a session.
 
         Raises:
-            LinkError: It comes from a stranger, or there are too many.
+            LinkError: It comes from a stranger, or there are too many, or the session is another's.
         """
         peer = check_peer(connection.connected, users=self._users, group=self._access.group)
         connection.peer = peer
+        owner, asker = self.host.owner_of(session), connection.identity
+        if owner and owner != asker:  # the end of this process would end that session
+            raise LinkError(not_yours(session, owner, asker).text)
         with self._mutex:
             mine = self._connections.get(session, set())
             problem = self._problem_with(session, mine, peer)

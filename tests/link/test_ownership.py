@@ -8,10 +8,11 @@ import zenoh
 
 from enact_dist.core import messages as m
 from enact_dist.core import parked, quotas, sessions
-from enact_dist.core.datum import Datum, LockId, Position
+from enact_dist.core.datum import Datum, LockId, Position, Slot
 from enact_dist.errors import PermissionDeniedError, ProtocolError
 from enact_dist.link import payload_desk, socket_service
 from enact_dist.link.refusals import error_of
+from enact_dist.link.socket_frames import Kind
 from enact_dist.link.zenoh_carrier import wait_connected
 from enact_dist.link.zenoh_config import MESSAGE_BYTES_MAX, close_session, open_session
 from enact_dist.wire.frames import decode_frame, encode_frame
@@ -136,6 +137,57 @@ def test_connection_speaks_for_its_own_session_only(raw, make_peer):
 
 
 @both
+def test_stranger_uses_up_no_data_that_wait_for_their_commit(
+    daemon, carry, make_peer, endpoint, stranger
+):
+    """A commit that is refused because of who sends it takes no staged data with it."""
+    daemon(endpoint)
+    victim = peer_over(carry(endpoint), make_peer)
+    granted = victim.acquire("cup")
+    file, body = f"{victim.session}-1", bytes(100_000)
+    slice_ = Datum(b"", body, len(body))
+    victim.call("s0", m.Stage(victim.session, file, 0, len(body), slice_))
+    named = Datum(b"\x01", b"", len(body), file=file)
+    writes = (m.WriteItem(Slot("online", "cup", "count"), named),)
+    commit = m.Commit(granted.lock, granted.token, writes, 0)
+
+    refused = stranger(commit, "eve@h:1")
+
+    assert refused.code == "permission"
+    assert isinstance(victim.call("s0", commit), m.Committed)
+
+
+GREETS_AND_ENDS = """
+import socket, sys
+from enact_dist.link.socket_frames import Kind, Stream, greeting_of, send_frame
+near = socket.socket(socket.AF_UNIX)
+near.connect(sys.argv[1])
+send_frame(near, greeting_of(sys.argv[2], "eve@h:1"), kind=Kind.OPEN)
+kind, text, _ = Stream(near).receive()
+print(int(kind), text.decode(), flush=True)
+"""
+
+
+@pytest.mark.carrier("socket")
+@pytest.mark.parametrize("carry", ["zenoh"], indirect=True)
+def test_process_that_greets_for_a_session_of_zenoh_does_not_end_it_with_its_own(
+    daemon, carry, make_peer, endpoint, program
+):
+    """The end of a process ends its own sessions; nobody opens a socket for another's."""
+    shard = daemon(endpoint)
+    victim = peer_over(carry(endpoint), make_peer)
+    granted = victim.acquire("cup")
+
+    eve = program(GREETS_AND_ENDS, shard._shared.path / "socket", victim.session)
+    said, _ = eve.communicate(timeout=30)
+    kind, _, text = said.strip().partition(" ")
+    assert int(kind) == Kind.REFUSED
+    assert "eve@h:1" in text
+    assert "may not speak for it" in text
+    assert isinstance(victim.commit(granted, "cup", b"1"), m.Committed)
+
+
+@both
 def test_commit_that_carries_more_than_it_may_is_refused_and_the_lock_stays(
     daemon, carry, make_peer, endpoint
 ):
@@ -180,13 +232,13 @@ def test_page_on_security_says_the_bounds_that_hold():
     """Each figure of its table is that of the code."""
     rows = dict(re.findall(r"^\| ([^|]+) \| ([^|]+) \|", PAGE.read_text("utf-8"), re.MULTILINE))
     held = {
-        "sessions": quotas.SESSIONS_MAX,
+        "sessions of one process": quotas.SESSIONS_MAX,
         "sessions of a shard": sessions.SESSIONS_MAX,
-        "locks held or awaited": quotas.WAITERS_MAX,
+        "locks that one process holds or awaits": quotas.WAITERS_MAX,
         "socket connections": socket_service.PROCESS_CONNECTIONS_MAX,
-        "questions that wait": parked.OF_A_SESSION_MAX,
+        "waiting questions": parked.OF_A_SESSION_MAX,
         "one message": FRAME_BYTES_MAX >> 20,
-        "data that travel with their commit": COMMIT_BYTES_MAX >> 20,
+        "data sent with their commit": COMMIT_BYTES_MAX >> 20,
     }
     said = {what: int(rows[what].split()[0].replace(",", "")) for what in held}
 
