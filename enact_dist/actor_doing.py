@@ -1,7 +1,8 @@
-"""What an actor's own code is doing at this moment, for whoever looks from another thread.
+"""What an actor's own code is doing at this moment, visible to other threads.
 
-An update that never returns reports nothing by itself.  `Doing` notes which method of the actor
-runs, since when and under which lock; a method that calls `sys.exit` is an error with its place.
+An update that never returns cannot report anything.  `Doing` therefore records which method of the
+actor runs, since when and under which lock.  If a method calls `sys.exit`, `Doing` raises an error
+that names the place of the call.
 """
 
 from __future__ import annotations
@@ -60,7 +61,7 @@ class Doing:
 
     Attributes:
         call: What runs now; None between the calls.
-        between: Held while a method runs; whoever holds it changes the actor between two calls.
+        between: Held while a method runs; a thread that holds it may change the actor.
     """
 
     __slots__ = ("_actor", "between", "call")
@@ -77,7 +78,7 @@ class Doing:
         """Note that the block calls a method of the actor; arguments as for `Call`.
 
         Raises:
-            MisuseError: The method called `sys.exit`, which would end the actor without a word.
+            MisuseError: The method called `sys.exit`, which would end the actor silently.
         """
         self.call = Call(method, about, monotonic_ns(), threading.get_ident(), lock, remains)
         try:
@@ -85,8 +86,8 @@ class Doing:
                 yield
         except SystemExit as error:
             raise MisuseError(
-                f"{self._actor}.{method} called sys.exit({error.code!r}) at {place_of(error)}; an"
-                " actor that cannot do its work raises an exception, and one that is done returns"
+                f"{self._actor}.{method} called sys.exit({error.code!r}) at {place_of(error)};"
+                " raise an exception if the actor cannot do its work, or return if it is done"
             ) from None
         finally:
             self.call = None

@@ -1,7 +1,7 @@
 """The end of an actor process whose actor does not end: after `drain_s`, or at a second signal.
 
-The first signal lets the update that runs finish and commit.  One that does not return within the
-drain is cut off: the process says what it was doing, and ends.  Its lock ends with it.
+After the first signal the current update may finish and commit.  If it does not return within the
+drain, the process cuts it off, logs what it was doing, and ends; its lock ends with it.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ class Drain:
         """Begin the drain at the first signal."""
         if self._doing.call is not None:
             log.info(
-                "%s received: actor %s ends after what it does now, within %g s; a second signal"
-                " ends it at once",
+                "%s received: actor %s finishes its current call and ends, within %g s; a second"
+                " signal ends it at once",
                 signal, self._name, self._drain_s,
             )  # fmt: skip
         why = f"did not end within {self._drain_s:g} s of {signal}"
@@ -56,7 +56,7 @@ class Drain:
 
     def hurry(self, _signal: str) -> None:
         """End the process at once at the second signal."""
-        self._cut_off("was told twice to end")
+        self._cut_off("received a second signal")
 
     def over(self) -> None:
         """Note that the actor has ended by itself."""

@@ -1,7 +1,7 @@
 """What flows from actor to actor, by their declarations: capture stamps, and streams.
 
-A source gives its data the stamp of its tick, what it triggers writes with that stamp, and so does
-what that triggers.  How often a triggered actor writes cannot be told from its declaration.
+A source stamps its data with its tick.  Actors that it triggers write with the same stamp, and so
+do the actors that these trigger.  A declaration does not show how often a triggered actor writes.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ STREAM_S: Final = 0.1
 
 
 def unstamped_sets(uses: Sequence[Use]) -> Iterator[Finding]:
-    """Find data of a `Together` whose writers are known and give no capture stamp."""
+    """Find data of a `Together` whose writers are known and set no capture stamp."""
     stamping = _stamping(uses)
     for use in uses:
         together = use.actor.actor_class.declaration.together
@@ -39,18 +39,18 @@ def unstamped_sets(uses: Sequence[Use]) -> Iterator[Finding]:
             "warning",
             "set without stamps",
             (use.actor.name, writer.actor.name),
-            f"{use} waits for data that bear one capture stamp, and {writer} writes them without:"
-            f" {writer.actor.name} {why}, and its module never says stamp_ns; write"
+            f"{use} waits for data with equal capture stamps, but {writer} writes them without one:"
+            f" {writer.actor.name} {why}, and its module never uses stamp_ns; call"
             " lock.put(…, stamp_ns=…), or let a source or stamped data trigger it",
         )
 
 
 def streams(uses: Sequence[Use], said: Collection[str]) -> Iterator[Finding]:
-    """Find aspects that are written often, and are durable only since nothing says otherwise.
+    """Find aspects that actors write often and that are durable only by default.
 
     Args:
         uses: All requests of the cell.
-        said: Names of the aspects whose durability `cell.toml` says.
+        said: Names of the aspects whose durability `cell.toml` sets.
     """
     told = {use.request.aspect.name for use in uses if use.request.aspect.durability} | set(said)
     for use in uses:
@@ -64,10 +64,10 @@ def streams(uses: Sequence[Use], said: Collection[str]) -> Iterator[Finding]:
             "advice",
             "durable stream",
             (use.actor.name,),
-            f"{use} may be written {1 / period_s:.3g} times a second, and is forced to the disk"
-            " each time, since nothing says how durable it is; for data that the next replace write"
+            f"{use} may be written {1 / period_s:.3g} times a second, and each write is forced to"
+            " the disk, because no durability is set; if each datum replaces the one before, write"
             f' [aspects.{aspect}] durability = "volatile" in cell.toml (or in Aspect(…)), else'
-            ' "os" or "durable", which says that this is meant',
+            ' "os" or "durable" to confirm that this is intended',
         )
 
 

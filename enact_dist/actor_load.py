@@ -173,8 +173,8 @@ def make_actor(actor_class: type[Actor], options: Mapping[str, object]) -> Actor
         raise ConfigError(f"actor {name} refuses its options {dict(options)}: {error}") from error
     except SystemExit as error:
         raise ConfigError(
-            f"{name}.__init__ called sys.exit({error.code!r}) at {place_of(error)}; it has to"
-            " return, or to raise what is wrong"
+            f"{name}.__init__ called sys.exit({error.code!r}) at {place_of(error)}; it must return,"
+            " or raise an exception"
         ) from error
     return actor
 

@@ -10,10 +10,10 @@ Rules that a change must keep:
 
 1. `update` runs only after a commit, known to stand, that names its version as taken; no other
    process takes that version afterwards.  So it runs at most once per version, whatever dies.
-2. Who finds a version taken by a session that is gone records it as interrupted, and runs the
-   next one; the version itself is never run again.
-3. While the taker's session lives, everybody else waits.
-4. An outcome is written only in place of the taking that it belongs to.
+2. An actor that finds a version taken by an ended session records it as interrupted and runs the
+   next one; the interrupted version never runs again.
+3. While the session that took a version lives, all other actors wait.
+4. An outcome only ever replaces the ``taken`` outcome that it belongs to.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class TakenError(LockTimeoutError):
 
 
 class Acted(NamedTuple):
-    """What one attempt has come to.
+    """The result of one attempt.
 
     Attributes:
         states: The states of the trigger data that it has seen, as `PendingTriggers.used`.
@@ -86,7 +86,7 @@ class Acted(NamedTuple):
 
 
 class OnceInbox(Inbox):
-    """An inbox that also tells the update that runs of what comes after its version."""
+    """An inbox that also notifies the running update of newer versions."""
 
     meanwhile = True
 
@@ -112,7 +112,7 @@ class OnceInbox(Inbox):
             self._tell()
 
     def end(self) -> None:
-        """Tell nobody any more."""
+        """Stop notifying the update."""
         with self._filled:
             self._running = None
 
@@ -141,7 +141,7 @@ class Once:
     Args:
         bound: The actor.
         name: Its name.
-        doing: What it does, for those who look.
+        doing: What it does, for other threads.
         stop: Set when it is to stop.
         inbox: Where its changes go; None without a watch, as in tests on a manual clock.
 
@@ -176,7 +176,7 @@ class Once:
         wait_s: float | None = None,
         granted: Callable[[], object] = lambda: None,
     ) -> Acted:
-        """Act on the newest version of an entity's datum if nobody has yet.
+        """Act on the newest version of an entity's datum unless an actor already has.
 
         Args:
             entity: The triggering entity.
@@ -221,7 +221,7 @@ class Once:
             raise
 
     def sweep(self) -> bool:
-        """Record what earlier runs of this actor have left as taken, whatever triggers now.
+        """Close the versions that earlier runs of this actor left as taken.
 
         Returns:
             Whether nothing is left: no session of such a run lives any more.
@@ -287,8 +287,8 @@ class Once:
             if found != self._waits_for:
                 self._waits_for = found
                 log.warning(
-                    "%s: waits: version %d for %r was taken by %s, which runs and has written no"
-                    " outcome yet",
+                    "%s: waits: version %d for %r was taken by %s, which still runs and has not"
+                    " written an outcome yet",
                     self._name, found.version, outcome, found.actor,
                 )  # fmt: skip
             raise TakenError(f"{outcome!r}: version {found.version} is taken by {found.actor}")
@@ -300,8 +300,8 @@ class Once:
         self.interrupted += 1
         self.last_interrupted = f"version {found.version} for {outcome!r}"
         log.error(
-            "%s: interrupted: %s was %s; how far it came is not known, and it is not run again."
-            " Write the datum anew to have it done",
+            "%s: interrupted: %s was %s; how far it came is unknown, and it will not run again."
+            " Write the datum again to run it",
             self._name, self.last_interrupted, text,
         )  # fmt: skip
 
@@ -358,7 +358,7 @@ class Once:
                     give_up_s = min(give_up_s, time.monotonic() + OUTCOME_S)
                 if time.monotonic() >= give_up_s:
                     log.error(  # noqa: TRY400 (the error is the shard's, and named)
-                        "%s: the outcome of version %d for %r is not written and will read"
+                        "%s: could not write the outcome of version %d for %r, which will read"
                         " interrupted; it was: %s %s: %s",
                         self._name, ended.version, outcome, ended.state, ended.text, error,
                     )  # fmt: skip
@@ -369,7 +369,7 @@ class Once:
             else:
                 if found not in (taken, ended):
                     log.error(
-                        "%s: %r reads %s by now: the outcome %s of version %d is not written",
+                        "%s: %r now reads %s, so the outcome %s of version %d is not written",
                         self._name, outcome, found, ended.state, ended.version,
                     )  # fmt: skip
                 return True

@@ -440,10 +440,10 @@ class ActorRun:
         if not self._warned:
             self._warned = True
             log.warning(
-                "%s%s: %s.update runs again, as it lost its lock before (hold_s = %g): nothing of"
-                " it was written, but what it did outside of the cell was done. An actor that moves"
-                " something says once = True (enact_dist/docs/actuators.md); another one may be"
-                " given a longer hold_s",
+                "%s%s: %s.update runs again, because it lost its lock (hold_s = %g). Its writes are"
+                " discarded, but its effects outside the cell remain. If the actor moves something,"
+                " set once = True (enact_dist/docs/actuators.md); otherwise consider a longer"
+                " hold_s",
                 self.name, _about(entity), type(self._actor).__name__, self._actor.hold_s,
             )  # fmt: skip
 

@@ -21,8 +21,8 @@ class ActorDeclaration:
     """One actor of a cell: under which name it runs, its class, what its roles are bound to.
 
     `worlds` None binds each role to the world context of the same name, as running it does;
-    `entity` is the one that it works on, None where it has no such; `every_s` replaces the period
-    of its class.
+    `entity` is the only one that it works on, or None for no such limit; `every_s` replaces the
+    period of its class.
     """
 
     name: str
@@ -38,7 +38,7 @@ class ActorDeclaration:
 
     @property
     def unsaid(self) -> bool:
-        """Whether it works on one entity, and which is not said."""
+        """Whether it works on one entity that the declaration does not name."""
         declaration = self.actor_class.declaration
         return self.entity is None and declaration.per_entity and not declaration.triggers
 
@@ -78,7 +78,7 @@ class Use:
 
     @property
     def unsaid(self) -> bool:
-        """Whether it is of one entity, and nobody says of which."""
+        """Whether it is of one entity that the declaration does not name."""
         return self.actor.unsaid and stands_for_trigger(self.request)
 
     @property

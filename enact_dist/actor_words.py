@@ -1,9 +1,9 @@
-"""What a person tells a running actor: other values of its attributes, or to begin anew.
+"""Commands to a running actor: change its attributes, or restart it.
 
-A word is a volatile datum of the entity `actor/SESSION` in one of the actor's world contexts.  Its
-process watches that slot, takes the word (the slot is null again), does what it says between two
-updates, and answers in its report.  Values last until the process ends: what an actor begins with
-stands in `cell.toml`.
+A command is a volatile datum of the entity `actor/SESSION` in one of the actor's world contexts.
+The actor's process watches that slot, takes the command (and sets the slot to null), executes it
+between two updates, and answers in its report.  Changed values last until the process ends;
+`cell.toml` holds the values that an actor starts with.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ log = logging.getLogger("enact.actor")
 
 
 def word_of(world: WorldContext, session: str) -> Write[dict[str, Any]]:
-    """Return the request for the slot of a session's words."""
+    """Return the request for the slot of a session's commands."""
     return Write(world, Entity(f"actor/{session}"), WORDS)
 
 
 def with_values(actor: Actor, values: dict[str, str]) -> None:
-    """Give attributes of an actor other values, all or none.
+    """Change attributes of an actor, all or none.
 
     Raises:
         ConfigError: One is no attribute that can be changed, or the text is no value of its type.
@@ -51,9 +51,9 @@ def with_values(actor: Actor, values: dict[str, str]) -> None:
     for key, text in values.items():
         if key not in hints:
             raise ConfigError(
-                f"{key} of actor {name} cannot be changed while it runs; what can is:"
-                f" {', '.join(hints) or 'nothing'} (attributes with an annotation and a value in"
-                " the class)"
+                f"{key} of actor {name} cannot be changed while it runs; these can:"
+                f" {', '.join(hints) or 'none'} (attributes with an annotation and a value in the"
+                " class)"
             )
         read[key] = read_option(f"option {key} of actor {name}", text, hints[key])
     for key, value in read.items():
@@ -61,13 +61,13 @@ def with_values(actor: Actor, values: dict[str, str]) -> None:
 
 
 class ListeningForWords:
-    """Listens for the words to one actor of this process, in a thread; a context manager.
+    """Listens for commands to one actor of this process, in a thread; a context manager.
 
     Args:
         actor: The actor.
         run: Its run.
         cell: Where it runs.
-        restart: Called when it is to begin anew.
+        restart: Called to restart it.
     """
 
     def __init__(

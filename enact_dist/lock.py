@@ -124,9 +124,9 @@ class Lock(Triggered):
             raise MisuseError("a lock of nothing: name at least one request")
         if len(requests) > ITEMS_MAX:
             raise MisuseError(
-                f"a lock of {len(requests)} requests; at most {ITEMS_MAX}: a pattern (ReadEach,"
-                " WriteEach, ViewEach) is one request and shows all that match, of which one lock"
-                f" writes at most {ITEMS_MAX}"
+                f"a lock with {len(requests)} requests; at most {ITEMS_MAX} are allowed. A pattern"
+                " (ReadEach, WriteEach, ViewEach) counts as one request and shows all matching"
+                f" data, but one lock writes at most {ITEMS_MAX}"
             )
         check_seconds("wait_s", wait_s)
         check_seconds("hold_s", hold_s)

@@ -1,4 +1,4 @@
-"""What a lock knows of why an actor's update runs; a lock of one's own knows none of it."""
+"""The reason why an actor's update runs, on its lock; a lock that you make yourself has none."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ class Triggered:
 
     @property
     def tick_ns(self) -> int:
-        """When the tick of `every_s` was due that this update is for, nanoseconds since 1970.
+        """The time of the tick of `every_s` that this update serves, nanoseconds since 1970.
 
-        A multiple of the period, on every host: sources of one period have the same ticks.  What
-        the update writes bears it as its capture stamp, unless `put` is given another.
+        Ticks are multiples of the period on every host, so sources with equal periods share their
+        ticks.  All writes of the update carry the tick as capture stamp, unless `put` sets another.
 
         Raises:
             MisuseError: The lock was not made for a tick.
@@ -50,14 +50,14 @@ class Triggered:
         Raises:
             MisuseError: No set triggered the update.
         """
-        raise MisuseError(f"{self!r} was not made by a Together, so nothing of a set is missing")
+        raise MisuseError(f"{self!r} was not made by a Together, so its set has no missing data")
 
     @property
     def newer(self) -> Newer:
-        """Set when a newer version has come, the version was deleted, or the actor is to stop.
+        """An event: a newer version was committed, the version was deleted, or the actor must stop.
 
-        Of an actor with ``once = True``; to be waited on or looked at in the loop of its motion, in
-        any thread.
+        For actors with ``once = True``.  Check it or wait on it in the loop of a motion, in any
+        thread.
 
         Raises:
             MisuseError: The lock is not that of an update that acts once.

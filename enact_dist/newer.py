@@ -1,4 +1,4 @@
-"""`lock.newer`: how an update that acts learns that what it acts on is over."""
+"""`lock.newer`: tells a running motion that its version is no longer the newest."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ LOOK_S: Final = 0.1
 
 
 class Newer:
-    """An event: what an update acts on was replaced, or deleted, or the actor is to stop.
+    """An event: the version was replaced or deleted, or the actor must stop.
 
-    Any thread may look, at any rate: it asks nobody and holds no lock.  An update that has seen it
-    and returns has its version recorded by the reason, one that has not as done.
+    Any thread may check it at any rate: a check sends no message and holds no lock.  If an update
+    has seen the event and returns, its outcome is the reason; otherwise its outcome is "done".
 
     Args:
         stop: Set when the actor is to stop.
@@ -56,7 +56,7 @@ class Newer:
         return self._reason if self.is_set() else ""
 
     def ended(self) -> str:
-        """Return what an update that returned has come to: "done", or the reason that it saw."""
+        """Return the outcome of an update that returned: "done", or the reason that it saw."""
         return self._reason if self._seen else "done"
 
     def _is_to_stop(self) -> bool:

@@ -40,8 +40,8 @@ class _Collected(Writing):
     def new(self, slot: Slot, asked: Asked, shard_of: Callable[[Slot], str]) -> Any:
         """Refuse to hand out memory of a shard: no lock holds it."""
         raise MisuseError(
-            f"new() of {slot.entity}/{slot.aspect}: an update with once = True holds no lock in"
-            " which a datum could be filled; make an array and put() it"
+            f"new() of {slot.entity}/{slot.aspect}: an update with once = True holds no lock, so it"
+            " cannot fill a datum in place; create an array and put() it"
         )
 
 
@@ -96,15 +96,15 @@ class OnceLock(ActorLock):
     def _put(self, slot: Slot, aspect: Aspect[Any], datum: Any, stamp_ns: int | None) -> None:
         if self._taken is not None and self._outcome is not None and slot == slot_of(self._outcome):
             raise MisuseError(
-                f"{self._outcome!r} is written by the framework when the update has ended; raise"
-                " an exception for a failure, and write what else is to be told to another aspect"
+                f"the framework writes {self._outcome!r} when the update ends; raise an exception"
+                " to report a failure, and write other results to another aspect"
             )
         super()._put(slot, aspect, datum, stamp_ns)
 
     def expect(self, view: Any) -> None:
         """Refuse: an update with ``once = True`` does not commit under this lock."""
         if self._taken is not None:
-            raise MisuseError("an update with once = True cannot expect a View: it holds no lock")
+            raise MisuseError("an update with once = True holds no lock and cannot expect a View")
         super().expect(view)
 
     def valid(self) -> bool:
@@ -112,10 +112,10 @@ class OnceLock(ActorLock):
         return not self._lost if self._taken is not None else super().valid()
 
     def check(self) -> None:
-        """Make sure that nobody else has closed the version, asking its shard.
+        """Ask the shard whether this process still holds the version.
 
         Raises:
-            LeaseLostError: Another process took this one for gone and wrote an outcome.
+            LeaseLostError: Another process concluded that this one had ended, and wrote an outcome.
         """
         if self._taken is None or self._outcome is None:
             super().check()
@@ -125,7 +125,7 @@ class OnceLock(ActorLock):
             found = lock.get(view)
         if found != self._taken:
             self._lost = True
-            raise LeaseLostError(f"{self._outcome!r} is {found!r} by now", cause="taken over")
+            raise LeaseLostError(f"{self._outcome!r} is now {found!r}", cause="taken over")
 
 
 def _value(datum: Datum, aspect: Aspect[Any]) -> Any:

@@ -95,7 +95,7 @@ def outcome_of(
     if len(triggers) != 1 or not isinstance(triggers[0], Read | View):
         raise MisuseError(
             f"{name} has once = True and triggers {list(triggers)!r}; it acts on the versions of"
-            " one datum: one View is its only trigger"
+            " one datum, so declare one View as its only trigger"
         )
     found = [
         request
@@ -112,18 +112,18 @@ def outcome_of(
     (outcome,) = found
     if type(outcome.entity) is not type(triggers[0].entity):
         raise MisuseError(
-            f"{name} acts on {triggers[0]!r} and writes outcomes to {outcome!r}; each entity has an"
-            f" outcome of its own: name {triggers[0].entity!r} in both"
+            f"{name} acts on {triggers[0]!r} and writes outcomes to {outcome!r}; each entity has"
+            f" its own outcome, so name {triggers[0].entity!r} in both"
         )
     if outcome.aspect.durability is Durability.VOLATILE:
         raise MisuseError(
-            f"{name}: outcomes in {outcome!r} are volatile, so a shard that restarts would let a"
-            " version be acted on twice; leave the durability out"
+            f"{name}: outcomes in {outcome!r} are volatile, so after a restart of the shard a"
+            " version could run twice; omit the durability"
         )
     for request in requests.values():
         if request.access.each and request.access.writes:
             raise MisuseError(
-                f"{name} has once = True and declares {request!r}; its update holds no lock, so it"
-                " writes the data of entities that it names"
+                f"{name} has once = True and declares {request!r}; its update holds no lock, so"
+                " declare a Write for each entity by name"
             )
     return outcome

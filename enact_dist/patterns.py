@@ -76,8 +76,8 @@ def checked_patterns(patterns: Iterable[str]) -> None:
     starred = sum("*" in pattern for pattern in several)
     if starred > PATTERNS_MAX:
         raise ValueError(
-            f"{starred} patterns of entities at once; at most {PATTERNS_MAX}: ask with fewer, or in"
-            " several questions"
+            f"{starred} patterns of entities at once; at most {PATTERNS_MAX} are allowed; use fewer"
+            " or split the request"
         )
     for pattern in several:
         checked_pattern(pattern)

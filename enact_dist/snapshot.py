@@ -41,8 +41,8 @@ def take_snapshot(
         raise MisuseError("a view of nothing: name at least one View or ViewEach")
     if len(requests) > ITEMS_MAX:
         raise MisuseError(
-            f"a view of {len(requests)} requests; at most {ITEMS_MAX}: a ViewEach is one"
-            " request and shows all that match"
+            f"a view with {len(requests)} requests; at most {ITEMS_MAX} are allowed. A ViewEach"
+            " counts as one request and shows all matching data"
         )
     session = session_of(requests, view=True)
     session.client.check_usable()

@@ -205,9 +205,9 @@ def refuse_unfrozen(hint: Any, where: str = "") -> None:
         return
     if not hint.__dataclass_params__.frozen:  # type: ignore[attr-defined]  # of every dataclass
         raise DatumTypeError(
-            f"{where and where + ': '}dataclass {hint.__qualname__} is not frozen; data are"
-            " immutable values: write @dataclass(frozen=True), or call"
-            f" register_codec({hint.__qualname__}, …) before"
+            f"{where and where + ': '}dataclass {hint.__qualname__} is not frozen, but data are"
+            " immutable values; write @dataclass(frozen=True), or first call"
+            f" register_codec({hint.__qualname__}, …)"
         )
     try:
         hints = typing.get_type_hints(hint)

@@ -125,8 +125,8 @@ class Writing:
         size += self._bytes - (old.size if old else 0)
         if slot not in self.data and len(self.data) >= ITEMS_MAX:
             raise MisuseError(
-                f"one lock writes at most {ITEMS_MAX} data, of patterns too; use several locks,"
-                " each atomic by itself, or keep what belongs together in one datum"
+                f"one lock writes at most {ITEMS_MAX} data, including those of patterns;"
+                " use several locks, each atomic by itself, or put related data into one datum"
             )
         if size > BODY_BYTES_MAX:
             raise MisuseError(

@@ -61,7 +61,7 @@ if TYPE_CHECKING:
     from enact_dist.cli.verbs import Verb
 
 ANEW: Final = 75
-"""Exit status of an actor that was told to begin anew: what supervises it starts it again."""
+"""Exit status of an actor that ends in order to restart: its supervisor starts it again."""
 
 _log = logging.getLogger("enact.actor")
 
@@ -136,7 +136,7 @@ def _add_run(verbs: argparse._SubParsersAction[Verb]) -> None:
         dest="drain_s",
         type=duration,
         metavar="S",
-        help="seconds that an update may still take after SIGTERM, before it is cut off (default:"
+        help="seconds that an update may take after SIGTERM before it is cut off (default:"
         " `drain_s` of the actor in cell.toml, else 8)",
     )
 
@@ -337,18 +337,21 @@ def list_actors(arguments: argparse.Namespace) -> int:
 
 
 def _losses(report: ActorStatistics) -> Iterator[str]:
-    """Yield what an actor has lost and the table does not show; nothing where it lost nothing."""
+    """Yield the losses of an actor that the table does not show."""
     last = f", the newest a {report.last_incomplete}" if report.last_incomplete else ""
-    never = f", the newest {report.last_interrupted}: how far they came is not known"
-    remedy = ": this actor waits for data of one stamp, give it with lock.put(…, stamp_ns=…)"
+    never = f", the newest {report.last_interrupted}: how far they came is unknown"
+    remedy = ": this actor waits for data with equal stamps; set them with lock.put(…, stamp_ns=…)"
     lost = (
         (report.incomplete, f"incomplete sets{last}"),
         (report.late, "data too late for their set"),
         (report.partial, f"sets ran without some data, the newest a {report.last_partial}"),
         (report.unstamped, f"data without a capture stamp, from {report.unstamped_from}{remedy}"),
         (report.missed, "ticks missed"),
-        (report.interrupted, f"versions taken and never ended{never}; written anew they are done"),
-        (report.unknown, "commits never answered, which may stand (see its log)"),
+        (
+            report.interrupted,
+            f"versions taken, never ended{never}; write them again to run them",
+        ),
+        (report.unknown, "commits without an answer, which may stand (see its log)"),
     )
     yield from (f"{count} {what}" for count, what in lost if count)
 
@@ -381,7 +384,7 @@ def _rows(info: ActorInfo) -> Iterator[tuple[object, ...]]:
 
 
 def _doing(report: ActorStatistics) -> str:
-    """Return an actor's state, of an update that does not return for how long."""
+    """Return an actor's state; if its update does not return, with the time it has taken."""
     if report.state != "stuck":
         return report.state
     return f"stuck for {shown_s(report.updating_s)} in update (lock lost)"

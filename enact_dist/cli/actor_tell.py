@@ -1,4 +1,4 @@
-"""`enact actor set|restart`: what a running actor is told, on whatever host it runs."""
+"""`enact actor set|restart`: change or restart a running actor on any host."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ if TYPE_CHECKING:
 
 LOOK_S: Final = 0.1
 ANSWER_S: Final = 10.0
-"""How long an actor may take to answer: its update ends before."""
+"""How long an actor may take to answer: it first finishes its update."""
 RETURN_S: Final = 60.0
-"""How long an actor may take to end and to be back."""
+"""How long an actor may take to end and to run again."""
 
 
 def add_to(verbs: argparse._SubParsersAction[Verb]) -> None:
@@ -37,22 +37,22 @@ def add_to(verbs: argparse._SubParsersAction[Verb]) -> None:
     change = add_verb(
         verbs,
         "set",
-        "change attributes of a running actor, until it ends; what it begins with stands in"
-        " cell.toml",
+        "change attributes of a running actor until it ends; cell.toml has the values that it"
+        " starts with",
         run=set_values,
         example="enact actor set camera gain=0.7 label=front",
     )
     restart = add_verb(
         verbs,
         "restart",
-        "let a running actor end its update and begin anew; what supervises it (enact up, systemd,"
-        " docker) starts it again",
+        "restart an actor after its current update; its supervisor (enact up, systemd, docker)"
+        " starts it again",
         run=restart_actor,
         example="enact actor restart camera",
     )
     for verb in (change, restart):
         verb.add_argument(
-            "name", metavar="NAME", help="name of the actor, as enact actor ls has it"
+            "name", metavar="NAME", help="name of the actor, as enact actor ls shows it"
         )
         add_cell(verb)
         add_timeout(verb)
@@ -62,7 +62,7 @@ def add_to(verbs: argparse._SubParsersAction[Verb]) -> None:
 
 
 def set_values(arguments: argparse.Namespace) -> int:
-    """Tell each actor of the name; fail if one refuses."""
+    """Change every actor of the name; fail if one refuses."""
     values = pairs(arguments.values, "set")
     with open_cell(arguments, observer=False, actor="enact actor set") as cell:
         status = DONE
@@ -79,7 +79,7 @@ def set_values(arguments: argparse.Namespace) -> int:
 
 
 def restart_actor(arguments: argparse.Namespace) -> int:
-    """Tell each actor of the name, and wait until as many others run."""
+    """Ask every actor of the name to restart, and wait until as many new ones run."""
     with open_cell(arguments, observer=False, actor="enact actor restart") as cell:
         before = _found(cell, arguments.name)
         for info, row in before:
@@ -91,12 +91,12 @@ def restart_actor(arguments: argparse.Namespace) -> int:
             back = [info for info, row in rows if info.session not in old and _runs(row)]
             if len(back) >= len(before) and not old & {info.session for info, _ in rows}:
                 for info in back:
-                    print(f"actor {arguments.name} runs anew at {info.host} pid {info.pid}")
+                    print(f"actor {arguments.name} restarted at {info.host} pid {info.pid}")
                 return DONE
             time.sleep(LOOK_S)
     print(
-        f"enact: actor {arguments.name} did not come back within {RETURN_S:g} s: is it run by"
-        " enact up, systemd or docker, which start it again, and does its update end?"
+        f"enact: actor {arguments.name} did not restart within {RETURN_S:g} s; check that its"
+        " update ends, and that enact up, systemd or docker runs it and so starts it again"
     )
     return FAILED
 
@@ -120,7 +120,7 @@ def _found(cell: Cell, name: str) -> list[tuple[ActorInfo, dict[str, Any]]]:
     """Return the running actors of a name.
 
     Raises:
-        MisuseError: There is none, or it takes no words.
+        MisuseError: There is none, or one accepts no commands.
     """
     found = _rows(cell, name)
     if not found:
@@ -129,8 +129,8 @@ def _found(cell: Cell, name: str) -> list[tuple[ActorInfo, dict[str, Any]]]:
     for info, row in found:
         if not row.get("words_in"):
             raise MisuseError(
-                f"actor {name} at {info.host} pid {info.pid} takes no words: it is not ready yet,"
-                " or runs inside another program and not by enact actor run or enact up"
+                f"actor {name} at {info.host} pid {info.pid} accepts no commands: it is not ready"
+                " yet, or it runs inside another program, not under enact actor run or enact up"
             )
     return found
 
@@ -147,7 +147,7 @@ def _tell(cell: Cell, info: ActorInfo, row: dict[str, Any], word: dict[str, Any]
 
 
 def _answer(cell: Cell, session: str, name: str, token: str) -> str:
-    """Return what an actor has answered to a word."""
+    """Return the answer of an actor to a command."""
     end_s = time.monotonic() + ANSWER_S
     while time.monotonic() < end_s:
         for info, row in _rows(cell, name):
@@ -155,4 +155,4 @@ def _answer(cell: Cell, session: str, name: str, token: str) -> str:
             if info.session == session and told == token:
                 return answer
         time.sleep(LOOK_S)
-    return f"no answer within {ANSWER_S:g} s; a word is heard between two updates"
+    return f"no answer within {ANSWER_S:g} s; an actor reads commands between two updates"

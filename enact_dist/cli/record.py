@@ -103,8 +103,8 @@ def _add_replay(nouns: argparse._SubParsersAction[Verb]) -> None:
         action="append",
         type=world_choice,
         metavar="NAME|OLD=NEW",
-        help="only this context (where a NAME is given, only the contexts that are named); OLD=NEW"
-        " writes what was recorded of OLD into NEW",
+        help="replay only this context (repeat it for several); OLD=NEW writes the recorded data of"
+        " OLD into NEW",
     )
     replay.add_argument(
         "--entities", metavar="PATTERN", type=entities, default="**", help="only these entities"
@@ -126,7 +126,7 @@ def _add_replay(nouns: argparse._SubParsersAction[Verb]) -> None:
 
 
 def world_choice(text: str) -> tuple[str, str]:
-    """Read ``NAME`` or ``OLD=NEW``, the name twice where it stays; an `argparse` type."""
+    """Read ``NAME`` (returned twice) or ``OLD=NEW``; an `argparse` type."""
     return pair(text) if "=" in text else (text, text)
 
 
@@ -249,9 +249,9 @@ def run_replay(arguments: argparse.Namespace) -> int:
     else:
         print(_replayed_line(summary))
         for slot, who in summary.other_writers.items():
-            print(f"  {slot}: {who} writes it, too")
+            print(f"  {slot}: {who} also writes it")
     if summary.rounds and not summary.versions:
-        print("enact: nothing in the recording is as asked, so nothing was set", file=sys.stderr)
+        print("enact: no recorded data match the options, so nothing was set", file=sys.stderr)
         return FAILED
     return DONE
 

@@ -42,8 +42,8 @@ def add_to(verbs: argparse._SubParsersAction[Verb]) -> None:
     verb.add_argument(
         "--unused",
         action="store_true",
-        help="forget all aspects and world contexts without data; forks and what the cell.toml"
-        " names stay",
+        help="forget all aspects and world contexts without data, except forks and those that"
+        " cell.toml names",
     )
     add_cell(verb, file_only=True)
     verb.add_argument(
@@ -82,7 +82,7 @@ def run_forget(arguments: argparse.Namespace) -> int:
         raise ConfigError("name the aspects to forget, or --unused for all without data")
     if arguments.unused and len(folders) < sum(s.folder is not None for s in config.shards):
         raise ConfigError(
-            f"--unused looks at the data of all shards, and {'; '.join(elsewhere) or 'not all'}:"
+            f"--unused needs the data of all shards, but {'; '.join(elsewhere) or 'not all'}:"
             " name the folders of the others with --store"
         )
     unused = config.worlds if arguments.unused else None

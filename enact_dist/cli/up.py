@@ -132,14 +132,14 @@ def _refuse_homeless(config: CellConfig, shards: Sequence[ShardConfig], host: st
         where = f"[shards.{shard.name}] of {config.path}"
         if named:
             raise ConfigError(
-                f"{where} names no host, and the cell has machines ({', '.join(named)}): `enact up`"
-                f' would start the shard on each; write host = "{host}" there if it runs here'
+                f"{where} names no host, but the cell has several machines ({', '.join(named)}):"
+                f' `enact up` would start the shard on each; if it runs here, write host = "{host}"'
             )
         strange = [endpoint for endpoint in shard.listen if not is_of_this_host(endpoint)]
         if strange:
             raise ConfigError(
-                f"shard {shard.name} listens at {strange[0]}, which is no address of this machine;"
-                f" name the machine that runs it as `host` in {where}"
+                f"shard {shard.name} listens at {strange[0]}, which is not an address of this"
+                f" machine; set `host` in {where} to the machine that runs the shard"
             )
 
 
@@ -190,9 +190,9 @@ def _refuse_second(config: CellConfig, shard: ShardConfig) -> None:
         except LinkError as error:
             if not shard.host and not any(somebody_listens(one) for one in shard.listen):
                 raise LinkError(
-                    f"{error}; if that is another machine, name it as `host` in"
+                    f"{error}; if that is another machine, set it as `host` in"
                     f" [shards.{shard.name}] of {config.path}, so that `enact up` starts the shard"
-                    " there alone"
+                    " only there"
                 ) from error
             if time.monotonic() > end_s:
                 raise

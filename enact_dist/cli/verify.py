@@ -35,8 +35,8 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
     verify.add_argument(
         "--frames",
         action="store_true",
-        help="send the core and the store every kind of message with hostile values in each field"
-        " (takes --seconds or --minutes, else a minute; --seeds, --first, --seed)",
+        help="send every kind of message to the core and the store, with hostile values in each"
+        " field (default: for one minute; see --seconds, --minutes, --seeds, --first, --seed)",
     )
     verify.add_argument("--json", action="store_true", help="print one JSON object")
 
@@ -118,11 +118,11 @@ def add_floods(verify: Verb) -> None:
     floods.add_argument(
         "--floods",
         action="store_true",
-        help="flood the shards of a throw-away cell with questions, sessions, registrations, forged"
-        " messages and so on, each beside the updates of an honest client",
+        help="flood the shards of a temporary cell with questions, sessions, registrations, forged"
+        " messages and so on, in turn, while an honest client keeps updating",
     )
     floods.add_argument(
-        "--flood", action="append", metavar="NAME", help="only this one (more than once: these)"
+        "--flood", action="append", metavar="NAME", help="run only this flood (repeatable)"
     )
     floods.add_argument(
         "--updates", type=whole, default=3000, metavar="N", help="per flood (default: 3000)"

@@ -81,8 +81,8 @@ def add_diff(verbs: argparse._SubParsersAction[Verb]) -> None:
     diff.add_argument(
         "--trust",
         action="store_true",
-        help="run whatever module a `compare` in cell.toml names, not only those beside the cell's"
-        " actors: a cell.toml is a program",
+        help="run every module that a `compare` in cell.toml names, not only those in the packages"
+        " of the cell's actors (caution: this runs code that cell.toml chooses)",
     )
     add_reader(diff)
 
@@ -150,8 +150,8 @@ def configured_aspects(arguments: argparse.Namespace) -> dict[str, Aspect[Any]]:
         if not arguments.trust and not _is_of_actors(entry.compare, config):
             raise ConfigError(
                 f"{config.path}: [aspects.{entry.name}] compare = {entry.compare!r} would run a"
-                " module that no actor of the cell has in its package; if you trust who wrote the"
-                f" file, say --trust, else --tolerance {entry.name}=0",
+                " module outside the packages of the cell's actors; if you trust the author of the"
+                f" file, pass --trust, else --tolerance {entry.name}=0",
                 path=str(config.path),
             )
     return {entry.name: load_aspect(entry.name, entry.compare) for entry in wanted}

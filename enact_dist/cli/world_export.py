@@ -106,8 +106,8 @@ def _checked_names(version: Recorded) -> tuple[str, str]:
         checked_name("aspect", aspect, slashes=False)
     except ValueError as error:
         raise ProtocolError(
-            f"shard {version.shard!r} has told a name that would lead out of the folder, or is no"
-            f" name of a file: {error}; nothing was written for it"
+            f"shard {version.shard!r} sent a name that leads out of the folder or is not a valid"
+            f" file name: {error}; nothing was written for it"
         ) from None
     return entity, aspect
 

@@ -1,4 +1,4 @@
-"""`enact world watch`: the changes of a world context as they come, their data, or their rates."""
+"""`enact world watch`: shows the changes of a world context as they arrive, with data or rates."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ ONE_LINE_MAX: Final = 80
 def add_watch(verbs: argparse._SubParsersAction[Verb]) -> None:
     """Add the verb to the noun `world`."""
     watch = add_verb(
-        verbs, "watch", "print what is there and then every change, until Ctrl-C", run=watch_world,
+        verbs, "watch", "print the present data, then every change, until Ctrl-C", run=watch_world,
         example="enact world watch online 'tray/**' --aspect surface\n"
         "enact world watch online robot --data\n"
         "enact world watch online 'camera/*' --stats --seconds 10",
@@ -71,17 +71,17 @@ def add_watch(verbs: argparse._SubParsersAction[Verb]) -> None:
         "--aspect",
         action="append",
         metavar="NAME",
-        help="only these, as soon as a shard knows them",
+        help="watch only these aspects, from the moment a shard knows them (repeatable)",
     )
     what = watch.add_mutually_exclusive_group()
     what.add_argument(
-        "--data", action="store_true", help="print the data, too; of large arrays a summary"
+        "--data", action="store_true", help="also print the data; of large arrays, a summary"
     )
     what.add_argument(
         "--stats",
         action="store_true",
-        help="print rate, period, jitter, delay since the capture, size and bandwidth of each datum"
-        f" over the last {WINDOW_S:.0f} s, and at the end over all of the run",
+        help="print rate, period, jitter, delay since capture, size and bandwidth of each datum"
+        f" over the last {WINDOW_S:.0f} s, and at the end over the whole run",
     )
     watch.add_argument(
         "--every",
@@ -96,7 +96,7 @@ def add_watch(verbs: argparse._SubParsersAction[Verb]) -> None:
 
 
 def watch_world(arguments: argparse.Namespace) -> int:
-    """Print changes as they come until a signal, or until there were enough."""
+    """Print changes as they arrive, until a signal or one of the limits ends the watch."""
     with StopSignals() as stop, open_cell(arguments) as cell:
         world = cell.world(arguments.world)
         aspects = tuple(dict.fromkeys(arguments.aspect or ()))
@@ -116,7 +116,7 @@ def watch_world(arguments: argparse.Namespace) -> int:
 
 
 def _tell_unknown(wanted: Iterable[str], cell: Cell) -> None:
-    """Say which aspects no shard knows so far: what comes of them may never come."""
+    """Name the aspects that no shard knows yet: their first datum may never arrive."""
     known = cell.aspects()
     for name in wanted:
         if name not in known:

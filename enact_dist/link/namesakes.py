@@ -111,9 +111,9 @@ def moved_places(
 def two_daemons(cell: str, shard: str, found: Sequence[Serving]) -> str:
     """Return what is said of a shard that several daemons serve."""
     return (
-        f"{len(found)} daemons serve shard {shard} of cell {cell}, each with data of its own:"
-        f" {' and '.join(map(str, found))}; stop all but the one whose data count, and let every"
-        " cell.toml name its endpoint; a shard of another cell needs another cell name"
+        f"{len(found)} daemons serve shard {shard} of cell {cell}, each with its own data:"
+        f" {' and '.join(map(str, found))}; stop all but the one whose data you want to keep, and"
+        " name its endpoint in every cell.toml; a shard of another cell needs another cell name"
     )
 
 

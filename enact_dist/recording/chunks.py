@@ -95,8 +95,8 @@ class Chunk:
         raise ProtocolError(
             f"{where} claims to unpack from {self.packed} to {self.size} bytes; at most"
             f" {CHUNK_BYTES_MAX} are read, and beyond {RATIO_FREE_BYTES} at most {RATIO_MAX} times"
-            " the packed size: this is no recording of enact record, or one of very uniform large"
-            " data, which are to be recorded with --compress lz4"
+            " the packed size: enact record did not write this file, or its data are large and very"
+            " uniform; record such data with --compress lz4"
         )
 
     def channels(self) -> Iterator[bytes]:

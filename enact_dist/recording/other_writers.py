@@ -73,9 +73,9 @@ class OtherWriters:
             if both:
                 self.found |= dict.fromkeys(map(str, both), who)
                 self._warn(
-                    f"{who} runs and writes {_named(both)}, too: readers will see its data between"
-                    " the replayed ones; stop it, leave these data out (--entities, --aspect), or"
-                    " replay into another world context (--world OLD=NEW)"
+                    f"{who} is running and also writes {_named(both)}: readers will see its data"
+                    " between the replayed ones; stop it, exclude these data (--entities,"
+                    " --aspect), or replay into another world context (--world OLD=NEW)"
                 )
 
     def look_at(self, session: Session, lock: MultiLock) -> None:

@@ -60,8 +60,8 @@ def test_set_whose_writer_gives_no_stamp_is_told_of():
     one, other = found(Joined, Once)
 
     assert (one.level, one.actors) == ("warning", ("joined", "once"))
-    assert "joined.masks[0] (View online/view/left mask) waits for data that bear one" in one.text
-    assert "once runs once, and its module never says" in one.text
+    assert "joined.masks[0] (View online/view/left mask) waits for data with equal" in one.text
+    assert "once runs once, and its module never uses" in one.text
     assert "joined.masks[1]" in other.text
 
 

@@ -13,9 +13,11 @@ MANY = [Entity(f"tray/{number}") for number in range(ITEMS_MAX + 1)]
 
 def test_lock_and_view_of_too_many_requests_name_what_has_no_such_limit(online):
     """A pattern is one request; that it writes no more is said, too."""
-    with pytest.raises(MisuseError, match="shows all that match, of which one lock writes at most"):
+    with pytest.raises(MisuseError, match="shows all matching data, but one lock writes at most"):
         Lock(*(Write(online, entity, COUNT) for entity in MANY))
-    with pytest.raises(MisuseError, match="a ViewEach is one request and shows all that match"):
+    with pytest.raises(
+        MisuseError, match="A ViewEach counts as one request and shows all matching data"
+    ):
         online.view(*(View(online, entity, COUNT) for entity in MANY))
 
 
@@ -25,7 +27,9 @@ def test_pattern_writes_as_many_data_as_a_lock_has_requests(online):
     with Lock(each) as lock:
         for entity in MANY[:-1]:
             lock[each][entity] = 1
-        with pytest.raises(MisuseError, match="at most 4096 data, of patterns too; use several"):
+        with pytest.raises(
+            MisuseError, match="at most 4096 data, including those of patterns; use several"
+        ):
             lock[each][MANY[-1]] = 1
 
     with Lock(each) as lock:

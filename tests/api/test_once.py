@@ -255,7 +255,7 @@ def test_update_sees_what_it_declared_and_writes_at_the_end(cell, online):
     assert cases["valid"] is True
     assert "holds no lock" in cases["new"]
     assert "cannot expect" in cases["expect"]
-    assert "written by the framework" in cases["outcome"]
+    assert "the framework writes" in cases["outcome"]
     assert read(online, JOINTS) == [1]
     assert read(online, OUTCOME).state == "done"
 
@@ -285,7 +285,7 @@ def test_version_whose_taker_is_gone_is_interrupted_and_never_repeated(cell, onl
     assert "process 7 on cell-1" in found.text
     assert thread.statistics().interrupted == 1
     assert "version 1 for " in thread.statistics().last_interrupted
-    assert "how far it came is not known" in caplog.text
+    assert "how far it came is unknown" in caplog.text
 
 
 def test_version_that_was_deleted_meanwhile_is_closed_too(cell, online):
@@ -412,9 +412,9 @@ def declared(**attributes):
     ("wrong", "reason"),
     [
         (declared(once=1), "must be True or False"),
-        (declared(triggers=()), "one View is its only trigger"),
+        (declared(triggers=()), "declare one View as its only trigger"),
         (declared(outcome=None), 'declare one: outcome = Write(online, Entity(name=\'robot\'), Aspect("plan_outcome", Outcome))'),
-        (declared(outcome=Write(ONLINE, Entities("robot*"), OUTCOME)), "each entity has an outcome of its own"),
+        (declared(outcome=Write(ONLINE, Entities("robot*"), OUTCOME)), "each entity has its own outcome"),
         (declared(outcome=Write(ONLINE, ROBOT, Aspect("plan_outcome", Outcome, Durability.VOLATILE))), "volatile"),
         (declared(parts=WriteEach(ONLINE, Entities("part/*"), JOINTS)), "holds no lock"),
     ],
@@ -463,5 +463,5 @@ def test_update_that_lost_its_lock_and_runs_again_is_told_of_once(cell, online, 
     assert mover.moved == 3
     told = [line for line in caplog.messages if "update runs again" in line]
     assert len(told) == 1
-    assert told[0].startswith("arm for robot: Mover.update runs again, as it lost its lock before")
+    assert told[0].startswith("arm for robot: Mover.update runs again, because it lost its lock")
     assert "once = True (enact_dist/docs/actuators.md)" in told[0]

@@ -101,22 +101,22 @@ def test_only_what_was_lost_is_told_of():
     robot = ActorStatistics("robot", interrupted=1, last_interrupted="version 7 for Write(…)")
     assert list(_losses(robot)) == [
         (
-            "1 versions taken and never ended, the newest version 7 for Write(…): how far they came is"
-            " not known; written anew they are done"
+            "1 versions taken, never ended, the newest version 7 for Write(…): how far they came is"
+            " unknown; write them again to run them"
         )
     ]
     fusion = ActorStatistics("fusion", unstamped=240, unstamped_from="online:camera/1/mask")
     assert list(_losses(fusion)) == [
         (
-            "240 data without a capture stamp, from online:camera/1/mask: this actor waits for data of"
-            " one stamp, give it with lock.put(…, stamp_ns=…)"
+            "240 data without a capture stamp, from online:camera/1/mask: this actor waits for data"
+            " with equal stamps; set them with lock.put(…, stamp_ns=…)"
         )
     ]
     assert list(
         _losses(ActorStatistics("fusion", incomplete=2, last_incomplete="set", unknown=1))
     ) == [
         "2 incomplete sets, the newest a set",
-        "1 commits never answered, which may stand (see its log)",
+        "1 commits without an answer, which may stand (see its log)",
     ]
 
 

@@ -67,6 +67,6 @@ def test_ls_counts_incomplete_sets_and_names_what_was_missing(summing, cell_file
     assert report["last_incomplete"] == "set of stamp 2: without online:set/r/set_depth"
     assert (
         "sum: 1 incomplete sets, the newest a set of stamp 2: without online:set/r/set_depth\n"
-        "sum: 1 data without a capture stamp, from online:set/l/set_depth: this actor waits for data of"
-        " one stamp, give it with lock.put(…, stamp_ns=…)\n"
+        "sum: 1 data without a capture stamp, from online:set/l/set_depth: this actor waits for data"
+        " with equal stamps; set them with lock.put(…, stamp_ns=…)\n"
     ) in table

@@ -225,7 +225,7 @@ def test_a_replay_of_what_is_chosen(enact, cell_file, put, tmp_path):
 
     assert (done.status, done.json["versions"], done.json["other_writers"]) == (0, 1, {})
     assert nothing.status == 1
-    assert "nothing in the recording is as asked" in nothing.err
+    assert "no recorded data match the options" in nothing.err
     assert "'left'" in enact("world", "tree", "left", "--cell", cell_file).err  # nothing came to it
 
 
@@ -257,7 +257,7 @@ def test_an_actor_that_writes_the_same_is_named(enact, spawn, until, cell_file, 
 
     assert done.status == 0
     assert f"enact: actor scale (process {actor.pid} on " in done.err
-    assert "writes both:a/count, too" in done.err
+    assert "also writes both:a/count" in done.err
     assert f"  both:a/count: actor scale (process {actor.pid} on " in done.out
 
 

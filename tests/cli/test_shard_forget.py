@@ -153,7 +153,7 @@ def test_what_has_no_data_goes_at_once(enact, stopped):
 def test_unused_wants_all_shards_and_nothing_named_is_refused(enact, stopped):
     """What one shard has no data of another may be full of."""
     told = enact("shard", "forget", "--unused", "--cell", stopped, "--shard", "left")
-    assert (told.status, "--unused looks at the data of all shards" in told.err) == (2, True)
+    assert (told.status, "--unused needs the data of all shards" in told.err) == (2, True)
     told = enact("shard", "forget", "--cell", stopped)
     assert (told.status, "or --unused for all without data" in told.err) == (2, True)
 

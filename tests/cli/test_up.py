@@ -94,7 +94,7 @@ def test_shard_that_listens_at_another_machine_is_refused_by_host(enact, write_c
 
     assert done.status == 2
     assert "192.0.2.7" in done.err
-    assert "no address of this machine" in done.err
+    assert "not an address of this machine" in done.err
     assert "`host` in [shards.left]" in done.err
 
 
@@ -181,7 +181,7 @@ def test_running_actor_is_told_other_values_and_to_begin_anew(enact, beside, spa
     assert "beat: step=3, label=rear, first=7" in enact("actor", "ls", "--cell", file).out
     for wrong, said in (
         ("step=three", "step of actor Beat is 'three'; it must be a whole number"),
-        ("first=1", "first of actor Beat cannot be changed while it runs; what can is: step"),
+        ("first=1", "first of actor Beat cannot be changed while it runs; these can: step"),
     ):
         refused = enact("actor", "set", "beat", "label=no", wrong, "--cell", file)
         assert refused.status == 1
@@ -193,5 +193,5 @@ def test_running_actor_is_told_other_values_and_to_begin_anew(enact, beside, spa
 
     again = enact("actor", "restart", "beat", "--cell", file)
     assert again.status == 0
-    assert "actor beat runs anew at" in again.out
+    assert "actor beat restarted at" in again.out
     assert "beat: step=2, label=front, first=7" in enact("actor", "ls", "--cell", file).out

@@ -135,7 +135,7 @@ def test_doctor_asks_at_each_place_that_file_and_shards_name(begin, free):
     )
     with connect(first) as cell:
         (finding,) = namesakes("cell", file, cell.welcomes())
-    assert "stop all but the one whose data count" in finding.remedy
+    assert "stop all but the one whose data you want to keep" in finding.remedy
 
 
 def test_only_places_that_share_nothing_are_looked_into():

@@ -134,8 +134,8 @@ def test_an_actor_that_declares_to_write_the_same_is_named_before(cell, pieces):
 
     assert seen[0] == len(told) == 1
     assert told[0].startswith("actor weighing (process ")
-    assert "writes online:piece/value, too" in told[0]
-    assert "stop it, leave these data out (--entities, --aspect)" in told[0]
+    assert "also writes online:piece/value" in told[0]
+    assert "stop it, exclude these data (--entities, --aspect)" in told[0]
     assert list(summary.other_writers) == ["online:piece/value"]
 
 
