@@ -284,6 +284,6 @@ def test_export_makes_no_path_of_a_name_that_is_none(
     done = enact("world", "export", "online", "--out", tmp_path / "out", "--cell", cell_file)
 
     assert done.status == 1
-    assert "no name of a file" in done.err
+    assert "not a valid file name" in done.err
     assert set(tmp_path.rglob("*")) == before
     assert not (tmp_path.parent / "escaped").exists()
