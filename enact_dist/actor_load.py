@@ -40,6 +40,10 @@ _WANTED: Final[Mapping[object, str]] = {
 }
 
 
+_SHOWN: Final = (int, float, str, Path, type(None))
+_NONE: Final = object()
+
+
 class BrokenModuleError(ConfigError):
     """A module raised at its import; its `__cause__` says what, its notes the user's own lines."""
 
@@ -191,18 +195,33 @@ def attributes_of(actor_class: type[Actor]) -> dict[str, object]:
     for one in reversed(actor_class.__mro__):
         if not issubclass(one, Actor) or one is Actor:
             continue
-        hints = typing.get_type_hints(one)
-        for name in inspect.get_annotations(one):
+        for name, annotation in inspect.get_annotations(one).items():
             readable = not name.startswith("_") and not hasattr(Actor, name)
-            if readable and hasattr(one, name) and _is_option(hints[name]):
-                found[name] = hints[name]
+            if readable and hasattr(one, name):
+                hint = _hint(one, annotation)
+                if _is_option(hint):
+                    found[name] = hint
     return found
 
 
+def _hint(owner: type, annotation: object) -> object:
+    """Return what an annotation stands for; itself where only a type checker knows its names."""
+    holder = type(owner.__name__, (), {"__annotations__": {"it": annotation}})
+    holder.__module__ = owner.__module__
+    try:
+        return typing.get_type_hints(holder, localns=dict(vars(owner)))["it"]
+    except Exception:  # noqa: BLE001 (it may be any expression)
+        return annotation
+
+
 def shown_values(actor: Actor) -> tuple[str, ...]:
-    """Return the values of an actor's parameters, as far as they are attributes: ``name=value``."""
+    """Return the values of an actor's parameters, as far as they are attributes: ``name=value``.
+
+    A model or another object that a program has handed in is left out.
+    """
     names = dict.fromkeys((*attributes_of(type(actor)), *inspect.signature(type(actor)).parameters))
-    shown = (f"{name}={getattr(actor, name)}"[:80] for name in names if hasattr(actor, name))
+    values = {name: vars(actor).get(name, getattr(type(actor), name, _NONE)) for name in names}
+    shown = (f"{key}={one}"[:80] for key, one in values.items() if isinstance(one, _SHOWN))
     return tuple(shown)[:ARGS_MAX]
 
 

@@ -31,6 +31,7 @@ from enact_dist.actor_triggers import BackOff
 from enact_dist.errors import (
     ChangedError,
     CommitUnknownError,
+    EnactError,
     LeaseLostError,
     LinkError,
     LockTimeoutError,
@@ -331,7 +332,16 @@ class Once:
                 self._inbox.end()
         # What a failed update wrote is not published, as with any other.
         written = [] if error is not None else list(lock.written())
-        if self._write(outcome, taken, ended, written):
+        try:
+            stands = self._write(outcome, taken, ended, written)
+        except EnactError as refused:
+            if not written:
+                raise
+            # It can never be written: too much, of a wrong type, without permission or room.
+            error = refused
+            text = f"{type(refused).__name__} of what it wrote: {refused}"[:2000]
+            stands = self._write(outcome, taken, replace(taken, state="failed", text=text), [])
+        if stands:
             del self._begun[entity]
         lock.end()
         return error

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import unicodedata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -107,7 +108,10 @@ def _array_summary(array: NDArray[Any]) -> str:
 
 
 def plain(datum: object) -> object:
-    """Return a datum as JSON can carry it; arrays as their description with summary values."""
+    """Return a datum as JSON can carry it; arrays as their description with summary values.
+
+    JSON has no NaN and no infinity: these are the texts "NaN", "Infinity" and "-Infinity".
+    """
     if isinstance(datum, dict):
         return {str(key): plain(value) for key, value in datum.items()}
     if isinstance(datum, list | tuple):
@@ -116,6 +120,8 @@ def plain(datum: object) -> object:
         return _array_facts(datum)
     if isinstance(datum, bytes):
         return {"bytes": len(datum), "hex": datum[:64].hex()}
+    if isinstance(datum, float) and not math.isfinite(datum):
+        return "NaN" if math.isnan(datum) else "Infinity" if datum > 0 else "-Infinity"
     return datum
 
 

@@ -67,10 +67,8 @@ def _made_at() -> str:
 def _dropped(pid: int, name: str, made_at: str, carrier: Any, core: Any, *left: Any) -> None:
     if pid != os.getpid():  # a forked child: all of it is the parent's
         return
-    pauses, host = left
-    pauses.end()
     ending = threading.Thread(
-        target=_end, args=(carrier, core, host), name="enact-dropped", daemon=True
+        target=_end, args=(carrier, core, *left), name="enact-dropped", daemon=True
     )
     # Not here: whoever happens to drop the last reference may hold locks that the end takes.
     with contextlib.suppress(RuntimeError):  # the interpreter ends
@@ -83,7 +81,8 @@ def _dropped(pid: int, name: str, made_at: str, carrier: Any, core: Any, *left: 
     )
 
 
-def _end(carrier: Any, core: Any, host: Any) -> None:
+def _end(carrier: Any, core: Any, pauses: Any, host: Any) -> None:
+    pauses.end()
     goodbyes = [(shard, Goodbye(core.session)) for shard in core.shards_in_use()]
     with contextlib.suppress(EnactError):
         carrier.request_all(goodbyes, timeout_s=GOODBYE_S)

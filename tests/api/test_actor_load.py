@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar
 
 import pytest
 
 from enact_dist.actor import Actor
-from enact_dist.actor_load import load_actor, make_actor
+from enact_dist.actor_load import attributes_of, load_actor, make_actor, shown_values
 from enact_dist.errors import ConfigError
 from enact_dist.terms import Aspect, Entity, World, Write
+
+if TYPE_CHECKING:
+    from library_of_types import Picture
 
 
 class Camera(Actor):
@@ -108,3 +112,41 @@ def test_load_names_the_missing_library_when_a_module_needs_one(
 
     with pytest.raises(ConfigError, match="needs the module a_library_that_is_not_installed"):
         load_actor("needs_much:Camera")
+
+
+class Typed(Actor):
+    """An actor with annotations that only a type checker can read."""
+
+    image = Write(World("online"), Entity("camera"), Aspect("image", int))
+    last: Picture | None = None
+    _buffer: Picture | None = None
+    made: ClassVar[int] = 0
+    gain: float = 0.5
+    label: str | None = None
+
+    def update(self, lock):
+        pass
+
+
+def test_annotations_of_names_that_only_a_type_checker_imports_hinder_nothing():
+    """Such an attribute is no parameter; the others are read, changed and shown as ever."""
+    actor = make_actor(Typed, {"gain": "0.7"})
+
+    assert list(attributes_of(Typed)) == ["gain", "label"]
+    assert shown_values(actor) == ("gain=0.7", "label=None")
+    with pytest.raises(ConfigError, match=r"has no option 'last'; it has gain, label"):
+        make_actor(Typed, {"last": "x"})
+
+
+def test_report_shows_values_and_leaves_objects_out():
+    """It is made each second, in a thread of its own: no code of the user's objects runs in it."""
+
+    class Model:
+        def __str__(self):
+            raise RuntimeError("its text takes a second, and a lock")
+
+    class Detector(Camera):
+        def __init__(self, model=None, limit=0.5):
+            self.model, self.limit = model, limit
+
+    assert shown_values(Detector(Model())) == ("limit=0.5",)

@@ -218,6 +218,22 @@ def test_update_that_fails_is_not_repeated(cell, online):
     assert thread.statistics().failures == 1
 
 
+def test_motion_whose_writes_are_refused_for_good_has_failed_and_the_actor_goes_on(
+    cell, online, monkeypatch
+):
+    """What is more than one lock may write does not end the actor, nor leave the version taken."""
+    robot = Robot(lambda _: monkeypatch.setattr("enact_dist.writing.BODY_BYTES_MAX", 10_000))
+    with ActorThread(robot, cell) as thread:
+        write(online, PLAN, ["x" * 20_000])
+        failed = until(online, "failed")
+        write(online, PLAN, [2])
+        until(online, "done")
+
+    assert "MisuseError of what it wrote: the writes of one lock have" in failed.text
+    assert [plan[-1:] for plan in robot.moved[1:]] == [[2]]
+    assert thread.statistics().failures == 1
+
+
 def test_update_sees_what_it_declared_and_writes_at_the_end(cell, online):
     """All as of the taking, though no lock is held; the token is that of the taking's grant."""
     cases = {}

@@ -1,6 +1,7 @@
 """Data shown and saved by the command line."""
 
 import json
+import math
 
 import numpy as np
 import pytest
@@ -95,3 +96,13 @@ def test_a_text_steers_no_terminal(hostile):
         assert hostile not in shown
     assert showing.visible(f"a{hostile}") == "a" + ascii(hostile)[1:-1]
     assert showing.visible("ü\ttab\nline") == "ü\ttab\nline"
+
+
+def test_plain_data_are_json_though_numbers_are_not_finite():
+    """`NaN` without quotes is no JSON: most programs refuse the whole line."""
+    datum = {"a": math.nan, "b": [math.inf, -math.inf, 1.5], "c": np.array([1.0, math.nan])}
+
+    plain = json.loads(json.dumps(showing.plain(datum), allow_nan=False))
+
+    assert (plain["a"], plain["b"]) == ("NaN", ["Infinity", "-Infinity", 1.5])
+    assert plain["c"]["values"] == [1.0, "NaN"]

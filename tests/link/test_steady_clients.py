@@ -3,11 +3,14 @@
 import gc
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from enact_dist import Aspect, Durability, Entity, Lock, View, Write, connect, local
 from enact_dist.errors import StoreError
+from enact_dist.link.dropped import when_dropped
+from enact_dist.link.pauses import Pauses
 
 CYCLES = 100
 KEPT_BYTES_MAX = 8_000
@@ -87,3 +90,44 @@ def test_local_cell_that_is_dropped_lets_go_of_its_folder(tmp_path, until):
     with until(opened) as cell:
         view = View(cell.world("online"), Entity("part"), aspect)
         assert cell.world("online").view(view)[view] == 7
+
+
+class _Carrier:
+    """A carrier that only says that it was closed."""
+
+    def __init__(self):
+        self.closed = threading.Event()
+
+    def request_all(self, calls, timeout_s):
+        return []
+
+    def close(self):
+        self.closed.set()
+
+
+class _Client:
+    """What `when_dropped` needs of a session."""
+
+    def __init__(self, carrier, core, pauses):
+        self.carrier, self.core, self.pauses = carrier, core, pauses
+
+
+@pytest.mark.filterwarnings("ignore:cell .* was dropped")
+def test_session_that_is_dropped_by_a_thread_with_its_locks_is_ended_all_the_same():
+    """The garbage collector runs anywhere: in the session's own thread, between two of its steps."""
+    carrier, pauses = _Carrier(), Pauses()
+    core = SimpleNamespace(session="s", shards_in_use=list)
+    used = [_Client(carrier, core, pauses)]
+    when_dropped(used[0], "cell", None)
+
+    def collect():
+        with pauses._changed:
+            used.clear()
+
+    collecting = threading.Thread(target=collect, daemon=True)
+    collecting.start()
+
+    assert carrier.closed.wait(30)
+    assert pauses.rest(0.0)
+    collecting.join(30)
+    assert not collecting.is_alive()
