@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from enact_dist.cli.verbs import Verb
 
 LOOK_S: Final = 0.1
+REPORTED_S: Final = 3.0
+"""How long an actor that is ready may take to report that it hears words."""
 ANSWER_S: Final = 10.0
 """How long an actor may take to answer: it first finishes its update."""
 RETURN_S: Final = 60.0
@@ -119,10 +121,16 @@ def _runs(row: dict[str, Any]) -> bool:
 def _found(cell: Cell, name: str) -> list[tuple[ActorInfo, dict[str, Any]]]:
     """Return the running actors of a name.
 
+    An actor reports a moment after it is ready, so this looks for up to `REPORTED_S`.
+
     Raises:
         MisuseError: There is none, or one accepts no commands.
     """
-    found = _rows(cell, name)
+    end_s = time.monotonic() + REPORTED_S
+    while not (found := _rows(cell, name)) or not all(row.get("words_in") for _, row in found):
+        if time.monotonic() >= end_s:
+            break
+        time.sleep(LOOK_S)
     if not found:
         known = sorted({one for info in cell.actors() for one in info.names()})
         raise MisuseError(f"no actor {name!r} runs (running: {', '.join(known) or 'none'})")

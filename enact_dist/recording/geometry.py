@@ -72,7 +72,8 @@ def packed_points(
         The bytes, the bytes of one point, and (name, offset, is a float32) of each field.
     """
     names: list[tuple[str, int, bool]] = [("x", 0, True), ("y", 4, True), ("z", 8, True)]
-    points = np.ascontiguousarray(points_m, "<f4")
+    with np.errstate(over="ignore"):  # what no float32 can hold is infinitely far
+        points = np.ascontiguousarray(points_m, "<f4")
     if colours is None:
         return points.tobytes(), 12, tuple(names)
     packed = np.empty(len(points), [("xyz", "<f4", 3), ("rgba", "u1", 4)])

@@ -65,6 +65,7 @@ def test_cell_that_is_dropped_is_closed_and_says_where_it_was_opened(daemon, end
 
     with pytest.warns(ResourceWarning, match=rf"opened at {__file__}:\d+") as warned:
         dropped(users)
+        until(lambda: len(warned))  # a thread may be in the midst of a call for it
 
     assert len(warned) == 1
     until(lambda: threading.active_count() <= before)
@@ -78,8 +79,9 @@ def test_local_cell_that_is_dropped_lets_go_of_its_folder(tmp_path, until):
     with Lock(users[1]) as lock:
         lock[users[1]] = 7
     del lock
-    with pytest.warns(ResourceWarning, match="dropped without close"):
+    with pytest.warns(ResourceWarning, match="dropped without close") as warned:
         dropped(users)
+        until(lambda: len(warned))
 
     def opened():
         try:
