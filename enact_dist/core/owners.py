@@ -10,7 +10,7 @@ Rules to keep
 
 - The first `Hello` of a session binds it to its identity, on the disk too; everything else that
   names the session has to come under that identity.  What became of a commit anybody may ask: the
-  session that made it may be gone.
+  session that made it may be gone; once it is, anybody may release its locks before he asks.
 - `Finish` and `Resolve` come from the shard that they name, under `shard_identity`.
 - The identity "" is this process itself: an embedded shard, or a simulated one.
 """
@@ -32,6 +32,7 @@ from enact_dist.core.messages import (
     KeepVersions,
     Outcome,
     Refused,
+    Release,
     Request,
     Resolve,
 )
@@ -81,7 +82,8 @@ def refusal(
     elif kind is not Outcome:
         session = getter(message)
         owner = sessions.owner(session)
-        if owner and owner != identity:
+        ended = kind is Release and session not in sessions.by_id  # it takes nothing from anybody
+        if owner and owner != identity and not ended:
             return not_yours(session, owner, identity)
         if owner == "" and kind is not Hello and session in sessions.by_id:
             return EpochChanged(epoch)  # kept by a release that noted no owner: who greets has it

@@ -23,7 +23,7 @@ from enact_dist.core.messages import (
     Welcome,
     WriteItem,
 )
-from enact_dist.core.records import SessionRecord, SessionSeen
+from enact_dist.core.records import SessionDied, SessionRecord, SessionSeen
 from enact_dist.terms import Access
 
 ANN, EVE = "ann@h:1", "eve@h:2"
@@ -215,3 +215,14 @@ def test_release_of_an_unknown_session_is_answered():
     bench = ShardBench()
 
     assert isinstance(bench.ask_as(EVE, m.Release(lock_id("gone"))), Released)
+
+
+def test_release_of_an_ended_session_is_answered_to_anybody(bench):
+    """Another process may ask then what became of its commit: no copy of it comes any more."""
+    refused = bench.ask_as(EVE, m.Release(LOCK))
+    bench.event(SessionDied("ann"))
+
+    assert refused.code == "permission"
+    assert isinstance(bench.ask_as(EVE, m.Release(LOCK)), Released)
+    assert bench.ask_as(EVE, m.Outcome(LOCK)).kind == m.OUTCOME_UNSEEN
+    assert bench.ask_as(EVE, hello()).code == "permission"
