@@ -236,7 +236,8 @@ class SessionClient:
             shards: Whom to ask.
             request_of: Makes the call to a shard of its name, its epoch and the message counter;
                 anew when the shard has restarted.
-            timeout_s: How long they may take; None stands for no answer then.
+            timeout_s: How long they may take; None stands for no answer then.  A greeting that is
+                refused is the shard's answer.
         """
         answers: dict[str, Answer | None] = dict.fromkeys(shards)
         deadline_ns = self._deadline_ns(timeout_s)
@@ -244,8 +245,11 @@ class SessionClient:
             left = [shard for shard, answer in answers.items() if answer is None]
             left_s = max(0.0, (deadline_ns - self._now_ns()) / 1e9)
             hellos = [(s, self.core.hello(s)) for s in left if self.core.needs_hello(s)]
-            if hellos:
-                self.call_each(hellos, timeout_s=left_s)
+            greeted = self.call_each(hellos, timeout_s=left_s)
+            for (shard, _), answer in zip(hellos, greeted, strict=True):
+                if isinstance(answer, Refused):
+                    answers[shard] = answer
+                    left.remove(shard)
             with self._mutex:
                 next_count, now_ns = self.core.sendings.next, self._now_ns()
                 calls = [(s, request_of(s, self.core.epoch(s), next_count(now_ns))) for s in left]

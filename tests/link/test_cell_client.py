@@ -7,6 +7,7 @@ import time
 import pytest
 
 from enact_dist import Aspect, Durability, Entity, Lock, Read, View, Write, connect
+from enact_dist.core import quotas
 from enact_dist.core.messages import ListSessions, Pin, PlacementMap, ShardEntry
 from enact_dist.core.shard_state import ShardSettings
 from enact_dist.errors import LinkError, MisuseError, ProtocolError, ShardUnreachableError
@@ -372,6 +373,21 @@ def test_observer_is_told_that_it_cannot_lock(two):
         assert online.view(View(online, here, COUNT)).get(View(online, here, COUNT)) is None
         with pytest.raises(MisuseError, match="observer=True"):
             add_one(online, here)
+
+
+def test_shard_that_refuses_the_greeting_is_asked_once_and_its_reason_told(two, monkeypatch):
+    """Asked again and again without a pause it would have no time for the others."""
+    two.start("a")
+    two.start("b")
+    with two.connect() as cell:
+        online = cell.world("online")
+        monkeypatch.setattr(quotas, "SESSIONS_MAX", 0)
+        refused = pytest.raises(LinkError, match="has 0 sessions at this shard")
+        with refused, Lock(Write(online, there, COUNT)):
+            pass
+        counters = two.running["b"].host._shard.counters
+
+    assert counters["quota_refused"] == 1
 
 
 def test_connect_gives_up_in_time_when_the_peer_is_mute():
