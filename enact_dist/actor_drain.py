@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 DRAIN_S: Final = 8.0
 """How long an update may still take after the first signal; `docker stop` kills after 10 s."""
-SAY_S: Final = 1.0
+SAY_S: Final = 1.5
 """How long the last line may take where nobody reads the log."""
 CUT_OFF: Final = 1
 """Exit status of a process that has cut something off."""
