@@ -58,6 +58,7 @@ class LinkWatch:
     Attributes:
         lost: Where connections went that are lost, of a session that connects.
         patience_s: As given.
+        left: Whether the session is closed: nothing of it is looked after any more.
 
     Args:
         session: Not closed with this.
@@ -68,6 +69,7 @@ class LinkWatch:
     def __init__(self, session: zenoh.Session, connect: Sequence[str], patience_s: float) -> None:
         self.lost: list[str] = []
         self.patience_s = patience_s
+        self.left = False
         self._connects = bool(connect)
         _keeper.enter(self)
         try:
@@ -88,6 +90,7 @@ class LinkWatch:
     def join(self) -> None:
         """Wait for the end of what is heard, which follows that of the session."""
         self._events.join(JOIN_S)
+        self.left = True
         _keeper.leave(self)
 
 
@@ -186,6 +189,8 @@ class _Round:
             if watch.lost and watch.lost != before:
                 self._lost_s = self._look_s = time.monotonic()
             (self._losing.add if _hosts_of((watch,)) else self._losing.discard)(watch)
+            if watch.left:  # perhaps just now
+                self._losing.discard(watch)
         try:
             _settle_new(here)
         except Exception as error:  # noqa: BLE001 - what is lost is looked after all the same

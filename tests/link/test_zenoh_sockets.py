@@ -338,6 +338,35 @@ def test_lost_connection_to_this_host_is_not_looked_for(watching, monkeypatch):
     assert all(looks.get() == {(FAR, 1)} for _ in range(looks.qsize()))
 
 
+def test_loss_that_is_noted_after_the_session_was_closed_is_not_looked_after(watching, monkeypatch):
+    """The thread that looks after all sessions was busy; another session keeps it going."""
+    settled, go_on = queue.SimpleQueue(), threading.Event()
+
+    def settle_late(patience_s):
+        settled.put(patience_s)
+        assert go_on.wait(30)
+
+    monkeypatch.setattr(zenoh_links, "settle", settle_late)
+    monkeypatch.setattr(zenoh_links, "unanswered", lambda _: {})
+    callbacks = []
+    info = SimpleNamespace(
+        declare_link_events_listener=lambda callback, **_: callbacks.append(callback)
+    )
+    stays = watching(["tcp/192.0.2.1:1"])
+    leaves = zenoh_links.LinkWatch(SimpleNamespace(info=info), ["tcp/192.0.2.1:1"], 1.0)
+    came, went, again = link_events("+-+", FAR)
+    callbacks[0](came)
+    settled.get(timeout=30)
+    callbacks[0](went)
+    callbacks[0].drop()
+    leaves.join()
+    go_on.set()
+    stays(again)
+    settled.get(timeout=30)
+
+    assert not zenoh_links._keeper._round._losing
+
+
 def test_looks_for_a_lost_connection_come_more_and_more_rarely(watching, monkeypatch):
     """After a hundred seconds one is made every two seconds, however many sessions have lost one."""
     clock, looks = [1_000.0], []
