@@ -136,7 +136,7 @@ def _session_info(state: ShardState, session: Session) -> SessionInfo:
         session.lease_end_ns(state.now_ns) - state.now_ns,
         session.token_present,
         len(state.tenures.by_session.get(session.session, {})),
-        session.report if len(session.report) <= REPORT_BYTES_MAX else b"",
+        session.report,
     )
 
 

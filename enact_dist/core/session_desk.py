@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.core import quotas
 from enact_dist.core.admission import wrong_aspect, wrong_name
+from enact_dist.core.inspection import REPORT_BYTES_MAX
 from enact_dist.core.messages import (
     Alive,
     Answer,
@@ -201,7 +202,8 @@ class SessionDesk:
             return
         session.renewed_ns = max(session.renewed_ns, self._state.now_ns)
         session.count_seen = max(session.count_seen, message.count)
-        session.report = message.report or session.report
+        if message.report:  # kept for listings, which leave longer ones out
+            session.report = message.report if len(message.report) <= REPORT_BYTES_MAX else b""
         lowest = {view.lane: view.seq for view in message.view}
         for tenure in self._state.tenures.of_session(message.session):
             if tenure.lock.seq < lowest.get(tenure.lock.lane, 0) and not tenure.bound:

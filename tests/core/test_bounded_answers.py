@@ -5,11 +5,13 @@ from __future__ import annotations
 from shard_bench import MS, S, ShardBench, item, lock_id, slot
 
 from enact_dist.core.datum import Datum
+from enact_dist.core.inspection import REPORT_BYTES_MAX
 from enact_dist.core.messages import (
     OUTCOME_COMMITTED,
     AwaitStamp,
     Commit,
     Fetch,
+    KeepAlive,
     Outcome,
     Reached,
     Slice,
@@ -72,3 +74,15 @@ def test_wait_for_a_stamp_is_answered_after_a_slice_however_long_it_asks():
     answer = bench.answers[handle]
     assert isinstance(answer, Reached)
     assert not answer.reached
+
+
+def test_report_that_no_listing_shows_is_not_kept_either():
+    """Thousands of sessions with the longest report of the wire would take most of a gigabyte."""
+    bench = ShardBench()
+    bench.hello("ann")
+    kept = []
+    for size in (REPORT_BYTES_MAX, 0, REPORT_BYTES_MAX + 1):
+        bench.ask(KeepAlive("ann", bench.shard.epoch, 1, (), bytes(size)))
+        kept.append(len(bench.shard.state.sessions.by_id["ann"].report))
+
+    assert kept == [REPORT_BYTES_MAX, REPORT_BYTES_MAX, 0]
