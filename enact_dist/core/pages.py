@@ -103,7 +103,7 @@ def over_slots(
             if entities.cover(entity):
                 above = after.version if here and number == begin else 0
                 found, more = listed(Slot(column.context, entity, column.aspect), content, above)
-                work += more
+                work += min(more, WORK_MAX // 2)  # the rest of a page is for what was found
                 for entry in found:
                     if last is not None:
                         here_on = Cursor(epoch, column, number, version_of(last))

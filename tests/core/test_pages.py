@@ -175,3 +175,23 @@ def test_slot_with_many_versions_is_not_listed_anew_for_each_page(monkeypatch):
         assert found == list(range(301 - wanted, 301))
         assert count > 3
         assert len(made) <= wanted + 2 * count
+
+
+@pytest.mark.parametrize(
+    "request_", [ListHistory((), (), ("mask",)), Survey((), (), ("mask",), retained=True)]
+)
+def test_page_of_a_slot_with_very_many_versions_has_many_of_them(monkeypatch, request_):
+    """To find where a page goes on may take most of its time; one version a page has no end."""
+    monkeypatch.setattr(pages, "WORK_MAX", 20)
+    bench = ShardBench()
+    bench.hello("ann")
+    bench.ask(Register("ann", (), (AspectEntry("mask", "int", "durable", 400),)))
+    for seq in range(1, 401):
+        grant = bench.granted(lock_id("ann", 0, seq), item(Access.WRITE, "cup", "mask"))
+        bench.commit(lock_id("ann", 0, seq), grant.token, (slot("cup", "mask"), str(seq)))
+
+    listed = pages_of(bench, request_)
+
+    field = "states" if isinstance(request_, Survey) else "entries"
+    assert sum(len(getattr(page, field)) for page in listed) == 400
+    assert len(listed) <= 40
