@@ -173,20 +173,32 @@ class Catalogue:
         Else the smallest entries: what fills a catalogue is large, or without end.
         """
         if self._shown is None:
-            aspects: Iterable[AspectEntry] = self.aspects.values()
-            worlds: Iterable[WorldEntry] = self.worlds.values()
-            if self.bytes > CATALOGUE_BYTES_MAX:
-                half = CATALOGUE_BYTES_MAX // 2
-                aspects = _that_fit(sorted(aspects, key=bytes_in_frame), bytes_in_frame, half)
-                worlds = _that_fit(worlds, _world_bytes, half)
-            worlds, aspects = tuple(worlds), tuple(aspects)
-            self._shown = Shown(
-                tuple(world.name for world in worlds),
-                aspects,
-                tuple(world for world in worlds if world.source),
-                len(self.worlds) + len(self.aspects) - len(worlds) - len(aspects),
-            )
+            self._shown = self._now_shown()
         return self._shown
+
+    @property
+    def left_out(self) -> int:
+        """How many entries a `Welcome` has no room for.
+
+        Any thread may look, also while another one changes the catalogue: nothing is kept of it.
+        """
+        return (self._shown or self._now_shown()).left_out
+
+    def _now_shown(self) -> Shown:
+        all_aspects, all_worlds = tuple(self.aspects.values()), tuple(self.worlds.values())
+        aspects: Iterable[AspectEntry] = all_aspects
+        worlds: Iterable[WorldEntry] = all_worlds
+        if self.bytes > CATALOGUE_BYTES_MAX:
+            half = CATALOGUE_BYTES_MAX // 2
+            aspects = _that_fit(sorted(aspects, key=bytes_in_frame), bytes_in_frame, half)
+            worlds = _that_fit(worlds, _world_bytes, half)
+        worlds, aspects = tuple(worlds), tuple(aspects)
+        return Shown(
+            tuple(world.name for world in worlds),
+            aspects,
+            tuple(world for world in worlds if world.source),
+            len(all_worlds) + len(all_aspects) - len(worlds) - len(aspects),
+        )
 
     def put_back(self, aspects: Mapping[str, AspectEntry]) -> None:
         """Undo registrations that came to nothing."""

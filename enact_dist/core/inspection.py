@@ -169,7 +169,7 @@ def counted(state: ShardState) -> dict[str, int]:
     history = state.slots.history
     others = {
         "alarms": state.audit.alarms,
-        "catalogue_left_out": state.catalogue.shown().left_out,
+        "catalogue_left_out": state.catalogue.left_out,
         "draining": int(state.draining),
         "retained_bytes": history.bytes,
         "retained_dropped": history.dropped,

@@ -3,7 +3,7 @@
 import pytest
 from shard_bench import ShardBench, item, lock_id, slot
 
-from enact_dist.core import catalogue
+from enact_dist.core import catalogue, inspection
 from enact_dist.core.catalogue import ASPECTS_MAX, CATALOGUE_BYTES_MAX, WORLDS_MAX
 from enact_dist.core.forgetting import planned, unused_aspects, unused_worlds, world_drops
 from enact_dist.core.messages import (
@@ -17,6 +17,7 @@ from enact_dist.core.messages import (
     Register,
     Registered,
     Welcome,
+    WorldEntry,
 )
 from enact_dist.core.records import (
     Recovered,
@@ -159,6 +160,23 @@ def test_shard_with_an_older_store_that_is_too_full_says_hello():
     bench.hello("ann")
     assert register(bench, ["lab"]).code == "overload"
     assert isinstance(bench.granted(lock_id("ann"), item(Access.WRITE)).token.number, int)
+
+
+def test_who_reads_figures_meanwhile_leaves_no_catalogue_of_before_behind(bench, monkeypatch):
+    """Figures are taken without the shard's mutex: here between a look and a registration."""
+    known = bench.shard.state.catalogue
+    real = catalogue.Shown
+
+    def registered_meanwhile(*parts):
+        monkeypatch.setattr(catalogue, "Shown", real)
+        bench.ask(Register("ann", ("later",), ()))
+        return real(*parts)
+
+    known.add_world(WorldEntry("soon"))
+    monkeypatch.setattr(catalogue, "Shown", registered_meanwhile)
+    inspection.counted(bench.shard.state)
+
+    assert "later" in bench.ask(HELLO).worlds
 
 
 def test_what_is_unused_can_be_forgotten_from_such_a_store():
