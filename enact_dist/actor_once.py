@@ -67,6 +67,9 @@ REMAINS: Final = "its outcome will read interrupted, and it is not run again"
 
 log = logging.getLogger("enact.actor")
 
+_ended: set[str] = set()
+"""The runs of this process that are over: its session may live on, with the next one."""
+
 
 class TakenError(LockTimeoutError):
     """Another process, whose session lives, acts on an earlier version or on this one."""
@@ -212,6 +215,10 @@ class Once:
         granted()
         return Acted(seen, ran=True, error=self._act(entity, lock, outcome, taken))
 
+    def end(self) -> None:
+        """Note that this run acts on nothing any more."""
+        _ended.add(self._run)
+
     @contextlib.contextmanager
     def _taking(self, lock: OnceLock) -> Iterator[None]:
         try:
@@ -283,7 +290,7 @@ class Once:
             TakenError: Its session lives.
             LinkError: A shard that may know it does not answer.
         """
-        mine = found.run == self._run
+        mine = found.run == self._run or found.run in _ended
         if not mine and self._lives(found.session):
             if found != self._waits_for:
                 self._waits_for = found

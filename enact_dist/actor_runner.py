@@ -241,6 +241,8 @@ class ActorRun:
             if self._record.state == "running":
                 self._record.state = "stopped"
             self._ended.set()
+            if self._once is not None:
+                self._once.end()
             lookout.join()
             self._report(now=True)
             self._tell_left()

@@ -13,6 +13,7 @@ import pytest
 from enact_dist import testing
 from enact_dist.actor import Actor
 from enact_dist.actor_process import ActorThread
+from enact_dist.actor_runner import run_actor
 from enact_dist.errors import LeaseLostError, LockTimeoutError, MisuseError
 from enact_dist.lock import Lock
 from enact_dist.outcome import Outcome
@@ -302,6 +303,29 @@ def test_version_whose_taker_is_gone_is_interrupted_and_never_repeated(cell, onl
     assert thread.statistics().interrupted == 1
     assert "version 1 for " in thread.statistics().last_interrupted
     assert "how far it came is unknown" in caplog.text
+
+
+def test_version_of_a_run_before_in_this_process_is_closed(cell, online, caplog):
+    """Its session lives on with the next run, which would wait for an outcome for ever."""
+
+    class Killed(BaseException):
+        pass
+
+    def moves(_):
+        raise Killed
+
+    write(online, PLAN, [1])
+    with pytest.raises(Killed):
+        run_actor(Robot(moves), cell, stop=threading.Event())
+    assert read(online, OUTCOME).state == "taken"
+    robot = Robot()
+    with ActorThread(robot, cell):
+        until(online, "interrupted")
+        write(online, PLAN, [2])
+        until(online, "done")
+
+    assert robot.moved == [[2]]
+    assert "interrupted: version 1" in caplog.text
 
 
 def test_version_that_was_deleted_meanwhile_is_closed_too(cell, online):
