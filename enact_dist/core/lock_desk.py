@@ -134,9 +134,7 @@ class LockDesk:
                 yield from self._state.tenures.take_away(
                     tenure, "a newer lock of its thread", now_ns=self._state.now_ns
                 )
-        for pinned in [pinned for pinned in self._state.pins if pinned[:2] == lock[:2]]:
-            if pinned.seq < lock.seq:
-                del self._state.pins[pinned]
+        self._state.pins.drop_older(lock.session, {lock.lane: lock.seq})
 
     def refused(
         self, session: Session | None, map_version: int, items: tuple[Item, ...]
@@ -219,7 +217,7 @@ class LockDesk:
     def _pinned(self, message: Fetch) -> Datum | None:
         tenure = self._state.tenures.by_lock.get(message.lock)
         key = (message.slot, message.version)
-        for pins in (tenure.pins if tenure else {}, self._state.pins.get(message.lock, {})):
+        for pins in (tenure.pins if tenure else {}, self._state.pins.get(message.lock)):
             if key in pins:
                 return pins[key]
         content = self._state.slots[message.slot]
@@ -232,7 +230,7 @@ class LockDesk:
             yield from self._state.tenures.remove(tenure, now_ns=self._state.now_ns)
         elif tenure is not None:
             self._prepares.hint(message.lock)
-        self._state.pins.pop(message.lock, None)
+        self._state.pins.drop(message.lock)
         yield Reply(reply_to, Released())
 
 

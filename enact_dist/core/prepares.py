@@ -158,7 +158,7 @@ class PrepareDesk:
             message.primary_token,
             cause_of(message, tenure, session, versions, stamp_ns=stamp_ns, now_ns=state.now_ns),
         )
-        state.pins.pop(message.lock, None)
+        state.pins.drop(message.lock)
         yield self._persist(_AtStore(tenure, record, replies=[reply_to]), (record,))
 
     def _persist(self, work: _AtStore, records: tuple[Record, ...]) -> Effect:

@@ -211,9 +211,7 @@ class SessionDesk:
                 told = self._state.tenures.told(tenure, self._state.now_ns)
                 yield Story("lock.orphan", f"{told}, is not wanted any more")
                 yield from self._state.tenures.remove(tenure, now_ns=self._state.now_ns)
-        for lock in [lock for lock in self._state.pins if lock.session == message.session]:
-            if lock.seq < lowest.get(lock.lane, 0):
-                del self._state.pins[lock]
+        self._state.pins.drop_older(message.session, lowest)
         grants = tuple(
             [
                 GrantLeft(
@@ -257,7 +255,7 @@ class SessionDesk:
         for tenure in tenures:
             if not tenure.bound:
                 yield from self._state.tenures.take_away(tenure, cause, now_ns=self._state.now_ns)
-        self._state.drop_pins(session)
+        self._state.pins.drop_session(session)
         self._state.sessions.forget(session)
         self._state.sessions.end_grace_if_all_acknowledged(self._state.now_ns)
         recording = self._recording.pop(session, None)

@@ -248,13 +248,13 @@ class Shard:
     # ---------------------------------------------------------------- commits
 
     def _on_commit(self, message: Commit, reply_to: int) -> Iterator[Effect]:
-        self.state.pins.pop(message.lock, None)
+        self.state.pins.drop(message.lock)
         yield from self.state.commits.commit(
             message, reply_to=reply_to, now_ns=self.state.now_ns, wall_ns=self.state.wall_ns
         )
 
     def _on_validate(self, message: Validate, reply_to: int) -> Iterator[Effect]:
-        self.state.pins.pop(message.lock, None)
+        self.state.pins.drop(message.lock)
         yield from self.state.commits.validate(message, reply_to=reply_to, now_ns=self.state.now_ns)
 
     def _on_persisted(self, message: Persisted, _: int) -> Iterator[Effect]:
@@ -307,7 +307,7 @@ class Shard:
                 ttl_s = found.ttl_ns / 1e9 if found is not None else 0.0
                 cause = f"its lease of {ttl_s:g} s expired without a sign of life"
                 yield from self.state.tenures.take_away(tenure, cause, now_ns=self.state.now_ns)
-        self.state.drop_pins(session)
+        self.state.pins.drop_session(session)
 
     def _on_drain(self, _: Drain, __: int) -> Iterator[Effect]:
         self.state.draining = True
@@ -381,5 +381,5 @@ class Shard:
         if self.state.sessions.in_grace(self.state.now_ns):
             granted = [t for t in self.state.tenures.by_lock.values() if t.token is not None]
             assert all(t.prepared is not None for t in granted), "grant in grace"
-        for slot_pins in self.state.pins:
-            assert slot_pins.session in self.state.sessions.by_id
+        for lock in self.state.pins:
+            assert lock.session in self.state.sessions.by_id

@@ -22,6 +22,7 @@ from enact_dist.core.messages import (
     Refused,
     WorldEntry,
 )
+from enact_dist.core.pins import Pins
 from enact_dist.core.quotas import Quotas
 from enact_dist.core.sessions import Session, SessionTable
 from enact_dist.core.slots import SlotMap
@@ -31,7 +32,7 @@ from enact_dist.core.tenures import Tenure, Tenures
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from enact_dist.core.datum import Datum, LockId, Slot
+    from enact_dist.core.datum import LockId
     from enact_dist.core.messages import (
         Answer,
         Break,
@@ -100,7 +101,7 @@ class ShardState:
         self.asker = ""
         self.draining = False
         self.counters: dict[str, int] = {}
-        self.pins: dict[LockId, dict[tuple[Slot, int], Datum]] = {}
+        self.pins = Pins()
         self.busy_worlds: dict[str, str] = {}
         self.by_hand: dict[type, tuple[Break | ForceAbort, Broken]] = {}
         names = {shard.name for shard in settings.placement.shards}
@@ -205,11 +206,6 @@ class ShardState:
         ):
             self.stamps.last_ns = seen_ns
         return self.stamps.now(wall_ns=self.wall_ns)
-
-    def drop_pins(self, session: str) -> None:
-        """Forget everything that a session's views keep."""
-        for lock in [lock for lock in self.pins if lock.session == session]:
-            del self.pins[lock]
 
     def forget_top(self, lock: LockId) -> None:
         """Let a lock that never was granted be asked for again under the same seq."""

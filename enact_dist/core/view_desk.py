@@ -127,9 +127,8 @@ class ViewDesk:
                 state.count("views_forgotten")
                 return forgotten
         states, pins, from_ns = state.slots.shown(message.items, message.at_ns)
-        if pins:
-            # Added to: the client may have taken an answer to an earlier one of these.
-            state.pins.setdefault(message.lock, {}).update(pins)
+        if pins and state.pins.add(message.lock, pins):
+            state.count("views_displaced")
         stamp_ns = state.stamp()
         until_ns = min(stamp_ns, self._undecided_ns(message.items) - 1)
         if message.at_ns:

@@ -122,6 +122,10 @@ OF_A_SHARD: Final[dict[str, Counter]] = {
         "sessions that did nothing after their hello and made room where the table was full",
         "see the shard's log: somebody opens sessions in a loop, under ever new names",
     ),
+    "views_displaced": Counter(
+        "views whose large data a shard keeps no longer, since their client had too many of them",
+        "find the client that takes views in ever new lanes; it is none of this library's",
+    ),
     "requests_refused": Counter(
         "requests in the name of another's session or of another shard, or that name no epoch",
         "see the error at who sent them; the same session or process may be copied",

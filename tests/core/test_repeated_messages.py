@@ -87,7 +87,7 @@ def shard_picture(bench, sessions):
             for lock, tenure in state.tenures.by_lock.items()
         },
         "decisions": {lock: found.position for lock, found in state.decisions.by_lock.items()},
-        "pinned": {lock: set(pins) for lock, pins in state.pins.items()},
+        "pinned": {lock: set(state.pins.get(lock)) for lock in state.pins},
         "catalogue": (dict(state.catalogue.worlds), dict(state.catalogue.aspects)),
         "notices": list(bench.notices),
         "audit": (state.audit.alarms, state.audit.entries()),

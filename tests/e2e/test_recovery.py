@@ -3,7 +3,7 @@
 import pytest
 
 from enact_dist import Aspect, Entity, Lock, Write, connect
-from enact_dist.link.session_client import SessionClient
+from enact_dist.link.pauses import Pauses
 from enact_dist.verify.recovery import measure
 
 pytestmark = pytest.mark.slow
@@ -15,12 +15,12 @@ BUSY_S = 25.0
 
 def test_idle_clients_with_a_long_ttl_let_a_restarted_shard_grant_at_once(make_cell, monkeypatch):
     """Clients learn of the restart by themselves; here no keep-alive is due in the next hour."""
-    rest = SessionClient._rest
+    rest = Pauses.rest
     monkeypatch.setattr(
-        SessionClient,
-        "_rest",
-        lambda client, pause_s, returns: rest(
-            client, 3600.0 if pause_s > 5.0 else pause_s, returns
+        Pauses,
+        "rest",
+        lambda pauses, pause_s, returns=None: rest(
+            pauses, 3600.0 if pause_s > 5.0 else pause_s, returns
         ),
     )
     cell = make_cell(ttl_s=60.0).start_all()

@@ -167,8 +167,8 @@ def _shown(shard: Shard) -> Iterator[Datum | None]:
             if found is not None:
                 yield from (old.datum for old in found.states)
                 yield from (kept.content.datum for kept in found.kept.values())
-    for pins in shard.state.pins.values():
-        yield from pins.values()
+    for lock in shard.state.pins:
+        yield from shard.state.pins.get(lock).values()
 
 
 def copied(datum: Datum | None) -> Datum | None:
