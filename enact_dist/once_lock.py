@@ -73,7 +73,8 @@ class OnceLock(ActorLock):
     def end(self) -> None:
         """Free the data; the update is over, or the version was not taken."""
         self._taken = None
-        super()._let_go()
+        if self._lock is not None:  # else it was never granted
+            super()._let_go()
 
     def written(self) -> Iterator[tuple[Write[Any], Any, int]]:
         """Yield what the update has written: request, value or None for null, capture stamp."""

@@ -43,11 +43,14 @@ class ShardPresence:
     @property
     def here(self) -> bool:
         """Whether the shard is in reach, as far as Zenoh has noted."""
-        try:
-            # As it is; Zenoh's stub says otherwise.
-            return cast("zenoh.MatchingStatus", self._querier.matching_status).matching
-        except zenoh.ZError:  # the session is closed, or this is
-            return False
+        with self._mutex:  # Zenoh's binding raises where one thread asks and another ends it
+            if self._closed:
+                return False
+            try:
+                # As it is; Zenoh's stub says otherwise.
+                return cast("zenoh.MatchingStatus", self._querier.matching_status).matching
+            except zenoh.ZError:  # the session is closed
+                return False
 
     def _heard(self, _: zenoh.MatchingStatus) -> None:
         # Of a shard that goes and comes at once the later event may be the one of its going.
@@ -56,7 +59,7 @@ class ShardPresence:
 
     def close(self, wait_s: float = 0.0) -> None:
         """End it; wait so long for the end of what calls `returned`.  Twice is harmless."""
-        with self._mutex:  # Zenoh's binding raises where two threads do this at once
+        with self._mutex:  # nor may two threads end it at once
             if not self._closed:
                 self._closed = True
                 with contextlib.suppress(zenoh.ZError):  # the session is closed

@@ -295,7 +295,7 @@ def test_lock_refuses_more_requests_and_writes_than_a_frame_carries(online):
     """The limit of a lock is the same in process and over a network, and says what to use."""
     with pytest.raises(MisuseError, match=r"5000 requests.*pattern"):
         Lock(*[Read(online, Entity(f"e/{number}"), COUNT) for number in range(5000)])
-    with pytest.raises(MisuseError, match="view of 5000"):
+    with pytest.raises(MisuseError, match="view with 5000"):
         online.view(*[View(online, Entity(f"e/{number}"), COUNT) for number in range(5000)])
     each = WriteEach(online, Entities("e/*"), COUNT)
     with pytest.raises(MisuseError, match="4096 data"), Lock(each) as held:

@@ -505,3 +505,16 @@ def test_update_that_lost_its_lock_and_runs_again_is_told_of_once(cell, online, 
     assert len(told) == 1
     assert told[0].startswith("arm for robot: Mover.update runs again, because it lost its lock")
     assert "once = True (enact_dist/docs/actuators.md)" in told[0]
+
+
+def test_actor_that_is_stopped_while_it_waits_for_its_lock_just_ends(cell, online):
+    """Nothing was taken, so nothing is left to free."""
+    write(online, PLAN, [1])
+    outcome = Write(online, ROBOT, OUTCOME)
+    with Lock(outcome):
+        with ActorThread(Robot(Gate()), cell):
+            while all(lock.granted for lock in cell.locks()):
+                pass
+        assert all(lock.granted for lock in cell.locks())
+
+    assert read(online, OUTCOME) is None

@@ -83,3 +83,32 @@ def test_shard_that_goes_and_comes_at_once_is_told_whatever_event_is_the_last():
         assert returned.get(timeout=30) == "back"
     finally:
         presence.close(30.0)
+
+
+def test_presence_may_be_asked_while_it_is_ended(endpoint):
+    """From another thread: Zenoh's binding raises where one reads and another undeclares."""
+    session = open_session(listen=[endpoint], lease_s=1.0)
+    presences, over, errors = [], threading.Event(), []
+
+    def ask():
+        try:
+            while not over.is_set():
+                for presence in presences[-1:]:
+                    assert presence.here in {True, False}
+        except BaseException as error:
+            errors.append(error)
+            raise
+
+    asking = [threading.Thread(target=ask) for _ in range(2)]
+    try:
+        for thread in asking:
+            thread.start()
+        for number in range(100):
+            presences.append(ShardPresence(session, f"enact/cell/s{number}/hello/x", list))
+            presences[-1].close(30.0)
+    finally:
+        over.set()
+        for thread in asking:
+            thread.join()
+        close_session(session)
+    assert not errors
