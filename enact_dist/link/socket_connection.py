@@ -12,7 +12,7 @@ import socket
 import threading
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.core.messages import Answer, Outcome, Refused, Survey
+from enact_dist.core.messages import Answer, Outcome, Refused, Release, Request, Survey
 from enact_dist.core.owners import named_session, not_yours
 from enact_dist.errors import LinkError, ProtocolError
 from enact_dist.link.notices import Interest
@@ -151,13 +151,23 @@ class SocketConnection:
                 self._send(Refused("protocol", str(error)))
                 continue
             session = named_session(message)
-            if session and session != self.session and type(message) is not Outcome:
+            if session and session != self.session and not self._may_name(session, message):
                 self.step = step = step + 1
                 self._send(not_yours(session, "another connection", self.identity))
                 continue
             host.submit(message, self._take, self.identity)
             self.step = step = step + 1
             self._send_answer()
+
+    def _may_name(self, session: str, message: Request) -> bool:
+        """Whether a message may name another session: who asks for a commit's outcome sends these.
+
+        Of two sessions of one process each may release the locks of the other.  What else is
+        refused the core decides, by the identity.
+        """
+        if type(message) is Release:
+            return not self._service.is_of_another_process(session, self.peer)
+        return type(message) is Outcome
 
     def _take(self, answer: Answer) -> None:
         """Take the answer from the host, whose mutex is held: nothing here may wait.

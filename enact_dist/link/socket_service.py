@@ -145,6 +145,11 @@ class SocketService:
             return f"{CONNECTIONS_MAX} connections to shard {self.host.name} are open"
         return ""
 
+    def is_of_another_process(self, session: str, peer: Peer) -> bool:
+        """Whether a session has connections of another process than this."""
+        with self._mutex:
+            return any(one.peer != peer for one in self._connections.get(session, ()))
+
     def _has_its_share(self, peer: Peer) -> bool:
         """Whether a process has to leave the connections that are free to others."""
         free = CONNECTIONS_MAX - self._count

@@ -127,7 +127,7 @@ def test_connection_speaks_for_its_own_session_only(raw, make_peer):
     near, other = raw("mine"), raw("yours")
     hello = m.Hello("yours", 0, 2_000_000_000, "you", "h", 1, False)
     welcome = ask(other, hello)
-    forged = [ask(near, one) for one in (m.Goodbye("yours"), m.Release(LockId("yours", 0, 1)))]
+    forged = [ask(near, m.Goodbye("yours")), ask(near, m.KeepAlive("yours", 1, 1, (), b""))]
     finish = ask(near, m.Finish(LockId("yours", 0, 1), Position(1, "far")))
     sessions = ask(other, m.ListSessions())
 
@@ -184,6 +184,40 @@ def test_process_that_greets_for_a_session_of_zenoh_does_not_end_it_with_its_own
     assert int(kind) == Kind.REFUSED
     assert "eve@h:1" in text
     assert "may not speak for it" in text
+    assert isinstance(victim.commit(granted, "cup", b"1"), m.Committed)
+
+
+RELEASES_ANOTHERS = """
+import socket, sys
+from enact_dist.core.datum import LockId
+from enact_dist.core.messages import Release
+from enact_dist.link.socket_frames import Kind, Stream, greeting_of, send_frame
+from enact_dist.wire.frames import decode_frame, encode_frame
+near = socket.socket(socket.AF_UNIX)
+near.connect(sys.argv[1])
+stream = Stream(near)
+send_frame(near, greeting_of("e" * 32, sys.argv[3]), kind=Kind.OPEN)
+stream.receive()
+send_frame(near, encode_frame(Release(LockId(sys.argv[2], 0, 1)))[0])
+_, header, payload = stream.receive()
+print(decode_frame(header, payload).code, flush=True)
+"""
+
+
+@pytest.mark.carrier("socket")
+@pytest.mark.parametrize("carry", ["socket"], indirect=True)
+def test_process_that_takes_anothers_name_releases_none_of_its_locks(
+    daemon, carry, make_peer, endpoint, program
+):
+    """The kernel says that it is another process; two sessions of one process may do that."""
+    shard = daemon(endpoint)
+    victim = peer_over(carry(endpoint), make_peer)
+    granted = victim.acquire("cup")
+
+    eve = program(RELEASES_ANOTHERS, shard._shared.path / "socket", victim.session, "tester")
+    said, _ = eve.communicate(timeout=30)
+
+    assert said.strip() == "permission"
     assert isinstance(victim.commit(granted, "cup", b"1"), m.Committed)
 
 
