@@ -3,6 +3,8 @@
 ======================  ==========================================================
 shapes                  what the arrays mean: cloud, surface, depth image, camera
 poses                   rigid transforms, 4x4, named `to_from_of`
+projection              points -> pixels of a calibrated camera, with its distortion
+capsules                arms and people as capsules: distances, outlines in images
 depth                   depth image <-> points, filters, the sensor's spread
 rendering               surface -> depth image as a camera would see it
 reconstruction          one view's cloud -> triangles and planar patches
