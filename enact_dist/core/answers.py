@@ -15,6 +15,7 @@ from enact_dist.core.message_parts import (
     Holder,
     PlacementMap,
     SessionInfo,
+    ShardEntry,
     SlotState,
     SlotVersion,
     VersionEntry,
@@ -263,6 +264,13 @@ class Pong:
     state: str
     uptime_ns: int
     start: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Places:
+    """Where the answering shard expects each shard of the cell, itself included."""
+
+    shards: tuple[ShardEntry, ...]
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,6 +17,7 @@ from enact_dist.core.messages import (
     ListLocks,
     ListSessions,
     Locks,
+    Places,
     Pong,
     SessionInfo,
     Sessions,
@@ -162,6 +163,11 @@ def pong(state: ShardState) -> Pong:
         state.now_ns - state.born_ns,
         state.settings.start,
     )
+
+
+def places(state: ShardState) -> Places:
+    """Say where each shard of the cell is expected."""
+    return Places(state.settings.placement.shards)
 
 
 def counted(state: ShardState) -> dict[str, int]:

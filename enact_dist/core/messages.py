@@ -49,6 +49,7 @@ from enact_dist.core.answers import (
     Kept,
     Locks,
     OutcomeIs,
+    Places,
     Pong,
     Prepared,
     Reached,
@@ -110,6 +111,7 @@ from enact_dist.core.requests import (
     ListAudit,
     ListHistory,
     ListLocks,
+    ListPlaces,
     ListSessions,
     Outcome,
     Ping,
@@ -163,6 +165,7 @@ Request = (
     | Goodbye
     | AwaitStamp
     | Ping
+    | ListPlaces
     | Survey
     | ListLocks
     | ListSessions
@@ -198,6 +201,7 @@ Answer = (
     | Released
     | Reached
     | Pong
+    | Places
     | Surveyed
     | Locks
     | Sessions
@@ -268,6 +272,7 @@ __all__ = [
     "ListAudit",
     "ListHistory",
     "ListLocks",
+    "ListPlaces",
     "ListSessions",
     "Locks",
     "Message",
@@ -277,6 +282,7 @@ __all__ = [
     "Pin",
     "Ping",
     "PlacementMap",
+    "Places",
     "Pong",
     "Prepare",
     "Prepared",

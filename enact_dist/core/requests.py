@@ -12,6 +12,7 @@ from enact_dist.core.message_parts import (
     DatumRead,
     Item,
     LaneView,
+    ShardEntry,
     SlotVersion,
     WriteItem,
 )
@@ -249,6 +250,18 @@ class AwaitStamp:
 @dataclass(frozen=True, slots=True)
 class Ping:
     """Is a shard there, and does it grant?  Answer: `Pong`, at once; no session is needed."""
+
+
+@dataclass(frozen=True, slots=True)
+class ListPlaces:
+    """Where does the shard expect each shard of the cell?  Answer: `Places`; no session is needed.
+
+    A shard that serves says in `shard` who it is (then only that shard itself may ask), and in
+    `shards` where it expects each shard, itself included.
+    """
+
+    shard: str = ""
+    shards: tuple[ShardEntry, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

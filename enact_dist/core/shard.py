@@ -44,6 +44,7 @@ from enact_dist.core.messages import (
     ListAudit,
     ListHistory,
     ListLocks,
+    ListPlaces,
     ListSessions,
     Outcome,
     Ping,
@@ -129,6 +130,7 @@ class Shard:
             ForceAbort: self._prepares.on_force_abort,
             AwaitStamp: self._stamps.on_await_stamp,
             Ping: self._on_ping,
+            ListPlaces: self._on_list_places,
             Survey: self._on_survey,
             ListLocks: self._on_list_locks,
             ListSessions: self._on_list_sessions,
@@ -320,6 +322,9 @@ class Shard:
 
     def _on_ping(self, _: Ping, reply_to: int) -> Iterator[Effect]:
         yield Reply(reply_to, inspection.pong(self.state))
+
+    def _on_list_places(self, _: ListPlaces, reply_to: int) -> Iterator[Effect]:
+        yield Reply(reply_to, inspection.places(self.state))
 
     def _on_survey(self, message: Survey, reply_to: int) -> Iterator[Effect]:
         wrong = wrong_patterns(message.patterns)

@@ -12,7 +12,7 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.core.messages import Hello, Ping, Pong, Welcome
+from enact_dist.core.messages import ListPlaces, Ping, Places, Pong
 from enact_dist.link.endpoints import somebody_listens
 from enact_dist.link.zenoh_config import to_reach
 from enact_dist.link.zenoh_discovery import FoundShard, ask_shards
@@ -21,9 +21,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
     from enact_dist.core.messages import ShardEntry
-
-LOOKER: Final = Hello("0" * 32, 0, 1_000_000_000, "enact", "", 0, observer=True)
-"""The greeting of somebody who only wants to know which shards a shard knows."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,8 +87,8 @@ def told_places(
     endpoints = dict.fromkeys(to_reach(place) for entry in shards for place in entry.endpoints)
     listening = [endpoint for endpoint in endpoints if somebody_listens(endpoint)]
     asked = [FoundShard(cell, entry.name) for entry in shards]
-    answers = ask_shards(listening, asked, LOOKER, timeout_s=timeout_s) if listening else {}
-    return [one.placement.shards for one in answers.values() if isinstance(one, Welcome)]
+    answers = ask_shards(listening, asked, ListPlaces(), timeout_s=timeout_s) if listening else {}
+    return [one.shards for one in answers.values() if isinstance(one, Places)]
 
 
 def moved_places(

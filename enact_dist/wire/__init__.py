@@ -22,12 +22,12 @@ requests  Hello 1, Register 2, Acquire 3, TakeView 4, Fetch 5, KeepAlive 6, Comm
           Validate 9, Release 10, Goodbye 11, AwaitStamp 12, Survey 13, ListLocks 14,
           ListSessions 15, Break 16, Prepare 17, Finish 18, Resolve 19, ForceAbort 20,
           ListAudit 21, Stage 22, ListHistory 23, Explain 24, FindEffects 25, Fork 26,
-          DropWorld 27, KeepVersions 28, Ping 29
+          DropWorld 27, KeepVersions 28, Ping 29, ListPlaces 30
 answers   Welcome 33, Registered 34, Granted 35, Waiting 36, Stale 37, Viewed 38, Slice 39, Gone 40,
           Alive 41, Committed 42, Fenced 43, OutcomeIs 44, Valid 45, Released 46, Reached 47,
           Surveyed 48, Locks 49, Sessions 50, Broken 51, EpochChanged 52, WrongShard 53,
           Refused 54, Changed 55, Prepared 56, Finished 57, Resolved 58, Audited 59, Staged 60,
-          Versions 61, Forgotten 62, Forked 63, Dropped 64, Kept 65, Pong 66
+          Versions 61, Forgotten 62, Forked 63, Dropped 64, Kept 65, Pong 66, Places 67
 notices   Notice 97
 ========  ========================================================================================
 

@@ -71,6 +71,7 @@ CODES: Final[dict[type[Any], int]] = {
     m.DropWorld: 27,
     m.KeepVersions: 28,
     m.Ping: 29,
+    m.ListPlaces: 30,
     m.Welcome: 33,
     m.Registered: 34,
     m.Granted: 35,
@@ -105,6 +106,7 @@ CODES: Final[dict[type[Any], int]] = {
     m.Dropped: 64,
     m.Kept: 65,
     m.Pong: 66,
+    m.Places: 67,
     m.Notice: 97,
 }
 

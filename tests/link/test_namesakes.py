@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 
 from enact_dist import Aspect, Entity, Lock, Write, connect
-from enact_dist.core.messages import Pin, PlacementMap, ShardEntry
+from enact_dist.core.messages import ListSessions, Pin, PlacementMap, Sessions, ShardEntry
 from enact_dist.core.shard_state import ShardSettings
 from enact_dist.doctor_cell import namesakes
 from enact_dist.errors import LinkError
@@ -43,6 +43,20 @@ def put(cell, entity, number):
     """Commit a number."""
     with Lock(write := Write(cell.world("online"), Entity(entity), COUNT), wait_s=30.0) as lock:
         lock[write] = number
+
+
+def test_shards_that_start_show_nobody_who_is_not_there(begin, free):
+    """A shard that starts asks those that run where they expect it; that is no client."""
+    left, right = free(), free()
+    first = begin("left", left, left=left, right=right)
+    begin("right", right, left=left, right=right)
+    answers = []
+
+    first.host.submit(ListSessions(), answers.append)
+
+    (answer,) = answers
+    assert isinstance(answer, Sessions)
+    assert answer.sessions == ()
 
 
 def test_later_daemon_is_refused_where_other_shards_expect_the_first_one(begin, free):

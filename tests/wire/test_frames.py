@@ -73,7 +73,7 @@ def test_frame_codes_stand_still():
         ("Reached", 47), ("Surveyed", 48), ("Locks", 49), ("Sessions", 50), ("Broken", 51),
         ("EpochChanged", 52), ("WrongShard", 53), ("Refused", 54), ("Changed", 55),
         ("ForceAbort", 20), ("ListAudit", 21), ("Stage", 22), ("Audited", 59), ("Staged", 60),
-        ("Ping", 29), ("Pong", 66),
+        ("Ping", 29), ("Pong", 66), ("ListPlaces", 30), ("Places", 67),
         ("Notice", 97),
     }  # fmt: skip
 
