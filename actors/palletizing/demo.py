@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Final
 
 from actors.geometry.files import write_whole
 from actors.geometry.picture import png_bytes
-from actors.palletizing.demo_cell import DemoCell, DemoError, RunningCell, watched_cell
+from actors.palletizing.demo_cell import PalletizingCell, RunningCell, watched_cell
 from actors.palletizing.demo_lineage import show_lineage
 from actors.palletizing.demo_pictures import latest, model_picture, tray_picture
 from actors.palletizing.demo_report import difference_of, report_bytes, rows_of, score_of, table_of
@@ -44,6 +44,7 @@ from actors.palletizing.vocabulary import (
     VIEWS,
     place_entity,
 )
+from actors.running_cell import DemoError
 from enact_dist import View, ViewEach
 from enact_dist.errors import ShardUnreachableError
 from enact_dist.link.signals import StopSignals
@@ -110,7 +111,7 @@ def watch_demo(config: Path, *, out: Path) -> int:
     return _shown(running, out, up="watching a cell that runs already", keep_running=False)
 
 
-def _shown(demo: DemoCell, out: Path, *, up: str, keep_running: bool) -> int:
+def _shown(demo: PalletizingCell | RunningCell, out: Path, *, up: str, keep_running: bool) -> int:
     """Show a run and write its files; return the exit status."""
     from rich.console import Console
 
@@ -137,7 +138,9 @@ def _shown(demo: DemoCell, out: Path, *, up: str, keep_running: bool) -> int:
     return 0
 
 
-def _follow(cell: Cell, running: DemoCell, truths: Sequence[Package], console: Console) -> None:
+def _follow(
+    cell: Cell, running: PalletizingCell | RunningCell, truths: Sequence[Package], console: Console
+) -> None:
     """Show progress until the user was told of every package.
 
     Raises:
@@ -257,7 +260,7 @@ def _tray_pictures(cell: Cell) -> dict[int, Picture]:
     return pictures
 
 
-def _until_interrupted(running: DemoCell) -> None:
+def _until_interrupted(running: PalletizingCell | RunningCell) -> None:
     """Wait for Ctrl-C or SIGTERM, or until the cell goes down by itself."""
     with StopSignals() as signals:
         while not signals.event.wait(1.0):

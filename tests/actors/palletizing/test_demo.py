@@ -60,7 +60,7 @@ def test_ports_of_a_run_are_kept_while_it_runs(tmp_path, monkeypatch):
         send_signal = wait = poll = staticmethod(lambda *_: None)
 
     monkeypatch.setattr(
-        "actors.palletizing.demo_cell.subprocess",
+        "actors.running_cell.subprocess",
         SimpleNamespace(
             Popen=lambda *_, **__: started.append(1) or Up(),
             STDOUT=subprocess.STDOUT,

@@ -1,0 +1,193 @@
+"""Cells for demonstrations: one that runs already, or processes that `enact up` starts.
+
+Rule a change must keep: every process that was started here ends with the demonstration, also when
+that is killed, and such a run starts from an empty data folder of its own.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+import tomllib
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Self
+
+from actors.geometry.files import write_whole
+from enact_dist import connect
+from enact_dist.errors import LinkError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from enact_dist import Cell
+
+UP_S: Final = 60.0
+"""How long the shards may take to answer; one needs half a second on an idle machine."""
+TRY_S: Final = 2.0
+"""How long one try to join takes; after each it is looked whether the processes still run."""
+DOWN_S: Final = 20.0
+"""How long actors and shards may take to drain."""
+
+
+class DemoError(RuntimeError):
+    """The demonstration cannot go on; the message says where to look."""
+
+
+class DemoCell:
+    """A cell that others run; a context manager that leaves it as it is.
+
+    Attributes:
+        config: Its `cell.toml`.
+        log: Where to read what its processes said.
+    """
+
+    def __init__(self, config: Path, *, log: str) -> None:
+        self.config, self.log = config, log
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Leave it as it is."""
+
+    def check(self) -> None:
+        """Raise `DemoError` if it is known to be gone."""
+
+    def joined(self) -> Cell:
+        """Join the cell as soon as its shards answer.
+
+        Raises:
+            DemoError: The processes ended, or no shard answered within `UP_S`.
+        """
+        deadline_s = time.monotonic() + UP_S
+        while True:
+            self.check()
+            try:
+                return connect(self.config, actor="demo", timeout_s=TRY_S)
+            except LinkError as error:
+                if time.monotonic() > deadline_s:
+                    raise DemoError(f"no shard within {UP_S:.0f} s: {error}") from error
+
+
+class RunningCell(DemoCell):
+    """A cell that is up between entering and leaving the block.
+
+    Args:
+        out: Folder for `cell.toml` and `cell.log`; it exists.
+        name: Of the application, for its temporary folder.
+        template: The `cell.toml` of the application.
+        configured: Makes the text of the run's `cell.toml` of the template's text, a data folder
+            and a port for each shard.
+        env: Environment variables of its processes beside this process's.
+    """
+
+    def __init__(
+        self,
+        out: Path,
+        *,
+        name: str,
+        template: Path,
+        configured: Callable[[str, Path, Sequence[int]], str],
+        env: Mapping[str, str] | None = None,
+    ) -> None:
+        self._log = out / "cell.log"
+        super().__init__(out / "cell.toml", log=str(self._log))
+        self._name, self._template, self._configured = name, template, configured
+        self._env = dict(env or {})
+        self._data = Path()
+        self._ports: list[socket.socket] = []
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def __enter__(self) -> Self:
+        self._data = Path(tempfile.mkdtemp(prefix=f"enact-{self._name}-"))
+        template = self._template.read_text()
+        self._ports = kept_ports(len(tomllib.loads(template)["shards"]))
+        ports = [each.getsockname()[1] for each in self._ports]
+        write_whole({self.config: self._configured(template, self._data, ports).encode()})
+        command = [sys.executable, "-m", "enact_dist.cli.main", "up", str(self.config)]
+        with self._log.open("wb") as log:
+            self._process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                env={**os.environ, **self._env, "ENACT_SUPERVISOR_PID": str(os.getpid())},
+                process_group=0,  # Ctrl-C is this process's to pass on
+            )
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._process is not None:
+            self._process.send_signal(signal.SIGTERM)
+            try:
+                self._process.wait(DOWN_S)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.wait()
+        for each in self._ports:
+            each.close()
+        shutil.rmtree(self._data, ignore_errors=True)
+
+    def check(self) -> None:
+        """Raise `DemoError` with the end of the log if the processes are gone."""
+        if self._process is not None and self._process.poll() is not None:
+            lines = self._log.read_text(errors="replace").splitlines()[-8:]
+            raise DemoError("\n".join([f"the cell went down; the end of {self.log}:", *lines]))
+
+
+def placed(config: dict[str, Any], data: Path, ports: Sequence[int]) -> None:
+    """Give the shards of a parsed `cell.toml` this host's ports and a data folder.
+
+    Args:
+        config: The parsed file; it is changed.
+        data: Parent of the shards' folders.
+        ports: One of this host for each shard.
+    """
+    config["data_folder"] = str(data)
+    for shard, port in zip(config["shards"].values(), ports, strict=True):
+        shard["listen"] = f"tcp/127.0.0.1:{port}"
+
+
+def kept_ports(count: int) -> list[socket.socket]:
+    """Return sockets, each of which keeps a port of this host that nobody listens at.
+
+    The system gives it to nobody else, before a shard listens there or while it is started again;
+    who says SO_REUSEADDR, as Zenoh does, listens beside a socket that does not listen.
+    """
+    kept = [socket.socket() for _ in range(count)]
+    for each in kept:
+        each.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        each.bind(("127.0.0.1", 0))
+    return kept
+
+
+def toml_of(config: dict[str, Any]) -> str:
+    """Write tables of two levels, lists of tables and plain values as TOML."""
+    lines = [f"{key} = {_value(value)}" for key, value in config.items() if not _nested(value)]
+    for name, tables in config.items():
+        if isinstance(tables, dict):
+            named = [(f"[{name}.{key}]", table) for key, table in tables.items()]
+        else:
+            named = [(f"[[{name}]]", table) for table in tables] if _nested(tables) else []
+        for head, table in named:
+            lines += ["", head, *(f"{key} = {_value(value)}" for key, value in table.items())]
+    return "\n".join(lines) + "\n"
+
+
+def _nested(value: object) -> bool:
+    return isinstance(value, dict) or (isinstance(value, list) and isinstance(value[0], dict))
+
+
+def _value(value: object) -> str:
+    """Write one value; strings, numbers, truth values and lists of them look as in JSON."""
+    if isinstance(value, dict):
+        items = (f"{json.dumps(key)} = {_value(item)}" for key, item in value.items())
+        return "{ " + ", ".join(items) + " }"
+    return json.dumps(value)
