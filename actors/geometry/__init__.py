@@ -13,6 +13,7 @@ registration            where a known surface lies in a cloud of the tray
 segmentation            what is new on the tray, piece by piece
 deviation               render and compare: missing, extra, moved, deformed
 surface_distance        how far two surfaces or clouds are apart
+separation              distance to a person <-> speed of a robot (ISO/TS 15066)
 ======================  ==========================================================
 
 Rules a change must keep: metres, right-handed, z up (cameras: z forward, x right, y down);
