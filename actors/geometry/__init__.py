@@ -4,6 +4,7 @@
 shapes                  what the arrays mean: cloud, surface, depth image, camera
 poses                   rigid transforms, 4x4, named `to_from_of`
 projection              points -> pixels of a calibrated camera, with its distortion
+silhouettes             what differs in an image from the empty cell, without its shadows
 capsules                arms and people as capsules: distances, outlines in images
 depth                   depth image <-> points, filters, the sensor's spread
 rendering               surface -> depth image as a camera would see it
