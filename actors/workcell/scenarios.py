@@ -148,7 +148,8 @@ _ROUND: Final = (
     (-2.9, -0.9),
 )
 """Around the robot, past conveyor, table and cabinet, and out again."""
-_PAST: Final = ((-2.9, -1.85), (0.0, -1.85), (2.9, -1.8))
+_PAST: Final = ((1.75, -2.9), (1.65, 0.0), (1.75, 2.9))
+_WEST: Final = ((-1.6, -2.9), (-1.5, 0.0), (-1.6, 2.9))
 _ACROSS: Final = ((2.9, 1.2), (1.6, 1.0), (1.5, -1.0), (2.9, -1.4))
 _TO_TABLE: Final = ((2.9, -0.9), (1.75, -0.3))
 _TO_CABINET: Final = ((-2.9, 1.85), (-1.0, 1.72))
@@ -176,7 +177,7 @@ def _walks(name: str, seconds: float) -> tuple[Walk, ...]:
         "S8": (cross,),
         "S9": (cross,),
         "S10": (Walk(_PAST, 1.0),),
-        "S11": (Walk(_PAST, repeats=True), Walk(_ACROSS, 2.0, 1.0, 1.68, repeats=True)),
+        "S11": (Walk(_PAST, repeats=True), Walk(_WEST, 2.0, 1.0, 1.68, repeats=True)),
         "S12": (Walk((*_TO_TABLE, _TO_TABLE[0]), pauses=(table,)),),
     }
     return walks[name]

@@ -1,0 +1,387 @@
+"""Score a run of the workcell on the truth: rate, latency, hull, distance, tracks, safety, speed.
+
+    python -m actors.workcell.evaluation out/run.mcap
+
+reads the recording of `enact demo workcell` and prints the table.  The truth is what the scenario
+and its seed say of the people (`simulation.human`), and what the arm's joints say of the arm; no
+actor of the cell has seen it.
+
+What each score is stands with its function, its goal in `GOALS`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import math
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from actors.geometry.capsules import distance_to_points
+from actors.geometry.kinematics import capsules_at
+from actors.workcell import vocabulary as words
+from actors.workcell.trace import T, trace_of
+from actors.workcell.truth_of_run import Truth, safety_of, truth_of
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+
+    import numpy.typing as npt
+
+    from actors.workcell.trace import Kept, Trace
+
+    F64 = npt.NDArray[np.float64]
+
+NEAR_M: Final = 0.5
+"""Within this distance of the robot no voxel of a person may be lost."""
+PHANTOM_M: Final = 0.15
+"""What is farther than this from everything real is a phantom."""
+INSIDE_M: Final = 1.7
+"""Tracks are scored while the person's middle is so near to the robot's axis along x and y."""
+CLOSE_M: Final = 2.0
+"""Distances are scored below this true distance."""
+
+
+@dataclass(frozen=True, slots=True)
+class Goal:
+    """What a score should be.
+
+    Attributes:
+        what: In words, with the unit.
+        low: Least value that meets it.
+        high: Greatest value that meets it.
+    """
+
+    what: str
+    low: float = -math.inf
+    high: float = math.inf
+
+    def met(self, value: float) -> bool:
+        """Say whether a value meets it."""
+        return self.low <= value <= self.high
+
+    def __str__(self) -> str:
+        """Return the goal as the table shows it."""
+        if self.low == self.high:
+            return f"{self.low:g}"
+        if self.low == -math.inf:
+            return "" if self.high == math.inf else f"≤ {self.high:g}"
+        return f"≥ {self.low:g}" if self.high == math.inf else f"{self.low:g} to {self.high:g}"
+
+
+GOALS: Final[Mapping[str, Goal]] = {
+    "sets": Goal("sets of masks"),
+    "sets_missed": Goal("ticks without a set", 0, 0),
+    "sets_incomplete": Goal("sets with a stand-in", 0, 0),
+    "masks_p50_ms": Goal("capture → last mask, p50, ms"),
+    "masks_p99_ms": Goal("capture → last mask, p99, ms"),
+    "hull_p50_ms": Goal("capture → hull, p50, ms"),
+    "hull_p99_ms": Goal("capture → hull, p99, ms"),
+    "speed_p50_ms": Goal("capture → speed, p50, ms"),
+    "speed_p99_ms": Goal("capture → speed, p99, ms"),
+    "robot_p50_ms": Goal("capture → robot has the command, p50, ms", high=60),
+    "robot_p99_ms": Goal("capture → robot has the command, p99, ms", high=100),
+    "lost_near_voxels": Goal("true voxels lost within 0.5 m of the robot", 0, 0),
+    "lost_share": Goal("true voxels lost elsewhere, share", high=0.0002),
+    "true_voxels": Goal("true voxels looked at"),
+    "iou_p50": Goal("tight set against truth, IoU, p50", low=0.8),
+    "phantom_p99_l": Goal("phantom volume, p99, litres", high=2.0),
+    "distance_p50_m": Goal("distance, estimated - true, p50, m"),
+    "distance_p1_m": Goal("distance, estimated - true, p1, m", low=-0.12),
+    "distance_max_m": Goal("distance, estimated - true, greatest, m", high=0.0),
+    "nearest_true_m": Goal("nearest true distance, m"),
+    "track_position_p50_m": Goal("track, position, p50, m", high=0.04),
+    "track_velocity_p50_m_s": Goal("track, velocity, p50, m/s", high=0.1),
+    "track_ahead_p50_m": Goal("track, 0.5 s ahead, p50, m", high=0.12),
+    "violations": Goal("moments faster than ISO/TS 15066 allows", 0, 0),
+    "moments": Goal("moments looked at, 100 Hz"),
+    "speed_kept": Goal("mean share of the nominal speed"),
+    "productivity_oracle": Goal("the same, of an oracle's", low=0.9),
+    "productivity_zone": Goal("the same, of a fixed stop zone's", low=2.0),
+    "paths": Goal("paths planned"),
+    "replan_p99_ms": Goal("planning, p99, ms", high=100),
+    "paths_touching": Goal("planned paths that touch the hull", 0, 0),
+}
+"""Every score with its goal, in the order of the table."""
+
+
+def score(trace: Trace, *, every: int = 1) -> dict[str, float]:
+    """Return all scores of a run that can be made of what it has, by their names in `GOALS`.
+
+    Args:
+        trace: The versions of the run, with what was played.
+        every: Only each so-many-th hull is compared voxel by voxel.
+
+    Raises:
+        ConfigError: The run has no truth, no arm or no grid.
+    """
+    truth = truth_of(trace)
+    found = {
+        **_rates(trace, truth),
+        **_latencies(trace, truth),
+        **_voxels(trace, truth, every=every),
+        **_distances(trace, truth),
+        **_tracks(trace, truth),
+        **_planning(trace, truth),
+        **safety_of(trace, truth),
+    }
+    return {name: found[name] for name in GOALS if name in found}
+
+
+def missed(scores: Mapping[str, float]) -> list[str]:
+    """Return the names of the scores that do not meet their goals."""
+    return [name for name, value in scores.items() if not GOALS[name].met(value)]
+
+
+def _during(kept: Iterable[Kept[T]], truth: Truth) -> list[Kept[T]]:
+    """Return the versions whose exposure lies in the scenario, each stamp once."""
+    by_stamp = {one.stamp_ns: one for one in kept if truth.covers(one.stamp_ns)}
+    return [by_stamp[stamp] for stamp in sorted(by_stamp)]
+
+
+def _quantiles(name: str, values: Sequence[float] | F64, unit: str) -> dict[str, float]:
+    if not len(values):
+        return {}
+    low, high = np.percentile(values, [50, 99])
+    return {f"{name}_p50_{unit}": float(low), f"{name}_p99_{unit}": float(high)}
+
+
+def _rates(trace: Trace, truth: Truth) -> dict[str, float]:
+    """Count sets: one hull per tick of the scenario, each of images of all cameras."""
+    hulls = _during(trace.of(words.WORKSPACE.name, words.HULL), truth)
+    if not hulls:
+        return {"sets": 0.0, "sets_missed": float(truth.ticks)}
+    cameras = len(trace.entities(words.CALIBRATION))
+    incomplete = sum(len(kept.datum.cameras) < cameras for kept in hulls)
+    return {
+        "sets": float(len(hulls)),
+        "sets_missed": float(truth.ticks - len(hulls)),
+        "sets_incomplete": float(incomplete),
+    }
+
+
+def _latencies(trace: Trace, truth: Truth) -> dict[str, float]:
+    """Return the times from the exposure to the commits of each stage, and to the robot's loop."""
+    last: dict[int, int] = {}
+    for camera in trace.entities(words.SILHOUETTE):
+        for mask in _during(trace.of(camera, words.SILHOUETTE), truth):
+            last[mask.stamp_ns] = max(last.get(mask.stamp_ns, 0), mask.committed_ns)
+    found = _quantiles("masks", [(done - stamp) / 1e6 for stamp, done in last.items()], "ms")
+    for name, entity, aspect in (
+        ("hull", words.WORKSPACE, words.HULL),
+        ("speed", words.ROBOT, words.SPEED),
+    ):
+        those = _during(trace.of(entity.name, aspect), truth)
+        ages = [(one.committed_ns - one.stamp_ns) / 1e6 for one in those]
+        found |= _quantiles(name, ages, "ms")
+    arrived: dict[int, int] = {}
+    for done in trace.of(words.ROBOT.name, words.EXECUTION):
+        command = done.datum
+        if truth.covers(command.captured_ns):
+            arrived.setdefault(command.captured_ns, command.received_ns)
+    ages = [(received - captured) / 1e6 for captured, received in arrived.items()]
+    return found | _quantiles("robot", ages, "ms")
+
+
+class _Voxels:
+    """The voxels of the grid in which there can be a person, and whether they count."""
+
+    def __init__(self, trace: Trace) -> None:
+        grid = trace.newest(words.WORKSPACE.name, words.GRID)
+        self.origin_m, self.voxel_m = grid.origin_m, grid.voxel_m
+        self.shape = grid.shape
+        self.boxes = [
+            trace.newest(name, words.BOXES).reshape(-1, 15) for name in trace.entities(words.BOXES)
+        ]
+
+    def centres(self, index: npt.NDArray[np.integer]) -> F64:
+        """Return the centres of voxels, (n, 3), metres."""
+        return np.asarray(self.origin_m + (index + 0.5) * self.voxel_m)
+
+    def of(self, body: F64) -> npt.NDArray[np.int64]:
+        """Return the voxels (n, 3) whose centres lie in a body and in no static obstacle."""
+        ends, radius = body[:, :6].reshape(-1, 2, 3), body[:, 6:]
+        low = ((ends.min(1) - radius).min(0) - self.origin_m) / self.voxel_m
+        high = ((ends.max(1) + radius).max(0) - self.origin_m) / self.voxel_m
+        first = np.clip(np.floor(low).astype(int), 0, self.shape)
+        last = np.clip(np.ceil(high).astype(int) + 1, 0, self.shape)
+        axes = [np.arange(one, other) for one, other in zip(first, last, strict=True)]
+        index = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+        if not len(index):
+            return index
+        index = index[distance_to_points(body, self.centres(index)) <= 0.0]
+        return index[~self.static(self.centres(index))]
+
+    def static(self, points_m: F64) -> npt.NDArray[np.bool_]:
+        """Say which points lie in a static obstacle, or within one and a half voxels of it."""
+        inside = np.zeros(len(points_m), np.bool_)
+        for box in (row for rows in self.boxes for row in rows):
+            local = (points_m - box[:3]) @ box[6:].reshape(3, 3)
+            inside |= (np.abs(local) <= box[3:6] + 1.5 * self.voxel_m).all(1)
+        return inside
+
+    def number(self, index: npt.NDArray[np.integer]) -> npt.NDArray[np.int64]:
+        """Return one number per voxel."""
+        return np.asarray(np.ravel_multi_index(tuple(index.T.astype(np.int64)), self.shape))
+
+
+def _voxels(trace: Trace, truth: Truth, *, every: int) -> dict[str, float]:
+    """Compare hulls with bodies, voxel by voxel.
+
+    Lost is a voxel whose centre lies in a body, outside of static obstacles and of the robot, that
+    the safe set does not have.  The robot is grown as the refinement grows it.
+    """
+    voxels, motion = _Voxels(trace), trace.joints()
+    lost_near = lost = total = 0
+    ious, phantoms = [], []
+    for kept in _during(trace.of(words.WORKSPACE.name, words.HULL), truth)[::every]:
+        bodies, hull = truth.bodies_at(kept.stamp_ns), kept.datum
+        safe = voxels.number(hull.voxels)
+        parts = [voxels.of(body) for body in bodies]
+        index = np.unique(np.concatenate([np.empty((0, 3), int), *parts]), axis=0)
+        arm = capsules_at(truth.arm, motion.at(kept.stamp_ns))[0]
+        clearance_m = distance_to_points(arm, voxels.centres(index))
+        outside = clearance_m > 0.87 * voxels.voxel_m + 0.01
+        index, clearance_m = index[outside], clearance_m[outside]
+        real = voxels.number(index)
+        gone = ~np.isin(real, safe)
+        lost_near += int((gone & (clearance_m < NEAR_M)).sum())
+        lost += int((gone & (clearance_m >= NEAR_M)).sum())
+        total += len(real)
+        if len(real) and all(truth.inside(body) for body in bodies):
+            tight = safe[hull.tight]
+            common = int(np.isin(tight, real).sum())
+            ious.append(common / (len(tight) + len(real) - common))
+        phantoms.append(_phantom_l(voxels, hull, bodies, truth, kept.stamp_ns))
+    if not phantoms:
+        return {}
+    return {
+        "lost_near_voxels": float(lost_near),
+        "lost_share": lost / max(total, 1),
+        "true_voxels": float(total),
+        **({"iou_p50": float(np.median(ious))} if ious else {}),
+        "phantom_p99_l": float(np.percentile(phantoms, 99)),
+    }
+
+
+def _phantom_l(
+    voxels: _Voxels, hull: words.Hull, bodies: Sequence[F64], truth: Truth, stamp_ns: int
+) -> float:
+    """Return the volume of the safe set that is far from everything real, litres."""
+    if not len(hull.voxels):
+        return 0.0
+    points = voxels.centres(hull.voxels)
+    far_m = distance_to_points(np.concatenate([np.empty((0, 7)), *bodies]), points)
+    far_m = np.minimum(far_m, truth.distance_to_things(points, stamp_ns))
+    return float((far_m > PHANTOM_M).sum()) * voxels.voxel_m**3 * 1000.0
+
+
+def _distances(trace: Trace, truth: Truth) -> dict[str, float]:
+    """Compare the nearest clearance with the true distance of body and arm at the exposure."""
+    motion, errors, nearest = trace.joints(), [], []
+    for kept in _during(trace.of(words.WORKSPACE.name, words.HULL), truth):
+        true_m = truth.distance_m(kept.stamp_ns, motion.at(kept.stamp_ns), over_workspace=True)
+        nearest.append(true_m)
+        if true_m < CLOSE_M:
+            errors.append(kept.datum.nearest_m - true_m)
+    found = {"nearest_true_m": min(nearest)} if nearest and min(nearest) < math.inf else {}
+    if not errors:
+        return found
+    low, middle = np.percentile(errors, [1, 50])
+    return found | {
+        "distance_p1_m": float(low),
+        "distance_p50_m": float(middle),
+        "distance_max_m": max(errors),
+    }
+
+
+def _tracks(trace: Trace, truth: Truth) -> dict[str, float]:
+    """Compare each track with the person who is nearest to it."""
+    errors: list[tuple[float, float, float]] = []
+    for human in trace.entities(words.TRACK):
+        for kept in _during(trace.of(human, words.TRACK), truth):
+            track = kept.datum
+            if track.hidden:
+                continue
+            people = [
+                moving
+                for moving in truth.centres_at(kept.stamp_ns)
+                if np.abs(moving[0]).max() < INSIDE_M
+            ]
+            if not people:
+                continue
+            here, speed, ahead = min(
+                people, key=lambda one: float(np.linalg.norm(one[0] - track.position_m[:2]))
+            )
+            guess = track.position_m[:2] + 0.5 * track.velocity_m_s[:2]
+            errors.append(
+                (
+                    float(np.linalg.norm(track.position_m[:2] - here)),
+                    float(np.linalg.norm(track.velocity_m_s[:2] - speed)),
+                    float(np.linalg.norm(guess - ahead)),
+                )
+            )
+    if not errors:
+        return {}
+    position, velocity, ahead_m = np.median(errors, axis=0).tolist()
+    return {
+        "track_position_p50_m": position,
+        "track_velocity_p50_m_s": velocity,
+        "track_ahead_p50_m": ahead_m,
+    }
+
+
+def _planning(trace: Trace, truth: Truth) -> dict[str, float]:
+    """Count paths, and those that touch what was occupied in the set that they were planned on."""
+    paths = [
+        kept
+        for kept in trace.of(words.ROBOT.name, words.PATH)
+        if truth.covers(kept.stamp_ns) and len(kept.datum.waypoints)
+    ]
+    if not paths:
+        return {"paths": 0.0}
+    hulls = {kept.stamp_ns: kept.datum for kept in trace.of(words.WORKSPACE.name, words.HULL)}
+    voxels, touching = _Voxels(trace), 0
+    for kept in paths:
+        hull = hulls.get(kept.stamp_ns)
+        if hull is None or not len(hull.voxels):
+            continue
+        points = voxels.centres(hull.voxels)
+        touching += any(
+            float(distance_to_points(arm, points).min()) < 0.0
+            for arm in capsules_at(truth.arm, along(kept.datum.waypoints))
+        )
+    planned = [kept.datum.took_ms for kept in paths if kept.datum.took_ms > 0.0]
+    found = {"paths": float(len(paths)), "paths_touching": float(touching)}
+    return found | (
+        {"replan_p99_ms": float(np.percentile(planned, 99))} if len(planned) > 1 else {}
+    )
+
+
+def along(waypoints: F64, step_rad: float = 0.1) -> F64:
+    """Return states (n, 7) on a path, no two of them farther apart than `step_rad` in any joint."""
+    pieces = [waypoints[:1]]
+    for one, other in itertools.pairwise(waypoints):
+        count = max(1, math.ceil(float(np.abs(other - one).max()) / step_rad))
+        pieces.append(one + (other - one) * (np.arange(1, count + 1) / count)[:, None])
+    return np.concatenate(pieces)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Score a recording and print it as JSON; return 0, or 1 where a goal is missed."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("recording", type=Path)
+    parser.add_argument("--every", type=int, default=1, help="compare each N-th hull by voxels")
+    options = parser.parse_args(argv)
+    scores = score(trace_of(options.recording), every=options.every)
+    print(json.dumps({"scores": scores, "missed": missed(scores)}, indent=2))
+    return int(bool(missed(scores)))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,156 @@
+"""What a run left behind: the versions of a recording by aspect, and when each was committed.
+
+The evaluation and the pictures read this and nothing else, so a recording can be scored again.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
+
+import numpy as np
+
+from actors.workcell import vocabulary as words
+from enact_dist import Aspect
+from enact_dist.errors import ConfigError
+from enact_dist.recording.reading import Recording
+from enact_dist.wire.payload import decode_datum
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+    from pathlib import Path
+
+    import numpy.typing as npt
+
+    from enact_dist.recording.exact import Recorded
+
+T = TypeVar("T")
+
+ONLINE: Final = "online"
+TRUTH: Final = "truth"
+ASPECTS: Final[Mapping[str, Aspect[Any]]] = {
+    aspect.name: aspect for aspect in vars(words).values() if isinstance(aspect, Aspect)
+}
+"""The aspects of the workcell by name."""
+RECORDED: Final = tuple(sorted(ASPECTS.keys() - {"image", "raw_hull", "background", "wanted"}))
+"""What a run records: all but the images and what is only made for pictures."""
+
+
+@dataclass(frozen=True, slots=True)
+class Kept(Generic[T]):
+    """One version.
+
+    Attributes:
+        stamp_ns: Capture stamp.
+        committed_ns: When it was committed.
+        datum: The datum.
+    """
+
+    stamp_ns: int
+    committed_ns: int
+    datum: T
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trace:
+    """The versions of a run, in the order of their commits.
+
+    Attributes:
+        versions: By world context, entity and aspect; null versions are left out.
+        missing: How many versions the recording does not have.
+    """
+
+    versions: Mapping[tuple[str, str, str], list[Kept[Any]]]
+    missing: int = 0
+
+    def of(self, entity: str, aspect: Aspect[T], world: str = ONLINE) -> list[Kept[T]]:
+        """Return the versions of one slot, oldest first."""
+        return self.versions.get((world, entity, aspect.name), [])
+
+    def newest(self, entity: str, aspect: Aspect[T], world: str = ONLINE) -> T:
+        """Return the last datum of a slot.
+
+        Raises:
+            ConfigError: The run has none.
+        """
+        found = self.of(entity, aspect, world)
+        if not found:
+            raise ConfigError(f"the recording has no {world} {entity}/{aspect.name}")
+        return found[-1].datum
+
+    def entities(self, aspect: Aspect[Any], world: str = ONLINE) -> list[str]:
+        """Return the names of the entities that had a datum of an aspect, in order."""
+        return sorted(
+            entity
+            for context, entity, name in self.versions
+            if (context, name) == (world, aspect.name)
+        )
+
+    def joints(self) -> Motion:
+        """Return all samples of the arm, each once, in the order of time."""
+        data = [kept.datum for kept in self.of(words.ROBOT.name, words.JOINTS)]
+        if not data:
+            return Motion(np.empty(0, np.int64), *np.empty((2, 0, words.JOINT_COUNT)))
+        stamps, first = np.unique(np.concatenate([one.stamp_ns for one in data]), return_index=True)
+        q, dq = (
+            np.concatenate([getattr(one, name) for one in data])[first] for name in ("q", "dq")
+        )
+        return Motion(stamps, q, dq)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Motion:
+    """The arm over time.
+
+    Attributes:
+        stamp_ns: (n,) int64, increasing.
+        q: (n, 7) float64, rad.
+        dq: (n, 7) float64, rad/s.
+    """
+
+    stamp_ns: npt.NDArray[np.int64]
+    q: npt.NDArray[np.float64]
+    dq: npt.NDArray[np.float64]
+
+    def at(self, stamp_ns: int) -> npt.NDArray[np.float64]:
+        """Return (7,), the joints at a stamp, interpolated; those of the nearer end outside."""
+        return np.array([np.interp(stamp_ns, self.stamp_ns, joint) for joint in self.q.T])
+
+
+@dataclass(slots=True)
+class Gatherer:
+    """Collects versions of a recording while it is read."""
+
+    versions: dict[tuple[str, str, str], list[Kept[Any]]] = field(
+        default_factory=lambda: defaultdict(list)
+    )
+
+    def take(self, recorded: Recorded) -> None:
+        """Keep one version, unless it is null or of an aspect that is none of the workcell's."""
+        aspect = ASPECTS.get(recorded.slot.aspect)
+        if recorded.datum is None or aspect is None:
+            return
+        datum = decode_datum(recorded.datum, aspect.datum_type)
+        slot = (recorded.slot.context, recorded.slot.entity, recorded.slot.aspect)
+        self.versions[slot].append(Kept(recorded.captured_ns, recorded.stamp_ns, datum))
+
+
+def trace_of(path: Path) -> Trace:
+    """Read the recording of a run.
+
+    Args:
+        path: The MCAP file.
+
+    Raises:
+        ConfigError: The file is no recording, or cannot be read.
+    """
+    recording, gatherer = Recording(path), Gatherer()
+    for recorded in _versions(recording):
+        gatherer.take(recorded)
+    return Trace(dict(gatherer.versions), int(recording.end.get("missing", "0")))
+
+
+def _versions(recording: Recording) -> Iterator[Recorded]:
+    for commit in recording.commits():
+        yield from commit.versions

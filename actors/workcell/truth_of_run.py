@@ -1,0 +1,214 @@
+"""The truth of a run: bodies, distances and speeds at any stamp, of the scenario and the joints."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from actors.geometry.capsules import distance_between, distance_to_points
+from actors.geometry.kinematics import capsules_at, end_velocities
+from actors.geometry.separation import Separation
+from actors.workcell import vocabulary as words
+from actors.workcell.scenarios import Thing, scenario_of
+from actors.workcell.simulation.human import Person
+from actors.workcell.trace import TRUTH
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
+
+    from actors.workcell.trace import Trace
+
+    F64 = npt.NDArray[np.float64]
+    Moving = tuple[F64, F64, F64]
+
+RESTING_M_S: Final = 0.02
+"""Slower than this the arm is at rest: what the limit of jerk leaves at the end of a stop."""
+AHEAD_S: Final = 0.5
+"""How far ahead a prediction is scored."""
+PERIOD_NS: Final = round(words.PERIOD_S * 1e9)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Truth:
+    """What really was.
+
+    Attributes:
+        arm: The arm.
+        people: Everybody who comes.
+        things: Boxes that are left.
+        start_ns: Stamp of second 0.
+        seconds: How long it lasts.
+        half_m: Half of the workspace along x and y.
+    """
+
+    arm: words.ArmModel
+    people: tuple[Person, ...]
+    things: tuple[Thing, ...]
+    start_ns: int
+    seconds: float
+    half_m: F64
+
+    @property
+    def ticks(self) -> int:
+        """How many exposures the scenario has."""
+        return math.ceil(self.seconds / words.PERIOD_S)
+
+    def covers(self, stamp_ns: int) -> bool:
+        """Say whether a stamp lies in the scenario."""
+        return 0 <= stamp_ns - self.start_ns < self.ticks * PERIOD_NS
+
+    def at_s(self, stamp_ns: int) -> float:
+        """Return the second of the scenario."""
+        return (stamp_ns - self.start_ns) / 1e9
+
+    def bodies_at(self, stamp_ns: int) -> list[F64]:
+        """Return the bodies of who is there, each (17, 7) capsules."""
+        bodies = (person.capsules_at(self.at_s(stamp_ns)) for person in self.people)
+        return [body for body in bodies if body is not None]
+
+    def inside(self, body: F64) -> bool:
+        """Say whether all of a body lies over the workspace."""
+        return bool(self._over(body).all())
+
+    def _over(self, body: F64) -> npt.NDArray[np.bool_]:
+        """Say of both ends of each capsule, (n, 2), whether all of it lies over the workspace."""
+        ends = body[:, :6].reshape(-1, 2, 3)[..., :2]
+        return np.asarray((np.abs(ends) + body[:, None, 6:] < self.half_m).all(-1))
+
+    def centres_at(self, stamp_ns: int) -> list[Moving]:
+        """Return middle, velocity and middle half a second later of who is there."""
+        now, found = self.at_s(stamp_ns), []
+        for person in self.people:
+            here, ahead, before, after = (
+                person.centre_at(now + step) for step in (0.0, AHEAD_S, -0.05, 0.05)
+            )
+            if here is not None and ahead is not None and before is not None and after is not None:
+                found.append((here, (after - before) / 0.1, ahead))
+        return found
+
+    def distance_to_things(self, points_m: F64, stamp_ns: int) -> F64:
+        """Return the distance of points to the nearest box that stands there by then, metres."""
+        nearest = np.full(len(points_m), np.inf)
+        for thing in self.things:
+            if self.at_s(stamp_ns) >= thing.from_s:
+                beyond = np.abs(points_m - np.array(thing.centre_m)) - np.array(thing.half_m)
+                nearest = np.minimum(nearest, np.linalg.norm(np.maximum(beyond, 0.0), axis=1))
+        return nearest
+
+    def distance_m(self, stamp_ns: int, q_rad: F64, *, over_workspace: bool = False) -> float:
+        """Return the distance of the arm to who and what is there, metres; infinity if nobody is.
+
+        Args:
+            stamp_ns: When.
+            q_rad: (7,), the arm then.
+            over_workspace: Only limbs over the workspace count, as no voxel lies elsewhere.
+        """
+        arm = capsules_at(self.arm, q_rad)[0]
+        bodies = [
+            distance_between(arm, body[self._over(body).all(1)] if over_workspace else body)
+            for body in self.bodies_at(stamp_ns)
+        ]
+        things = [
+            float(distance_to_points(arm, _surface(thing)).min())
+            for thing in self.things
+            if self.at_s(stamp_ns) >= thing.from_s
+        ]
+        return min([*bodies, *things], default=math.inf)
+
+
+def truth_of(trace: Trace) -> Truth:
+    """Return the truth of a run.
+
+    Raises:
+        ConfigError: The run has no word on what was played, no arm or no grid.
+    """
+    playing = trace.newest(words.SCENARIO.name, words.PLAYING, TRUTH)
+    grid = trace.newest(words.WORKSPACE.name, words.GRID)
+    scenario = scenario_of(playing.scenario, playing.seed, playing.seconds)
+    return Truth(
+        arm=trace.newest(words.ROBOT.name, words.MODEL),
+        people=tuple(Person(walk) for walk in scenario.walks),
+        things=scenario.things,
+        start_ns=playing.start_ns,
+        seconds=playing.seconds,
+        half_m=np.array(grid.shape[:2]) * grid.voxel_m / 2.0,
+    )
+
+
+def _surface(thing: Thing, step_m: float = 0.03) -> F64:
+    """Return points on and in a box, (n, 3), no farther apart than `step_m`."""
+    axes = [
+        np.linspace(middle - half, middle + half, max(2, math.ceil(2.0 * half / step_m) + 1))
+        for middle, half in zip(thing.centre_m, thing.half_m, strict=True)
+    ]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+
+
+def safety_of(trace: Trace, truth: Truth) -> dict[str, float]:
+    """Score safety and productivity at each sample of the arm, 100 times per second.
+
+    A violation is a moment in which the arm was faster than ISO/TS 15066 allows for the *true*
+    distance of that moment, without any reaction time: T_r is used up.
+
+    Productivity is the mean share of the nominal speed while the arm is on a path: beside that of
+    an oracle that knows the true distance without delay, and of a fixed zone: full speed while
+    nobody is nearer to any place of the task than the protective distance of the full speed.
+    """
+    motion = trace.joints()
+    chosen = np.array([truth.covers(int(stamp)) for stamp in motion.stamp_ns], np.bool_)
+    if not chosen.any():
+        return {}
+    stamps, q, dq = motion.stamp_ns[chosen], motion.q[chosen], motion.dq[chosen]
+    fastest = np.linalg.norm(end_velocities(truth.arm, q, dq), axis=-1).max((1, 2))
+    distances = np.array(
+        [truth.distance_m(int(stamp), joints) for stamp, joints in zip(stamps, q, strict=True)]
+    )
+    spent = Separation(reaction_s=0.0)
+    allowed = np.array([spent.speed_max_m_s(distance) for distance in distances])
+    found = {
+        "violations": float(((fastest > allowed) & (fastest > RESTING_M_S)).sum()),
+        "moments": float(len(stamps)),
+    }
+    return found | _productivity(trace, truth, stamps, distances)
+
+
+def _productivity(
+    trace: Trace, truth: Truth, stamps: npt.NDArray[np.int64], distances: F64
+) -> dict[str, float]:
+    done = [
+        kept.datum
+        for kept in trace.of(words.ROBOT.name, words.EXECUTION)
+        if truth.covers(kept.datum.captured_ns)
+    ]
+    on_path = [one for one in done if one.state != "dwelling"]
+    quick = [one.speed_m_s / one.scale for one in on_path if one.scale > 0.3]
+    if not quick:
+        return {"speed_kept": 0.0} if on_path else {}
+    kept = float(np.mean([one.scale for one in on_path]))
+    nominal = float(np.median(quick))
+    rows = np.clip(
+        np.searchsorted(stamps, [one.captured_ns for one in on_path]), 0, len(stamps) - 1
+    )
+    law = Separation()
+    shares = [min(1.0, law.speed_max_m_s(float(one)) / nominal) for one in distances[rows]]
+    zone = _zone_share(trace, truth, on_path, law.protective_m(nominal))
+    return {
+        "speed_kept": kept,
+        "productivity_oracle": kept / max(float(np.mean(shares)), 1e-9),
+        **({"productivity_zone": kept / zone} if zone > 0.0 else {}),
+    }
+
+
+def _zone_share(trace: Trace, truth: Truth, done: list[words.Execution], radius_m: float) -> float:
+    """Return in which share of the moments nobody is in a fixed zone around the task."""
+    motion = trace.joints()
+    places = motion.q[:: max(1, len(motion.q) // 40)]
+    swept = capsules_at(truth.arm, places).reshape(-1, 7)
+    clear = [
+        all(distance_between(swept, body) > radius_m for body in truth.bodies_at(one.captured_ns))
+        for one in done
+    ]
+    return float(np.mean(clear))

@@ -1,0 +1,165 @@
+"""Claims about the scores: a perfect run meets its goals, and each fault shows in its own score."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from actors.geometry.kinematics import capsules_at
+from actors.workcell import vocabulary as words
+from actors.workcell.evaluation import GOALS, along, missed, score
+from actors.workcell.simulation.arm import ARM
+from actors.workcell.simulation.human import Person
+from actors.workcell.trace import ONLINE, Kept
+from enact_dist.errors import ConfigError
+
+from .runs import GRID, PERIOD_NS, START_NS, Run
+
+
+def arrived(run: Run, tick: int, *, scale: float = 1.0, speed_m_s: float = 1.0) -> None:
+    """Add what the robot made of the command of a tick, 55 ms after the exposure."""
+    stamp = START_NS + tick * PERIOD_NS
+    done = words.Execution("moving", scale, speed_m_s, stamp, stamp + 55_000_000, 1, 0, 0)
+    run.add(words.ROBOT.name, words.EXECUTION, done, tick)
+
+
+@pytest.fixture(scope="module")
+def perfect() -> dict[str, float]:
+    """Score a run in which all that is reported is the truth."""
+    run = Run("S2", 6.0)
+    run.rest()
+    for tick in run.ticks:
+        run.hull(tick)
+        arrived(run, tick)
+    return score(run.trace(), every=5)
+
+
+def test_the_truth_scores_perfectly(perfect: dict[str, float]) -> None:
+    assert perfect["lost_near_voxels"] == perfect["lost_share"] == 0.0
+    assert perfect["true_voxels"] > 500
+    assert perfect["iou_p50"] == 1.0
+    assert perfect["phantom_p99_l"] == 0.0
+    assert perfect["sets_missed"] == perfect["sets_incomplete"] == 0.0
+    assert abs(perfect["distance_p50_m"]) < 0.05  # half a voxel of 5 cm, and its diagonal
+    assert perfect["violations"] == 0.0
+
+
+def test_latencies_are_from_the_exposure(perfect: dict[str, float]) -> None:
+    assert perfect["hull_p50_ms"] == pytest.approx(40.0)
+    assert perfect["robot_p99_ms"] == pytest.approx(55.0)
+
+
+def test_lost_voxels_and_missed_sets_are_counted() -> None:
+    run = Run("S2", 4.0)
+    run.rest()
+    for tick in run.ticks:
+        if tick != 7:
+            run.hull(tick, without=3 if tick == 35 else 0)
+
+    found = score(run.trace())
+
+    assert found["sets_missed"] == 1.0
+    assert found["lost_share"] * found["true_voxels"] == pytest.approx(3.0)
+    assert {"sets_missed", "lost_share"} <= set(missed(found)) | {"lost_share"}
+
+
+def test_an_arm_that_is_too_fast_near_a_person_is_a_violation() -> None:
+    violations = []
+    for dq in (1.0, 0.0):
+        run = Run("S3", 8.0)  # a person reaches over the table
+        run.rest(dq)
+        violations.append(score(run.trace())["violations"])
+
+    assert violations[0] > 50
+    assert violations[1] == 0.0
+
+
+def test_productivity_is_set_beside_an_oracle_and_a_zone() -> None:
+    run = Run("S2", 6.0)
+    run.rest()
+    for tick in run.ticks:
+        run.hull(tick)
+        arrived(run, tick, scale=0.5, speed_m_s=0.5)
+
+    found = score(run.trace(), every=30)
+
+    assert found["speed_kept"] == pytest.approx(0.5)
+    assert 0.5 <= found["productivity_oracle"] <= 1.0
+    assert found["productivity_zone"] > 0.5  # the zone stops while somebody is near
+
+
+def test_tracks_are_compared_with_the_nearest_person() -> None:
+    run = Run("S2", 6.0)
+    run.rest()
+    person = Person(run.scenario.walks[0])
+    for tick in run.ticks:
+        run.hull(tick)
+        centre = person.centre_at(tick / 10)
+        if centre is None:
+            continue
+        track = words.Track(
+            position_m=np.array([centre[0] + 0.03, centre[1], 1.75]),
+            velocity_m_s=velocity_of(person, tick),
+            covariance=np.eye(6),
+            height_m=1.75,
+            volume_m3=0.07,
+            first_ns=START_NS,
+            hidden=False,
+        )
+        run.add("human/0", words.TRACK, track, tick)
+
+    found = score(run.trace(), every=60)
+
+    assert found["track_position_p50_m"] == pytest.approx(0.03, abs=1e-6)
+    assert found["track_velocity_p50_m_s"] < 1e-6
+    assert found["track_ahead_p50_m"] < 0.15
+
+
+def velocity_of(person: Person, tick: int) -> np.ndarray:
+    """Return the velocity of a person at a tick, (3,)."""
+    before, after = person.centre_at(tick / 10 - 0.05), person.centre_at(tick / 10 + 0.05)
+    step = np.zeros(2) if before is None or after is None else after - before
+    return np.array([*step / 0.1, 0.0])
+
+
+def test_a_path_through_the_hull_is_named() -> None:
+    run = Run("S1", 1.0)
+    run.rest()
+    for tick in run.ticks:
+        run.hull(tick)
+    index = np.floor((capsules_at(ARM, run.q)[0, 3:4, :3] - GRID.origin_m) / GRID.voxel_m)
+    hull = run.versions[ONLINE, words.WORKSPACE.name, "hull"][6].datum
+    inside = dataclasses.replace(hull, voxels=index.astype(np.int16))
+    run.versions[ONLINE, words.WORKSPACE.name, "hull"][6] = Kept(
+        START_NS + 6 * PERIOD_NS, START_NS + 6 * PERIOD_NS, inside
+    )
+    for tick in (1, 6):
+        path = words.Path(np.stack([run.q, run.q]), tick, 0, 1, START_NS, 0.0, took_ms=40.0)
+        run.add(words.ROBOT.name, words.PATH, path, tick)
+
+    found = score(run.trace(), every=100)
+
+    assert found["paths"] == 2.0
+    assert found["paths_touching"] == 1.0
+    assert found["replan_p99_ms"] == 40.0
+
+
+def test_states_along_a_path_are_close_and_keep_its_corners() -> None:
+    corner = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 0.5]])
+    states = along(corner, step_rad=0.1)
+    assert np.abs(np.diff(states, axis=0)).max() <= 0.1 + 1e-12
+    assert all((states == row).all(1).any() for row in corner)
+
+
+def test_a_recording_without_truth_is_refused() -> None:
+    run = Run("S1", 1.0)
+    del run.versions["truth", "scenario", "playing"]
+    with pytest.raises(ConfigError, match="no truth scenario/playing"):
+        score(run.trace())
+
+
+def test_every_goal_says_what_it_is_of() -> None:
+    assert all(goal.what for goal in GOALS.values())
+    assert GOALS["sets_missed"].met(0.0)
+    assert not GOALS["sets_missed"].met(1.0)
+    assert str(GOALS["robot_p99_ms"]) == "≤ 100"
