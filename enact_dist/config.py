@@ -70,7 +70,7 @@ shared_bytes_max       none           cap of each shard's large data in the memo
                                       type is known, too), or a comparator
   shows                guessed        what a recording shows the data as, one kind or several, with
   frame, parent,                      their coordinate frames: see `enact_dist.config_shows`
-  of, encoding
+  of, encoding, …
 [actors.NAME]          none           an actor process
   class                required       ``package.module:Class``
   worlds               {}             role of the class = world context of the cell
@@ -79,6 +79,9 @@ shared_bytes_max       none           cap of each shard's large data in the memo
                                       changes attributes while the actor runs
   options              {}             the older name for those of `__init__`
   env                  {}             environment variables of its process, texts
+  process              its own        name of the process that it shares with all actors of the
+                                      same `process`, each in a thread with a session of its own:
+                                      see `enact_dist.actor_group`
   every_s              the class's    period of a source, seconds
   entity               all            the one entity that it works on, of those that the patterns
                                       of its class match: one class for several cameras
@@ -104,6 +107,7 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.config_environment import with_environment
 from enact_dist.config_lines import LineLocator
+from enact_dist.config_processes import refuse_misfits, take_process
 from enact_dist.config_shows import SHOWS_KEYS, take_shows
 from enact_dist.config_table import Source, Table, suggestion
 from enact_dist.config_types import (
@@ -113,6 +117,7 @@ from enact_dist.config_types import (
     AspectConfig,
     CellConfig,
     ShardConfig,
+    processes_of,
 )
 from enact_dist.config_values import (
     CARRIERS,
@@ -222,9 +227,7 @@ def _cell(root: Table, file: Path) -> CellConfig:
         aspects=tuple(
             _aspect(name, table) for name, table in root.take_table("aspects").named_tables()
         ),
-        actors=tuple(
-            _actor(name, table, worlds) for name, table in root.take_table("actors").named_tables()
-        ),
+        actors=_actors(root, worlds),
     )
 
 
@@ -384,10 +387,19 @@ def _retention(table: Table) -> Retention | None:
     return table.checked("retention", lambda: Retention(versions, age_s, size_bytes))
 
 
+def _actors(root: Table, worlds: tuple[str, ...]) -> tuple[ActorConfig, ...]:
+    tables = dict(root.take_table("actors").named_tables())
+    actors = tuple(_actor(name, table, worlds) for name, table in tables.items())
+    for process in processes_of(actors):
+        refuse_misfits(process, tables)
+    return actors
+
+
 def _actor(name: str, table: Table, worlds: tuple[str, ...]) -> ActorConfig:
     table.refuse_unknown(
-        "class", "worlds", "args", "options", "env", "every_s", "entity", "host", "drain_s"
-    )
+        "class", "worlds", "args", "options", "env", "process", "every_s", "entity", "host",
+        "drain_s",
+    )  # fmt: skip
     _check_title(name, "actor", table)
     class_path = table.take_str("class")
     if not _DOTTED_NAME.match(class_path):
@@ -405,6 +417,7 @@ def _actor(name: str, table: Table, worlds: tuple[str, ...]) -> ActorConfig:
         entity=_entity(table),
         host=_host(table),
         drain_s=_drain_s(table),
+        process=take_process(table),
     )
 
 

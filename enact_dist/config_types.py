@@ -16,7 +16,7 @@ from enact_dist.core.retaining import said
 from enact_dist.errors import ConfigError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
     from pathlib import Path
 
     from enact_dist.core.shard_state import ShardSettings
@@ -88,6 +88,8 @@ class ActorConfig:
         worlds: Role of the actor class to world context of the cell.
         options: Parameters of the class (`args`), as TOML gives them.
         env: Environment variables of its process.
+        process: Name of the operating system process that it shares with others; empty: it has
+            one of its own.
         every_s: Period in seconds that replaces the one of a source, or ``None``.
         entity: The one entity that it works on, of those that its patterns match; empty: all.
         host: Host name of the machine it runs on; empty: wherever `enact up` is called.
@@ -104,6 +106,35 @@ class ActorConfig:
     host: str = ""
     drain_s: float | None = None
     env: Mapping[str, str] = field(default_factory=dict)
+    process: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class ActorProcess:
+    """One operating system process with its actors.
+
+    Attributes:
+        name: `process` of its actors; of an actor that has a process of its own, that actor's name.
+        actors: Its actors, at least one, in the order of the file.
+    """
+
+    name: str
+    actors: tuple[ActorConfig, ...]
+
+    @property
+    def env(self) -> Mapping[str, str]:
+        """Environment variables of the process: those of all its actors."""
+        return {name: text for actor in self.actors for name, text in actor.env.items()}
+
+    @property
+    def drain_s(self) -> float | None:
+        """The longest `drain_s` of its actors; ``None`` where no actor has one."""
+        return max((one.drain_s for one in self.actors if one.drain_s is not None), default=None)
+
+    @property
+    def members(self) -> tuple[str, ...]:
+        """Names of its actors."""
+        return tuple(actor.name for actor in self.actors)
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,6 +187,10 @@ class CellConfig:
             path=str(self.path),
         )
 
+    def processes(self) -> tuple[ActorProcess, ...]:
+        """Return the processes of the cell's actors, in the order of their first actors."""
+        return processes_of(self.actors)
+
     def placement_map(self) -> PlacementMap:
         """Return the shards with their advertised endpoints, and the pins.
 
@@ -187,3 +222,11 @@ class CellConfig:
             aspects=self.aspect_entries(),
             ttl_ns_max=self.ttl_ns,
         )
+
+
+def processes_of(actors: Iterable[ActorConfig]) -> tuple[ActorProcess, ...]:
+    """Return the processes in which these actors run, in the order of their first actors."""
+    found: dict[tuple[bool, str], list[ActorConfig]] = {}
+    for actor in actors:
+        found.setdefault((not actor.process, actor.process or actor.name), []).append(actor)
+    return tuple(ActorProcess(name, tuple(those)) for (_, name), those in found.items())

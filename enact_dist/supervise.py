@@ -83,6 +83,27 @@ class _Ready:
     child: _Child
 
 
+class Pauses:
+    """How long what ends waits for its next start: doubled each time, short after a good while."""
+
+    __slots__ = ("_next_s", "_started_s")
+
+    def __init__(self) -> None:
+        self._next_s = PAUSE_S_MIN
+        self._started_s = 0.0
+
+    def started(self) -> None:
+        """Note a start."""
+        self._started_s = time.monotonic()
+
+    def ended(self) -> float:
+        """Note an end; return the pause until the next start, seconds."""
+        if time.monotonic() - self._started_s > GOOD_S:
+            self._next_s = PAUSE_S_MIN
+        pause_s, self._next_s = self._next_s, min(2 * self._next_s, PAUSE_S_MAX)
+        return pause_s
+
+
 class _Child:
     """One task with its process; used by the supervisor's thread only, but for `_read`.
 
@@ -98,8 +119,7 @@ class _Child:
         self.pause_s = 0.0
         self._say, self._events = say, events
         self._process: subprocess.Popen[bytes] | None = None
-        self._pause_s = PAUSE_S_MIN
-        self._started_s = 0.0
+        self._pauses = Pauses()
 
     @property
     def running(self) -> bool:
@@ -110,7 +130,7 @@ class _Child:
         return self._process.pid if self._process is not None else 0
 
     def start(self) -> None:
-        self._started_s = time.monotonic()
+        self._pauses.started()
         self._process = subprocess.Popen(
             self.task.command,
             stdin=subprocess.DEVNULL,
@@ -130,10 +150,8 @@ class _Child:
     def ended(self) -> None:
         """Note that the process is gone and when it may be started again."""
         self._process = None
-        if time.monotonic() - self._started_s > GOOD_S:
-            self._pause_s = PAUSE_S_MIN
-        self.restart_at_s, self.pause_s = time.monotonic() + self._pause_s, self._pause_s
-        self._pause_s = min(2 * self._pause_s, PAUSE_S_MAX)
+        self.pause_s = self._pauses.ended()
+        self.restart_at_s = time.monotonic() + self.pause_s
 
     def send(self, number: signal.Signals) -> None:
         if self._process is not None:

@@ -22,10 +22,9 @@ import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final
 
-from enact_dist.cli.verbs import DONE, FAILED, UNREACHABLE, USAGE
-from enact_dist.errors import ConfigError, EnactError, ShardUnreachableError
+from enact_dist.cli.verbs import DONE, USAGE, exit_status, told
+from enact_dist.errors import EnactError
 from enact_dist.supervise import end_with_supervisor
-from enact_dist.wire.texts import shown
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -175,21 +174,20 @@ def _run(arguments: argparse.Namespace) -> int:
 def _report(error: Exception, arguments: argparse.Namespace) -> int:
     if arguments.debug:
         raise error
-    text = shown(" ".join((str(error) or type(error).__name__).split()))
+    text = told(error)
     for line in getattr(error, "__notes__", ()):
         print(line, file=sys.stderr)
     as_json = getattr(arguments, "log", "text") == "json"
     print(_refusal(arguments, text) if as_json else f"enact: {text}", file=sys.stderr)
-    if isinstance(error, ConfigError):
-        return USAGE
-    return UNREACHABLE if isinstance(error, ShardUnreachableError) else FAILED
+    return exit_status(error)
 
 
 def _refusal(arguments: argparse.Namespace, text: str) -> str:
     """Return the line of a log of objects by which a process says why it does not run."""
     from enact_dist.link.log import JsonLines
 
-    name = getattr(arguments, "name", "") or getattr(arguments, "target", "")
+    targets = [*getattr(arguments, "targets", ()), getattr(arguments, "process", "")]
+    name = getattr(arguments, "name", "") or " ".join(filter(None, targets))
     lines = JsonLines(process=f"{arguments.noun} {name}".rstrip())
     return lines.line(f"{arguments.noun}.refused", text, level=logging.CRITICAL)
 

@@ -6,7 +6,6 @@ import json
 import socket
 import sys
 import time
-from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.cli.output import coloured
@@ -19,6 +18,7 @@ from enact_dist.cli.verbs import (
     see_modules,
 )
 from enact_dist.config_table import suggestion
+from enact_dist.config_types import processes_of
 from enact_dist.errors import ConfigError, LinkError
 from enact_dist.link.signals import StopSignals
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from enact_dist.cli.verbs import Verb
-    from enact_dist.config_types import CellConfig, ShardConfig
+    from enact_dist.config_types import ActorProcess, CellConfig, ShardConfig
     from enact_dist.supervise import Say, Task
 
 LOOK_S: Final = 0.2
@@ -60,7 +60,7 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
             nargs="+",
             default=[],
             metavar="NAME",
-            help=f"{what} shards and actors of this machine",
+            help=f"{what} shards, actors and processes of this machine",
         )
     add_log(up)
 
@@ -85,15 +85,16 @@ def run_up(arguments: argparse.Namespace) -> int:
         _refuse_second(config, shard)
     tasks = [
         *(_task(config, "shard", shard.name, arguments.log, shard.drain_s) for shard in shards),
-        *(
-            replace(_task(config, "actor", one.name, arguments.log, one.drain_s), env=one.env)
-            for one in actors
-        ),
+        *(_actor_task(config, process, arguments.log) for process in processes_of(actors)),
     ]
     say: Say = _Log([task.name for task in tasks])
     if arguments.log == "json":
-        say = _JsonLog(config.name, {task.name: f"{task.kind} {task.name}" for task in tasks})
-    say("", f"up: cell {config.name} on {host}, {len(shards)} shards, {len(actors)} actors")
+        shared = {process.name for process in config.processes() if len(process.actors) > 1}
+        kinds = {task.name: "process" if task.name in shared else task.kind for task in tasks}
+        say = _JsonLog(config.name, {name: f"{kind} {name}" for name, kind in kinds.items()})
+    count = len(tasks) - len(shards)
+    there = f" in {count} processes" if count < len(actors) else ""
+    say("", f"up: cell {config.name} on {host}, {len(shards)} shards, {len(actors)} actors{there}")
     with StopSignals() as stop:
         status = Supervisor(tasks, say).run(stop.event, count=lambda: stop.count)
     say("", "down")
@@ -103,17 +104,25 @@ def run_up(arguments: argparse.Namespace) -> int:
 def _chosen(config: CellConfig, arguments: argparse.Namespace) -> set[str]:
     """Return the names of the shards and actors that are to run, wherever they belong.
 
+    The name of a process stands for all its actors, unless one of them has it, too.
+
     Raises:
         ConfigError: The cell has none of a name that was given.
     """
     known = {one.name for one in config.shards} | {one.name for one in config.actors}
+    meant = {process.name: set(process.members) for process in config.processes()}
+    meant |= {name: {name} for name in known}
     for name in (*arguments.only, *arguments.without):
-        if name not in known:
+        if name not in meant:
             raise ConfigError(
-                f"{config.path} has no shard and no actor {name!r}{suggestion(name, known)} (it has"
-                f" {', '.join(sorted(known))})"
+                f"{config.path} has no shard and no actor {name!r}{suggestion(name, meant)} (it has"
+                f" {', '.join(sorted(meant))})"
             )
-    return (set(arguments.only) or known) - set(arguments.without)
+    only, without = (
+        {each for name in names for each in meant[name]}
+        for names in (arguments.only, arguments.without)
+    )
+    return (only or known) - without
 
 
 def _refuse_homeless(config: CellConfig, shards: Sequence[ShardConfig], host: str) -> None:
@@ -205,12 +214,22 @@ def _refuse_second(config: CellConfig, shard: ShardConfig) -> None:
             return
 
 
+def _actor_task(config: CellConfig, process: ActorProcess, log: str) -> Task:
+    from enact_dist.supervise import Task
+
+    words = _command(config, "actor", process.members, log)
+    return Task(process.name, "actor", words, process.drain_s or 0.0, process.env)
+
+
 def _task(config: CellConfig, kind: str, name: str, log: str, drain_s: float | None = None) -> Task:
     from enact_dist.supervise import Task
 
-    command = (sys.executable, "-m", "enact_dist.cli.main", kind, "run", name)
-    words = ("--cell", str(config.path), "--log", log)
-    return Task(name, kind, (*command, *words), drain_s or 0.0)
+    return Task(name, kind, _command(config, kind, (name,), log), drain_s or 0.0)
+
+
+def _command(config: CellConfig, kind: str, names: tuple[str, ...], log: str) -> tuple[str, ...]:
+    command = (sys.executable, "-m", "enact_dist.cli.main", kind, "run", *names)
+    return (*command, "--cell", str(config.path), "--log", log)
 
 
 class _Log:

@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.config_values import checked_endpoint, metrics_address
-from enact_dist.errors import ConfigError
+from enact_dist.errors import ConfigError, ShardUnreachableError
 from enact_dist.terms import Entities, Entity, checked_name
+from enact_dist.wire.texts import shown
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -270,6 +271,18 @@ def cell_config(arguments: argparse.Namespace) -> CellConfig:
     if is_endpoint(target):
         raise ConfigError(f"{target} is an endpoint; this command needs the cell.toml: --cell FILE")
     return load_config(target)
+
+
+def exit_status(error: Exception) -> int:
+    """Return the exit status of a command that an error has ended."""
+    if isinstance(error, ConfigError):
+        return USAGE
+    return UNREACHABLE if isinstance(error, ShardUnreachableError) else FAILED
+
+
+def told(error: Exception) -> str:
+    """Return what a command says of an error that has ended it: one line."""
+    return shown(" ".join((str(error) or type(error).__name__).split()))
 
 
 def open_cell(arguments: argparse.Namespace, *, observer: bool = True, actor: str = "") -> Cell:

@@ -10,7 +10,8 @@ event    what happened, in words that programs may rely on ("lock.taken", "shard
          where a line is for people only
 text     the line for people
 cell     name of the cell; empty where it is not known yet
-process  "shard NAME" or "actor NAME"
+process  "shard NAME" or "actor NAME"; "process NAME" where several actors share a process and it
+         is not known which of them speaks
 error    a traceback; only where there is one
 =======  ==========================================================================================
 
@@ -30,9 +31,12 @@ import threading
 from contextlib import suppress
 from copy import copy
 from logging.handlers import QueueHandler
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from enact_dist.wire.texts import shown, shown_json
+
+if TYPE_CHECKING:
+    from collections.abc import Collection
 
 FORMATS: Final = ("text", "json")
 TEXT: Final = "%(asctime)s %(levelname)s %(name)s %(message)s"
@@ -53,14 +57,19 @@ class TextLines(logging.Formatter):
     """Makes lines for people; what a message holds of control characters is shown escaped.
 
     So a line of the log is one event, whatever clients are called; a traceback has its lines.
+
+    Args:
+        actors: Names of the actors that share this process; a line begins with that of its thread.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, actors: Collection[str] = ()) -> None:
         super().__init__(TEXT)
+        self._actors = actors
 
     def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802 - of `logging`
         """Return the line without a traceback."""
-        return shown(super().formatMessage(record))
+        actor = actor_of(record, self._actors)
+        return shown(f"[{actor}] " * bool(actor) + super().formatMessage(record))
 
     def formatException(self, ei: Any) -> str:  # noqa: N802 - of `logging`
         """Return the traceback."""
@@ -73,14 +82,17 @@ class JsonLines(logging.Formatter):
     Attributes:
         cell: Name of the cell.
         process: What the lines are said to come from.
+        actors: Names of the actors that share this process: a line of the thread of one is said to
+            come from that actor.
     """
 
-    def __init__(self, *, cell: str = "", process: str = "") -> None:
+    def __init__(self, *, cell: str = "", process: str = "", actors: Collection[str] = ()) -> None:
         super().__init__()
-        self.cell, self.process = cell, process
+        self.cell, self.process, self.actors = cell, process, actors
 
     def format(self, record: logging.LogRecord) -> str:
         """Return the line without its end."""
+        actor = actor_of(record, self.actors)
         line = {
             "time": round(record.created, 6),
             "level": record.levelname,
@@ -88,7 +100,7 @@ class JsonLines(logging.Formatter):
             "event": str(getattr(record, "event", "")),
             "text": record.getMessage(),
             "cell": self.cell,
-            "process": self.process,
+            "process": f"actor {actor}" if actor else self.process,
         }
         if record.exc_info:
             line["error"] = self.formatException(record.exc_info)
@@ -100,6 +112,15 @@ class JsonLines(logging.Formatter):
         named = {"name": f"enact.{event.partition('.')[0]}", "msg": text, "event": event}
         levels = {"levelno": level, "levelname": logging.getLevelName(level)}
         return self.format(logging.makeLogRecord({**named, **levels, _FIELDS: fields}))
+
+
+def actor_of(record: logging.LogRecord, actors: Collection[str]) -> str:
+    """Return which of these actors a record comes from, by its thread; empty: of none.
+
+    The thread of an actor is named as the actor, a thread that serves it "NAME lookout".
+    """
+    name = (record.threadName or "").partition(" ")[0]
+    return name if name in actors else ""
 
 
 def say(formatter: logging.Formatter, event: str, text: str, **fields: object) -> None:

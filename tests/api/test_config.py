@@ -156,6 +156,62 @@ def test_config_bounds_history_by_versions_age_and_bytes():
     assert size.aspect_entries() == (AspectEntry("x", "", "", 100, 0, 1_000_000),)
 
 
+RIG = """
+[actors.camera]
+class = "rig:Camera"
+process = "rig"
+env = { GAIN = "1", SIDE = "left" }
+drain_s = 3
+
+[actors.alone]
+class = "rig:Alone"
+
+[actors.subtraction]
+class = "rig:Subtraction"
+process = "rig"
+env = { GAIN = "1", DEPTH = "8" }
+"""
+
+
+def test_actors_of_one_process_are_found_together():
+    """In the order of the file; variables are of the process, the longest drain counts."""
+    rig, alone = parsed(f'name = "c"\n{SHARD}{RIG}').processes()
+
+    assert (rig.name, rig.members) == ("rig", ("camera", "subtraction"))
+    assert rig.env == {"GAIN": "1", "SIDE": "left", "DEPTH": "8"}
+    assert rig.drain_s == 3.0
+    assert (alone.name, alone.members, alone.drain_s) == ("alone", ("alone",), None)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "said"),
+    [
+        (
+            'GAIN = "1", DEPTH',
+            'GAIN = "2", DEPTH',
+            r"line \d+: .*share the process 'rig', but env sets GAIN to '1' for one and '2' for the",
+        ),
+        (
+            'Subtraction"',
+            'Subtraction"\nhost = "tray-pc"',
+            r"share the process 'rig', so their `host` must be the same: 'none', 'tray-pc'",
+        ),
+        (
+            'process = "rig"',
+            'process = "alone"',
+            r"process 'alone' of actor camera has the name of an actor that runs in another",
+        ),
+        ('process = "rig"', 'process = "a/b"', "cannot name a process"),
+    ],
+)
+def test_actors_that_cannot_share_a_process_are_refused(before, after, said):
+    """Each in one line that names both and what to write."""
+    text = f'name = "c"\n{SHARD}{RIG}'
+
+    with pytest.raises(ConfigError, match=said):
+        parsed(text.replace(before, after, 1))
+
+
 def test_placement_map_names_advertised_endpoints_and_pins():
     """The placement map tells clients where shards are reached, not where they listen."""
     placement = parsed(FULL).placement_map()

@@ -12,7 +12,8 @@ import pytest
 
 from enact_dist.actor_report import ActorStatistics
 from enact_dist.cell_info import ActorInfo
-from enact_dist.cli.actor import _losses, _warn_of_namesakes
+from enact_dist.cli.actor import _losses
+from enact_dist.cli.actor_run import _warn_of_namesakes
 
 MODULE = """\
 from enact_dist import Actor, Aspect, Entity, World, Write
