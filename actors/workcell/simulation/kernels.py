@@ -1,0 +1,149 @@
+"""The two loops over pixels that numpy is too slow for, compiled by numba on first use.
+
+Compiled code is kept in `__pycache__` beside this file, or where numba keeps it for a package
+that may not be written.  Both loops let other threads run.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numba
+import numpy as np
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
+
+    F32 = npt.NDArray[np.float32]
+    F64 = npt.NDArray[np.float64]
+
+
+@numba.njit(cache=True, fastmath=True, nogil=True, boundscheck=False)
+def draw(
+    image: npt.NDArray[np.uint8],
+    depth_m: F32,
+    names: npt.NDArray[np.int16],
+    origin_m: F64,
+    rays: F32,
+    windows: npt.NDArray[np.int32],
+    capsules: F64,
+    colours: F64,
+    lamp_m: F64,
+    first_name: int,
+) -> None:
+    """Draw capsules over an image where nothing nearer is in it.
+
+    Args:
+        image: (H, W, 3), drawn into; without a row only depth is drawn.
+        depth_m: (H, W), along the optical axis, drawn into.
+        names: (H, W), drawn into: `first_name` + number of the capsule; not without an image.
+        origin_m: (3,), the camera in the cell.
+        rays: (H, W, 4): unit direction of each pixel in the cell, depth per metre of it.
+        windows: (n, 4): first column, first row, last column + 1, last row + 1.
+        capsules: (n, 7), cell.
+        colours: (n, 3), 0 to 1, in the order of the image's channels.
+        lamp_m: (3,), cell.
+        first_name: Name of the first capsule.
+    """
+    coloured = image.shape[0] > 0
+    for k in range(capsules.shape[0]):
+        ax, ay, az = capsules[k, 0], capsules[k, 1], capsules[k, 2]
+        bx, by, bz = capsules[k, 3] - ax, capsules[k, 4] - ay, capsules[k, 5] - az
+        radius = capsules[k, 6]
+        ox, oy, oz = origin_m[0] - ax, origin_m[1] - ay, origin_m[2] - az
+        bb = bx * bx + by * by + bz * bz
+        bo = bx * ox + by * oy + bz * oz
+        oo = ox * ox + oy * oy + oz * oz
+        far = oo - radius * radius
+        c = bb * far - bo * bo
+        cx, cy, cz = ox - bx, oy - by, oz - bz
+        far_other = cx * cx + cy * cy + cz * cz - radius * radius
+        for v in range(windows[k, 1], windows[k, 3]):
+            for u in range(windows[k, 0], windows[k, 2]):
+                ex, ey, ez = rays[v, u, 0], rays[v, u, 1], rays[v, u, 2]
+                be = bx * ex + by * ey + bz * ez
+                oe = ex * ox + ey * oy + ez * oz
+                a = bb - be * be
+                b = bb * oe - bo * be
+                h = b * b - a * c
+                if h < 0.0:
+                    continue
+                t = (-b - math.sqrt(h)) / a if a > 1e-9 else 1e9
+                y = bo + t * be
+                if not 0.0 < y < bb:
+                    on = oe if y <= 0.0 else cx * ex + cy * ey + cz * ez
+                    hh = on * on - (far if y <= 0.0 else far_other)
+                    if hh < 0.0:
+                        continue
+                    t = -on - math.sqrt(hh)
+                    y = 0.0 if y <= 0.0 else bb
+                z = t * rays[v, u, 3]
+                if t <= 0.0 or z >= depth_m[v, u]:
+                    continue
+                depth_m[v, u] = z
+                if not coloured:
+                    continue
+                names[v, u] = first_name + k
+                along = y / bb if bb > 1e-12 else 0.0
+                px, py, pz = ox + t * ex, oy + t * ey, oz + t * ez
+                nx, ny, nz = px - along * bx, py - along * by, pz - along * bz
+                lx, ly, lz = lamp_m[0] - ax - px, lamp_m[1] - ay - py, lamp_m[2] - az - pz
+                to_lamp = radius * math.sqrt(lx * lx + ly * ly + lz * lz)
+                lit = max(0.0, (nx * lx + ny * ly + nz * lz) / to_lamp)
+                facing = max(0.0, -(nx * ex + ny * ey + nz * ez) / radius)
+                stripe = int(y / math.sqrt(bb + 1e-12) * 18.0 + 100.0) + (nx > ny)
+                shade = 255.0 * (0.35 + 0.45 * lit + 0.25 * facing)
+                shade *= 0.86 if stripe & 1 else 1.0
+                for channel in range(3):
+                    image[v, u, channel] = min(255.0, colours[k, channel] * shade)
+
+
+@numba.njit(cache=True, fastmath=True, nogil=True, boundscheck=False)
+def cast_shadows(
+    image: npt.NDArray[np.uint8],
+    depth_m: F32,
+    still_depth_m: F32,
+    light: F32,
+    lamp_depth_m: F32,
+    first_column: int,
+    first_row: int,
+    last_column: int,
+    last_row: int,
+) -> None:
+    """Darken what stands still where something between it and the lamp was drawn.
+
+    Args:
+        image: (H, W, 3), darkened.
+        depth_m: (H, W); where it is nearer than `still_depth_m`, nothing is darkened.
+        still_depth_m: (H, W), of what stands still.
+        light: (H, W, 4) per pixel of what stands still: column and row in the lamp's image, its
+            depth there (0: never lit), the factor of full shadow.
+        lamp_depth_m: (L, L), the lamp's image of what moves.
+        first_column: Of the window that is looked at.
+        first_row: Likewise.
+        last_column: Likewise, + 1.
+        last_row: Likewise, + 1.
+    """
+    size = lamp_depth_m.shape[0]
+    for v in range(first_row, last_row):
+        for u in range(first_column, last_column):
+            below = light[v, u, 2] - 0.04
+            column, row = int(light[v, u, 0]), int(light[v, u, 1])
+            if below < 0.0 or column < 0 or row < 0 or column >= size - 1 or row >= size - 1:
+                continue
+            right, down = light[v, u, 0] - column, light[v, u, 1] - row
+            dark = 0.0
+            if lamp_depth_m[row, column] < below:
+                dark += (1.0 - right) * (1.0 - down)
+            if lamp_depth_m[row, column + 1] < below:
+                dark += right * (1.0 - down)
+            if lamp_depth_m[row + 1, column] < below:
+                dark += (1.0 - right) * down
+            if lamp_depth_m[row + 1, column + 1] < below:
+                dark += right * down
+            if dark == 0.0 or depth_m[v, u] < still_depth_m[v, u]:
+                continue
+            factor = 1.0 - dark * (1.0 - light[v, u, 3])
+            for channel in range(3):
+                image[v, u, channel] = image[v, u, channel] * factor + 0.5

@@ -1,0 +1,245 @@
+"""The composite renderer: a backdrop, moving shadows, capsules in front by depth, noise.
+
+What moves is drawn anew in each image, what stands still was drawn once: 2 to 3 ms of one processor
+per view of 640 x 480.  The same stamp gives the same image.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from actors.geometry.capsules import image_boxes, outlines
+from actors.workcell.simulation.backdrop import LAMP_PX, backdrop_of, lamp, rays_of
+from actors.workcell.simulation.human import CAPSULES
+from actors.workcell.simulation.room import BOXES, LAMP_M, Box
+from actors.workcell.vocabulary import Calibration
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    import numpy.typing as npt
+
+    from actors.workcell.simulation.backdrop import Backdrop
+
+    F32 = npt.NDArray[np.float32]
+    F64 = npt.NDArray[np.float64]
+    Image = npt.NDArray[np.uint8]
+
+NOISE_LEVELS: Final = 2.5
+"""Standard deviation of a pixel's noise."""
+_BANK_PX: Final = 64
+"""The noise of an image begins anywhere in this many columns and rows of the bank."""
+
+ROBOT_COLOURS: Final = ((0.10, 0.45, 0.95), (0.85, 0.85, 0.85))
+"""Blue, green, red, in turns along the arm."""
+SKIN: Final = (0.58, 0.70, 0.88)
+CLOTHES: Final = (
+    ((0.42, 0.20, 0.15), (0.25, 0.48, 0.20)),
+    ((0.18, 0.18, 0.20), (0.20, 0.25, 0.70)),
+    ((0.30, 0.34, 0.40), (0.62, 0.40, 0.16)),
+)
+"""Trousers and shirt, by number of the person."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rendered:
+    """One view before its noise.
+
+    Attributes:
+        image: (H, W, 3) uint8, BGR.
+        depth_m: (H, W) float32, along the optical axis.
+        names: (H, W) int16: 0 is what stands still, then the capsules from 1 on, as they came.
+    """
+
+    image: Image
+    depth_m: F32
+    names: npt.NDArray[np.int16]
+
+
+class Painter:
+    """Draws moving capsules over the still pictures of one camera.
+
+    Attributes:
+        calibration: The camera.
+    """
+
+    def __init__(self, calibration: Calibration) -> None:
+        self.calibration = calibration
+        self._origin, self._rays = rays_of(calibration)
+        self._camera = (
+            calibration.camera_matrix,
+            calibration.distortion,
+            calibration.camera_from_cell,
+        )
+        matrix, pose = lamp()
+        downwards = Calibration(matrix, np.zeros(5), pose, LAMP_PX, LAMP_PX)
+        self._lamp_rays = rays_of(downwards)[1]
+        self._lamp = (matrix, np.zeros(5), pose)
+        self._lamp_m = np.array(LAMP_M)
+
+    def paint(self, drawn: Rendered, backdrop: Backdrop, capsules: F64, colours: F64) -> None:
+        """Draw capsules and their shadows into a view.
+
+        Args:
+            drawn: Changed in place; its names are 0 where nothing was drawn before.
+            backdrop: What stands still in it.
+            capsules: (n, 7), cell.
+            colours: (n, 3), blue, green, red, 0 to 1.
+        """
+        from actors.workcell.simulation.kernels import draw
+
+        if not len(capsules):
+            return
+        height, width = drawn.depth_m.shape
+        both = np.concatenate([capsules, _on_floor(capsules)])
+        around = outlines(both, [self._camera, self._lamp], sides=8)
+        spans = image_boxes(around[0], height, width)
+        windows, landed = spans[: len(capsules)], spans[spans[:, 2] > 0]
+        if not len(landed):
+            return
+        above = image_boxes(around[1, : len(capsules)], LAMP_PX, LAMP_PX)
+        window = (*landed[:, :2].min(0).tolist(), *landed[:, 2:].max(0).tolist())
+        self._shadow(drawn, backdrop, capsules, above, window)
+        first = int(drawn.names.max()) + 1 if drawn.names.any() else 1
+        draw(
+            drawn.image,
+            drawn.depth_m,
+            drawn.names,
+            self._origin,
+            self._rays,
+            windows,
+            capsules,
+            colours,
+            self._lamp_m,
+            first,
+        )
+
+    def _shadow(
+        self,
+        drawn: Rendered,
+        backdrop: Backdrop,
+        capsules: F64,
+        above: npt.NDArray[np.int32],
+        window: tuple[int, ...],
+    ) -> None:
+        """Darken what lies behind capsules as the lamp sees them: `above` there, `window` here."""
+        from actors.workcell.simulation.kernels import cast_shadows, draw
+
+        lamp_depth = np.full((LAMP_PX, LAMP_PX), np.inf, np.float32)
+        draw(
+            np.empty((0, 0, 3), np.uint8),
+            lamp_depth,
+            np.empty((0, 0), np.int16),
+            self._lamp_m,
+            self._lamp_rays,
+            above,
+            capsules,
+            np.empty((len(capsules), 3)),
+            self._lamp_m,
+            0,
+        )
+        cast_shadows(
+            drawn.image,
+            drawn.depth_m,
+            backdrop.depth_m,
+            backdrop.light,
+            lamp_depth,
+            *window,
+        )
+
+
+def _on_floor(capsules: F64) -> F64:
+    """Return capsules that hold the shadows on the floor of others, (n, 7)."""
+    landed = capsules.copy()
+    lamp_m = np.array(LAMP_M)
+    scale = np.ones(len(capsules))
+    for column in (0, 3):
+        ends = capsules[:, column : column + 3] - lamp_m
+        times = lamp_m[2] / np.maximum(-ends[:, 2] - capsules[:, 6], 0.3)
+        landed[:, column : column + 3] = lamp_m + ends * times[:, None]
+        scale = np.maximum(scale, times)
+    landed[:, 6] *= scale
+    return landed
+
+
+class Noise:
+    """Noise of a sensor from a bank of random numbers; each stamp has its own."""
+
+    def __init__(self, height: int, width: int, seed: int) -> None:
+        generator = np.random.default_rng(seed)
+        shape = (height + _BANK_PX, width + _BANK_PX, 3)
+        noise = generator.standard_normal(shape, np.float32) * NOISE_LEVELS
+        self._bank = np.rint(noise).astype(np.int8)
+        self._height, self._width, self._seed = height, width, seed
+
+    def added(self, image: Image, stamp_ns: int) -> Image:
+        """Return an image with the noise of its stamp."""
+        import cv2
+
+        mixed = (stamp_ns // 1_000_000 * 2_654_435_761 + self._seed * 40_503) & 0xFFFF_FFFF
+        row, column = (mixed >> 8) % _BANK_PX, (mixed >> 20) % _BANK_PX
+        tile = self._bank[row : row + self._height, column : column + self._width]
+        return np.asarray(cv2.add(image, tile, dtype=cv2.CV_8U))
+
+
+def robot_colours(count: int) -> F64:
+    """Return the colours of an arm of so many capsules, (n, 3)."""
+    return np.array([ROBOT_COLOURS[number % 2] for number in range(count)], np.float64)
+
+
+def person_colours(number: int) -> F64:
+    """Return the colours of a person, (17, 3)."""
+    trousers, shirt = CLOTHES[number % len(CLOTHES)]
+    arm = [shirt, SKIN, SKIN]
+    rows = [trousers] * 7 + [shirt] * 2 + [SKIN] * 2 + arm * 2
+    assert len(rows) == CAPSULES
+    return np.array(rows, np.float64)
+
+
+class View:
+    """One simulated camera: its backdrops and its painter.
+
+    Attributes:
+        calibration: The camera.
+    """
+
+    def __init__(self, calibration: Calibration, seed: int) -> None:
+        self.calibration = calibration
+        self._painter = Painter(calibration)
+        self._noise = Noise(calibration.height, calibration.width, seed)
+        self._backdrops: dict[tuple[Box, ...], Backdrop] = {}
+
+    def backdrop(self, boxes: Sequence[Box] = BOXES) -> Backdrop:
+        """Return the room with boxes in it; made when first asked for."""
+        key = tuple(boxes)
+        if key not in self._backdrops:
+            self._backdrops[key] = backdrop_of(self.calibration, key)
+        return self._backdrops[key]
+
+    def render(self, capsules: F64, colours: F64, boxes: Sequence[Box] = BOXES) -> Rendered:
+        """Return the view of capsules in the room, without noise.
+
+        Args:
+            capsules: (n, 7), cell.
+            colours: (n, 3), blue, green, red, 0 to 1.
+            boxes: What stands in the room.
+        """
+        backdrop = self.backdrop(boxes)
+        drawn = Rendered(
+            backdrop.image.copy(),
+            backdrop.depth_m.copy(),
+            np.zeros(backdrop.depth_m.shape, np.int16),
+        )
+        self._painter.paint(drawn, backdrop, capsules, colours)
+        return drawn
+
+    def exposed(self, image: Image, stamp_ns: int, brightness: float = 1.0) -> Image:
+        """Return an image as the sensor gives it: with the light of the moment, and with noise."""
+        import cv2
+
+        if brightness != 1.0:
+            image = np.asarray(cv2.convertScaleAbs(image, alpha=brightness), np.uint8)
+        return self._noise.added(image, stamp_ns)
