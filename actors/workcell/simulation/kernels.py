@@ -19,7 +19,41 @@ if TYPE_CHECKING:
     F64 = npt.NDArray[np.float64]
 
 
-@numba.njit(cache=True, fastmath=True, nogil=True, boundscheck=False)
+@numba.njit(cache=True, fastmath=True, nogil=True)
+def _first_cut(
+    be: float, oe: float, bb: float, bo: float, c: float, far: float, far_other: float
+) -> tuple[float, float]:
+    """Return where a ray enters a capsule: how far along the ray (-1: nowhere), place on the axis.
+
+    Args:
+        be: Product of axis and direction; the axis leads from the first end to the other.
+        oe: Product of the ray's start, seen from the first end, and its direction.
+        bb: Squared length of the axis.
+        bo: Product of the axis and the start.
+        c: ``bb * far - bo * bo``.
+        far: Squared distance of the start from the first end, less the squared radius.
+        far_other: Likewise of the other end.
+
+    Returns:
+        Metres; and product of the axis and the point that was hit, 0 to bb.
+    """
+    a = bb - be * be
+    b = bb * oe - bo * be
+    h = b * b - a * c
+    if h < 0.0:
+        return -1.0, 0.0
+    t = (-b - math.sqrt(h)) / a if a > 1e-9 else 1e9
+    y = bo + t * be
+    if 0.0 < y < bb:
+        return t, y
+    on = oe if y <= 0.0 else oe - be
+    h = on * on - (far if y <= 0.0 else far_other)
+    if h < 0.0:
+        return -1.0, 0.0
+    return -on - math.sqrt(h), (0.0 if y <= 0.0 else bb)
+
+
+@numba.njit(cache=True, fastmath=True, nogil=True)
 def draw(
     image: npt.NDArray[np.uint8],
     depth_m: F32,
@@ -57,27 +91,12 @@ def draw(
         oo = ox * ox + oy * oy + oz * oz
         far = oo - radius * radius
         c = bb * far - bo * bo
-        cx, cy, cz = ox - bx, oy - by, oz - bz
-        far_other = cx * cx + cy * cy + cz * cz - radius * radius
+        far_other = far - 2.0 * bo + bb
         for v in range(windows[k, 1], windows[k, 3]):
             for u in range(windows[k, 0], windows[k, 2]):
                 ex, ey, ez = rays[v, u, 0], rays[v, u, 1], rays[v, u, 2]
-                be = bx * ex + by * ey + bz * ez
-                oe = ex * ox + ey * oy + ez * oz
-                a = bb - be * be
-                b = bb * oe - bo * be
-                h = b * b - a * c
-                if h < 0.0:
-                    continue
-                t = (-b - math.sqrt(h)) / a if a > 1e-9 else 1e9
-                y = bo + t * be
-                if not 0.0 < y < bb:
-                    on = oe if y <= 0.0 else cx * ex + cy * ey + cz * ez
-                    hh = on * on - (far if y <= 0.0 else far_other)
-                    if hh < 0.0:
-                        continue
-                    t = -on - math.sqrt(hh)
-                    y = 0.0 if y <= 0.0 else bb
+                be, oe = bx * ex + by * ey + bz * ez, ox * ex + oy * ey + oz * ez
+                t, y = _first_cut(be, oe, bb, bo, c, far, far_other)
                 z = t * rays[v, u, 3]
                 if t <= 0.0 or z >= depth_m[v, u]:
                     continue
@@ -89,17 +108,17 @@ def draw(
                 px, py, pz = ox + t * ex, oy + t * ey, oz + t * ez
                 nx, ny, nz = px - along * bx, py - along * by, pz - along * bz
                 lx, ly, lz = lamp_m[0] - ax - px, lamp_m[1] - ay - py, lamp_m[2] - az - pz
-                to_lamp = radius * math.sqrt(lx * lx + ly * ly + lz * lz)
-                lit = max(0.0, (nx * lx + ny * ly + nz * lz) / to_lamp)
-                facing = max(0.0, -(nx * ex + ny * ey + nz * ez) / radius)
+                away = math.sqrt(lx * lx + ly * ly + lz * lz)
+                lit = max(0.0, (nx * lx + ny * ly + nz * lz) / away)
+                facing = max(0.0, -(nx * ex + ny * ey + nz * ez))
+                shade = 255.0 * (0.35 + (0.45 * lit + 0.25 * facing) / radius)
                 stripe = int(y / math.sqrt(bb + 1e-12) * 18.0 + 100.0) + (nx > ny)
-                shade = 255.0 * (0.35 + 0.45 * lit + 0.25 * facing)
                 shade *= 0.86 if stripe & 1 else 1.0
                 for channel in range(3):
                     image[v, u, channel] = min(255.0, colours[k, channel] * shade)
 
 
-@numba.njit(cache=True, fastmath=True, nogil=True, boundscheck=False)
+@numba.njit(cache=True, fastmath=True, nogil=True)
 def cast_shadows(
     image: npt.NDArray[np.uint8],
     depth_m: F32,
