@@ -75,12 +75,16 @@ def namesakes(
         cell: The cell's name.
         config: The file; None where there is none.
         welcomes: What the shards that answer say of the cell.
+
+    Each shard is asked, too, at which further places others have named it.
     """
-    from enact_dist.link.namesakes import serving, two_daemons
+    from enact_dist.link.namesakes import serving, told_places, two_daemons
 
     entries = [entry for welcome in welcomes.values() for entry in welcome.placement.shards]
     if config is not None:
         entries += config.placement_map().shards
+    for told in told_places(cell, list(dict.fromkeys(entries)), timeout_s=ASK_S):
+        entries += told
     places: dict[str, dict[str, None]] = {}
     for entry in entries:
         places.setdefault(entry.name, {}).update(dict.fromkeys(entry.endpoints))

@@ -247,5 +247,6 @@ def _shared(shard: ShardInfo) -> str:
 
 def _state(shard: ShardInfo) -> str:
     state = state_of(grants=shard.open, draining=bool(shard.counters.get("draining")))
-    alarms = shard.counters.get("alarms", 0)
-    return f"{state}, ALARMS: {alarms} (enact lock audit)" if alarms else state
+    alarms, namesakes = (shard.counters.get(name, 0) for name in ("alarms", "namesakes"))
+    state += f", ALARMS: {alarms} (enact lock audit)" if alarms else ""
+    return f"{state}, SHARDS RUNNING TWICE: {namesakes} (enact doctor)" if namesakes else state

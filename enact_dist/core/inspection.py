@@ -17,7 +17,6 @@ from enact_dist.core.messages import (
     ListLocks,
     ListSessions,
     Locks,
-    Places,
     Pong,
     SessionInfo,
     Sessions,
@@ -165,11 +164,6 @@ def pong(state: ShardState) -> Pong:
     )
 
 
-def places(state: ShardState) -> Places:
-    """Say where each shard of the cell is expected."""
-    return Places(state.settings.placement.shards)
-
-
 def counted(state: ShardState) -> dict[str, int]:
     """Return the statistics, what there is now, and alarms, of earlier epochs too."""
     history = state.slots.history
@@ -177,6 +171,7 @@ def counted(state: ShardState) -> dict[str, int]:
         "alarms": state.audit.alarms,
         "catalogue_left_out": state.catalogue.left_out,
         "draining": int(state.draining),
+        "namesakes": len(state.doubled),
         "retained_bytes": history.bytes,
         "retained_dropped": history.dropped,
     }

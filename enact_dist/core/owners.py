@@ -11,7 +11,8 @@ Rules to keep
 - The first `Hello` of a session binds it to its identity, on the disk too; everything else that
   names the session has to come under that identity.  What became of a commit anybody may ask: the
   session that made it may be gone; once it is, anybody may release its locks before he asks.
-- `Finish` and `Resolve` come from the shard that they name, under `shard_identity`.
+- `Finish`, `Resolve` and a `ListPlaces` that names a shard come from that shard, under
+  `shard_identity`.
 - The identity "" is this process itself: an embedded shard, or a simulated one.
 """
 
@@ -30,6 +31,7 @@ from enact_dist.core.messages import (
     Fork,
     Hello,
     KeepVersions,
+    ListPlaces,
     Outcome,
     Refused,
     Release,
@@ -61,6 +63,7 @@ def _session_getter(kind: type) -> Callable[[object], str] | None:
 
 SESSION_OF: Final = {kind: _session_getter(kind) for kind in get_args(Request)}
 """How to read from each request for which session it speaks; None for what speaks for none."""
+_OF_SHARDS: Final = frozenset((Finish, Resolve, ListPlaces))
 _SAY_EPOCH: Final = frozenset((Break, DropWorld, ForceAbort, Fork, KeepVersions))
 
 
@@ -77,8 +80,8 @@ def refusal(
     kind = type(message)
     getter = SESSION_OF.get(kind)
     if getter is None:
-        if kind is Finish or kind is Resolve:
-            return _not_its_shard(message, identity)  # type: ignore[arg-type]  # one of the two
+        if kind in _OF_SHARDS:
+            return _not_its_shard(message, identity)  # type: ignore[arg-type]  # one of these
     elif kind is not Outcome:
         session = getter(message)
         owner = sessions.owner(session)
@@ -100,8 +103,13 @@ def not_yours(session: str, owner: str, asker: str) -> Refused:
     )
 
 
-def _not_its_shard(message: Finish | Resolve, identity: str) -> Refused | None:
-    named = message.position.shard if isinstance(message, Finish) else message.asker
+def _not_its_shard(message: Finish | Resolve | ListPlaces, identity: str) -> Refused | None:
+    if isinstance(message, Finish):
+        named = message.position.shard
+    else:
+        named = message.asker if isinstance(message, Resolve) else message.shard
+        if not named and isinstance(message, ListPlaces):
+            return None
     if identity == shard_identity(named):
         return None
     said = f"{type(message).__name__} in the name of shard {named}"

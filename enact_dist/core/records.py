@@ -296,6 +296,14 @@ class Call:
 
 
 @dataclass(frozen=True, slots=True)
+class Compare:
+    """Ask which daemons serve a shard at these places; the answer comes back as `Served`."""
+
+    shard: str
+    places: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class Story:
     """One line for the log: what the shard decided and about whom; `grave` needs people."""
 
@@ -304,7 +312,7 @@ class Story:
     grave: bool = False
 
 
-Effect = Reply | Persist | Publish | Call | Story
+Effect = Reply | Persist | Publish | Call | Compare | Story
 
 
 # ---------------------------------------------------------------- events that are no requests
@@ -331,6 +339,18 @@ class ShardReturned:
     """Another shard has come (back) into reach; a hint, which may come late, twice or never."""
 
     shard: str
+
+
+@dataclass(frozen=True, slots=True)
+class Served:
+    """The daemons that serve a shard at the places of a `Compare`, each by its random start number.
+
+    `text` is for people: where they are, and what to do.
+    """
+
+    shard: str
+    starts: tuple[int, ...]
+    text: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -369,4 +389,14 @@ class MakeRoom:
     bytes: int
 
 
-Event = Persisted | Called | ShardReturned | SessionSeen | SessionDied | Tick | Drain | MakeRoom
+Event = (
+    Persisted
+    | Called
+    | ShardReturned
+    | Served
+    | SessionSeen
+    | SessionDied
+    | Tick
+    | Drain
+    | MakeRoom
+)

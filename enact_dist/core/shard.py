@@ -48,6 +48,7 @@ from enact_dist.core.messages import (
     ListSessions,
     Outcome,
     Ping,
+    Places,
     Prepare,
     Refused,
     Register,
@@ -58,6 +59,7 @@ from enact_dist.core.messages import (
     TakeView,
     Validate,
 )
+from enact_dist.core.places import PlaceDesk
 from enact_dist.core.prepares import PrepareDesk
 from enact_dist.core.records import (
     AuditRecord,
@@ -69,6 +71,7 @@ from enact_dist.core.records import (
     Record,
     Recovered,
     Reply,
+    Served,
     SessionDied,
     SessionSeen,
     ShardReturned,
@@ -106,6 +109,7 @@ class Shard:
         self._history = HistoryDesk(self.state, self._sessions, self._prepares)
         self._views = ViewDesk(self.state, self._locks, self._prepares)
         self._worlds = WorldDesk(self.state, self._prepares)
+        self._places = PlaceDesk(self.state)
         lineage = LineageDesk(self.state)
         self._stamps = StampDesk(self.state, self._prepares)
         self._handlers: dict[type, Callable[..., Iterator[Effect]]] = {
@@ -125,12 +129,13 @@ class Shard:
             Prepare: self._prepares.on_prepare,
             Finish: self._prepares.on_finish,
             Resolve: self._prepares.on_resolve,
-            Called: self._prepares.on_called,
-            ShardReturned: self._prepares.on_shard_returned,
+            Called: self._on_called,
+            ShardReturned: self._on_shard_returned,
             ForceAbort: self._prepares.on_force_abort,
             AwaitStamp: self._stamps.on_await_stamp,
             Ping: self._on_ping,
-            ListPlaces: self._on_list_places,
+            ListPlaces: self._places.on_list_places,
+            Served: self._places.on_served,
             Survey: self._on_survey,
             ListLocks: self._on_list_locks,
             ListSessions: self._on_list_sessions,
@@ -271,6 +276,16 @@ class Shard:
         else:
             yield from self._sessions.persisted(message.ticket)
 
+    def _on_called(self, message: Called, reply_to: int) -> Iterator[Effect]:
+        if isinstance(message.answer, Places):
+            yield from self._places.on_called(message.answer)
+        else:
+            yield from self._prepares.on_called(message, reply_to)
+
+    def _on_shard_returned(self, message: ShardReturned, reply_to: int) -> Iterator[Effect]:
+        yield from self._prepares.on_shard_returned(message, reply_to)
+        yield from self._places.on_shard_returned(message)
+
     def _on_outcome(self, message: Outcome, reply_to: int) -> Iterator[Effect]:
         yield from self.state.commits.outcome(message, reply_to=reply_to)
 
@@ -322,9 +337,6 @@ class Shard:
 
     def _on_ping(self, _: Ping, reply_to: int) -> Iterator[Effect]:
         yield Reply(reply_to, inspection.pong(self.state))
-
-    def _on_list_places(self, _: ListPlaces, reply_to: int) -> Iterator[Effect]:
-        yield Reply(reply_to, inspection.places(self.state))
 
     def _on_survey(self, message: Survey, reply_to: int) -> Iterator[Effect]:
         wrong = wrong_patterns(message.patterns)

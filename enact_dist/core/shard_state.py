@@ -90,6 +90,7 @@ class ShardState:
         busy_worlds: What is being done to the context of a name, which is not to be used meanwhile.
         by_hand: The last lock that people have broken, and the last aborted: asked and answered.
         draining: The shard is about to stop and grants nothing.
+        doubled: The shards of the cell that several daemons serve now, with the start of each.
     """
 
     def __init__(
@@ -103,6 +104,7 @@ class ShardState:
         self.counters: dict[str, int] = {}
         self.pins = Pins()
         self.busy_worlds: dict[str, str] = {}
+        self.doubled: dict[str, tuple[int, ...]] = {}
         self.by_hand: dict[type, tuple[Break | ForceAbort, Broken]] = {}
         names = {shard.name for shard in settings.placement.shards}
         self.peers = frozenset(names - {settings.name})

@@ -102,6 +102,13 @@ OF_A_SHARD: Final[dict[str, Counter]] = {
     ),
     "alarms": Counter("of these, those that nobody has settled yet", "enact lock audit", now=True),
     # This process and its host
+    "namesakes_found": Counter(
+        "times that two daemons were found under the name of one shard of the cell",
+        "see the shard's log for where they are; stop all but the one whose data you want to keep",
+    ),
+    "namesakes": Counter(
+        "shards of the cell that several daemons serve now", "enact doctor", now=True
+    ),
     "catalogue_left_out": Counter(
         "world contexts and aspects that the catalogue has no room to show",
         "stop the cell and run enact shard forget --unused",

@@ -6,7 +6,7 @@
     store thread ── persisted ───────────┤ mutex │── Shard.handle ── effects ──┐
     timer thread ── Tick ────────────────┘                                     │
               reply(answer)  ◄── Reply │ StoreThread ◄── Persist │ watchers ◄── Publish
-                                       │ other shards ◄── Call
+                                       │ other shards ◄── Call, Compare
 
 A transport needs `submit` and nothing else; the shard cannot tell which one a message came by.
 Rules that a change must keep:
@@ -43,7 +43,7 @@ from enact_dist.core.messages import (
     Stage,
 )
 from enact_dist.core.records import (
-    Called,
+    Compare,
     Drain,
     MakeRoom,
     Persist,
@@ -175,6 +175,7 @@ class ShardHost:
         self._kept_at_once: deque[int] = deque()
         self._watchers: tuple[Callable[[Notice], None], ...] = ()
         self._call: Callable[[str, Request], None] | None = None
+        self._compare: Callable[[Compare], None] | None = None
         self._inboxes: tuple[Callable[[], None], ...] = ()
         self._each_tick: tuple[Callable[[], None], ...] = ()
         self._failure: Exception | None = None
@@ -302,13 +303,11 @@ class ShardHost:
         names = ", ".join(f"{name} {size}" for name, size in found)
         return f"; the largest: {names}" if names else ""
 
-    def call_with(self, call: Callable[[str, Request], None]) -> None:
-        """Let `call(shard, request)` carry requests to other shards; it must not wait."""
-        self._call = call
-
-    def called(self, shard: str, request: Request, answer: Answer) -> None:
-        """Take the answer of another shard."""
-        self.event(Called(shard, request, answer))
+    def call_with(
+        self, call: Callable[[str, Request], None], compare: Callable[[Compare], None] | None = None
+    ) -> None:
+        """Let `call(shard, request)` and `compare(effect)` ask other shards; they must not wait."""
+        self._call, self._compare = call, compare
 
     def watch(self, watcher: Callable[[Notice], None]) -> Callable[[], None]:
         """Call `watcher` with each notice, in order; return the function that ends it."""
@@ -372,6 +371,9 @@ class ShardHost:
                 later.append(effect)
             elif isinstance(effect, Persist):
                 self._persist(effect)
+            elif isinstance(effect, Compare):
+                if self._compare is not None:
+                    self._compare(effect)
             elif self._call is not None:
                 self._call(effect.shard, cast("Request", effect.request))
         for effect in later:

@@ -8,19 +8,25 @@ two folders may be in the same one, and a restart at the same place is one daemo
 
 from __future__ import annotations
 
+import logging
+import threading
 import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.messages import ListPlaces, Ping, Places, Pong
+from enact_dist.core.records import Served
 from enact_dist.link.endpoints import somebody_listens
 from enact_dist.link.zenoh_config import to_reach
 from enact_dist.link.zenoh_discovery import FoundShard, ask_shards
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from enact_dist.core.messages import ShardEntry
+    from enact_dist.core.records import Compare
+
+_log = logging.getLogger("enact.link")
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,6 +118,81 @@ def two_daemons(cell: str, shard: str, found: Sequence[Serving]) -> str:
         f" {' and '.join(map(str, found))}; stop all but the one whose data you want to keep, and"
         " name its endpoint in every cell.toml; a shard of another cell needs another cell name"
     )
+
+
+class Comparing:
+    """Asks which daemons serve a shard, for a shard that runs: on a thread of its own, in turn.
+
+    A shard that several daemons serve is asked about again until one of them is gone.
+
+    Args:
+        cell: Name of the cell.
+        tell: Takes what was found.
+    """
+
+    ASK_S: Final = 0.5
+    """How long each place may take to answer."""
+    AGAIN_S: Final = 5.0
+    """After so long a shard that several daemons serve is asked about again."""
+
+    def __init__(self, cell: str, tell: Callable[[Served], None]) -> None:
+        self._cell, self._tell = cell, tell
+        self._asked: dict[str, Compare] = {}
+        self._doubled: dict[str, Compare] = {}
+        self._wake = threading.Condition(threading.Lock())
+        self._thread: threading.Thread | None = None
+        self._closed = False
+
+    def submit(self, compare: Compare) -> None:
+        """Ask soon; the newest question about a shard replaces one that waits."""
+        with self._wake:
+            if self._closed:
+                return
+            self._asked[compare.shard] = compare
+            if self._thread is None:
+                thread = threading.Thread(target=self._run, name="enact-compare", daemon=True)
+                try:
+                    thread.start()
+                except RuntimeError as error:  # no thread is left: the next question tries again
+                    _log.warning("the places of shard %s not compared: %s", compare.shard, error)
+                    return
+                self._thread = thread
+            self._wake.notify()
+
+    def _run(self) -> None:
+        while (compare := self._next()) is not None:
+            try:
+                found = serving(self._cell, compare.shard, compare.places, timeout_s=self.ASK_S)
+            except Exception as error:  # noqa: BLE001 - a place that somebody named may be anything
+                if not self._closed:
+                    _log.warning("the places of shard %s not compared: %s", compare.shard, error)
+                continue
+            with self._wake:
+                self._doubled.pop(compare.shard, None)
+                if len(found) > 1:
+                    self._doubled[compare.shard] = compare
+                if self._closed:
+                    return
+            starts = tuple(sorted(one.start for one in found))
+            text = two_daemons(self._cell, compare.shard, found) if len(found) > 1 else ""
+            self._tell(Served(compare.shard, starts, text))
+
+    def _next(self) -> Compare | None:
+        """Wait for a question; return None at the end."""
+        with self._wake:
+            while not self._asked and not self._closed:
+                if not self._wake.wait(self.AGAIN_S if self._doubled else None):
+                    self._asked = self._doubled | self._asked
+            return None if self._closed else self._asked.pop(next(iter(self._asked)))
+
+    def close(self, join_s: float = 0.5) -> None:
+        """Ask no more; wait so long for a question under way.  Twice is harmless."""
+        with self._wake:
+            self._closed = True
+            thread = self._thread
+            self._wake.notify()
+        if thread is not None:
+            thread.join(join_s)
 
 
 class Doubts:

@@ -19,12 +19,18 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.messages import ListLocks, Locks
-from enact_dist.core.records import ShardReturned
+from enact_dist.core.records import Called, ShardReturned
 from enact_dist.errors import ConfigError, EnactError, LinkError
 from enact_dist.link.endpoints import somebody_listens
 from enact_dist.link.host import open_host
 from enact_dist.link.log import READY, JsonLines, Log, TextLines, say
-from enact_dist.link.namesakes import moved_places, serving, told_places, two_daemons
+from enact_dist.link.namesakes import (
+    Comparing,
+    moved_places,
+    serving,
+    told_places,
+    two_daemons,
+)
 from enact_dist.link.service_manager import ServiceManager
 from enact_dist.link.shard_calls import ShardCalls
 from enact_dist.link.shared_folder import SharedFolder
@@ -131,14 +137,16 @@ class RunningShard:
                 shard.name,
                 shard.placement.shards,
                 lease_s=settings.link_lease_s,
-                answered=self.host.called,
+                answered=lambda *call: self.host.event(Called(*call)),
                 returned=lambda name: self.host.event(ShardReturned(name)),
             )
             undo.callback(self._calls.close)
-            self.host.call_with(self._calls.submit)
+            self._comparing = Comparing(settings.cell, self.host.event)
+            undo.callback(self._comparing.close)
+            self.host.call_with(self._calls.submit, self._comparing.submit)
+            self._service = ZenohService(self.host, self._session, settings.cell)
             for other in self._calls.others:  # what the first tick asked of them nobody carried
                 self.host.event(ShardReturned(other))
-            self._service = ZenohService(self.host, self._session, settings.cell)
             undo.pop_all()
 
     @property
@@ -166,6 +174,7 @@ class RunningShard:
             self.host.drain()  # who asked meanwhile is parked: answer them, too
             self.host.close()
             self._calls.close()
+            self._comparing.close()
             if self._sockets is not None:
                 self._sockets.close()
             self._service.close()

@@ -43,6 +43,7 @@ def test_every_counter_of_a_shard_is_explained_and_no_other():
         "alarms",
         "catalogue_left_out",
         "draining",
+        "namesakes",
         "retained_bytes",
         "retained_dropped",
     }

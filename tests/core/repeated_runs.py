@@ -30,6 +30,7 @@ from enact_dist.core.messages import (
     ListAudit,
     ListHistory,
     ListLocks,
+    ListPlaces,
     ListSessions,
     Outcome,
     Ping,
@@ -246,7 +247,8 @@ def catalogue_and_people(cell: RepeatingCell) -> None:
     assert lock.position is not None
     ann.call("s0", AwaitStamp(lock.position.stamp_ns, 0))
     ann.call("s0", AwaitStamp(WALL_NS + 100 * S, 0))
-    for request in (Ping(), Survey((), (), ()), ListLocks(), ListSessions(), ListAudit("")):
+    listings = (ListPlaces(), Survey((), (), ()), ListLocks(), ListSessions(), ListAudit(""))
+    for request in (Ping(), *listings):
         ann.call("s0", request)
 
 

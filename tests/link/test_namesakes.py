@@ -1,15 +1,24 @@
 """Two daemons under one shard's name: the later one, clients and the doctor see it."""
 
+import logging
 from types import SimpleNamespace
 
 import pytest
 
 from enact_dist import Aspect, Entity, Lock, Write, connect
-from enact_dist.core.messages import ListSessions, Pin, PlacementMap, Sessions, ShardEntry
+from enact_dist.cli.shard import _state
+from enact_dist.core.messages import (
+    ListPlaces,
+    ListSessions,
+    Pin,
+    PlacementMap,
+    Sessions,
+    ShardEntry,
+)
 from enact_dist.core.shard_state import ShardSettings
 from enact_dist.doctor_cell import namesakes
 from enact_dist.errors import LinkError
-from enact_dist.link.namesakes import Doubts, moved_places, serving
+from enact_dist.link.namesakes import Comparing, Doubts, moved_places, serving
 from enact_dist.link.shard_daemon import DaemonSettings, start_shard
 
 COUNT = Aspect("count", int)
@@ -23,6 +32,8 @@ def begin(tmp_path, monkeypatch, carrier):
     monkeypatch.setattr("enact_dist.link.shard_daemon.PROBE_S", ASK_S)
     monkeypatch.setattr(Doubts, "ASK_S", ASK_S)
     monkeypatch.setattr(Doubts, "AGAIN_S", 0.0)
+    monkeypatch.setattr(Comparing, "ASK_S", ASK_S)
+    monkeypatch.setattr(Comparing, "AGAIN_S", 0.1)
     running = []
 
     def start(name, listen, **places):
@@ -157,3 +168,50 @@ def test_only_places_that_share_nothing_are_looked_into():
     known = {"a": ["x"], "b": ["x", "y"], "c": ["x"], "d": [], "e": ["x"]}
     told = {"a": ["z"], "b": ["y", "z"], "c": [], "d": ["x"], "f": ["x"]}
     assert moved_places(known, told.items()) == {"a": ["x", "z"]}
+
+
+def places(shard):
+    """Return where a running shard, and those that talk to it, expect each shard."""
+    answers = []
+    shard.host.submit(ListPlaces(), answers.append)
+    return answers[0].shards
+
+
+def alarms(shard):
+    """Return how many shards a running shard holds for doubled, and how often it found one so."""
+    answers = []
+    shard.host.submit(ListSessions(), answers.append)
+    counters = dict(answers[0].counters)
+    return counters.get("namesakes", 0), counters.get("namesakes_found", 0)
+
+
+def test_running_shards_notice_a_daemon_that_comes_back_beside_its_successor(
+    begin, free, until, caplog
+):
+    """A shard was lost and begun elsewhere; then the lost one is back, where nobody was asked."""
+    first, second, right = free(), free(), free()
+    running = begin("right", right, left=first, right=right)
+    successor = begin("left", second, left=second, right=right)
+    until(lambda: second in str(places(running)))
+    assert alarms(running) == (0, 0)  # it may have moved: nobody serves at its first place
+
+    with pytest.raises(LinkError, match="already runs"):
+        begin("left", first, left=first, right=right)
+    begin("left", first, left=first)  # its file names no other shard: it asks nobody
+
+    until(lambda: alarms(running) == (1, 1))
+    told = [one for one in caplog.records if "daemons serve shard left" in one.getMessage()]
+    assert told[0].levelno >= logging.ERROR
+    assert first in told[0].getMessage()
+    assert second in told[0].getMessage()
+    with connect(right) as cell:
+        (shown,) = [shard for shard in cell.shards() if shard.name == "right"]
+        assert "SHARDS RUNNING TWICE: 1" in _state(shown)
+    entries = (ShardEntry("left", (first,)), ShardEntry("right", (right,)))
+    file = SimpleNamespace(placement_map=lambda: PlacementMap(1, entries, ()))
+    (finding,) = namesakes("cell", file, {})
+    assert (finding.subject, second in finding.text) == ("shard left", True)
+
+    successor.stop(drain_s=0.0)
+
+    until(lambda: alarms(running) == (0, 1))
