@@ -1,0 +1,227 @@
+"""What each scenario must hold, on the truth of its run; the table is in `scenarios`."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from actors.geometry.capsules import distance_to_points
+from actors.workcell import vocabulary as words
+from actors.workcell.truth_of_run import PERIOD_NS, truth_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from actors.workcell.trace import Kept, Trace
+    from actors.workcell.truth_of_run import Truth
+
+REST_SCALE = 0.02
+"""Below this share of the nominal speed the arm counts as at rest."""
+HAND_M = 0.42
+"""Nearest true distance that a reaching hand may come to a moving arm."""
+
+
+def checks_of(trace: Trace, scores: Mapping[str, float]) -> dict[str, bool]:
+    """Return what the scenario of a run must hold, in words, and whether it did.
+
+    Args:
+        trace: The run.
+        scores: Its scores.
+    """
+    truth = truth_of(trace)
+    name = trace.newest(words.SCENARIO.name, words.PLAYING, "truth").scenario
+    found = {"no moment faster than ISO/TS 15066 allows": scores.get("violations", 1.0) == 0.0}
+    return found | _CHECKS.get(name, _nothing)(trace, truth, scores)
+
+
+def _nothing(_: Trace, __: Truth, ___: Mapping[str, float]) -> dict[str, bool]:
+    return {}
+
+
+def _speeds(trace: Trace, truth: Truth) -> list[Kept[words.Speed]]:
+    return [kept for kept in trace.of(words.ROBOT.name, words.SPEED) if truth.covers(kept.stamp_ns)]
+
+
+def _hulls(trace: Trace, truth: Truth) -> list[Kept[words.Hull]]:
+    those = trace.of(words.WORKSPACE.name, words.HULL)
+    return [kept for kept in those if truth.covers(kept.stamp_ns)]
+
+
+def _empty(trace: Trace, truth: Truth, scores: Mapping[str, float]) -> dict[str, bool]:
+    """S1: nobody is there."""
+    speeds = _speeds(trace, truth)
+    return {
+        "full speed in every set": bool(speeds) and all(one.datum.scale == 1.0 for one in speeds),
+        "no voxel is occupied": not any(len(one.datum.voxels) for one in _hulls(trace, truth)),
+        "no set is incomplete": scores.get("sets_incomplete", 1.0) == 0.0,
+    }
+
+
+def _past(trace: Trace, truth: Truth, _: Mapping[str, float]) -> dict[str, bool]:
+    """S2: full speed again a second after everybody has left the workspace."""
+    speeds, slow = _speeds(trace, truth), []
+    empty_since = 0
+    for kept in speeds:
+        inside = any(
+            bool((np.abs(body[:, :2]) < truth.half_m).all(1).any())
+            for body in truth.bodies_at(kept.stamp_ns)
+        )
+        empty_since = 0 if inside else empty_since + 1
+        if empty_since > round(1.0 / words.PERIOD_S) and kept.datum.scale < 1.0:
+            slow.append(kept)
+    slowed = any(kept.datum.scale < 1.0 for kept in speeds)
+    return {
+        "the robot slows down for who walks past": slowed,
+        "full speed a second after they have left": not slow,
+    }
+
+
+def _reach(trace: Trace, truth: Truth, _: Mapping[str, float]) -> dict[str, bool]:
+    """S3, S12: at rest before the hand is near, and no restart while it is there."""
+    motion = trace.joints()
+    stopped = restarted = False
+    nearest_moving = math.inf
+    for kept in trace.of(words.ROBOT.name, words.EXECUTION):
+        stamp = kept.datum.captured_ns
+        if not truth.covers(stamp):
+            continue
+        true_m = truth.distance_m(stamp, motion.at(stamp))
+        if kept.datum.scale > REST_SCALE:
+            nearest_moving = min(nearest_moving, true_m)
+            restarted |= stopped and true_m < HAND_M
+        stopped |= kept.datum.scale <= REST_SCALE and true_m < 2.0
+    return {
+        "the robot stops": stopped,
+        f"it moves only while the hand is farther than {HAND_M} m": nearest_moving >= HAND_M,
+        "no restart while the hand is there": not restarted,
+    }
+
+
+def _hidden(trace: Trace, truth: Truth, scores: Mapping[str, float]) -> dict[str, bool]:
+    """S4: who hides stays known, and keeps their place occupied."""
+    behind = [
+        kept
+        for kept in _hulls(trace, truth)
+        if (centres := truth.centres_at(kept.stamp_ns))
+        and np.abs(centres[0][0]).max() < float(truth.half_m[0]) - 0.3
+    ]
+    lost = [kept for kept in behind if not len(kept.datum.voxels)]
+    return {
+        "the place of who hides stays occupied": bool(behind) and not lost,
+        "no voxel is lost near the robot": scores.get("lost_near_voxels", 1.0) == 0.0,
+    }
+
+
+def _still(trace: Trace, truth: Truth, _: Mapping[str, float]) -> dict[str, bool]:
+    """S5: who stands still does not fade into the background."""
+    hulls = [kept for kept in _hulls(trace, truth) if truth.bodies_at(kept.stamp_ns)]
+    inside = [
+        kept for kept in hulls if all(truth.inside(body) for body in truth.bodies_at(kept.stamp_ns))
+    ]
+    sizes = [len(kept.datum.voxels) for kept in inside]
+    third = max(1, len(sizes) // 3)
+    first, last = (
+        float(np.median(part)) if part else 0.0 for part in (sizes[:third], sizes[-third:])
+    )
+    return {"who stands still does not fade": first > 0.0 and last > 0.8 * first}
+
+
+def _left(trace: Trace, truth: Truth, _: Mapping[str, float]) -> dict[str, bool]:
+    """S6: what is left in the cell stays an obstacle."""
+    thing = truth.things[0]
+    after = [
+        kept
+        for kept in _hulls(trace, truth)
+        if truth.at_s(kept.stamp_ns) > thing.from_s + 1.0 and not truth.bodies_at(kept.stamp_ns)
+    ]
+    grid = trace.newest(words.WORKSPACE.name, words.GRID)
+    point = np.array([[*thing.centre_m, *thing.centre_m, 0.05]])
+    kept_there = [
+        len(kept.datum.voxels) > 0
+        and float(
+            distance_to_points(
+                point, grid.origin_m + (kept.datum.voxels + 0.5) * grid.voxel_m
+            ).min()
+        )
+        < 0.1
+        for kept in after
+    ]
+    return {"what is left stays an obstacle": bool(kept_there) and all(kept_there)}
+
+
+def _cameras(trace: Trace, truth: Truth, _: Mapping[str, float]) -> dict[str, bool]:
+    """S7: the cell goes on with fewer cameras, and takes each back."""
+    hulls = _hulls(trace, truth)
+    total = len(trace.entities(words.CALIBRATION))
+    counts = [len(kept.datum.cameras) for kept in hulls]
+    longest = max(
+        ((other.stamp_ns - one.stamp_ns) / PERIOD_NS for one, other in itertools.pairwise(hulls)),
+        default=math.inf,
+    )
+    return {
+        "sets with a stand-in": min(counts, default=total) < total,
+        "every camera is taken back": bool(counts) and counts[-1] == total,
+        "the cell goes on within 2 s": longest <= 20.0,
+    }
+
+
+def _restarts(trace: Trace, truth: Truth, _: Mapping[str, float]) -> dict[str, bool]:
+    """S8: the robot rests while an actor is away, and goes on by itself."""
+    motion = trace.joints()
+    stamps = np.array([kept.stamp_ns for kept in _speeds(trace, truth)], np.int64)
+    if not len(stamps):
+        return {"the robot goes on by itself": False}
+    late = 0
+    for stamp, dq in zip(motion.stamp_ns, motion.dq, strict=True):
+        if not truth.covers(int(stamp)):
+            continue
+        newest = stamps[stamps <= stamp].max(initial=truth.start_ns)
+        late += (stamp - newest) / 1e9 > 0.25 + 0.5 and bool(np.abs(dq).max() > 0.02)
+    gaps = int((np.diff(stamps) > 5 * PERIOD_NS).sum())
+    last_s = truth.at_s(int(stamps[-1]))
+    return {
+        "the commands stop while an actor is away": gaps >= 1,
+        "at rest within 250 ms and the braking time": late == 0,
+        "the robot goes on by itself": last_s > truth.seconds - 1.0,
+    }
+
+
+def _dark(trace: Trace, truth: Truth, _: Mapping[str, float]) -> dict[str, bool]:
+    """S10: the light drops: a fault that stops the robot, not a crash."""
+    states = [kept.datum for kept in trace.of(words.SYSTEM.name, words.SAFETY)]
+    faults = [one for one in states if one.state == "fault" and truth.covers(one.since_ns)]
+    after = [
+        one.datum for one in _speeds(trace, truth) if truth.at_s(one.stamp_ns) > 0.6 * truth.seconds
+    ]
+    return {
+        "a fault names the background": any("background" in one.reason for one in faults),
+        "the robot stands": bool(after) and all(one.scale == 0.0 for one in after),
+    }
+
+
+def _two(trace: Trace, truth: Truth, _: Mapping[str, float]) -> dict[str, bool]:
+    """S11: two people are two tracks."""
+    at_once: dict[int, int] = {}
+    for human in trace.entities(words.TRACK):
+        for kept in trace.of(human, words.TRACK):
+            if truth.covers(kept.stamp_ns):
+                at_once[kept.stamp_ns] = at_once.get(kept.stamp_ns, 0) + 1
+    return {"two tracks at once": max(at_once.values(), default=0) >= 2}
+
+
+_CHECKS: Mapping[str, Callable[[Trace, Truth, Mapping[str, float]], dict[str, bool]]] = {
+    "S1": _empty,
+    "S2": _past,
+    "S3": _reach,
+    "S4": _hidden,
+    "S5": _still,
+    "S6": _left,
+    "S7": _cameras,
+    "S8": _restarts,
+    "S10": _dark,
+    "S11": _two,
+    "S12": _reach,
+}

@@ -1,0 +1,49 @@
+"""Claims about the pictures: what changed is coloured, gaps stay gaps, empty data are drawn."""
+
+import numpy as np
+
+from actors.workcell import plots
+from actors.workcell.figures import CHANGED, SAME, masks_figure, scene_picture, voxel_points
+from actors.workcell.vocabulary import Grid, Silhouette
+
+GRID = Grid(np.zeros(3), 0.1, (8, 8, 8))
+
+
+def mask(rows: slice) -> Silhouette:
+    """Return a silhouette of whole rows."""
+    picture = np.zeros((16, 16), np.bool_)
+    picture[rows] = True
+    return Silhouette(np.packbits(picture, axis=1), int(picture.sum()))
+
+
+def test_only_changed_pixels_are_coloured() -> None:
+    picture = masks_figure({"camera/0": mask(slice(0, 8))}, {"camera/0": mask(slice(4, 12))})
+    counts = {
+        name: int((picture == colour).all(-1).sum())
+        for name, colour in (("changed", CHANGED), ("same", SAME))
+    }
+    assert counts == {"changed": 16, "same": 16}  # two of four rows of eight, at half the size
+
+
+def test_inner_faces_of_voxels_are_not_drawn() -> None:
+    cube = np.stack(np.meshgrid(*[np.arange(3)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    points, colours, _ = voxel_points(GRID, cube, np.array([200, 100, 50]))
+    assert len(points) == len(colours) == 6 * 9
+    assert np.allclose(np.abs(points - 0.15).max(1), 0.15)
+
+
+def test_nothing_occupied_is_drawn_as_nothing() -> None:
+    nothing = voxel_points(GRID, np.empty((0, 3), np.int16), np.array(SAME))
+    floor = voxel_points(GRID, np.array([[0, 0, 0]]), np.array(SAME))
+    assert scene_picture([floor, nothing], size_px=(64, 48)).shape == (48, 64, 3)
+
+
+def test_a_value_that_is_not_known_is_a_gap() -> None:
+    def drawn(values: np.ndarray) -> int:
+        line = plots.Line("speed", np.arange(6.0), values, (255, 0, 0))
+        picture = plots.timeline([("speed, m/s", 2.0, [line])], size_px=(300, 120))
+        return int((picture[30:80] == (255, 0, 0)).all(-1).sum())
+
+    whole, gap = np.ones(6), np.ones(6)
+    gap[2:4] = np.inf
+    assert 0 < drawn(gap) < 0.7 * drawn(whole)
