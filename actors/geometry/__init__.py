@@ -14,6 +14,9 @@ registration            where a known surface lies in a cloud of the tray
 segmentation            what is new on the tray, piece by piece
 deviation               render and compare: missing, extra, moved, deformed
 surface_distance        how far two surfaces or clouds are apart
+joint_paths             waypoints -> rounded path; how fast an arm may be along it
+arm_clearance           which states of an arm touch what is occupied, in batches
+joint_planning          collision-free paths by RRT-Connect and shortcuts
 separation              distance to a person <-> speed of a robot (ISO/TS 15066)
 ======================  ==========================================================
 
