@@ -11,12 +11,22 @@
 kind             takes the first part of the datum, in the order of its fields, that is
 ===============  ================================================================================
 ``image``        an array (H, W), (H, W, 3) or (H, W, 4) of uint8; (H, W) of uint16 or float32
-``mask``         an array (H, W) of bool or uint8; shown as 0 and 255
+``mask``         an array (H, W) of bool or uint8, shown as 0 and 255; in a field ``packed`` the
+                 bits of an array (H, W / 8) of uint8 (`numpy.packbits` along the rows)
 ``point_cloud``  an array (N, 3) of floats, metres; with colours if an (N, 3) of uint8 stands beside
 ``mesh``         an array (N, 3) of floats, metres, and beside it an (M, 3) of integers
+``voxels``       an array (N, 3) of integers, indices of occupied voxels: the cubes' outer faces.
+                 ``voxel_m`` and ``origin_m`` (the grid's lowest corner) stand beside it or in the
+                 aspect's table
+``capsules``     an array (N, 7) of floats, metres: centre of one end, of the other, radius
+``joints``       an array (J,) of floats, positions of joints in rad or m, or (T, J), of which the
+                 last row counts; velocities if a second one of that shape stands beside; names from
+                 ``joints = ["…", …]`` in the aspect's table, else ``joint_1`` …
 ``pose``         a rigid (4, 4), metres: where the thing is in ``frame``
-``transform``    a rigid (4, 4), metres: where ``frame`` is in ``parent``
-``calibration``  a pinhole camera: ``width_px height_px fx_px fy_px cx_px cy_px``
+``transform``    a rigid (4, 4), metres: where ``frame`` is in ``parent``; with ``inverse = true``
+                 in the aspect's table: where ``parent`` is in ``frame``
+``calibration``  a pinhole camera: ``width_px height_px fx_px fy_px cx_px cy_px``, or
+                 ``camera_matrix`` (3, 3), ``width`` and ``height``, with ``distortion`` if there is
 ``json``         anything; long arrays only with dtype and shape
 ===============  ================================================================================
 
@@ -26,7 +36,8 @@ frame ``{entity}`` stands for the entity's name and ``{1}``, ``{2}`` … for its
 it is the entity's name, as nobody said more.
 
 Nothing said: an array (H, W, 3) or (H, W, 4) of uint8 is an image, a rigid (4, 4) a pose, a
-dataclass with ``points_m`` a cloud, with ``vertices_m`` and ``triangles`` a mesh, the rest JSON.
+dataclass with ``points_m`` a cloud, with ``vertices_m`` and ``triangles`` a mesh, with ``voxels``
+and ``voxel_m`` voxels, the rest JSON.
 """
 
 from __future__ import annotations
@@ -48,6 +59,9 @@ KINDS: Final = (
     "mask",
     "point_cloud",
     "mesh",
+    "voxels",
+    "capsules",
+    "joints",
     "pose",
     "transform",
     "calibration",
@@ -55,8 +69,12 @@ KINDS: Final = (
 )
 ENCODINGS: Final = ("rgb8", "bgr8", "rgba8", "bgra8", "mono8", "mono16", "16UC1", "32FC1")
 
-SHOWS_KEYS: Final = ("shows", "frame", "parent", "of", "encoding")
+SHOWS_KEYS: Final = (
+    "shows", "frame", "parent", "of", "encoding", "voxel_m", "origin_m", "joints", "inverse",
+)  # fmt: skip
 """Keys of an aspect's table that say what it shows."""
+
+VOXEL_M_MAX: Final = 1000.0
 
 _PLACE: Final = re.compile(r"\{(entity|[1-9][0-9]?)\}")
 
@@ -74,6 +92,10 @@ class Shows:
         parent: For a transform: the frame in which ``frame`` lies.
         of: Dotted path of the part to look at; the whole datum unless given.
         encoding: Of an image's pixels; by shape and dtype unless given.
+        voxel_m: Edge of a voxel where the datum does not say it; 0: it has to.
+        origin_m: Lowest corner of the grid of voxels where the datum does not say it.
+        joints: Names of joints, in order.
+        inverse: A transform says where the parent is in the frame.
 
     Raises:
         ConfigError: A kind or encoding is unknown, a pattern or frame is written wrongly.
@@ -84,6 +106,10 @@ class Shows:
     parent: Frames = ""
     of: str = ""
     encoding: str = ""
+    voxel_m: float = 0.0
+    origin_m: tuple[float, ...] = (0.0, 0.0, 0.0)
+    joints: tuple[str, ...] = ()
+    inverse: bool = False
 
     def __post_init__(self) -> None:
         for kind in self.kinds:
@@ -92,6 +118,10 @@ class Shows:
         if self.encoding and self.encoding not in ENCODINGS:
             known = ", ".join(ENCODINGS)
             raise ConfigError(f"unknown encoding {self.encoding!r} of an image; known: {known}")
+        if len(self.origin_m) != 3:
+            raise ConfigError(
+                f"origin_m is the place of a corner, three numbers, not {self.origin_m}"
+            )
         if "transform" in self.kinds and not self.parent:
             raise ConfigError("a transform needs the frame in which it lies: parent = '…'")
         for frames in (self.frame, self.parent):
@@ -146,8 +176,11 @@ def take_shows(table: Table) -> Shows:
     kinds = table.take_strings("shows")
     frame, parent = _take_frames(table, "frame"), _take_frames(table, "parent")
     of, encoding = table.take_str("of", ""), table.take_str("encoding", "")
+    voxel_m = table.take_float("voxel_m", 0.0, low=0.0, high=VOXEL_M_MAX)
+    origin_m = table.take_floats("origin_m", (0.0, 0.0, 0.0))
+    joints, inverse = table.take_strings("joints"), table.take_bool("inverse", default=False)
     try:
-        return Shows(kinds, frame, parent, of, encoding)
+        return Shows(kinds, frame, parent, of, encoding, voxel_m, origin_m, joints, inverse)
     except ConfigError as error:
         key = next((key for key in SHOWS_KEYS if key in table.values), "shows")
         table.refuse(key, f"in {table.title} {error}")

@@ -100,6 +100,23 @@ class Table:
             )
         return float(found)
 
+    def take_floats(self, key: str, default: tuple[float, ...]) -> tuple[float, ...]:
+        """Return the numbers of the array at `key`."""
+        found = self.values.get(key, list(default))
+        if not isinstance(found, list):
+            self.refuse(key, f"{key!r} in {self.title} is an array of numbers, not {_shown(found)}")
+        for index, item in enumerate(found):
+            if isinstance(item, bool) or not isinstance(item, int | float):
+                where = (*self.where, key, index)
+                self.source.refuse(
+                    where, f"{key!r} in {self.title} is an array of numbers, not {_shown(item)}"
+                )
+        return tuple(map(float, found))
+
+    def take_bool(self, key: str, *, default: bool) -> bool:
+        """Return the truth value at `key`."""
+        return self._take(key, bool, default)
+
     def take_count(self, key: str) -> int | None:
         """Return the whole number above zero at `key`, None where it is absent."""
         found = self.values.get(key)

@@ -66,8 +66,8 @@ def _add_record(nouns: argparse._SubParsersAction[Verb]) -> None:
         action="append",
         type=pair,
         metavar="ASPECT=KIND",
-        help="image, mask, point_cloud, mesh, pose, calibration or json (default: as the cell.toml"
-        " says, else guessed)",
+        help="image, mask, point_cloud, mesh, voxels, capsules, joints, pose, calibration or json"
+        " (default: as the cell.toml says, else guessed)",
     )
     record.add_argument(
         "--exact-only", action="store_true", help="only what replay needs, nothing to look at"

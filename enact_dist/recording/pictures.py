@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
 from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
 from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
@@ -30,10 +31,21 @@ from enact_dist.recording.geometry import (
     packed_points,
     quaternion,
 )
+from enact_dist.recording.parts import (
+    array_beside,
+    arrays_of,
+    guess,
+    is_image,
+    is_points,
+    number_of,
+    part_at,
+    parts_of,
+)
+from enact_dist.recording.solids import capsule_of, voxel_faces
 from enact_dist.wire.payload import decode_untyped
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Iterator
 
     from google.protobuf.message import Message
     from numpy.typing import NDArray
@@ -46,6 +58,10 @@ ELEMENTS_MAX: Final = 256
 ITEMS_MAX: Final = 1024
 """Longer lists and dicts are cut in JSON, with the number of what is left out."""
 SURFACE_COLOUR: Final = (0.75, 0.75, 0.78, 1.0)
+VOXEL_COLOUR: Final = (0.95, 0.55, 0.15, 0.9)
+CAPSULE_COLOUR: Final = (0.25, 0.5, 0.85, 0.8)
+_SCENES: Final = ("mesh", "voxels", "capsules")
+"""Kinds that are entities of a scene: they stay until another one replaces them."""
 _CAMERA: Final = ("width_px", "height_px", "fx_px", "fy_px", "cx_px", "cy_px")
 _BY_SHAPE: Final = {
     ("u1", 2): "mono8", ("u1", 3): "rgb8", ("u1", 4): "rgba8", ("u2", 2): "16UC1",
@@ -72,13 +88,6 @@ class Pictures(NamedTuple):
     unfit: list[str]
 
 
-class _Part(NamedTuple):
-    """A part of a datum and the fields that stand beside it."""
-
-    value: object
-    beside: Mapping[str, object]
-
-
 def pictures_of(recorded: Recorded, shows: Shows) -> Pictures:
     """Return what a version looks like.
 
@@ -88,8 +97,8 @@ def pictures_of(recorded: Recorded, shows: Shows) -> Pictures:
     if recorded.datum is None:
         return Pictures([*_endings(recorded, shows)], [])
     value = decode_untyped(recorded.datum)
-    part = _at(value, shows.of)
-    kinds = shows.kinds or (_guess(value),)
+    part = part_at(value, shows.of)
+    kinds = shows.kinds or (guess(value),)
     pictures, unfit = [], []
     for kind in kinds:
         message = _KINDS[kind](recorded, shows, part)
@@ -107,7 +116,7 @@ def _endings(recorded: Recorded, shows: Shows) -> Iterator[Picture]:
     stamp_ns = recorded.stamp_ns
     for kind in shows.kinds:
         suffix = "" if kind == shows.kinds[0] else f"/{kind}"
-        if kind == "mesh":
+        if kind in _SCENES:
             update = SceneUpdate()
             gone = update.deletions.add(type=SceneEntityDeletion.MATCHING_ID)
             gone.id = str(recorded.slot)
@@ -116,76 +125,14 @@ def _endings(recorded: Recorded, shows: Shows) -> Iterator[Picture]:
         elif kind == "point_cloud":
             frame = shows.frame_of(recorded.slot.entity)
             yield Picture(suffix, _cloud(stamp_ns, frame, np.empty((0, 3)), None))
+        elif kind == "joints":
+            states = JointStates()
+            states.timestamp.FromNanoseconds(stamp_ns)
+            yield Picture(suffix, states)
         elif kind == "json":
             yield Picture(suffix, _json(recorded, None))
     if not shows.kinds:
         yield Picture("/null", _json(recorded, None))
-
-
-# ---------------------------------------------------------------- parts
-
-
-def _at(value: object, path: str) -> object:
-    for name in path.split(".") if path else ():
-        value = value.get(name) if isinstance(value, dict) else None
-    return value
-
-
-def _parts(value: object, beside: Mapping[str, object]) -> Iterator[_Part]:
-    """Yield a value and all that it consists of, in the order of its fields."""
-    yield _Part(value, beside)
-    if isinstance(value, dict):
-        for each in value.values():
-            yield from _parts(each, value)
-    elif isinstance(value, list | tuple):
-        for each in value:
-            yield from _parts(each, beside)
-
-
-def _arrays(value: object) -> Iterator[tuple[NDArray[Any], Mapping[str, object]]]:
-    for part in _parts(value, {}):
-        if isinstance(part.value, np.ndarray):
-            yield part.value, part.beside
-
-
-def _guess(value: object) -> str:
-    if isinstance(value, np.ndarray):
-        if _is_image(value) and value.ndim == 3:
-            return "image"
-        return "pose" if is_rigid(value) else "json"
-    if isinstance(value, dict) and "__type__" in value:
-        if "vertices_m" in value and "triangles" in value:
-            return "mesh"
-        if "points_m" in value:
-            return "point_cloud"
-    return "json"
-
-
-def _is_image(array: NDArray[Any]) -> bool:
-    if array.ndim == 3:
-        return array.dtype == np.uint8 and array.shape[2] in (3, 4) and array.size > 0
-    kind = array.dtype.kind + str(array.dtype.itemsize)
-    return array.ndim == 2 and kind in ("u1", "u2", "f4") and array.size > 0
-
-
-def _is_points(array: NDArray[Any]) -> bool:
-    return array.ndim == 2 and array.shape[1] == 3 and array.dtype.kind == "f"
-
-
-def _beside(
-    beside: Mapping[str, object], kinds: str, length: int | None = None
-) -> NDArray[Any] | None:
-    """Return the first array (N, 3) of those kinds of dtype among fields."""
-    for value in beside.values():
-        if (
-            isinstance(value, np.ndarray)
-            and value.ndim == 2
-            and value.shape[1] == 3
-            and value.dtype.kind in kinds
-            and (length is None or (len(value) == length and value.dtype == np.uint8))
-        ):
-            return value
-    return None
 
 
 # ---------------------------------------------------------------- the kinds
@@ -196,7 +143,7 @@ def _stamp_ns(recorded: Recorded) -> int:
 
 
 def _image(recorded: Recorded, shows: Shows, part: object) -> Message | None:
-    array = next((array for array, _ in _arrays(part) if _is_image(array)), None)
+    array = next((array for array, _ in arrays_of(part) if is_image(array)), None)
     if array is None:
         return None
     channels = array.shape[2] if array.ndim == 3 else 2
@@ -206,8 +153,10 @@ def _image(recorded: Recorded, shows: Shows, part: object) -> Message | None:
 
 
 def _mask(recorded: Recorded, shows: Shows, part: object) -> Message | None:
-    for array, _ in _arrays(part):
+    for array, beside in arrays_of(part):
         if array.ndim == 2 and array.dtype.kind + str(array.dtype.itemsize) in ("b1", "u1"):
+            if array is beside.get("packed"):
+                array = np.unpackbits(array, axis=1)  # noqa: PLW2901 - bits for pixels
             pixels = np.where(array != 0, np.uint8(255), np.uint8(0))
             return _raw_image(recorded, shows, pixels, "mono8")
     return None
@@ -228,10 +177,10 @@ def _raw_image(recorded: Recorded, shows: Shows, pixels: NDArray[Any], encoding:
 
 
 def _point_cloud(recorded: Recorded, shows: Shows, part: object) -> Message | None:
-    for array, beside in _arrays(part):
-        if _is_points(array):
+    for array, beside in arrays_of(part):
+        if is_points(array):
             frame = shows.frame_of(recorded.slot.entity)
-            colours = _beside(beside, "u", len(array))
+            colours = array_beside(beside, "u", len(array))
             return _cloud(_stamp_ns(recorded), frame, array, colours)
     return None
 
@@ -250,33 +199,114 @@ def _cloud(
 
 
 def _mesh(recorded: Recorded, shows: Shows, part: object) -> Message | None:
-    for array, beside in _arrays(part):
-        triangles = _beside(beside, "iu") if _is_points(array) else None
+    for array, beside in arrays_of(part):
+        triangles = array_beside(beside, "iu") if is_points(array) else None
         if triangles is not None:
-            update = SceneUpdate()
-            entity = update.entities.add(
-                frame_id=shows.frame_of(recorded.slot.entity), id=str(recorded.slot)
-            )
-            entity.timestamp.FromNanoseconds(_stamp_ns(recorded))
-            entity.triangles.append(_triangles(array, triangles))
+            update, entity = _scene(recorded, shows)
+            entity.triangles.append(_triangles(array, triangles, SURFACE_COLOUR))
             return update
     return None
 
 
-def _triangles(vertices_m: NDArray[Any], triangles: NDArray[Any]) -> TriangleListPrimitive:
+def _scene(recorded: Recorded, shows: Shows) -> tuple[SceneUpdate, Any]:
+    """Return a scene with one entity, that of the slot; it replaces the one before."""
+    update = SceneUpdate()
+    entity = update.entities.add(
+        frame_id=shows.frame_of(recorded.slot.entity), id=str(recorded.slot)
+    )
+    entity.timestamp.FromNanoseconds(_stamp_ns(recorded))
+    return update, entity
+
+
+def _voxels(recorded: Recorded, shows: Shows, part: object) -> Message | None:
+    for array, beside in arrays_of(part):
+        if array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind not in "iu":
+            continue
+        voxel_m = number_of(beside.get("voxel_m")) or shows.voxel_m
+        origin_m = beside.get("origin_m")
+        if not isinstance(origin_m, np.ndarray) or origin_m.dtype.kind not in "fiu":
+            origin_m = np.array(shows.origin_m)
+        if not voxel_m or origin_m.shape != (3,):
+            return None
+        try:
+            corners, triangles = voxel_faces(array)
+        except ValueError:
+            return None
+        update, entity = _scene(recorded, shows)
+        if len(triangles):
+            vertices_m = origin_m + voxel_m * corners
+            entity.triangles.append(_triangles(vertices_m, triangles, VOXEL_COLOUR))
+        return update
+    return None
+
+
+def _capsules(recorded: Recorded, shows: Shows, part: object) -> Message | None:
+    for array, _ in arrays_of(part):
+        if array.ndim != 2 or array.shape[1] != 7 or array.dtype.kind != "f":
+            continue
+        update, entity = _scene(recorded, shows)
+        for row in array[np.isfinite(array).all(axis=1)]:
+            capsule = capsule_of(row)
+            wide_m = 2.0 * capsule.radius_m
+            solids = [(entity.spheres.add(), end_m, wide_m) for end_m in capsule.ends_m]
+            if capsule.length_m > 0.0:
+                cylinder = entity.cylinders.add(bottom_scale=1.0, top_scale=1.0)
+                solids.append((cylinder, capsule.pose[:3, 3], capsule.length_m))
+            for solid, middle_m, high_m in solids:
+                matrix = capsule.pose.copy()
+                matrix[:3, 3] = middle_m
+                _place(solid.pose.position, solid.pose.orientation, matrix)
+                solid.size.x, solid.size.y, solid.size.z = wide_m, wide_m, high_m
+                _paint(solid.color, CAPSULE_COLOUR)
+        return update
+    return None
+
+
+def _joints(recorded: Recorded, shows: Shows, part: object) -> Message | None:
+    for array, beside in arrays_of(part):
+        if array.dtype.kind != "f" or array.ndim not in (1, 2) or not array.size:
+            continue
+        names = shows.joints or tuple(f"joint_{at + 1}" for at in range(array.shape[-1]))
+        if len(names) != array.shape[-1]:
+            return None
+        alike = [
+            other
+            for other in beside.values()
+            if isinstance(other, np.ndarray)
+            and other is not array
+            and (other.shape, other.dtype.kind) == (array.shape, "f")
+        ]
+        newest = np.atleast_2d(array)[-1]
+        speeds = np.atleast_2d(alike[0])[-1] if alike else [None] * len(newest)
+        states = JointStates()
+        states.timestamp.FromNanoseconds(_stamp_ns(recorded))
+        for name, position, speed in zip(names, newest, speeds, strict=True):
+            joint = states.joints.add(name=name, position=float(position))
+            if speed is not None:
+                joint.velocity = float(speed)
+        return states
+    return None
+
+
+def _paint(colour: Any, rgba: tuple[float, float, float, float]) -> None:
+    colour.r, colour.g, colour.b, colour.a = rgba
+
+
+def _triangles(
+    vertices_m: NDArray[Any], triangles: NDArray[Any], rgba: tuple[float, float, float, float]
+) -> TriangleListPrimitive:
     fields = TriangleListPrimitive.DESCRIPTOR.fields_by_name
     points = encoded_points(vertices_m, fields["points"].number)
     indices = encoded_indices(triangles, fields["indices"].number)
     primitive = TriangleListPrimitive()
     primitive.ParseFromString(points + indices)
     primitive.pose.orientation.w = 1.0
-    colour = primitive.color
-    colour.r, colour.g, colour.b, colour.a = SURFACE_COLOUR
+    _paint(primitive.color, rgba)
     return primitive
 
 
 def _pose(recorded: Recorded, shows: Shows, part: object) -> Message | None:
-    matrix = next((array for array, _ in _arrays(part) if is_rigid(array)), None)
+    matrix = next((array for array, _ in arrays_of(part) if is_rigid(array)), None)
     if matrix is None:
         return None
     found = PoseInFrame(frame_id=shows.frame_of(recorded.slot.entity))
@@ -286,13 +316,14 @@ def _pose(recorded: Recorded, shows: Shows, part: object) -> Message | None:
 
 
 def _transform(recorded: Recorded, shows: Shows, part: object) -> Message | None:
-    matrix = next((array for array, _ in _arrays(part) if is_rigid(array)), None)
+    matrix = next((array for array, _ in arrays_of(part) if is_rigid(array)), None)
     parent = shows.parent_of(recorded.slot.entity)
     if matrix is None or not parent:
         return None
     child = shows.frame_of(recorded.slot.entity)
     found = FrameTransform(parent_frame_id=parent, child_frame_id=child)
     found.timestamp.FromNanoseconds(_stamp_ns(recorded))
+    matrix = np.linalg.inv(matrix) if shows.inverse else matrix
     _place(found.translation, found.rotation, matrix)
     return found
 
@@ -303,18 +334,38 @@ def _place(position: Any, orientation: Any, matrix: NDArray[Any]) -> None:
 
 
 def _calibration(recorded: Recorded, shows: Shows, part: object) -> Message | None:
-    for found in _parts(part, {}):
-        camera = found.value
-        if isinstance(camera, dict) and all(name in camera for name in _CAMERA):
-            width, height, fx, fy, cx, cy = (float(camera[name]) for name in _CAMERA)
+    for found in parts_of(part, {}):
+        camera = _pinhole(found.value)
+        if camera is not None:
+            width, height, matrix, distortion = camera
             message = CameraCalibration(
-                frame_id=shows.frame_of(recorded.slot.entity), width=int(width), height=int(height)
+                frame_id=shows.frame_of(recorded.slot.entity), width=width, height=height
             )
             message.timestamp.FromNanoseconds(_stamp_ns(recorded))
-            message.K.extend((fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0))
-            message.R.extend((1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0))
-            message.P.extend((fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0))
+            message.K.extend(matrix.ravel().tolist())
+            message.R.extend(np.eye(3).ravel().tolist())
+            message.P.extend(np.hstack((matrix, np.zeros((3, 1)))).ravel().tolist())
+            if len(distortion):
+                message.distortion_model = "plumb_bob"
+                message.D.extend(distortion)
             return message
+    return None
+
+
+def _pinhole(value: object) -> tuple[int, int, NDArray[np.float64], list[float]] | None:
+    """Return width, height, camera matrix and distortion of a camera; None if it is none."""
+    if not isinstance(value, dict):
+        return None
+    if all(name in value for name in _CAMERA):
+        width, height, fx, fy, cx, cy = (number_of(value[name]) for name in _CAMERA)
+        return int(width), int(height), np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), []
+    matrix, distortion = value.get("camera_matrix"), value.get("distortion")
+    width, height = number_of(value.get("width")), number_of(value.get("height"))
+    if isinstance(matrix, np.ndarray) and matrix.shape == (3, 3) and matrix.dtype.kind == "f":
+        coefficients: list[float] = []
+        if isinstance(distortion, np.ndarray) and distortion.dtype.kind == "f":
+            coefficients = distortion.ravel().tolist()
+        return int(width), int(height), matrix.astype(np.float64), coefficients
     return None
 
 
@@ -381,6 +432,9 @@ _KINDS: Final[
     "mask": _mask,
     "point_cloud": _point_cloud,
     "mesh": _mesh,
+    "voxels": _voxels,
+    "capsules": _capsules,
+    "joints": _joints,
     "pose": _pose,
     "transform": _transform,
     "calibration": _calibration,

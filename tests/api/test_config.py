@@ -78,6 +78,17 @@ def test_what_an_aspect_shows_is_read_with_its_frames():
     assert aspect.shows.parent_of("view/3") == "tray"
 
 
+def test_what_voxels_and_joints_are_is_read():
+    """What their data leave open: size and place of a grid, names of joints."""
+    text = MINIMAL_SHOWS.format(
+        'shows = ["voxels", "joints", "transform"]\nvoxel_m = 0.025\norigin_m = [-3.6, 0, 1]\n'
+        'joints = ["base", "tip"]\nparent = "cell"\ninverse = true'
+    )
+    shows = parse_config(text, Path("cell.toml"), environment={}).aspects[0].shows
+    assert (shows.voxel_m, shows.origin_m) == (0.025, (-3.6, 0.0, 1.0))
+    assert (shows.joints, shows.inverse) == (("base", "tip"), True)
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
@@ -85,6 +96,9 @@ def test_what_an_aspect_shows_is_read_with_its_frames():
         ('shows = "transform"', "line 5.*parent"),
         ('show = "image"', "line 5.*did you mean"),
         ('shows = "pose"\nframe = "{x}"', "names no frame"),
+        ('shows = "voxels"\norigin_m = [0.0, 1.0]', "line 5.*three numbers"),
+        ('shows = "voxels"\norigin_m = [0.0, "1"]', "line 6.*an array of numbers"),
+        ('shows = "transform"\nparent = "a"\ninverse = 1', "line 7.*a boolean"),
     ],
 )
 def test_what_an_aspect_cannot_show_is_refused(words, said):

@@ -168,6 +168,124 @@ def test_one_datum_shows_several_things():
     assert found["unfit"] == []
 
 
+# ---------------------------------------------------------------- voxels, capsules, joints
+
+
+@dataclass(frozen=True, eq=False)
+class Occupied:
+    voxels: np.ndarray
+    voxel_m: float
+    origin_m: np.ndarray
+
+
+def faces_of(update):
+    """Return the triangles (M, 3, 3) of a scene with one entity, metres."""
+    (entity,) = update.entities
+    (triangles,) = entity.triangles
+    points = np.array([(point.x, point.y, point.z) for point in triangles.points])
+    return points[np.array(triangles.indices).reshape(-1, 3)]
+
+
+def volume_of(faces):
+    """Return what closed triangles enclose, by the divergence theorem; negative if inside out."""
+    return np.einsum("ij,ij->", faces[:, 0], np.cross(faces[:, 1], faces[:, 2])) / 6.0
+
+
+def test_voxels_are_their_outer_faces():
+    """Two cubes side by side have ten faces; place and size are those of the grid."""
+    pair = Occupied(np.array([[4, 0, 0], [5, 0, 0]], np.int16), 0.5, np.array([1.0, 2.0, 3.0]))
+    faces = faces_of(shown(pair)[""])
+    assert len(faces) == 20
+    assert faces.reshape(-1, 3).min(axis=0).tolist() == [3.0, 2.0, 3.0]
+    assert faces.reshape(-1, 3).max(axis=0).tolist() == [4.0, 2.5, 3.5]
+    assert np.isclose(volume_of(faces), 2 * 0.5**3)
+
+
+@given(st.sets(st.tuples(*[st.integers(-3, 3)] * 3), min_size=1, max_size=40))
+def test_faces_of_any_voxels_enclose_their_volume(voxels):
+    """Fronts outside, none between two voxels, whatever their order; the size is of the cell."""
+    array = np.array(sorted(voxels, reverse=True), np.int32)
+    faces = faces_of(shown(array, "voxels", voxel_m=0.1, origin_m=(9.0, 9.0, 9.0))[""])
+    assert np.isclose(volume_of(faces), len(voxels) * 1e-3)
+    steps = np.eye(3, dtype=int)
+    shared = sum(tuple(np.add(one, step)) in voxels for one in voxels for step in steps)
+    assert len(faces) == 2 * (6 * len(voxels) - 2 * shared)
+
+
+def test_voxels_without_a_size_are_told_and_none_is_an_empty_scene():
+    """Nobody knows how large they are; a hull that is empty takes the last one away."""
+    assert shown(np.zeros((2, 3), np.int16), "voxels")["unfit"] == ["voxels"]
+    (entity,) = shown(np.zeros((0, 3), np.int16), "voxels", voxel_m=0.1)[""].entities
+    assert not entity.triangles
+
+
+def test_capsules_are_cylinders_with_spheres_at_their_ends():
+    """The axis of the cylinder is that of the capsule; a ball has no cylinder."""
+    rows = np.array([[0, 0, 1, 0.6, 0, 1, 0.1], [1, 1, 1, 1, 1, 1, 0.2]], np.float32)
+    (entity,) = shown(rows, "capsules", frame="cell")[""].entities
+    (cylinder,) = entity.cylinders
+    assert entity.frame_id == "cell"
+    assert np.allclose([cylinder.size.x, cylinder.size.y, cylinder.size.z], [0.2, 0.2, 0.6])
+    at = cylinder.pose.position
+    assert np.allclose([at.x, at.y, at.z], [0.3, 0.0, 1.0])
+    turn = cylinder.pose.orientation
+    axis = 2 * np.array([turn.x * turn.z + turn.w * turn.y, turn.y * turn.z - turn.w * turn.x, 0.5])
+    axis[2] -= 2 * (turn.x**2 + turn.y**2)
+    assert np.allclose(np.abs(axis), [1.0, 0.0, 0.0], atol=1e-6)
+    assert sorted(round(ball.size.x, 3) for ball in entity.spheres) == [0.2, 0.2, 0.4, 0.4]
+
+
+@dataclass(frozen=True, eq=False)
+class Arm:
+    q: np.ndarray
+    dq: np.ndarray
+    stamp_ns: np.ndarray
+
+
+def test_joints_are_the_newest_of_their_samples():
+    """Positions, and velocities where they stand beside; names by the cell, or by number."""
+    arm = Arm(np.array([[0.0, 0.1], [0.2, 0.3]]), np.array([[1.0, 2.0], [3.0, 4.0]]), np.arange(2))
+    found = shown(arm, "joints", joints=("base", "tip"))[""]
+    assert [(one.name, one.position, one.velocity) for one in found.joints] == [
+        ("base", 0.2, 3.0), ("tip", 0.3, 4.0),
+    ]  # fmt: skip
+    (bare,) = shown(np.array([0.5]), "joints")[""].joints
+    assert (bare.name, bare.position, bare.HasField("velocity")) == ("joint_1", 0.5, False)
+    assert shown(arm, "joints", joints=("base",))["unfit"] == ["joints"]
+
+
+@dataclass(frozen=True, eq=False)
+class Eye:
+    camera_matrix: np.ndarray
+    distortion: np.ndarray
+    camera_from_cell: np.ndarray
+    width: int
+    height: int
+
+
+def test_camera_of_a_matrix_has_its_distortion_and_its_place_in_the_cell():
+    """A transform that says where the cell is in the camera is turned round."""
+    eye = Eye(np.diag([9.0, 8.0, 1.0]), np.array([0.1, 0.2, 0, 0, 0.3]), TURNED, 640, 480)
+    found = shown(eye, "calibration", "transform", frame="{entity}", parent="cell", inverse=True)
+    camera = found[""]
+    assert (camera.width, camera.height, camera.distortion_model) == (640, 480, "plumb_bob")
+    assert (list(camera.D), camera.K[4]) == ([0.1, 0.2, 0.0, 0.0, 0.3], 8.0)
+    at = found["/transform"].translation
+    assert np.allclose([at.x, at.y, at.z], np.linalg.inv(TURNED)[:3, 3])
+
+
+@dataclass(frozen=True, eq=False)
+class Bits:
+    packed: np.ndarray
+
+
+def test_packed_mask_is_unpacked():
+    """Eight pixels in a byte, the first in its highest bit."""
+    image = shown(Bits(np.array([[0x81, 0x00]], np.uint8)), "mask")[""]
+    assert (image.width, image.height) == (16, 1)
+    assert image.data == b"\xff" + bytes(6) + b"\xff" + bytes(8)
+
+
 def test_of_names_the_part_to_look_at():
     """Where the first image of a datum is not the wanted one."""
     assert shown(SHOT, "image", of="before_mm")[""].data == np.full(6, 9, "<u2").tobytes()
@@ -205,8 +323,11 @@ def test_datum_that_does_not_fit_is_told_and_shown_as_json(kind):
 def test_null_takes_a_mesh_away_and_empties_a_cloud():
     """What was deleted does not stand in the scene for ever."""
     gone = recorded("piece", None, null="DELETED")
-    (mesh, cloud) = pictures_of(gone, Shows(("mesh", "point_cloud"))).pictures
-    assert [one.id for one in mesh.message.deletions] == ["online:piece/value"]
+    wanted = Shows(("mesh", "point_cloud", "voxels", "capsules", "joints"))
+    (mesh, cloud, voxels, capsules, joints) = pictures_of(gone, wanted).pictures
+    for scene in (mesh, voxels, capsules):
+        assert [one.id for one in scene.message.deletions] == ["online:piece/value"]
+    assert not joints.message.joints
     assert cloud.message.data == b""
     (null,) = pictures_of(gone, GUESSED).pictures
     assert null.message["null"] == "DELETED"
@@ -233,6 +354,7 @@ def test_any_datum_is_some_picture(held):
         ({"kinds": ("image",), "encoding": "rgb9"}, "rgb9"),
         ({"kinds": ("pose",), "frame": "a/{x}"}, "a/{x}"),
         ({"kinds": ("pose",), "frame": {"a b": "x"}}, "pattern"),
+        ({"kinds": ("voxels",), "origin_m": (0.0, 1.0)}, "three numbers"),
     ],
 )
 def test_declaration_that_makes_no_sense_is_refused(words, said):

@@ -1,0 +1,90 @@
+"""Voxels and capsules as triangles and solids of Foxglove's scenes."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+_CORNERS: Final = {
+    (0, 0): ((0, 0, 0), (0, 0, 1), (0, 1, 1), (0, 1, 0)),
+    (0, 1): ((1, 0, 0), (1, 1, 0), (1, 1, 1), (1, 0, 1)),
+    (1, 0): ((0, 0, 0), (1, 0, 0), (1, 0, 1), (0, 0, 1)),
+    (1, 1): ((0, 1, 0), (0, 1, 1), (1, 1, 1), (1, 1, 0)),
+    (2, 0): ((0, 0, 0), (0, 1, 0), (1, 1, 0), (1, 0, 0)),
+    (2, 1): ((0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)),
+}
+"""Corners of the face of a unit cube by axis and side, counterclockwise as seen from outside."""
+VOXELS_MAX: Final = 1 << 20
+"""Extent of a grid along one axis, beyond which nobody means voxels."""
+
+
+def voxel_faces(voxels: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the outer faces of voxels: what lies between two of them is left out.
+
+    Args:
+        voxels: (N, 3) integers, indices into a grid; in any order, twice is once.
+
+    Returns:
+        (V, 3) corners in voxels and (M, 3) numbers of corners, two triangles per face, with their
+        front outside.
+
+    Raises:
+        ValueError: The voxels lie more than `VOXELS_MAX` apart.
+    """
+    none = np.empty((0, 3), np.int64)
+    if not len(voxels):
+        return none, none
+    indices = np.asarray(voxels, np.int64)
+    lowest = indices.min(axis=0) - 1
+    extent = indices.max(axis=0) - lowest + 2  # a layer of nothing all around
+    if extent.max() > VOXELS_MAX:
+        raise ValueError(f"voxels lie {extent.max()} apart; a grid has at most {VOXELS_MAX}")
+    strides = np.array([extent[1] * extent[2], extent[2], 1])
+    codes = np.unique((indices - lowest) @ strides)
+    faces = []
+    for (axis, side), corners in _CORNERS.items():
+        beyond = codes + (2 * side - 1) * strides[axis]
+        place = np.minimum(np.searchsorted(codes, beyond), len(codes) - 1)
+        outer = codes[codes[place] != beyond]
+        faces.append(outer[:, None] + np.array(corners) @ strides)
+    quads = np.concatenate(faces)
+    found, numbers = np.unique(quads, return_inverse=True)
+    numbers = numbers.reshape(quads.shape)
+    corners_at = np.stack(np.unravel_index(found, extent), axis=1) + lowest
+    return corners_at, numbers[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
+
+
+class Capsule(NamedTuple):
+    """A cylinder with half spheres at its ends.
+
+    Attributes:
+        ends_m: (2, 3) centres of the spheres.
+        radius_m: Radius of all three.
+        length_m: Between the centres.
+        pose: (4, 4) rigid: middle of the cylinder, z along it.
+    """
+
+    ends_m: NDArray[np.float64]
+    radius_m: float
+    length_m: float
+    pose: NDArray[np.float64]
+
+
+def capsule_of(row: NDArray[Any]) -> Capsule:
+    """Return the capsule of a row (7,): end, end, radius."""
+    ends_m = np.asarray(row[:6], np.float64).reshape(2, 3)
+    along = ends_m[1] - ends_m[0]
+    length_m = float(np.linalg.norm(along))
+    pose = np.eye(4)
+    pose[:3, 3] = ends_m.mean(axis=0)
+    if length_m > 0.0:
+        z = along / length_m
+        aside = np.eye(3)[int(np.argmin(np.abs(z)))]
+        x = np.cross(aside, z)
+        x /= np.linalg.norm(x)
+        pose[:3, :3] = np.column_stack((x, np.cross(z, x), z))
+    return Capsule(ends_m, float(row[6]), length_m, pose)
