@@ -10,7 +10,6 @@ import logging
 import os
 import sys
 import threading
-import time
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
@@ -20,9 +19,6 @@ if TYPE_CHECKING:
 
 DRAIN_S: Final = 8.0
 """How long an update may still take after the first signal; `docker stop` kills after 10 s."""
-SAME_S: Final = 1.0
-"""A second signal this soon after the first comes from the same request: `timeout` sends one to its
-command and one to the group, systemd one to each process of a unit and `enact up` one more."""
 SAY_S: Final = 1.5
 """How long the last line may take where nobody reads the log."""
 CUT_OFF: Final = 1
@@ -46,11 +42,9 @@ class Drain:
     ) -> None:
         self._name, self._doing, self._drain_s, self._leave = name, doing, drain_s, leave
         self._over = threading.Event()
-        self._begun_s = 0.0
 
     def begin(self, signal: str) -> None:
         """Begin the drain at the first signal."""
-        self._begun_s = time.monotonic()
         if self._doing.call is not None:
             log.info(
                 "%s received: actor %s finishes its current call and ends, within %g s; a second"
@@ -61,9 +55,8 @@ class Drain:
         threading.Thread(target=self._wait, args=(why,), name="drain", daemon=True).start()
 
     def hurry(self, _signal: str) -> None:
-        """End the process at once at the second signal, unless it belongs to the first."""
-        if time.monotonic() - self._begun_s >= SAME_S:
-            self._cut_off("received a second signal")
+        """End the process at once at the second request to end."""
+        self._cut_off("received a second signal")
 
     def over(self) -> None:
         """Note that the actor has ended by itself."""

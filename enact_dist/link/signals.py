@@ -19,12 +19,16 @@ import os
 import signal
 import socket
 import threading
+import time
 from typing import TYPE_CHECKING, Final, Self
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from types import FrameType
 
+SAME_S: Final = 1.0
+"""A signal this soon after the first belongs to the same request: `timeout` sends one to its
+command and one to the group, systemd one to each process of a unit and `enact up` one more."""
 STOPPING: Final = (signal.SIGTERM, signal.SIGINT)
 _END: Final = 0
 
@@ -49,7 +53,7 @@ class StopSignals:
 
     Attributes:
         event: Set by the first signal.
-        count: How many signals came.
+        count: How many requests to end came; signals within `SAME_S` of the first are one.
         before: The handlers outside of the block.
     """
 
@@ -92,14 +96,19 @@ class StopSignals:
             act(name)
 
     def call_again(self, act: Callable[[str], None]) -> None:
-        """Call `act` with the first signal's name at each signal after the first."""
+        """Call `act` with the first signal's name at each request to end after the first."""
         with self._mutex:
             self._acts_again.append(act)
 
     def _serve(self) -> None:
+        first_s = 0.0
         while (number := self._numbers.recv(1)[0]) != _END:
             if number not in STOPPING:
                 continue  # of a handler that somebody else has set
+            now_s = time.monotonic()
+            if self.count and now_s - first_s < SAME_S:
+                continue
+            first_s = first_s if self.count else now_s
             self.count += 1
             with self._mutex:
                 first, self._name = not self._name, signal.Signals(number).name

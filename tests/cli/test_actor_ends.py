@@ -8,9 +8,6 @@ import time
 
 import pytest
 
-from enact_dist.actor_doing import Doing
-from enact_dist.actor_drain import CUT_OFF, Drain
-
 HUNG = """\
 import sys
 import threading
@@ -140,19 +137,6 @@ def test_second_signal_cuts_off_at_once(module, spawn, until, cell_file):
     assert actor.wait(60) == 1
     assert "cut off: actor HungStart received a second signal" in rest
     assert re.search(r"in start, at hung\.py:1[89] \(start\)", rest)  # it may still print
-
-
-@pytest.mark.parametrize(("same_s", "left"), [(3600.0, []), (0.0, [CUT_OFF])])
-def test_second_signal_that_belongs_to_the_first_cuts_nothing_off(monkeypatch, same_s, left):
-    """`timeout` and systemd send the same request twice, which is nobody's impatience."""
-    monkeypatch.setattr("enact_dist.actor_drain.SAME_S", same_s)
-    ended = []
-    drain = Drain("hung", Doing("Hung"), 3600.0, ended.append)
-    drain.begin("SIGTERM")
-    drain.hurry("SIGTERM")
-    drain.over()
-
-    assert ended == left
 
 
 def test_drain_of_the_cell_file_is_taken(module, spawn, until, tmp_path, cell_file):

@@ -12,18 +12,22 @@ import pytest
 from enact_dist.link.signals import StopSignals
 
 
-def test_signal_sets_event_and_calls_act_once():
-    """The first signal acts, later ones are counted."""
-    acted = []
+@pytest.mark.parametrize(("same_s", "count"), [(3600.0, 1), (0.0, 2)])
+def test_signal_sets_event_and_calls_act_once(monkeypatch, same_s, count):
+    """The first signal acts, later ones are counted; `timeout` sends the same request twice."""
+    monkeypatch.setattr("enact_dist.link.signals.SAME_S", same_s)
+    acted, again = [], []
     done = threading.Event()
     with StopSignals() as signals:
         signals.call(lambda name: (acted.append(name), done.set()))
+        signals.call_again(again.append)
         os.kill(os.getpid(), signal.SIGTERM)
         assert signals.event.wait(30)
         assert done.wait(30)
         os.kill(os.getpid(), signal.SIGINT)
     assert acted == ["SIGTERM"]
-    assert signals.count == 2
+    assert signals.count == count
+    assert len(again) == count - 1
 
 
 def test_signal_that_came_first_acts_when_act_is_known():
