@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import reprlib
 from functools import partial
-from typing import Any, Final, cast, get_args
+from typing import TYPE_CHECKING, Any, Final, cast, get_args
 
 import msgpack
 
@@ -31,9 +31,13 @@ from enact_dist.wire.limits import (
     PAYLOAD_BYTES_MAX,
     TEXT_BYTES_MAX,
 )
+from enact_dist.wire.long_headers import LONG_HEADER_BYTES, LongHeaders
 from enact_dist.wire.message_parts import reader_of, values_of, writers_of
 from enact_dist.wire.quick_readers import quick_reader_of
 from enact_dist.wire.texts import refuse_unsafe
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 
 class FrameTooLongError(ProtocolError):
@@ -110,15 +114,15 @@ CODES: Final[dict[type[Any], int]] = {
     m.Notice: 97,
 }
 
-_unpack = partial(
-    msgpack.unpackb,
-    use_list=False,
-    max_str_len=TEXT_BYTES_MAX,
-    max_bin_len=TEXT_BYTES_MAX,
-    max_array_len=ENTRIES_MAX,
-    max_map_len=0,
-    max_ext_len=0,
-)
+_limits: Final = {
+    "use_list": False,
+    "max_str_len": TEXT_BYTES_MAX,
+    "max_bin_len": TEXT_BYTES_MAX,
+    "max_array_len": ENTRIES_MAX,
+    "max_map_len": 0,
+    "max_ext_len": 0,
+}
+_unpack = partial(msgpack.unpackb, **_limits)
 
 
 def encode_frame(message: m.Message) -> tuple[bytes, bytes | None]:
@@ -182,6 +186,12 @@ def decode_frame(header: bytes, payload: bytes | memoryview = b"") -> m.Message:
     Raises:
         ProtocolError: Whatever is wrong with the frame; it is checked whole.
     """
+    return _decoded(header, payload, _unpack)
+
+
+def _decoded(
+    header: bytes, payload: bytes | memoryview, unpack: Callable[[bytes], Any]
+) -> m.Message:
     if len(header) > HEADER_BYTES_MAX or len(payload) > PAYLOAD_BYTES_MAX:
         raise ProtocolError(
             f"a frame of {len(header)} + {len(payload)} bytes came; at most {HEADER_BYTES_MAX} +"
@@ -189,7 +199,7 @@ def decode_frame(header: bytes, payload: bytes | memoryview = b"") -> m.Message:
         )
     _check_version(header)
     try:
-        values = _unpack(header)
+        values = unpack(header)
     except (ValueError, TypeError, OverflowError, RecursionError, msgpack.UnpackException) as error:
         raise ProtocolError(f"a frame cannot be read: {error or type(error).__name__}") from error
     code = values[1] if len(values) > 1 else None
@@ -219,7 +229,8 @@ def decode_request(header: bytes, payload: bytes | memoryview = b"") -> m.Reques
     Raises:
         ProtocolError: As `decode_frame`; it is no request, or a commit that carries too much.
     """
-    message = decode_frame(header, payload)
+    long = len(header) > LONG_HEADER_BYTES
+    message = _decoded(header, payload, _long_requests.unpack if long else _unpack)
     kind = type(message)
     if kind not in _REQUESTS:
         raise ProtocolError(f"{kind.__name__} is no request")
@@ -269,6 +280,7 @@ _readers: Final = {
     code: (quick_reader_of if cls in _OF_EVERY_LOCK else reader_of)(cls)
     for cls, code in CODES.items()
 }
+_long_requests: Final = LongHeaders({CODES[cls]: cls for cls in _REQUESTS}, _limits)
 _uncoded = set(get_args(m.Message)) ^ set(CODES)
 assert not _uncoded, f"no message, or one without a code: {_uncoded}"
 assert len(_readers) == len(CODES), "a code is used twice"

@@ -60,6 +60,9 @@ KEPT_VERSIONS_MAX: Final = 1 << 14
 """Most versions that one request keeps; a shard keeps no more than 10,000 in all."""
 ENTRIES_MAX: Final = 1 << 18
 """Most entries of any other list of a header; the header's length bounds them earlier."""
+REQUEST_VALUES_MAX: Final = 1 << 18
+"""Most values in the header of a request, those of all lists together: twice as many as 16,384
+versions to keep have, and a tenth of a second to read."""
 INTEGER_MAX: Final = (1 << 63) - 1
 """Largest integer of a header: what a signed 64-bit column of a store holds."""
 

@@ -147,9 +147,7 @@ def reader_of(cls: type[Any]) -> Read:
                 raise ProtocolError(f"{_at(cls, index)} is {raw[index]}; at most {INTEGER_MAX}")
         for index, length_max in lengths:
             if len(raw[index]) > length_max:
-                raise ProtocolError(
-                    f"{_at(cls, index)} has the length {len(raw[index])}; at most {length_max}"
-                )
+                raise too_long(cls, index, len(raw[index]), length_max)
         if readers:
             raw = list(raw)
             for index, read_part in readers:
@@ -232,6 +230,11 @@ def lengths_of(cls: type[Any]) -> list[tuple[int, int]]:
         if length_max is not None and len(raw_types) == 1 and not is_part:
             lengths.append((index, length_max))
     return lengths
+
+
+def too_long(cls: type[Any], index: int, length: int, length_max: int) -> ProtocolError:
+    """Return the error for a field that is longer than it may be."""
+    return ProtocolError(f"{_at(cls, index)} has the length {length}; at most {length_max}")
 
 
 def _at(cls: type[Any], index: int) -> str:
