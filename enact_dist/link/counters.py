@@ -140,6 +140,10 @@ OF_A_SHARD: Final[dict[str, Counter]] = {
     "frames_refused": Counter(
         "messages that could not be read", "run the same release everywhere; see the shard's log"
     ),
+    "requests_dropped": Counter(
+        "requests that had no room beside all that wait: their clients ask again",
+        "see the shard's log for whose; a program that asks without an end does that",
+    ),
     "connections_refused": Counter(
         "sockets refused: too many, another user, or no greeting", "see the shard's log"
     ),

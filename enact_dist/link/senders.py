@@ -90,25 +90,31 @@ class Senders:
 
     Args:
         count: Called with the name and amount of what was dropped.
+
+    Attributes:
+        burst: How often the inbox was seen empty.
     """
 
     def __init__(self, count: Callable[[str, int], None]) -> None:
         self._count = count
         self._accounts: dict[str, _Account] = {}
         self._mutex = threading.Lock()
-        self._burst = 0
+        self.burst = 0
         self._senders = 0
         self._closed = False
 
     def new_burst(self) -> None:
         """Note that the inbox was empty: what comes now was sent after all earlier answers."""
-        self._burst += 1
+        self.burst += 1
 
-    def heard(self, client: str) -> None:
-        """Note a request of `client`: it lives, what it was sent in earlier bursts was read."""
+    def heard(self, client: str, burst: int | None = None) -> None:
+        """Note a request of `client`: it lives, what it was sent in earlier bursts was read.
+
+        `burst` is in which one it came, where it has waited since; None stands for this one.
+        """
         account = self._accounts.get(client)
-        if account is not None and account.burst != self._burst:
-            account.burst = self._burst
+        if account is not None and account.burst < (self.burst if burst is None else burst):
+            account.burst = self.burst
             account.bytes = 0
 
     def send(self, client: str, parcel: Parcel) -> None:
@@ -132,7 +138,7 @@ class Senders:
                 idle = next((c for c, a in self._accounts.items() if a.sender is None), None)
                 if idle is not None:
                     del self._accounts[idle]
-            account = self._accounts[client] = _Account(self._burst)
+            account = self._accounts[client] = _Account(self.burst)
         return account
 
     def _queue(self, account: _Account, parcel: Parcel) -> bool:

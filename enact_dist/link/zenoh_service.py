@@ -1,8 +1,14 @@
 """Serves one `ShardHost` over Zenoh: requests in, answers and notices out, tokens watched.
 
-One queryable receives everything, so the messages of one client keep their order.  The thread that
-takes a query from Zenoh's channel decodes it, lets the host decide and sends the answer itself;
-`Senders` moves it to a thread of the client's own only where sending might block.
+One queryable receives everything, and one thread takes it all from Zenoh's channel, so the messages
+of one client keep their order.  That thread empties the channel first and then serves the clients
+in turn (`Turns`), so that one who sends a thousand requests delays the others by one of them.  It
+decodes a query, lets the host decide and sends the answer itself; `Senders` moves it to a thread of
+the client's own only where sending might block.
+
+A client is the identity in the key of its requests here.  Where Zenoh's access rules do not bind
+that to a certificate, a hostile program that gives itself another one for each request has as many
+turns.
 
 A query is answered once and then dropped; one that is dropped without an answer tells the client
 *unknown*.  A frame that cannot be read is refused and counted, never followed by anything else.
@@ -13,7 +19,8 @@ from __future__ import annotations
 import logging
 import queue
 import threading
-from typing import TYPE_CHECKING, Final
+import time
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import zenoh
 
@@ -30,6 +37,7 @@ from enact_dist.core.records import SessionSeen
 from enact_dist.errors import ProtocolError
 from enact_dist.link.recycling import recycle_blocks
 from enact_dist.link.senders import Senders, encoded, size_of
+from enact_dist.link.turns import Turns
 from enact_dist.link.zenoh_config import QUEUED_MAX, keep_after_fork
 from enact_dist.wire.frames import decode_request, encode_frame
 from enact_dist.wire.keys import (
@@ -54,6 +62,18 @@ _NOTICES: Final = "@notices"
 """Stands for all watchers together among the clients of `Senders`."""
 STAGED_BYTES_MAX: Final = 256 << 20
 """Bytes of slices that wait for their place: 32 transfers; a client asks again for a lost one."""
+PULLED_MAX: Final = 256
+"""Queries that are taken from Zenoh's channel between two turns: 1 ms."""
+DRAIN_S_MAX: Final = 1.0
+"""How long a tick waits at most for what has arrived before it."""
+DRAIN_STEP_S: Final = 0.001
+"""How long a tick waits for a query that has just been taken from the channel, if one was."""
+OVERHEAD_BYTES: Final = 1024
+"""What a query that waits is counted with beside its data."""
+TOLD_MAX: Final = 1_000
+"""So many clients whose requests were dropped the log names, each once."""
+SHOWN_CHARACTERS: Final = 200
+"""So much of its name."""
 JOIN_S: Final = 0.5
 """How long a closing service waits for each of its threads."""
 
@@ -88,6 +108,12 @@ class ZenohService:
         # The handlers, not their owners: these cannot be undeclared while a thread waits on them,
         # and have no handler any more for a thread that begins when they are.
         self._inbox: zenoh.Handler[zenoh.Query] = self._queryable.handler
+        self._turns = Turns[_Arrived]()
+        self._told: set[str] = set()
+        self._resting = True
+        self._drained: threading.Event | None = None
+        self._marked: threading.Event | None = None
+        self._mark = self._left = 0
         host.add_inbox(self.drain_inbox)
         self._staged: queue.SimpleQueue[tuple[Stage, _Call, str] | None] = queue.SimpleQueue()
         self._staged_mutex = threading.Lock()
@@ -106,35 +132,105 @@ class ZenohService:
     # ---------------------------------------------------------------- requests
 
     def _dispatch(self) -> None:
-        """Take queries until the queryable ends."""
-        inbox, senders = self._inbox, self.senders
+        """Serve the clients in turn until the queryable ends."""
+        turns = self._turns
         try:
             while True:
-                query = inbox.try_recv()
-                if query is None:
-                    senders.new_burst()
-                    query = inbox.recv()
-                self._take(query)
+                if self._pull():
+                    self._mark_drain()
+                if not turns:
+                    self._rest()
+                number, arrived = turns.take()
+                self._take(arrived)
+                if number < self._mark and self._left:
+                    self._left -= 1
+                    if not self._left:
+                        self._end_drain(self._marked)
         except zenoh.ZError:
             if not self._closed:
                 _log.critical("shard %s: its queryable ended by itself", self._host.name)
+        finally:
+            self._resting = True
+            while turns:
+                turns.take()[1].query.drop()  # type: ignore[no-untyped-call]  # as Zenoh's stub has it
+
+    def _rest(self) -> None:
+        """Wait for the next query: the channel was empty, so no tick waits for anything."""
+        self._resting = True
+        self._end_drain(self._drained)
+        query = self._inbox.recv()
+        self._resting = False
+        self._arrived(query)
+
+    def _pull(self) -> bool:
+        """Let the queries that have arrived wait for their turns; say whether these are all."""
+        try_recv = self._inbox.try_recv
+        for _ in range(PULLED_MAX):
+            query = try_recv()
+            if query is None:
+                self.senders.new_burst()
+                return True
+            self._arrived(query)
+        return False
+
+    def _mark_drain(self) -> None:
+        """Note what a tick waits for that has begun to wait: all that is here now."""
+        drained = self._drained
+        if drained is not None and drained is not self._marked:
+            self._marked, self._mark, self._left = drained, self._turns.put_count, len(self._turns)
+
+    def _arrived(self, query: zenoh.Query) -> None:
+        header, payload, key = query.attachment, query.payload, str(query.key_expr)
+        size = OVERHEAD_BYTES
+        if header is not None:
+            size += len(header)
+        if payload is not None:
+            size += len(payload)
+        arrived = _Arrived(query, key, header, payload, self.senders.burst)
+        client = key.rpartition("/")[2]
+        if not self._turns.put(client, size, arrived):
+            query.drop()  # type: ignore[no-untyped-call]  # as Zenoh's stub has it
+            self._dropped(client)
+
+    def _dropped(self, client: str) -> None:
+        """Count a request that had no room; name each client in the log once."""
+        self._host.count("requests_dropped")
+        client = client[:SHOWN_CHARACTERS]
+        if client not in self._told and len(self._told) < TOLD_MAX:
+            self._told.add(client)
+            _log.warning(
+                "shard %s: too many requests of %s, or of all clients, wait; some were dropped, and"
+                " further ones are only counted",
+                self._host.name,
+                client,
+            )
 
     def drain_inbox(self) -> None:
-        """Take the queries that have arrived already; called from the timer before a tick."""
-        try:
-            while (query := self._inbox.try_recv()) is not None:
-                self._take(query)
-        except zenoh.ZError:
-            return
+        """Wait until what has arrived already is handed in; called from the timer before a tick.
 
-    def _take(self, query: zenoh.Query) -> None:
-        header, payload = query.attachment, query.payload
+        The dispatcher hands it in, so that each client's requests keep their order.
+        """
+        drained = self._drained = threading.Event()
+        end_s = time.monotonic() + DRAIN_S_MAX
+        while not drained.wait(DRAIN_STEP_S):
+            # A dispatcher that still rests has found the channel empty, and then nothing came.
+            if self._resting or self._closed or time.monotonic() > end_s:
+                return
+
+    def _end_drain(self, drained: threading.Event | None) -> None:
+        if drained is not None:
+            drained.set()
+            if self._drained is drained:
+                self._drained = None
+
+    def _take(self, arrived: _Arrived) -> None:
+        query, key, header, payload, burst = arrived
         try:
             message = decode_request(
                 bytes(header) if header is not None else b"",
                 bytes(payload) if payload is not None else b"",
             )
-            cell, shard, verb, identity = parse_request_key(str(query.key_expr))
+            cell, shard, verb, identity = parse_request_key(key)
             if verb != verb_of(message):
                 raise ProtocolError(f"a {verb_of(message)} came on the key of a {verb}")
             if (ANY in cell or ANY in shard) and type(message) is not Ping:
@@ -144,16 +240,16 @@ class ZenohService:
                 # A fault of the decoder: whoever found it must not make the shard deaf.
                 _log.exception("a frame of %d bytes broke the decoder", len(header or b""))
             self._host.count("frames_refused")
-            call = _Call(self, query, str(query.key_expr))
-            if _answerable(str(query.key_expr)):
+            call = _Call(self, query, key)
+            if _answerable(key):
                 call(Refused("protocol", str(error)))
             else:
                 call.drop()
             return
-        client = named_session(message) or str(query.key_expr)
+        client = named_session(message) or key
         if type(message) in _SLICES:
             client += DATA_SUFFIX
-        self.senders.heard(client)
+        self.senders.heard(client, burst)
         call = _Call(self, query, client)
         if type(message) is Stage:
             self._stage_later(message, call, identity)
@@ -230,6 +326,16 @@ class ZenohService:
         self._staged.put(None)
         for thread in self._threads:
             thread.join(JOIN_S)
+
+
+class _Arrived(NamedTuple):
+    """One query that waits for its turn, and in which burst it came; see `Senders`."""
+
+    query: zenoh.Query
+    key: str
+    header: zenoh.ZBytes | None
+    payload: zenoh.ZBytes | None
+    burst: int
 
 
 class _Publication:

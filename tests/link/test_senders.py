@@ -115,6 +115,26 @@ def test_senders_count_small_answers_together_until_the_client_is_heard_again(se
     assert [parcel.thread == here for parcel in burst] == [True, True, True, False]
 
 
+def test_senders_take_a_request_that_has_waited_for_no_proof_of_what_was_sent_since(senders):
+    """A request of an earlier burst than the last one heard proves nothing of what came after."""
+    size = OUTSTANDING_BYTES_MAX // 2
+    came, _ = senders.burst, senders.send("a", FakeParcel(1))
+    senders.new_burst()
+    senders.heard("a", senders.burst)
+    senders.send("a", FakeParcel(size))
+    late, early = FakeParcel(size), FakeParcel(size)
+
+    senders.heard("a", came)
+    senders.send("a", late)
+    assert late.done.wait(30)
+    senders.new_burst()
+    senders.heard("a", senders.burst)
+    senders.send("a", early)
+    assert early.done.wait(30)
+
+    assert late.thread != threading.get_ident()
+
+
 def test_senders_drop_and_count_what_is_too_much_for_one_client(senders, counts):
     """Beyond its queue a client's answers are dropped, by name; nothing else is."""
     gate = threading.Event()
