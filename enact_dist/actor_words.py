@@ -1,8 +1,10 @@
 """Commands to a running actor: change its attributes, or restart it.
 
-A command is a volatile datum of the entity `actor/SESSION` in one of the actor's world contexts.
-The actor's process watches that slot, takes the command (and sets the slot to null), executes it
-between two updates, and answers in its report.  Changed values last until the process ends;
+Commands stand in one volatile datum of the entity `actor` in one of the actor's world contexts, by
+the session of the actor's process.  One slot serves all: a shard never forgets a slot, so one for
+each session would stay after the session.  The actor's process watches the slot, takes its command
+out of the datum, executes it between two updates, and answers in its report.  A writer drops the
+commands of sessions that are gone.  Changed values last until the process ends;
 `cell.toml` holds the values that an actor starts with.
 """
 
@@ -15,10 +17,10 @@ from typing import TYPE_CHECKING, Any, Final
 from enact_dist.actor_load import attributes_of, read_option
 from enact_dist.errors import ConfigError, EnactError
 from enact_dist.lock import Lock
-from enact_dist.terms import Aspect, Durability, Entity, Write
+from enact_dist.terms import Aspect, Durability, Entity, View, Write
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable
 
     from enact_dist.actor import Actor
     from enact_dist.actor_runner import ActorRun
@@ -26,6 +28,7 @@ if TYPE_CHECKING:
     from enact_dist.watch import Watch
     from enact_dist.world import WorldContext
 
+ACTOR: Final = Entity("actor")
 WORDS: Final = Aspect("actor_words", dict, Durability.VOLATILE, retention=1)
 DONE: Final = "done"
 """What a report says behind the token of a word that was done; else why it was not."""
@@ -34,9 +37,21 @@ ENDS: Final = "ends, to begin anew"
 log = logging.getLogger("enact.actor")
 
 
-def word_of(world: WorldContext, session: str) -> Write[dict[str, Any]]:
-    """Return the request for the slot of a session's commands."""
-    return Write(world, Entity(f"actor/{session}"), WORDS)
+def words_of(world: WorldContext) -> Write[dict[str, Any]]:
+    """Return the request for the commands to actors, by the session of each."""
+    return Write(world, ACTOR, WORDS)
+
+
+def tell(world: WorldContext, word: dict[str, Any], *, session: str, live: Iterable[str]) -> None:
+    """Give the actor of a session a command; drop those of sessions that are not live.
+
+    Raises:
+        EnactError: The lock was not granted, or its commit failed.
+    """
+    request = words_of(world)
+    with Lock(request) as lock:
+        kept = {one: words for one, words in lock.get(request, {}).items() if one in {*live}}
+        lock[request] = {**kept, session: word}
 
 
 def with_values(actor: Actor, values: dict[str, str]) -> None:
@@ -99,7 +114,7 @@ class ListeningForWords:
                 self._closing.wait(5.0)
 
     def _follow(self) -> None:
-        with self._world.watch(f"actor/{self._session}", WORDS) as watch:
+        with self._world.watch(ACTOR, WORDS) as watch:
             self._watch = watch
             while not self._closing.is_set():
                 change = watch.next()
@@ -109,10 +124,19 @@ class ListeningForWords:
                     self._take()
 
     def _take(self) -> None:
-        request = word_of(self._world, self._session)
+        request = words_of(self._world)
+        seen = View(self._world, ACTOR, WORDS)
+        if self._session not in self._world.view(seen).get(seen, {}):
+            return
         with Lock(request, wait_s=5.0) as lock:
-            word = lock.get(request, {})
-            del lock[request]
+            words = dict(lock.get(request, {}))
+            word = words.pop(self._session, None)
+            if words:
+                lock[request] = words
+            else:
+                del lock[request]
+        if word is None:
+            return
         token = str(word.get("token", ""))
         if word.get("restart"):
             self._run.answer(f"{token} {ENDS}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import secrets
+import sys
 import time
 from typing import TYPE_CHECKING, Any, Final
 
@@ -72,7 +73,8 @@ def set_values(arguments: argparse.Namespace) -> int:
             token = _tell(cell, info, row, {"set": values})
             answer = _answer(cell, info.session, arguments.name, token)
             if answer != "done":
-                print(f"enact: actor {arguments.name} at {info.host} pid {info.pid}: {answer}")
+                where = f"{info.host} pid {info.pid}"
+                print(f"enact: actor {arguments.name} at {where}: {answer}", file=sys.stderr)
                 status = FAILED
                 continue
             told = ", ".join(f"{key} = {value}" for key, value in values.items())
@@ -98,7 +100,8 @@ def restart_actor(arguments: argparse.Namespace) -> int:
             time.sleep(LOOK_S)
     print(
         f"enact: actor {arguments.name} did not restart within {RETURN_S:g} s; check that its"
-        " update ends, and that enact up, systemd or docker runs it and so starts it again"
+        " update ends, and that enact up, systemd or docker runs it and so starts it again",
+        file=sys.stderr,
     )
     return FAILED
 
@@ -144,13 +147,12 @@ def _found(cell: Cell, name: str) -> list[tuple[ActorInfo, dict[str, Any]]]:
 
 
 def _tell(cell: Cell, info: ActorInfo, row: dict[str, Any], word: dict[str, Any]) -> str:
-    from enact_dist.actor_words import word_of
-    from enact_dist.lock import Lock
+    from enact_dist.actor_words import tell
 
     token = secrets.token_hex(4)
-    request = word_of(cell.world(str(row["words_in"])), info.session)
-    with Lock(request) as lock:
-        lock[request] = {"token": token, **word}
+    live = [one.session for one in cell.actors() if not one.silent]
+    world = cell.world(str(row["words_in"]))
+    tell(world, {"token": token, **word}, session=info.session, live=live)
     return token
 
 

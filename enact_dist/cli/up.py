@@ -122,7 +122,14 @@ def _chosen(config: CellConfig, arguments: argparse.Namespace) -> set[str]:
         {each for name in names for each in meant[name]}
         for names in (arguments.only, arguments.without)
     )
-    return (only or known) - without
+    chosen = (only or known) - without
+    if not chosen:
+        said = f"--only {' '.join(arguments.only)} " if arguments.only else ""
+        raise ConfigError(
+            f"{said}--without {' '.join(arguments.without)} leaves nothing of {config.path} to run;"
+            " name fewer after --without"
+        )
+    return chosen
 
 
 def _refuse_homeless(config: CellConfig, shards: Sequence[ShardConfig], host: str) -> None:

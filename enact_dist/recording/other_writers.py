@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.actor_report import read_reports
 from enact_dist.core.datum import Slot
-from enact_dist.errors import LinkError, ProtocolError
+from enact_dist.errors import EnactError, ProtocolError
 from enact_dist.patterns import pattern_matches
 from enact_dist.version_data import Wanted, explained
 
@@ -122,7 +122,7 @@ def _who(session: Session, reading: Reading) -> str:
     wanted = Wanted(state.stamp_ns, state.slot, state.version, reading.shard)
     try:
         entry = explained(session, [wanted]).get(wanted)
-    except LinkError:
+    except EnactError:  # the warning matters, not the name in it: the replay goes on
         entry = None
     if entry is None or entry.cause is None:
         return "another process"

@@ -8,7 +8,7 @@ from recording_samples import BEGIN_NS, counting, file, recorded
 from enact_dist import Actor, Aspect, Entities, Entity, Lock, World, Write
 from enact_dist.actor_report import ActorStatistics, encode_reports
 from enact_dist.core.datum import Slot
-from enact_dist.errors import ConfigError
+from enact_dist.errors import ConfigError, MisuseError
 from enact_dist.recording import Replay
 
 VALUE = Aspect("value", int)
@@ -179,6 +179,27 @@ def test_whoever_writes_during_the_replay_is_named_once(cell, online, pieces):
     assert "has written online:piece/value (v2) during the replay" in text
     assert "(process " in text
     assert list(summary.other_writers) == ["online:piece/value"]
+
+
+def test_shard_that_refuses_to_say_who_wrote_ends_no_replay(cell, online, pieces, monkeypatch):
+    """The warning comes without a name."""
+
+    def refuses(*_):
+        raise MisuseError("too many versions are asked about")
+
+    monkeypatch.setattr("enact_dist.recording.other_writers.explained", refuses)
+    told = []
+    request = Write(online, piece, VALUE)
+
+    def interfere(summary):
+        if summary.commits == 1:
+            with Lock(request) as lock:
+                lock[request] = -1
+
+    Replay(cell, pieces, speed=0.0).run(warn=told.append, tell=interfere)
+
+    (text,) = told
+    assert text.startswith("another process has written online:piece/value")
 
 
 def test_a_replay_alone_warns_of_nobody(cell, pieces):
