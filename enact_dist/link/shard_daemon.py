@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Final
 from enact_dist.core.messages import ListLocks, Locks
 from enact_dist.core.records import Called, ShardReturned
 from enact_dist.errors import ConfigError, EnactError, LinkError
+from enact_dist.link.calls import Calls
 from enact_dist.link.endpoints import somebody_listens
 from enact_dist.link.host import open_host
 from enact_dist.link.log import READY, JsonLines, Log, TextLines, say
@@ -190,15 +191,20 @@ class RunningShard:
         self.host.hurry()
 
     def _name_holders(self, drain_s: float) -> None:
-        answers: list[Answer] = []
-        self.host.submit(ListLocks(), answers.append)
-        held = [
-            f"{holder.actor}@{holder.host} ({', '.join(holder.slots)})"
-            for answer in answers
-            if isinstance(answer, Locks)
-            for holder in answer.holders
-            if holder.granted
-        ]
+        held = []
+        calls = Calls([(self.settings.shard.name, ListLocks())])
+        while calls.left:
+            answers: list[Answer] = []
+            self.host.submit(calls.asked[0][1], answers.append)
+            if not answers:  # it has stopped by itself
+                break
+            calls.take(0, answers[0])
+        for answer in calls.answers:
+            held += [
+                f"{holder.actor}@{holder.host} ({', '.join(holder.slots)})"
+                for holder in (answer.holders if isinstance(answer, Locks) else ())
+                if holder.granted
+            ]
         if held:
             _log.warning(
                 "%d locks are lost, still held when the drain of %g s was over: %s; give them"

@@ -11,9 +11,11 @@ import pytest
 from parked_parts import parked
 from quiet_moments import judge, met_once
 
+from enact_dist import Aspect, Entity, connect
 from enact_dist.core.messages import (
     Committed,
     Granted,
+    Item,
     ListLocks,
     ListSessions,
     Locks,
@@ -25,7 +27,10 @@ from enact_dist.link import shard_daemon
 from enact_dist.link.shard_daemon import DaemonSettings, start_shard
 from enact_dist.link.zenoh_config import close_session, open_session
 from enact_dist.link.zenoh_service import ZenohService
+from enact_dist.terms import Access
 from enact_dist.wire.frames import decode_frame, encode_frame
+
+HELD = 250
 
 
 def speak(carrier, make_peer, **options):
@@ -333,3 +338,21 @@ def _latencies_s(peer, count):
         assert isinstance(peer.write("cup", b"x"), Committed)
         took.append(time.perf_counter() - began_s)
     return sorted(took)
+
+
+def test_drain_that_is_over_names_the_holders_of_all_pages(daemon, endpoint, caplog):
+    """A page of the listing has two hundred of them; the warning counted those alone."""
+    shard = daemon(endpoint)
+    with connect(endpoint) as cell:
+        world = cell.world("online")
+        for name in ("first", "last"):
+            world.init(Entity(name), Aspect("number", int), 0)
+        names = [f"part/{number:03}" for number in range(HELD)] + ["last"]
+        items = [Item(int(Access.WRITE), "online", name, "number") for name in names]
+        locks = [cell._client.acquire([one], wait_s=30.0, hold_s=60.0) for one in items]
+        shard._name_holders(0.0)
+        for lock in locks:
+            cell._client.release(lock)
+
+    assert f"{HELD + 1} locks are lost" in caplog.text
+    assert "online:last/number (write)" in caplog.text
