@@ -218,6 +218,7 @@ class Watch(Following[Change]):
 
     def _look_for_missed_tail(self) -> None:
         """Compare with what the keep-alives know; they come every quarter of a TTL."""
+        self._client.renewal.used()
         self._follow_placement()
         for shard, following in self._following.items():
             known = (following.epoch, following.number)

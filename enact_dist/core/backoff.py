@@ -7,14 +7,23 @@ from typing import TYPE_CHECKING, Final
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-CALLED_NS_MIN: Final = 1_000_000_000
-CALLED_NS_MAX: Final = 2_000_000_000
-"""Pauses of somebody who waits for a shard that is out of reach, from the first to the longest."""
+CALLED_NS_MIN: Final = 5_000_000_000
+CALLED_NS_MAX: Final = 20_000_000_000
+"""Pauses of somebody who waits for a shard that is out of reach, from the first to the longest.
+
+The session's own signs of life find it sooner, once for all who wait, and wake them.
+"""
 AWAY_NS_MIN: Final = 2_000_000_000
 AWAY_NS_MAX: Final = 5_000_000_000
 """Pause between two signs of life to a shard that is out of reach; doubles up to the second figure.
 
 The carrier tells when it comes back, so these only repair what the carrier has missed.
+"""
+USED_PARTS: Final = 4
+IDLE_PARTS: Final = 2
+"""A session gives so many signs of life in a TTL while it is used, and while it holds nothing.
+
+An idle one has nothing to lose: its shards forget it only after several TTLs without any.
 """
 
 
@@ -42,15 +51,23 @@ class Backoff:
 class SignsOfLife:
     """Whom a session sends its next signs of life: shards in reach each time, others rarely.
 
+    Those that are away are asked together, and all of them at once when another one goes.
+
     Args:
         draw: Returns numbers in [0, 1).
+
+    Attributes:
+        gone: The shards that were out of reach when it was last asked who is due.
     """
 
-    __slots__ = ("_away", "_draw")
+    __slots__ = ("_at_ns", "_backoff", "_draw", "_used_until_ns", "gone")
 
     def __init__(self, draw: Callable[[], float]) -> None:
         self._draw = draw
-        self._away: dict[str, tuple[int, Backoff]] = {}
+        self.gone: frozenset[str] = frozenset()
+        self._backoff = Backoff(AWAY_NS_MIN, AWAY_NS_MAX, draw)
+        self._at_ns = 0
+        self._used_until_ns = 0
 
     def due(self, shards: Iterable[str], away: Callable[[str], bool], now_ns: int) -> list[str]:
         """Return the shards that are to be asked now.
@@ -60,27 +77,28 @@ class SignsOfLife:
             away: Whether a shard is known to be out of reach.
             now_ns: The session's clock.
         """
-        asked = []
-        for shard in shards:
-            if not away(shard):
-                self._away.pop(shard, None)
-                asked.append(shard)
-                continue
-            at_ns, backoff = self._away.get(shard) or (
-                now_ns,
-                Backoff(AWAY_NS_MIN, AWAY_NS_MAX, self._draw),
-            )
-            if now_ns >= at_ns:
-                asked.append(shard)
-                at_ns = now_ns + backoff.pause_ns()
-            self._away[shard] = at_ns, backoff
-        return asked
+        shards = list(shards)
+        gone = frozenset(shard for shard in shards if away(shard))
+        if gone - self.gone:
+            self._backoff, self._at_ns = Backoff(AWAY_NS_MIN, AWAY_NS_MAX, self._draw), now_ns
+        self.gone = gone
+        asks = now_ns >= self._at_ns
+        if gone and asks:
+            self._at_ns = now_ns + self._backoff.pause_ns()
+        return [shard for shard in shards if asks or shard not in gone]
+
+    def used(self, now_ns: int, ttl_ns: int) -> None:
+        """Note that the session has a lock, or that somebody follows what its answers tell."""
+        self._used_until_ns = max(self._used_until_ns, now_ns + ttl_ns)
+
+    def is_used(self, now_ns: int) -> bool:
+        """Whether the session was used within the last TTL."""
+        return now_ns < self._used_until_ns
 
     def pause_ns(
-        self, shards: Iterable[str], away: Callable[[str], bool], usual_ns: int, now_ns: int
+        self, shards: Iterable[str], away: Callable[[str], bool], ttl_ns: int, now_ns: int
     ) -> int:
-        """Return how long nobody is due: `usual_ns` while a shard is in reach."""
-        due_ns = [
-            self._away[shard][0] if away(shard) and shard in self._away else 0 for shard in shards
-        ]
-        return max(usual_ns, min(due_ns, default=0) - now_ns)
+        """Return how long nobody is due: a part of the TTL while a shard is in reach."""
+        usual_ns = ttl_ns // (USED_PARTS if self.is_used(now_ns) else IDLE_PARTS)
+        in_reach = any(shard not in self.gone or not away(shard) for shard in shards)
+        return usual_ns if in_reach else max(usual_ns, self._at_ns - now_ns)

@@ -176,6 +176,7 @@ class CellClient(SessionClient):
 
     def _drive(self, lock: MultiLock, *, interrupt: threading.Event | None = None) -> None:
         """Make the lock's calls until it rests."""
+        self.renewal.used()
         far, returns = Backoff(CALLED_NS_MIN, CALLED_NS_MAX, random.random), self.pauses.returns
         try:
             while lock.phase.busy or interrupt is not None:

@@ -1,12 +1,23 @@
-"""Pauses of a session: they end early once it is closed, or a shard has come back."""
+"""Pauses of a session: they end early once it is closed, or a shard has come back.
+
+A session that is used gives signs of life more often than one that only exists; the first lock
+after a while wakes the thread that gives them.
+"""
 
 from __future__ import annotations
 
+import random
 import threading
 from typing import TYPE_CHECKING, Protocol
 
+from enact_dist.core.backoff import SignsOfLife
+
 if TYPE_CHECKING:
     import weakref
+    from collections.abc import Callable
+
+    from enact_dist.core.client import Client
+    from enact_dist.link.carrier import Carrier
 
 
 class Pauses:
@@ -18,6 +29,7 @@ class Pauses:
 
     def __init__(self) -> None:
         self.returns = 0
+        self._hurried = False
         self._over = False
         self._changed = threading.Condition(threading.Lock())
 
@@ -36,6 +48,26 @@ class Pauses:
         with self._changed:
             self.returns += 1
             self._changed.notify_all()
+
+    def rest_of_renewal(self, pause_s: float, returns: int) -> bool:
+        """Wait as in `rest`, and not once the session is used; say whether that came first."""
+        with self._changed:
+            over = self._changed.wait_for(
+                lambda: self._over or self.returns != returns or self._hurried, max(0.0, pause_s)
+            )
+            hurried, self._hurried = self._hurried, False
+            return over and hurried and not self._over and self.returns == returns
+
+    def hurry(self) -> None:
+        """Let a renewal that rests for long look again: the session is used."""
+        with self._changed:
+            self._hurried = True
+            self._changed.notify_all()
+
+    @property
+    def over(self) -> bool:
+        """Whether nobody waits any more."""
+        return self._over
 
     def end(self) -> None:
         """Let nobody wait any more."""
@@ -60,10 +92,61 @@ def keep_renewing(found: weakref.ref[Renewed], pauses: Pauses) -> None:
     while (session := found()) is not None:
         pause_s = session.next_renewal_s()
         del session  # its last user may go while this waits
-        if pauses.rest(pause_s, returns):
+        hurried = pauses.rest_of_renewal(pause_s, returns)
+        if pauses.over:
             return
         returns = pauses.returns
-        session = found()
+        session = None if hurried else found()
         if session is not None:
             session.renew()
         del session
+
+
+class Renewal:
+    """When one session gives signs of life, and to which shards.  Thread-safe.
+
+    Args:
+        core: The session.
+        carrier: Knows which shards are away.
+        mutex: Guards the session.
+        pauses: Where its renewal rests.
+        now_ns: Its clock.
+    """
+
+    def __init__(
+        self,
+        core: Client,
+        carrier: Carrier,
+        mutex: threading.RLock,
+        pauses: Pauses,
+        now_ns: Callable[[], int],
+    ) -> None:
+        self._core, self._carrier, self._mutex = core, carrier, mutex
+        self._pauses, self._now_ns = pauses, now_ns
+        self._signs = SignsOfLife(random.random)
+        self._rests_long = False
+
+    def pause_s(self) -> float:
+        """Return how long no sign of life is due."""
+        core, away = self._core, self._carrier.away
+        with self._mutex:
+            now_ns = self._now_ns()
+            if core.live_locks():
+                self._signs.used(now_ns, core.ttl_ns)
+            self._rests_long = not self._signs.is_used(now_ns)
+            return self._signs.pause_ns(core.shards_in_use(), away, core.ttl_ns, now_ns) / 1e9
+
+    def due(self) -> list[tuple[str, bool]]:
+        """Return the shards that are to be asked now, and whether each of them was away."""
+        shards, away = self._core.shards_in_use(), self._carrier.away
+        with self._mutex:
+            due = self._signs.due(shards, away, self._now_ns())
+            return [(shard, shard in self._signs.gone) for shard in due]
+
+    def used(self) -> None:
+        """Note that a lock begins, or that somebody follows what the answers tell."""
+        with self._mutex:
+            self._signs.used(self._now_ns(), self._core.ttl_ns)
+            hurry, self._rests_long = self._rests_long, False
+        if hurry:
+            self._pauses.hurry()

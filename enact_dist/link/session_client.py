@@ -18,7 +18,7 @@ import threading
 import weakref
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.core.backoff import CALLED_NS_MAX, CALLED_NS_MIN, Backoff, SignsOfLife
+from enact_dist.core.backoff import CALLED_NS_MAX, CALLED_NS_MIN, Backoff
 from enact_dist.core.messages import (
     Alive,
     Answer,
@@ -40,7 +40,7 @@ from enact_dist.link.clock import boottime_ns
 from enact_dist.link.dropped import weakly
 from enact_dist.link.further_shards import FurtherShards
 from enact_dist.link.lanes import Lanes
-from enact_dist.link.pauses import Pauses, keep_renewing
+from enact_dist.link.pauses import Pauses, Renewal, keep_renewing
 from enact_dist.link.payload_client import SharedPayloads
 from enact_dist.link.refusals import error_of, unreachable
 from enact_dist.link.used_names import SERIES_BITS
@@ -105,7 +105,7 @@ class SessionClient:
         self._now_ns = now_ns
         self._mutex = threading.RLock()
         self.pauses = Pauses()
-        self._signs = SignsOfLife(random.random)
+        self.renewal = Renewal(client, carrier, self._mutex, self.pauses, now_ns)
         self._lanes = Lanes()
         self._catalogue = KnownCatalogue()
         self.payloads = SharedPayloads(
@@ -446,8 +446,7 @@ class SessionClient:
 
     def next_renewal_s(self) -> float:
         """Return how long no sign of life is due."""
-        shards, usual_ns = self.core.shards_in_use(), self.core.ttl_ns // 4
-        return self._signs.pause_ns(shards, self.carrier.away, usual_ns, self._now_ns()) / 1e9
+        return self.renewal.pause_s()
 
     def renew(self) -> None:
         """Send the signs of life that are due; whatever comes of it is for the log."""
@@ -471,14 +470,16 @@ class SessionClient:
 
         One that is known to be away is asked more and more rarely.
         """
+        due = self.renewal.due()
         with self._mutex:
             now_ns = self._now_ns()
-            due = self._signs.due(self.core.shards_in_use(), self.carrier.away, now_ns)
-            calls = [(shard, self.core.keep_alive(shard, now_ns)) for shard in due]
+            calls = [(shard, self.core.keep_alive(shard, now_ns)) for shard, _ in due]
         answers = self.carrier.request_all(calls, timeout_s=max(0.1, self.core.ttl_ns / 4e9))
-        for (shard, request), answer in zip(calls, answers, strict=True):
+        for (shard, request), (_, was_away), answer in zip(calls, due, answers, strict=True):
             if answer is not None:
                 self._take(shard, request, answer)
+                if was_away:
+                    self._shard_returned(shard)
             else:
                 self.count("keep_alives_unanswered")
 

@@ -17,6 +17,7 @@ import logging
 import os
 import threading
 import weakref
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.messages import Alive, Ping, Pong, Welcome
@@ -211,8 +212,13 @@ class SocketCarrier:
                 old = self._lines.pop(shard, None)
                 line = None
                 if welcome.shared:
-                    line = SocketLine(shard, welcome.shared, welcome.shared_nonce, self._greeting)
-                    self._lines[shard] = line
+                    line = self._lines[shard] = SocketLine(
+                        shard,
+                        welcome.shared,
+                        welcome.shared_nonce,
+                        self._greeting,
+                        partial(self._behind.away, shard),
+                    )
         if old is not None:
             old.close()
         if line is not None:
@@ -279,7 +285,15 @@ class SocketCarrier:
 
     def tell_returns(self, returned: Callable[[str], None]) -> None:
         """Call `returned` with the name of each shard that comes (back) into reach."""
-        self._behind.tell_returns(returned)
+        lines = self._lines
+
+        def told(shard: str) -> None:
+            line = lines.get(shard)
+            if line is not None:
+                line.try_again()
+            returned(shard)
+
+        self._behind.tell_returns(told)
 
     def endpoint_of(self, shard: str) -> str:
         """Return where the shard is expected, for messages to people."""

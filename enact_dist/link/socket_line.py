@@ -35,6 +35,8 @@ from enact_dist.link.socket_peers import check_peer
 from enact_dist.wire.frames import decode_frame, encode_parts
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from enact_dist.core.messages import Request
 
 SOCKET_NAME: Final = "socket"
@@ -52,6 +54,8 @@ two calls of a lock, which differ by that much, then share one time that the ker
 RETRY_S_MIN: Final = 0.1
 RETRY_S_MAX: Final = 5.0
 """Pause before a lost socket is tried again; doubles up to the second figure."""
+AWAY_S: Final = 10.0
+"""That pause while Zenoh has no way to the shard either; the return of the shard ends it."""
 
 _log = logging.getLogger("enact.link")
 
@@ -171,18 +175,27 @@ class SocketLine:
         name: Name of its shared folder, from its WELCOME.
         nonce: What has to stand in there.
         greeting: For whom the connections speak, from `socket_frames.greeting_of`.
+        away: Whether the shard is known to be out of reach.
 
     Attributes:
         name: As given.
         problem: Why the last attempt to connect failed; empty while all is well.
     """
 
-    def __init__(self, shard: str, name: str, nonce: bytes, greeting: bytes) -> None:
+    def __init__(
+        self,
+        shard: str,
+        name: str,
+        nonce: bytes,
+        greeting: bytes,
+        away: Callable[[], bool] = lambda: False,
+    ) -> None:
         self.shard = shard
         self.name = name
         self.problem = ""
         self._nonce = nonce
         self._greeting = greeting
+        self._away = away
         self._idle: list[Connection] = []
         # Weak: Ctrl-C may come between any two steps of who holds one, and takes it out of use.
         self._open: weakref.WeakSet[Connection] = weakref.WeakSet()
@@ -232,8 +245,9 @@ class SocketLine:
             none = isinstance(error, FileNotFoundError)
             before = self.problem
             self.problem = "it offers none" if none else str(error) or type(error).__name__
+            away = self._away()
             with self._mutex:
-                self._retry_at_s = time.monotonic() + self._retry_s
+                self._retry_at_s = time.monotonic() + (AWAY_S if away else self._retry_s)
                 self._retry_s = min(2 * self._retry_s, RETRY_S_MAX)
             if self.problem != before:  # not at each further attempt
                 _log.debug("no socket to shard %s: %s", self.shard, self.problem)
@@ -269,7 +283,7 @@ class SocketLine:
         return connection
 
     def try_again(self) -> None:
-        """Forget the pause after a failure: the shard has just said that it is there."""
+        """Forget the pause after a failure: the shard is there, as it or Zenoh has just said."""
         self._retry_at_s = 0.0
 
     def abandon(self) -> None:

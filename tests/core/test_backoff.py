@@ -2,9 +2,17 @@
 
 import pytest
 
-from enact_dist.core.backoff import AWAY_NS_MAX, AWAY_NS_MIN, Backoff, SignsOfLife
+from enact_dist.core.backoff import (
+    AWAY_NS_MAX,
+    AWAY_NS_MIN,
+    IDLE_PARTS,
+    USED_PARTS,
+    Backoff,
+    SignsOfLife,
+)
 
 SECOND = 1_000_000_000
+TTL_NS = 2 * SECOND
 
 
 @pytest.mark.parametrize(
@@ -16,17 +24,19 @@ def test_pauses_double_up_to_the_longest_and_are_shortened_at_random(drawn, paus
     assert [backoff.pause_ns() for _ in pauses] == pauses
 
 
-def test_shard_in_reach_is_due_each_time_and_one_away_ever_more_rarely():
+@pytest.mark.parametrize(("parts", "used"), [(USED_PARTS, True), (IDLE_PARTS, False)])
+def test_shard_in_reach_is_due_each_time_and_one_away_ever_more_rarely(parts, used):
     """In ten minutes without one shard the other gets all signs of life, this one few."""
     signs, asked, now_ns = SignsOfLife(lambda: 0.0), {"near": 0, "far": 0}, 0
-    usual_ns = SECOND // 2
     while now_ns < 600 * SECOND:
+        if used:
+            signs.used(now_ns, TTL_NS)
         for shard in signs.due(asked, lambda shard: shard == "far", now_ns):
             asked[shard] += 1
-        pause_ns = signs.pause_ns(asked, lambda shard: shard == "far", usual_ns, now_ns)
-        assert pause_ns == usual_ns
+        pause_ns = signs.pause_ns(asked, lambda shard: shard == "far", TTL_NS, now_ns)
+        assert pause_ns == TTL_NS // parts
         now_ns += pause_ns
-    assert asked["near"] == 1200
+    assert asked["near"] == 600 * SECOND * parts // TTL_NS
     assert 600 * SECOND / AWAY_NS_MAX < asked["far"] <= 600 * SECOND / AWAY_NS_MAX + 4
 
 
@@ -34,9 +44,29 @@ def test_session_whose_shards_are_all_away_sleeps_until_one_is_due():
     """And asks all of them each time again once they are back."""
     signs = SignsOfLife(lambda: 0.0)
     assert signs.due(["s0", "s1"], lambda _: True, 0) == ["s0", "s1"]
-    assert signs.pause_ns(["s0", "s1"], lambda _: True, 5, 0) == AWAY_NS_MIN
+    assert signs.pause_ns(["s0", "s1"], lambda _: True, 4, 0) == AWAY_NS_MIN
     assert signs.due(["s0", "s1"], lambda _: True, AWAY_NS_MIN - 1) == []
 
-    assert signs.pause_ns(["s0", "s1"], lambda shard: shard == "s0", 5, 1) == 5
+    assert signs.pause_ns(["s0", "s1"], lambda shard: shard == "s0", 4, 1) == 2
     assert signs.due(["s0", "s1"], lambda _: False, 2) == ["s0", "s1"]
     assert signs.due(["s0"], lambda _: True, 3) == ["s0"]
+
+
+def test_shards_that_are_away_are_asked_together():
+    """One that goes later is asked at once with those that are away, and from then on with them."""
+    signs, away = SignsOfLife(lambda: 0.0), {"s0"}
+    assert signs.due(["s0", "s1"], away.__contains__, 0) == ["s0", "s1"]
+    away.add("s1")
+    assert signs.due(["s0", "s1"], away.__contains__, 1) == ["s0", "s1"]
+    assert signs.gone == {"s0", "s1"}
+    for now_ns in range(2, AWAY_NS_MIN, SECOND // 2):
+        assert signs.due(["s0", "s1"], away.__contains__, now_ns) == []
+    assert signs.due(["s0", "s1"], away.__contains__, 1 + AWAY_NS_MIN) == ["s0", "s1"]
+
+
+def test_session_rests_twice_as_long_from_a_ttl_after_its_last_use():
+    """Until then it may have to repair what a lock has left behind."""
+    signs = SignsOfLife(lambda: 0.0)
+    signs.used(5, TTL_NS)
+    for now_ns, parts in ((6, USED_PARTS), (4 + TTL_NS, USED_PARTS), (5 + TTL_NS, IDLE_PARTS)):
+        assert signs.pause_ns(["s0"], lambda _: False, TTL_NS, now_ns) == TTL_NS // parts
