@@ -101,25 +101,7 @@ def check_cell(config: CellConfig, *, initial: Collection[str] = ()) -> tuple[Fi
         config: The cell.
         initial: Names of aspects that are written from outside (`init`, other programs).
     """
-    findings: list[Finding] = []
-    actors: list[ActorDeclaration] = []
-    for actor in config.actors:
-        try:
-            actor_class = load_class(actor.class_path)
-            only = Entity(actor.entity) if actor.entity else actor_class.only_entity
-            actors.append(
-                ActorDeclaration(actor.name, actor_class, actor.worlds or None, only, actor.every_s)
-            )
-            read_options(actor_class, actor.options)
-            if actor.every_s is not None:
-                check_every_s(actor_class, actor.every_s)
-        except MisuseError as error:
-            if type(error) is ConfigError:
-                text = f"actor {actor.name}: {error}"
-                findings.append(Finding("error", "no such actor", (actor.name,), text))
-                continue
-            text = f"actor {actor.name} ({actor.class_path}): {raised(error.__cause__ or error)}"
-            findings.append(Finding("error", "broken module", (actor.name,), text))
+    actors, findings = declarations_of(config)
     findings += check_actors(actors, worlds=config.worlds, initial=initial)
     findings += streams(
         list(uses_of(actors)), {one.name for one in config.aspects if one.durability}
@@ -142,6 +124,30 @@ def check_cell(config: CellConfig, *, initial: Collection[str] = ()) -> tuple[Fi
                 )
             )
     return _ordered(findings)
+
+
+def declarations_of(config: CellConfig) -> tuple[list[ActorDeclaration], list[Finding]]:
+    """Return the actors of a `cell.toml` that load, and what is wrong with those that do not."""
+    findings: list[Finding] = []
+    actors: list[ActorDeclaration] = []
+    for actor in config.actors:
+        try:
+            actor_class = load_class(actor.class_path)
+            only = Entity(actor.entity) if actor.entity else actor_class.only_entity
+            actors.append(
+                ActorDeclaration(actor.name, actor_class, actor.worlds or None, only, actor.every_s)
+            )
+            read_options(actor_class, actor.options)
+            if actor.every_s is not None:
+                check_every_s(actor_class, actor.every_s)
+        except MisuseError as error:
+            if type(error) is ConfigError:
+                text = f"actor {actor.name}: {error}"
+                findings.append(Finding("error", "no such actor", (actor.name,), text))
+                continue
+            text = f"actor {actor.name} ({actor.class_path}): {raised(error.__cause__ or error)}"
+            findings.append(Finding("error", "broken module", (actor.name,), text))
+    return actors, findings
 
 
 def _sets(

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import sys
 import time
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
 
 from enact_dist.cli import actor_run, actor_tell
 from enact_dist.cli.output import print_json, print_table, shown_s
@@ -19,7 +21,7 @@ from enact_dist.cli.verbs import (
     see_modules,
     verbs_of,
 )
-from enact_dist.errors import ProtocolError
+from enact_dist.errors import ConfigError, EnactError, ProtocolError
 
 if TYPE_CHECKING:
     import argparse
@@ -28,6 +30,10 @@ if TYPE_CHECKING:
     from enact_dist.actor_report import ActorStatistics
     from enact_dist.cell_info import ActorInfo
     from enact_dist.cli.verbs import Verb
+    from enact_dist.config_types import CellConfig
+
+LOOK_S: Final = 2.0
+"""How long a shard may take to say how often the actors run."""
 
 
 def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
@@ -48,7 +54,7 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
         "check",
         "check all declared reads and writes of the cell's actors, without running any",
         run=check_actors,
-        example="enact actor check --cell cell.toml",
+        example="enact actor check --cell cell.toml\nenact actor check --graph cell.svg",
     )
     add_cell(check, file_only=True)
     check.add_argument("--json", action="store_true", help="print JSON instead of lines")
@@ -58,6 +64,13 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
         default=[],
         metavar="ASPECT",
         help="an aspect that is written from outside; may be repeated",
+    )
+    check.add_argument(
+        "--graph",
+        type=Path,
+        metavar="FILE.svg",
+        help="draw entities, aspects and actors with all declared reads and writes; of a cell that"
+        " runs, with the rate of each actor",
     )
 
 
@@ -157,4 +170,48 @@ def check_actors(arguments: argparse.Namespace) -> int:
             print(finding)
         if all(finding.level == "advice" for finding in findings):
             print(f"ok: {len(config.actors)} actors of cell {config.name} fit together")
+    if arguments.graph is not None:
+        _draw(config, arguments.graph)
     return FAILED if wrong else DONE
+
+
+def _draw(config: CellConfig, file: Path) -> None:
+    """Write the picture of a cell's actors and data.
+
+    Raises:
+        ConfigError: The name of the file is none of an SVG, or no actor of the cell can be loaded.
+        OSError: The file cannot be written.
+    """
+    from enact_dist.actor_check import declarations_of
+    from enact_dist.actor_graph import graph_of
+    from enact_dist.actor_graph_svg import svg_of
+
+    if file.suffix.lower() != ".svg":
+        raise ConfigError(f"--graph writes an SVG file; name it FILE.svg, not {file}")
+    actors, _ = declarations_of(config)
+    if not actors:
+        raise ConfigError(f"{config.path} has no actor that can be loaded; nothing is drawn")
+    graph = graph_of(actors, rates_hz=_rates_hz(config))
+    file.write_text(svg_of(graph, f"cell {config.name}"), encoding="utf-8")
+    print(
+        f"drawn: {file}, {len(actors)} actors, {len(graph.data)} data, {len(graph.lines)} declared"
+        " reads and writes",
+        file=sys.stderr,
+    )
+
+
+def _rates_hz(config: CellConfig) -> dict[str, float]:
+    """Return the updates per second of the actors that run now; none where no shard answers."""
+    from enact_dist.connecting import connect
+    from enact_dist.link.endpoints import somebody_listens
+
+    if not any(somebody_listens(one) for shard in config.shards for one in shard.advertise):
+        return {}
+    try:
+        with connect(
+            config.path, actor="enact", timeout_s=LOOK_S, patience_s=LOOK_S, observer=True
+        ) as cell:
+            infos = cell.actors()
+    except EnactError:
+        return {}
+    return {one.name: one.rate_hz for info in infos if not info.silent for one in _reports(info)}

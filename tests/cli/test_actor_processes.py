@@ -109,6 +109,9 @@ def test_actors_of_one_process_fail_restart_and_end_alone(rig, spawn, until, ena
     why = enact("why", "online", "camera/3/double_number", "--cell", rig).out
     assert "subtraction-3" in why
     assert "camera-3" in why
+    picture = rig.with_name("rig.svg")
+    assert enact("actor", "check", "--cell", rig, "--graph", picture).status == 0
+    assert "/s</text>" in picture.read_text(encoding="utf-8")  # rates, as the cell runs
 
     again = enact("actor", "restart", "camera-3", "--cell", rig)
     assert again.status == 0, again
