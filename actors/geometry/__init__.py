@@ -5,6 +5,11 @@ shapes                  what the arrays mean: cloud, surface, depth image, camer
 poses                   rigid transforms, 4x4, named `to_from_of`
 projection              points -> pixels of a calibrated camera, with its distortion
 silhouettes             what differs in an image from the empty cell, without its shadows
+voxels                  a grid of voxels, numbered block by block
+visibility              which camera can say what about which voxel
+visual_hull             what no silhouette says to be free
+refinement              what of it is neither robot nor static nor impossible
+pockets                 where people can be that no camera sees
 capsules                arms and people as capsules: distances, outlines in images
 depth                   depth image <-> points, filters, the sensor's spread
 rendering               surface -> depth image as a camera would see it

@@ -1,0 +1,309 @@
+"""What of a visual hull is neither robot nor static nor impossible: refinement by knowledge.
+
+====  ===========  =================================================  ===========================
+rule  in counts    what                                               why it loses nobody
+====  ===========  =================================================  ===========================
+R0    static       voxels within known obstacles go                   nobody is inside of those
+R1    robot        voxels that touch the robot at the exposure go     it is at rest before anybody
+                                                                      comes that near
+R2    small        a component with less than 0.5 l of visible        smaller than a hand
+                   volume that the robot does not explain goes
+R3    explained    a voxel within 10 cm of the robot goes if each     a hidden part of a body would
+                   camera that sees it sees it on the robot           have to fit into that shell,
+                                                                      which is thinner than the
+                                                                      distance at which it rests
+R4    unreachable  a block goes that nobody reaches at 3 m/s from     people do not appear out of
+                   where something was, or from outside               nothing
+R5    forgiven     where something was, and 5 cameras or more have a  camouflage, or a camera that
+      (kept)       say, one of them may say "free"                    is half blind
+====  ===========  =================================================  ===========================
+
+A voxel that no camera can see is neither free nor an obstacle.  It counts as occupied while
+something visible touches its block.  Where such voxels together could hold a person (a *pocket*),
+and whatever touched them does not come back out, they stay occupied.
+
+Rules a change must keep: the safe set (all voxels) is what protects; the tight set is within it and
+serves figures, tracking and scores; without the pose of the robot no voxel is taken for the robot.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from actors.geometry.capsules import distance_to_points, fill, outlines
+from actors.geometry.pockets import Pockets
+from actors.geometry.visibility import seen_by, static_voxels
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    import numpy.typing as npt
+
+    from actors.geometry.visibility import Calibrated
+    from actors.geometry.visual_hull import VisualHull
+
+    Bits = npt.NDArray[np.uint8]
+    Flags = npt.NDArray[np.bool_]
+    Numbers = npt.NDArray[np.floating]
+    Rows = npt.NDArray[np.int64]
+
+ROBOT_MARGIN_M: Final = 0.01
+"""R1: pose and shape of the robot are known this well."""
+SHELL_M: Final = 0.10
+"""R3: how far from the robot a voxel may be explained by it."""
+EXPLAINED_GROWN_M: Final = 0.06
+"""R3: by how much the robot's outlines are grown; its shadows and blurred edges."""
+VISIBLE_M3_MIN: Final = 0.0005
+"""R2: half a litre."""
+SPEED_MAX_M_S: Final = 3.0
+"""R4: faster than anybody in a workcell."""
+GAP_MAX_S: Final = 1.0
+"""R4: after a longer gap between sets anything may be anywhere."""
+SAYS_MIN: Final = 5
+"""R5: so many cameras must have a say for one to be outvoted."""
+BLIND_SHARE: Final = 0.15
+"""R5: a camera that alone denies more than this share of what the others leave is half blind."""
+NEIGHBOURS_MIN: Final = 13
+"""A voxel of the tight set has at least so many of its 26 neighbours in it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Refined:
+    """What is occupied, and what was taken away.
+
+    Attributes:
+        rows: (N,) int64, voxels of the safe set.
+        clearance_m: (N,) float32, from the sphere around the voxel to the robot; metres.
+        tight: (N,) bool, the tight set.
+        component: (N,) int16, number of the connected component, the largest is 0.
+        counts: Voxels per rule; `raw` before any of them, `forgiven` those that R5 kept.
+        raw: (M,) int64, voxels before any rule.
+    """
+
+    rows: Rows
+    clearance_m: npt.NDArray[np.float32]
+    tight: Flags
+    component: npt.NDArray[np.int16]
+    counts: dict[str, int]
+    raw: Rows
+
+    @property
+    def nearest(self) -> int:
+        """Index of the voxel that is nearest to the robot; -1 if nothing is occupied."""
+        return int(self.clearance_m.argmin()) if len(self.rows) else -1
+
+
+class Refinement:
+    """Turns sets of silhouettes into what is occupied, set by set.
+
+    Args:
+        hull: The visual hull of the cell's cameras.
+        calibrations: Of the same cameras, in the same order.
+        boxes: Static obstacles, (n, 15) each: centre, half sizes, rotation; cell frame.
+    """
+
+    def __init__(
+        self, hull: VisualHull, calibrations: Sequence[Calibrated], boxes: Sequence[Numbers]
+    ) -> None:
+        self._hull, self._grid = hull, hull.grid
+        self._cameras = [(c.camera_matrix, c.distortion, c.camera_from_cell) for c in calibrations]
+        self._sizes = [(c.height, c.width) for c in calibrations]
+        self._static = static_voxels(self._grid, boxes)
+        self._all_blocks = np.arange(self._grid.blocks)
+        self._before: Flags | None = None
+        self._live: tuple[int, ...] | None = None
+        self._says = np.empty(0, np.uint8)
+        self._pockets = Pockets(self._grid, np.zeros(self._grid.voxels, bool))
+
+    def step(
+        self,
+        silhouettes: Sequence[Bits | None],
+        robot: Numbers | None,
+        elapsed_s: float,
+    ) -> Refined:
+        """Return what is occupied at an exposure.
+
+        Args:
+            silhouettes: (H, W / 8) uint8 per camera, None where one has none.
+            robot: (n, 7) capsules at the exposure, metres, cell; None if the pose is not known:
+                then nothing is taken for the robot, and everything is at distance 0.
+            elapsed_s: Time since the set of the last call; what is beyond `GAP_MAX_S` starts anew.
+
+        Raises:
+            ValueError: Silhouettes of another number or size than the calibrations.
+        """
+        self._hull.load(silhouettes)
+        self._note_live(tuple(n for n, bits in enumerate(silhouettes) if bits is not None))
+        raw = self._hull.carve(self._all_blocks)
+        counts = {"raw": len(raw)}
+        rows = raw[~self._static[raw]]
+        counts["static"] = len(raw) - len(rows)
+        reachable = self._reachable(elapsed_s)
+        kept = rows if reachable is None else rows[reachable.ravel()[rows >> 6]]
+        counts["unreachable"] = len(rows) - len(kept)
+        forgiven = self._forgiven(kept)
+        counts["forgiven"] = len(forgiven)
+        rows = np.concatenate([kept, forgiven])
+        seen = self._says[rows] > 0
+        near_m, explained = self._of_robot(rows, seen, robot, counts)
+        away = ~((near_m <= self._grid.half_diagonal_m + ROBOT_MARGIN_M) | explained)
+        if robot is None:
+            away[:] = True
+        tight = np.zeros(len(rows), bool)
+        tight[: len(kept)] = self._hull.tight(kept) & seen[: len(kept)]
+        rows, near_m, tight = rows[away], near_m[away], tight[away]
+        clearance = near_m - np.float32(self._grid.half_diagonal_m)
+        return self._components(rows, clearance, tight, counts, raw)
+
+    def _note_live(self, live: tuple[int, ...]) -> None:
+        """Count anew who has a say where, if other cameras than before gave a silhouette."""
+        if live == self._live:
+            return
+        self._live = live
+        tables = self._hull.tables
+        self._says = (
+            seen_by([tables[n] for n in live]) if live else np.zeros(self._grid.voxels, np.uint8)
+        )
+        self._pockets = Pockets(self._grid, (self._says == 0) & ~self._static, self._pockets)
+
+    def _reachable(self, elapsed_s: float) -> Flags | None:
+        """Return which blocks (i, j, k) may be occupied now (R4); None if all."""
+        if self._before is None or not 0.0 <= elapsed_s <= GAP_MAX_S:
+            return None
+        block_m = self._grid.voxel_m * 4
+        reach = int(np.ceil(SPEED_MAX_M_S * elapsed_s / block_m - 1e-9))
+        result = grown(self._before | self._pockets.held_blocks, reach)
+        result[:reach] = result[-reach:] = True
+        result[:, :reach] = result[:, -reach:] = True
+        return result
+
+    def _forgiven(self, kept: Rows) -> Rows:
+        """Return the voxels where something was, and that only one camera says to be free (R5).
+
+        They count if they lie between what all cameras leave, so that a limb does not fall apart,
+        or if the camera contradicts the others in so many voxels that it must be half blind.
+        """
+        if self._before is None or not self._before.any():
+            return np.empty(0, np.int64)
+        blocks = np.flatnonzero(self._before.ravel())
+        rows, camera = self._hull.with_one_veto(blocks)
+        outvoted = (self._says[rows] >= SAYS_MIN) & ~self._static[rows]
+        rows, camera = rows[outvoted], camera[outvoted]
+        alone = np.bincount(camera, minlength=len(self._sizes))
+        blind = alone > BLIND_SHARE * max(len(kept), 1)
+        left = np.zeros(self._grid.block_shape, bool)
+        left.ravel()[kept >> 6] = True
+        between = ~grown(~grown(left, 1), 1)
+        return np.asarray(rows[between.ravel()[rows >> 6] | blind[camera]])
+
+    def _of_robot(
+        self, rows: Rows, seen: Flags, robot: Numbers | None, counts: dict[str, int]
+    ) -> tuple[npt.NDArray[np.float32], Flags]:
+        """Return distances to the robot (centres, metres), and what it explains (R1, R3)."""
+        counts["robot"] = counts["explained"] = 0
+        explained = np.zeros(len(rows), bool)
+        if robot is None:
+            return np.zeros(len(rows), np.float32), explained
+        near_m = distance_to_points(robot, self._grid.centres(rows))
+        touches = near_m <= self._grid.half_diagonal_m + ROBOT_MARGIN_M
+        counts["robot"] = int(touches.sum())
+        candidates = np.flatnonzero((near_m < SHELL_M) & ~touches & seen)
+        if len(candidates):
+            larger = np.array(robot, np.float64)
+            larger[:, 6] += EXPLAINED_GROWN_M
+            lines = outlines(larger, self._cameras)
+            masks = [
+                fill(of_camera[None], *size)[0]
+                for of_camera, size in zip(lines, self._sizes, strict=True)
+            ]
+            explained[candidates] = self._hull.on_masks(rows[candidates], masks)
+            counts["explained"] = int(explained.sum())
+        return near_m, explained
+
+    def _components(
+        self,
+        rows: Rows,
+        clearance: npt.NDArray[np.float32],
+        tight: Flags,
+        counts: dict[str, int],
+        raw: Rows,
+    ) -> Refined:
+        """Join blocks to components, drop the small ones (R2) and what is unseen and untouched."""
+        from scipy import ndimage
+
+        shape = self._grid.block_shape
+        voxel_m3 = self._grid.voxel_m**3
+        visible = self._says[rows] > 0
+        touched = np.zeros(shape, bool)
+        touched.ravel()[rows[visible] >> 6] = True
+        touched = grown(touched, 1)
+        held = self._pockets.held_voxels(rows)
+        stays = visible | touched.ravel()[rows >> 6] | held
+        counts["unseen"] = int(len(rows) - stays.sum())
+        occupied = np.zeros(shape, bool)
+        occupied.ravel()[rows[stays] >> 6] = True
+        labels, found = ndimage.label(occupied, np.ones((3, 3, 3)))
+        label = np.where(stays, labels.ravel()[rows >> 6], 0)
+        volume = np.bincount(label[visible], minlength=found + 1) * voxel_m3
+        good = volume >= VISIBLE_M3_MIN
+        good[label[held]] = True
+        good[0] = False
+        order = np.argsort(np.where(good, -volume, np.inf), kind="stable")
+        number = np.empty(found + 1, np.int64)
+        number[order] = np.arange(found + 1)
+        kept = good[label]
+        counts["small"] = int(stays.sum() - kept.sum())
+        rows, label, visible = rows[kept], label[kept], visible[kept]
+        self._before = np.zeros(shape, bool)
+        self._before.ravel()[rows >> 6] = True
+        self._pockets.note(rows, label, visible)
+        return Refined(
+            rows=rows,
+            clearance_m=clearance[kept],
+            tight=self._without_corners(rows, tight[kept]),
+            component=number[label].astype(np.int16),
+            counts=counts,
+            raw=raw,
+        )
+
+    def _without_corners(self, rows: Rows, tight: Flags) -> Flags:
+        """Return the tight set without voxels that stick out.
+
+        The corners that a hull of few cameras has, and a body has not, have few neighbours.
+        """
+        inside = rows[tight]
+        if not len(inside):
+            return tight
+        index = self._grid.indices(inside).astype(np.int64)
+        low = index.min(0) - 1
+        dense = np.zeros(index.max(0) - low + 2, np.uint8)
+        i, j, k = (index - low).T
+        dense[i, j, k] = 1
+        for axis in range(3):
+            total = dense.copy()
+            ahead = [slice(None)] * 3
+            behind = [slice(None)] * 3
+            ahead[axis], behind[axis] = slice(1, None), slice(None, -1)
+            total[tuple(behind)] += dense[tuple(ahead)]
+            total[tuple(ahead)] += dense[tuple(behind)]
+            dense = total
+        result = tight.copy()
+        result[tight] = dense[i, j, k] > NEIGHBOURS_MIN
+        return result
+
+
+def grown(blocks: Flags, reach: int) -> Flags:
+    """Return blocks (i, j, k) and all within so many blocks of them, along axes and diagonals."""
+    import cv2
+
+    if reach < 1:
+        return blocks.copy()
+    wide, deep, high = blocks.shape
+    edge = 2 * reach + 1
+    image = np.ascontiguousarray(blocks, np.uint8)
+    flat = cv2.dilate(image, np.ones((edge, edge), np.uint8))
+    lines = np.ascontiguousarray(flat).reshape(wide * deep, high)
+    return np.asarray(cv2.dilate(lines, np.ones((1, edge), np.uint8)) > 0).reshape(blocks.shape)

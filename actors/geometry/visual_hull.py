@@ -1,0 +1,206 @@
+"""The visual hull of a set of silhouettes: all voxels that no camera says to be free.
+
+Two levels: blocks of 4 x 4 x 4 voxels are looked up in pooled masks, what is left voxel by voxel,
+each camera only on what the last one left.  Two levels are all of an octree that pays.
+
+Rules a change must keep: numpy only; a camera without a silhouette vetoes nothing; the result is
+the same in whatever order the cameras are asked.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from actors.geometry.silhouettes import unpacked
+from actors.geometry.visibility import GROWN_PX, POOL_PX, POOLS
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    import numpy.typing as npt
+
+    from actors.geometry.visibility import CameraTable
+    from actors.geometry.voxels import VoxelBlocks
+
+    Bits = npt.NDArray[np.uint8]
+    Rows = npt.NDArray[np.integer]
+
+
+class Masks:
+    """One camera's silhouette as its table looks it up: grown, pooled, with sentinels.
+
+    Args:
+        table: Of the camera.
+    """
+
+    def __init__(self, table: CameraTable) -> None:
+        self._table = table
+        shape = (1 + len(GROWN_PX), table.height, table.width)
+        self.pixels = np.zeros(table.sentinel + 1, np.uint8)
+        self.pixels[-1] = 255
+        self._levels = self.pixels[:-1].reshape(shape)
+        self.cells = np.zeros(table.pool_sentinel + 1, np.uint8)
+        self.cells[-1] = 255
+        self._pools = self.cells[:-1].reshape(len(POOLS), *table.pool_shape)
+        self._dirty = (slice(0, 0), slice(0, 0))
+
+    def load(self, bits: Bits) -> None:
+        """Take the silhouette of a set.
+
+        Args:
+            bits: (H, W / 8) uint8, as `silhouettes.packed` makes them.
+
+        Raises:
+            ValueError: The silhouette is not of the size of the calibration.
+        """
+        import cv2
+
+        table = self._table
+        asked = (table.height, -(-table.width // 8))
+        if bits.shape != asked or bits.dtype != np.uint8:
+            raise ValueError(
+                f"silhouette: asked for {table.width} x {table.height} pixels as in the"
+                f" calibration, (uint8 of shape {asked}), found {bits.dtype} of shape {bits.shape}"
+            )
+        self._load_pools(bits)
+        rows = np.flatnonzero(bits.any(1))
+        columns = np.flatnonzero(bits.any(0))
+        self._levels[:, *self._dirty] = 0
+        if not len(rows):
+            self._dirty = (slice(0, 0), slice(0, 0))
+            return
+        most = GROWN_PX[-1]
+        top, bottom = max(rows[0] - most, 0), min(rows[-1] + 1 + most, table.height)
+        left = max(8 * columns[0] - most, 0)
+        right = min(8 * columns[-1] + 8 + most, table.width)
+        region = self._dirty = (slice(top, bottom), slice(left, right))
+        levels = self._levels[:, *region]
+        levels[0] = unpacked(bits, table.width)[region]
+        before = 0
+        for place, grown in enumerate(GROWN_PX, 1):
+            kernel = np.ones((2 * (grown - before) + 1,) * 2, np.uint8)
+            cv2.dilate(levels[place - 1], kernel, dst=levels[place])
+            before = grown
+
+    def _load_pools(self, bits: Bits) -> None:
+        """Pool the bits to cells and grow these."""
+        import cv2
+
+        missing = -len(bits) % POOL_PX
+        if missing:
+            bits = np.concatenate([bits, np.zeros((missing, bits.shape[1]), np.uint8)])
+        pooled = np.bitwise_or.reduce(bits.reshape(-1, POOL_PX, bits.shape[1]), axis=1)
+        before, grown = 0, (pooled > 0).astype(np.uint8)
+        for place, reach in enumerate(POOLS):
+            kernel = np.ones((2 * (reach - before) + 1,) * 2, np.uint8)
+            grown = np.asarray(cv2.dilate(grown, kernel), np.uint8)
+            self._pools[place] = grown
+            before = reach
+
+
+class VisualHull:
+    """Carves the voxels of a grid by silhouettes.
+
+    Args:
+        grid: The voxels.
+        tables: What each camera can say, of the same grid.
+    """
+
+    def __init__(self, grid: VoxelBlocks, tables: Sequence[CameraTable]) -> None:
+        self.grid = grid
+        self.tables = tuple(tables)
+        self._masks = tuple(Masks(table) for table in self.tables)
+        self._given: tuple[int, ...] = ()
+
+    def load(self, silhouettes: Sequence[Bits | None]) -> None:
+        """Take a set of silhouettes, one per camera in the order of the tables.
+
+        Args:
+            silhouettes: (H, W / 8) uint8 each; None where a camera has none and vetoes nothing.
+
+        Raises:
+            ValueError: Another number of silhouettes than of cameras, or one of another size.
+        """
+        if len(silhouettes) != len(self.tables):
+            raise ValueError(
+                f"asked for {len(self.tables)} silhouettes, one per camera,"
+                f" found {len(silhouettes)}"
+            )
+        given = []
+        for number, bits in enumerate(silhouettes):
+            if bits is not None:
+                self._masks[number].load(bits)
+                given.append(number)
+        self._given = tuple(given)
+
+    def carve(self, blocks: Rows) -> npt.NDArray[np.int64]:
+        """Return the rows of all voxels of some blocks that no camera says to be free.
+
+        Args:
+            blocks: Numbers of blocks, each once.
+        """
+        for number in self._given:
+            cells, table = self._masks[number].cells, self.tables[number]
+            blocks = blocks[cells[table.cell[blocks]] > 0]
+        rows = self.grid.rows_in(blocks)
+        for number in self._given:
+            pixels, table = self._masks[number].pixels, self.tables[number]
+            rows = rows[pixels[table.pixel[rows]] > 0]
+        return rows
+
+    def with_one_veto(self, blocks: Rows) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int8]]:
+        """Return all voxels of some blocks that exactly one camera says to be free.
+
+        Args:
+            blocks: Numbers of blocks, each once.
+
+        Returns:
+            Their rows, (N,), and the number of the camera, (N,).
+        """
+        vetoes = np.zeros(len(blocks), np.uint8)
+        for number in self._given:
+            vetoes += self._masks[number].cells[self.tables[number].cell[blocks]] == 0
+        rows = self.grid.rows_in(blocks[vetoes <= 1])
+        vetoes = np.zeros(len(rows), np.uint8)
+        camera = np.full(len(rows), -1, np.int8)
+        for number in self._given:
+            free = self._masks[number].pixels[self.tables[number].pixel[rows]] == 0
+            vetoes += free
+            camera[free] = number
+            few = vetoes <= 1
+            rows, vetoes, camera = rows[few], vetoes[few], camera[few]
+        one = vetoes == 1
+        return np.asarray(rows[one]), np.asarray(camera[one])
+
+    def tight(self, rows: Rows) -> npt.NDArray[np.bool_]:
+        """Return which voxels have their centre in every silhouette, as it came.
+
+        Args:
+            rows: Any voxels.
+        """
+        result = np.ones(len(rows), bool)
+        for number in self._given:
+            table = self.tables[number]
+            index = table.pixel[rows]
+            silent = index == table.sentinel
+            result &= silent | (self._masks[number].pixels[index % table.mask_px] > 0)
+        return result
+
+    def on_masks(self, rows: Rows, masks: Sequence[npt.NDArray[np.uint8]]) -> npt.NDArray[np.bool_]:
+        """Return which voxels lie on given masks for every camera that has a say about them.
+
+        Args:
+            rows: Any voxels.
+            masks: (H, W) uint8 per camera, not 0 where it is.
+        """
+        left = np.arange(len(rows))
+        for number in self._given:
+            table = self.tables[number]
+            index = table.pixel[rows[left]]
+            silent = index == table.sentinel
+            left = left[silent | (masks[number].ravel()[index % table.mask_px] > 0)]
+        result = np.zeros(len(rows), bool)
+        result[left] = True
+        return result
