@@ -88,7 +88,7 @@ class Life:
             drain.begin(why)
 
     def hurry(self, why: str) -> None:
-        """Cut the actor off now, unless this request belongs to the one before."""
+        """Cut the actor off now."""
         if self._drain is not None:
             self._drain.hurry(why)
 
@@ -162,7 +162,7 @@ class ActorGroup:
             life.end(why)
 
     def hurry(self, why: str) -> None:
-        """Cut off all actors that still run, unless this request belongs to the one before."""
+        """Cut off all actors that still run."""
         with self._changed:
             lives = list(self._lives.values())
         for life in lives:  # each may have to wait for a log that nobody reads

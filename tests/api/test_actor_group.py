@@ -149,9 +149,8 @@ def test_actor_that_hangs_when_it_is_to_restart_takes_the_process_with_it(caplog
     assert any("process camera-3 ends, since actor hung does not" in one for one in caplog.messages)
 
 
-def test_second_signal_cuts_off_all_that_still_run(monkeypatch):
+def test_second_signal_cuts_off_all_that_still_run():
     """At once, whatever their drains are."""
-    monkeypatch.setattr("enact_dist.actor_drain.SAME_S", 0.0)
     with Actors(first=["hangs"], second=["hangs"]) as actors:
         actors.group._drains_s = dict.fromkeys(actors.begun, 3600.0)
         actors.until(lambda: actors.ready)
