@@ -29,7 +29,7 @@ CORNER_RAD: Final = 0.5
 """Greatest distance from a corner at which its rounding begins."""
 GRID_RAD: Final = 0.01
 """Distance of the places along a path at which limits are worked out."""
-BRAKING_SHARE: Final = 0.6
+BRAKING_SHARE: Final = 0.8
 """Of a joint's greatest acceleration; the rest is for the curvature of the path."""
 BRAKING_RAMP_S: Final = 0.01
 """How long full deceleration takes to come: its limit of jerk."""

@@ -1,0 +1,283 @@
+"""The robot's inner loop: along the newest path, no faster than the newest speed allows.
+
+It runs in a thread of its own at 100 Hz and takes no lock: commands come in and states go out as
+immutable values.  Time is an argument, so that tests and simulations run it as fast as they like.
+
+Rules a change must keep:
+
+1. Silence means stop.  The arm brakes in full as soon as the newest command that it took is older
+   than that command is valid, counted from the exposure that it rests on, whatever the reason.
+2. A command whose stamps are too old is refused when it arrives, as is one from the future and one
+   that rests on an earlier exposure than the last.
+3. The arm leaves a path only at rest, in a place that lies on it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, Protocol
+
+import numpy as np
+
+from actors.geometry.joint_paths import (
+    BRAKING_RAMP_S,
+    STARTING_SHARE,
+    JointPath,
+    PathFollower,
+    PathSpeeds,
+)
+from actors.workcell.vocabulary import JOINTS_KEPT, Joints
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
+
+    from actors.workcell.vocabulary import ArmModel, Path, Speed
+
+    F64 = npt.NDArray[np.float64]
+
+CYCLE_S: Final = 0.01
+"""Period of the loop."""
+ROBOT_S: Final = CYCLE_S + (1.0 + STARTING_SHARE) * BRAKING_RAMP_S
+"""From the arrival of a command to full deceleration: one cycle, and the ramp from full
+acceleration.  It is the robot's part of the reaction time T_r."""
+NOMINAL_M_S: Final = 1.5
+"""Greatest speed of the quickest point of the arm where nobody is near."""
+BRAKING_M_S2: Final = 6.0
+"""Deceleration of that point on which the protective distance counts."""
+BESIDE_RAD: Final = 0.02
+"""So far from where the arm is may a path begin."""
+FUTURE_NS: Final = 20_000_000
+"""So far ahead of this host's clock may a stamp be."""
+
+
+class RobotDriver(Protocol):
+    """What the loop needs of an arm.
+
+    For a real arm, implement these over its interface for cyclic commands of joint positions
+    (KUKA FRI, UR servoj, Franka joint position control): `command` is called every 10 ms with
+    positions that keep the limits of the model.  The arm's own controller has to brake by itself
+    when commands stay away, since a process can freeze.
+    """
+
+    def open(self, last_rad: F64 | None) -> F64:
+        """Connect; return where the arm is, (7,) rad.
+
+        Args:
+            last_rad: Where it was when it was last published; a real arm ignores it.
+        """
+        ...
+
+    def command(self, q_rad: F64, dq_rad_s: F64) -> tuple[F64, F64]:
+        """Send the next position; return the measured position and speed, each (7,)."""
+        ...
+
+    def close(self) -> None:
+        """Disconnect; the arm is at rest or brakes."""
+        ...
+
+
+class CommandedArm:
+    """An arm that is where it is commanded to be: the robot of a simulated cell.
+
+    Args:
+        home_rad: Where it stands at the first start, 7 numbers; also as text with blanks.
+    """
+
+    def __init__(self, home_rad: str | tuple[float, ...] = "0 0.6 0 -1.3 0 0.9 0") -> None:
+        values = home_rad.split() if isinstance(home_rad, str) else home_rad
+        self._home = np.array([float(value) for value in values])
+        if self._home.shape != (7,):
+            raise ValueError(f"home_rad is {home_rad!r}; it must be 7 numbers")
+
+    def open(self, last_rad: F64 | None) -> F64:
+        """Return where it was last, or home."""
+        return self._home if last_rad is None else np.asarray(last_rad, np.float64)
+
+    def command(self, q_rad: F64, dq_rad_s: F64) -> tuple[F64, F64]:
+        """Be there."""
+        return q_rad, dq_rad_s
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Doing:
+    """What the loop does now.
+
+    Attributes:
+        state: "moving", "dwelling", "waiting" (for a path), "stopped" (nothing may move).
+        reason: Why it does not move.
+        scale: Share of the nominal speed, 0 to 1.
+        speed_m_s: Of the quickest capsule end.
+        path_number: Path that it follows, -1 of none.
+        goals_reached: Paths that it has followed to their ends.
+    """
+
+    state: str = "waiting"
+    reason: str = "no path yet"
+    scale: float = 0.0
+    speed_m_s: float = 0.0
+    path_number: int = -1
+    goals_reached: int = 0
+
+
+class Motion:
+    """The loop, one cycle at a time, see the module.
+
+    Args:
+        model: The arm.
+        q_rad: Where it is, (7,); it is at rest.
+        now_ns: The time.
+
+    Attributes:
+        doing: What it does now.
+        refused: Commands that it has refused.
+    """
+
+    def __init__(self, model: ArmModel, q_rad: F64, now_ns: int) -> None:
+        self._model = model
+        self.q_rad, self.dq_rad_s = np.array(q_rad, np.float64), np.zeros(len(q_rad))
+        self._recent: tuple[tuple[int, F64, F64], ...] = ((now_ns, self.q_rad, self.dq_rad_s),)
+        self._speed: Speed | None = None
+        self._asked: tuple[Path, PathSpeeds] | None = None
+        self._followed: Path | None = None
+        self._follower: PathFollower | None = None
+        self._cut_for = -1
+        self._reached = False
+        self._silence = "no speed has been commanded"
+        self.doing, self.refused = Doing(), 0
+
+    def obey(self, speed: Speed, now_ns: int) -> str:
+        """Take a command.
+
+        Returns:
+            Why it is refused; empty if it is taken.
+        """
+        age_ms = (now_ns - speed.captured_ns) / 1e6
+        if age_ms > speed.valid_ms:
+            why = f"the command is {age_ms:.0f} ms old, {speed.valid_ms:.0f} are allowed"
+        elif age_ms * 1e6 < -FUTURE_NS:
+            why = f"the command is {-age_ms:.0f} ms ahead of this host's clock"
+        elif self._speed is not None and speed.captured_ns < self._speed.captured_ns:
+            why = "the command rests on an earlier exposure than the last"
+        else:
+            self._speed = speed
+            return ""
+        self.refused += 1
+        return why
+
+    def follow(self, path: Path) -> None:
+        """Take a path; one without waypoints ends the motion where it can stop."""
+        asked = self._asked
+        if asked is not None and asked[0].number == path.number:
+            return
+        waypoints = path.waypoints if len(path.waypoints) else self.q_rad[None]
+        line = JointPath(waypoints)
+        self._asked = path, PathSpeeds(self._model, line, nominal_m_s=NOMINAL_M_S)
+
+    def silence(self, reason: str) -> None:
+        """Forget the newest command: the arm brakes and rests until another one comes."""
+        self._speed, self._silence = None, reason
+
+    def cycle(self, now_ns: int) -> None:
+        """Do what is to be done in one period of the loop."""
+        limit_m_s, why = self._limit(now_ns)
+        limit_m_s = self._change_path(limit_m_s)
+        follower = self._follower
+        if follower is not None:
+            follower.step(limit_m_s)
+            q, dq, _ = follower.speeds.path.at(follower.s_rad)
+            self.q_rad, self.dq_rad_s = q[0], dq[0] * follower.speed_rad_s
+        self._tell(why)
+
+    def measured(self, q_rad: F64, dq_rad_s: F64, now_ns: int) -> None:
+        """Keep what the arm has measured."""
+        self._recent = (*self._recent[1 - JOINTS_KEPT :], (now_ns, q_rad, dq_rad_s))
+
+    def joints(self) -> Joints:
+        """Return the last 0.3 s; before they have passed, the first sample stands for what was."""
+        recent = self._recent
+        missing = JOINTS_KEPT - len(recent)
+        first_ns = recent[0][0]
+        step_ns = round(CYCLE_S * 1e9)
+        stamps = [first_ns - step_ns * k for k in range(missing, 0, -1)]
+        return Joints(
+            q=np.stack([recent[0][1]] * missing + [q for _, q, _ in recent]),
+            dq=np.stack([np.zeros_like(recent[0][2])] * missing + [dq for _, _, dq in recent]),
+            stamp_ns=np.array(stamps + [stamp for stamp, _, _ in recent], np.int64),
+        )
+
+    def _limit(self, now_ns: int) -> tuple[float, str]:
+        """Return the speed that is allowed now, and why there is none."""
+        speed = self._speed
+        if speed is None:
+            return 0.0, self._silence
+        age_ms = (now_ns - speed.captured_ns) / 1e6
+        if age_ms > speed.valid_ms or age_ms * 1e6 < -FUTURE_NS:
+            return 0.0, f"the newest command is {age_ms:.0f} ms old"
+        if speed.scale <= 0.0 or not speed.limit_m_s > 0.0:
+            return 0.0, speed.reason
+        return speed.limit_m_s, ""
+
+    def _change_path(self, limit_m_s: float) -> float:
+        """Go over to the newest path where that can be; return the limit until then."""
+        if self._asked is None or self._asked[0] is self._followed:
+            return limit_m_s
+        path, speeds = self._asked
+        follower = self._follower
+        at_rest = follower is None or follower.speed_rad_s == 0.0
+        if not len(path.waypoints):
+            if at_rest:
+                self._follow(path, None)
+            return 0.0
+        beside_rad = float(np.linalg.norm(path.waypoints[0] - self.q_rad))
+        if at_rest and beside_rad <= 1.5 * BESIDE_RAD:
+            if beside_rad > 1e-9:
+                line = JointPath(np.vstack([self.q_rad, path.waypoints]))
+                speeds = PathSpeeds(self._model, line, nominal_m_s=NOMINAL_M_S)
+            self._follow(path, speeds)
+            return limit_m_s
+        if follower is not None and self._ends_there(follower, path):
+            return limit_m_s
+        if at_rest:
+            self._follow(path, None)
+        return 0.0
+
+    def _ends_there(self, follower: PathFollower, path: Path) -> bool:
+        """Let the present path end where the next one begins; False if it does not lead there."""
+        if self._cut_for != path.number:
+            line, start = follower.speeds.path, path.waypoints[0]
+            place_rad = line.nearest_rad(start)
+            beside_rad = np.linalg.norm(line.at(place_rad)[0][0] - start)
+            if beside_rad > BESIDE_RAD or not follower.end_at(place_rad):
+                return False
+            self._cut_for = path.number
+        return True
+
+    def _follow(self, path: Path, speeds: PathSpeeds | None) -> None:
+        """Begin a path, or none."""
+        self._followed, self._cut_for, self._reached = path, -1, False
+        self._follower = None
+        if speeds is not None:
+            self._follower = PathFollower(speeds, cycle_s=CYCLE_S, braking_m_s2=BRAKING_M_S2)
+
+    def _number(self) -> int:
+        followed = self._followed
+        return followed.number if followed is not None and self._follower is not None else -1
+
+    def _tell(self, why: str) -> None:
+        follower, reached = self._follower, self.doing.goals_reached
+        if follower is None:
+            path = self._followed
+            reason = "no path yet" if path is None else path.reason or "the path begins elsewhere"
+            self.doing = Doing("waiting", reason, 0.0, 0.0, -1, reached)
+        elif follower.arrived:
+            if not self._reached and self._cut_for < 0:
+                self._reached, reached = True, reached + 1
+            self.doing = Doing("dwelling", "", 0.0, 0.0, self._number(), reached)
+        elif why and follower.speed_rad_s == 0.0:
+            self.doing = Doing("stopped", why, 0.0, 0.0, self._number(), reached)
+        else:
+            speed = follower.share, follower.speed_m_s
+            self.doing = Doing("moving", why, *speed, self._number(), reached)

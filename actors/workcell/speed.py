@@ -1,0 +1,203 @@
+"""Speed control: how fast the robot may be, by speed and separation monitoring (ENACT 4.1)."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from actors.geometry.joint_paths import JointPath, PathSpeeds
+from actors.geometry.separation import Reaction, Separation
+from actors.workcell.motion import BRAKING_M_S2, NOMINAL_M_S, ROBOT_S
+from actors.workcell.vocabulary import (
+    CAMERA_STATES,
+    HULL,
+    JOINTS,
+    MODEL,
+    PATH,
+    PERIOD_S,
+    ROBOT,
+    SAFETY,
+    SPEED,
+    SYSTEM,
+    WORKSPACE,
+    Safety,
+    Speed,
+)
+from enact_dist import Actor, View, World, Write
+
+if TYPE_CHECKING:
+    from actors.workcell.vocabulary import ArmModel, Joints, Path
+    from enact_dist import Lock
+
+MISFITS_MAX = 2
+"""More cameras than this whose background no longer fits are a fault."""
+AHEAD_S = 0.15
+"""How far along the path the share of the nominal speed is worked out."""
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What the cell may do.
+
+    Attributes:
+        state: "run", "slow", "stop" or "fault".
+        limit_m_s: Greatest speed of the quickest point of the arm.
+        cause: Why, without figures: what changes only when the cause does.
+        reason: Why, with figures.
+    """
+
+    state: str
+    limit_m_s: float
+    cause: str
+    reason: str
+
+
+def judged(
+    *,
+    nearest_m: float,
+    age_s: float,
+    joints_age_s: float,
+    nominal_m_s: float,
+    separation: Separation,
+    latest_s: float,
+    misfits: int = 0,
+    without_path: str = "",
+) -> Verdict:
+    """Return what follows from a set of images.
+
+    Args:
+        nearest_m: Distance from what is occupied to the robot at the exposure.
+        age_s: Of the exposure, now.
+        joints_age_s: Of the newest sample of the joints, at the exposure.
+        nominal_m_s: Speed of the quickest point on the path if nothing limits.
+        separation: The quantities of the protective distance.
+        latest_s: Oldest exposure, and oldest sample of the joints, on which the robot may move.
+        misfits: Cameras whose background no longer fits.
+        without_path: Why there is no path; empty if there is one.
+    """
+    if misfits > MISFITS_MAX:
+        cause = "the background no longer fits"
+        return Verdict("fault", 0.0, cause, f"{cause} in {misfits} cameras")
+    if joints_age_s > latest_s:
+        cause = "the robot does not tell where it is"
+        text = f"no sample of its joints in the {1e3 * joints_age_s:.0f} ms before the exposure"
+        return Verdict("fault", 0.0, cause, text)
+    if age_s > latest_s:
+        cause = "the images come late"
+        return Verdict("stop", 0.0, cause, f"the newest set is {1e3 * age_s:.0f} ms old")
+    limit_m_s = separation.speed_max_m_s(nearest_m)
+    if limit_m_s <= 0.0:
+        cause = "someone is too near"
+        least_m = separation.protective_m(0.0)
+        text = f"{nearest_m:.2f} m to the robot, {least_m:.2f} m are the least at rest"
+        return Verdict("stop", 0.0, cause, text)
+    if without_path:
+        return Verdict("stop", limit_m_s, f"no path: {without_path}", without_path)
+    if limit_m_s < nominal_m_s:
+        text = f"{nearest_m:.2f} m to the robot allow {limit_m_s:.2f} m/s"
+        return Verdict("slow", limit_m_s, "someone is near", text)
+    near = "nobody is there" if math.isinf(nearest_m) else f"{nearest_m:.2f} m to the robot"
+    return Verdict("run", limit_m_s, "", near)
+
+
+class SpeedControl(Actor):
+    """Attach to the robot how fast it may be, at each hull.
+
+    The protective distance is that of ISO/TS 15066 5.5.4.  Its reaction time is measured: the
+    greatest age of the images of the last minute, one period, and the robot's own time.  The
+    command is valid for just that time, so the robot brakes before it would be exceeded.
+
+    The speed rests on the hull, the robot's joints, and the state of the cameras; it carries the
+    stamp of the exposure.
+    """
+
+    online = World("online")
+    hull = View(online, WORKSPACE, HULL)
+    joints = View(online, ROBOT, JOINTS)
+    path = View(online, ROBOT, PATH)
+    model = View(online, ROBOT, MODEL)
+    cameras = View(online, SYSTEM, CAMERA_STATES)
+    speed = Write(online, ROBOT, SPEED)
+    safety = Write(online, SYSTEM, SAFETY)
+    triggers = (hull,)
+
+    human_m_s: float = 1.6
+    braking_m_s2: float = BRAKING_M_S2
+    intrusion_m: float = 0.10
+    uncertainty_m: float = 0.05
+    latest_s: float = 0.25
+    """Oldest exposure on which the robot may move, whatever was measured."""
+
+    def __init__(self) -> None:
+        self._reaction: Reaction | None = None
+        self._speeds: tuple[int, PathSpeeds | None] = (-1, None)
+
+    def update(self, lock: Lock) -> None:
+        """Judge the newest hull."""
+        hull, captured_ns = lock[self.hull], lock.stamp_ns(self.hull)
+        joints, path = lock.get(self.joints), lock.get(self.path)
+        states = lock.get(self.cameras, {})
+        age_s = (time.time_ns() - captured_ns) / 1e9
+        reaction = self._measured(age_s)
+        joints_ns = int(joints.stamp_ns[-1]) if joints is not None else 0
+        nominal_m_s = self._nominal_m_s(lock.get(self.model), path, joints)
+        separation = Separation(
+            reaction_s=reaction.reaction_s,
+            human_m_s=self.human_m_s,
+            braking_m_s2=self.braking_m_s2,
+            intrusion_m=self.intrusion_m,
+            uncertainty_m=self.uncertainty_m,
+        )
+        verdict = judged(
+            nearest_m=hull.nearest_m,
+            age_s=age_s,
+            joints_age_s=max(0.0, (captured_ns - joints_ns) / 1e9),
+            nominal_m_s=nominal_m_s,
+            separation=separation,
+            latest_s=self.latest_s,
+            misfits=sum(state.trouble == "background no longer fits" for state in states.values()),
+            without_path=_missing(path),
+        )
+        blind = [name for name, state in sorted(states.items()) if not state.alive]
+        without = f"; without {', '.join(blind)}" if blind else ""
+        lock[self.speed] = Speed(
+            scale=min(1.0, verdict.limit_m_s / nominal_m_s) if verdict.limit_m_s else 0.0,
+            limit_m_s=verdict.limit_m_s,
+            nearest_m=hull.nearest_m,
+            reason=verdict.reason + without,
+            valid_ms=1e3 * reaction.valid_s,
+            captured_ns=captured_ns,
+            joints_ns=joints_ns,
+        )
+        last = lock.get(self.safety)
+        said = verdict.state, verdict.cause + without
+        if last is None or (last.state, last.reason) != said:
+            lock[self.safety] = Safety(*said, since_ns=captured_ns)
+
+    def _measured(self, age_s: float) -> Reaction:
+        """Return the reaction time that was measured, this set included."""
+        if self._reaction is None:
+            self._reaction = Reaction(period_s=PERIOD_S, robot_s=ROBOT_S, latest_s=self.latest_s)
+        self._reaction.seen(age_s)
+        return self._reaction
+
+    def _nominal_m_s(
+        self, model: ArmModel | None, path: Path | None, joints: Joints | None
+    ) -> float:
+        """Return how fast the robot would be where it is on its path, nothing limiting."""
+        if model is None or joints is None or path is None or not len(path.waypoints):
+            return NOMINAL_M_S
+        number, speeds = self._speeds
+        if number != path.number or speeds is None:
+            speeds = PathSpeeds(model, JointPath(path.waypoints), nominal_m_s=NOMINAL_M_S)
+            self._speeds = path.number, speeds
+        return speeds.nominal_m_s(speeds.path.nearest_rad(joints.q[-1]), AHEAD_S)
+
+
+def _missing(path: Path | None) -> str:
+    """Return why there is no path; empty if there is one."""
+    if path is None:
+        return "none is planned yet"
+    return "" if len(path.waypoints) else path.reason

@@ -1,0 +1,220 @@
+"""Speed control says run, slow, stop or fault with the reason, and on what it rests."""
+
+import math
+import time
+
+import numpy as np
+import pytest
+
+from actors.geometry.separation import Separation
+from actors.workcell.motion import NOMINAL_M_S, ROBOT_S
+from actors.workcell.simulation.arm import ARM, HOME_RAD
+from actors.workcell.speed import SpeedControl, judged
+from actors.workcell.vocabulary import (
+    CAMERA_STATES,
+    HULL,
+    JOINTS,
+    MODEL,
+    PATH,
+    ROBOT,
+    SAFETY,
+    SPEED,
+    SYSTEM,
+    WORKSPACE,
+    CameraState,
+    Hull,
+    Joints,
+    Path,
+)
+from enact_dist import Lock, View, Write, testing
+
+MS = 1_000_000
+SEPARATION = Separation()
+SOUND = {
+    "nearest_m": math.inf,
+    "age_s": 0.06,
+    "joints_age_s": 0.0,
+    "nominal_m_s": 1.0,
+    "separation": SEPARATION,
+    "latest_s": 0.25,
+}
+
+
+@pytest.mark.parametrize(
+    ("changes", "state", "text"),
+    [
+        ({}, "run", "nobody is there"),
+        ({"nearest_m": 2.0}, "run", "2.00 m to the robot"),
+        ({"nearest_m": 0.8}, "slow", "0.80 m to the robot allow 0.45 m/s"),
+        ({"nearest_m": 0.5}, "stop", "0.50 m to the robot, 0.55 m are the least"),
+        ({"nearest_m": -0.1}, "stop", "-0.10 m"),
+        ({"without_path": "no path was found"}, "stop", "no path was found"),
+        ({"age_s": 0.26}, "stop", "260 ms old"),
+        ({"joints_age_s": 0.3}, "fault", "300 ms before the exposure"),
+        ({"misfits": 2}, "run", ""),
+        ({"misfits": 3}, "fault", "the background no longer fits in 3 cameras"),
+    ],
+)
+def test_verdict_follows_from_what_is_known(changes, state, text):
+    """Each cause has its state and names the figures that it rests on."""
+    verdict = judged(**{**SOUND, **changes})
+
+    assert verdict.state == state
+    assert text in verdict.reason
+    assert (verdict.limit_m_s == 0.0) == (
+        state in {"stop", "fault"} and "without_path" not in changes
+    )
+
+
+def test_worse_causes_come_first():
+    """A fault is not hidden by someone who is near."""
+    assert judged(**{**SOUND, "misfits": 8, "nearest_m": 0.0, "age_s": 9.0}).state == "fault"
+
+
+def hull(nearest_m):
+    none = np.empty(0)
+    return Hull(
+        np.empty((0, 3), np.int16), none.astype(np.float32), none.astype(bool),
+        none.astype(np.int16), {}, (), nearest_m, -1,
+    )  # fmt: skip
+
+
+class Cell:
+    """A cell in this process in which SpeedControl runs."""
+
+    def __init__(self, cell):
+        self.cell, self.online, self.actor = cell, cell.world("online"), SpeedControl()
+        self.online.init(ROBOT, MODEL, ARM)
+
+    def put(self, entity, aspect, value, stamp_ns=0):
+        request = Write(self.online, entity, aspect)
+        with Lock(request) as lock:
+            lock.put(request, value, stamp_ns=stamp_ns)
+
+    def get(self, entity, aspect):
+        request = View(self.online, entity, aspect)
+        return self.online.view(request)[request]
+
+    def joints(self, stamp_ns):
+        q = np.tile(HOME_RAD, (30, 1))
+        stamps = stamp_ns - 10 * MS * np.arange(29, -1, -1)
+        self.put(ROBOT, JOINTS, Joints(q, np.zeros((30, 7)), stamps.astype(np.int64)))
+
+    def path(self, *waypoints, number=1, reason=""):
+        rows = np.array(waypoints, float).reshape(-1, 7)
+        self.put(ROBOT, PATH, Path(rows, number, 0, 1, 0, 0.0, reason))
+
+    def judge(self, nearest_m, age_ms=50):
+        """Put a hull and run the actor; return the speed."""
+        captured_ns = time.time_ns() - age_ms * MS
+        self.put(WORKSPACE, HULL, hull(nearest_m), captured_ns)
+        assert testing.run_once(self.actor, self.cell) == 1
+        speed = self.get(ROBOT, SPEED)
+        assert speed.captured_ns == captured_ns
+        return speed
+
+
+@pytest.fixture
+def cell():
+    with testing.worlds("online") as worlds:
+        yield Cell(worlds)
+
+
+AWAY = np.array(HOME_RAD) + np.array([1.5, 0, 0, 0, 0, 0, 0])
+
+
+def test_speed_carries_what_it_rests_on(cell):
+    """Stamp of the exposure, stamp of the joints, the distance, and how long it is valid."""
+    stamp_ns = time.time_ns()
+    cell.joints(stamp_ns)
+    cell.path(HOME_RAD, AWAY)
+
+    speed = cell.judge(0.8)
+
+    assert (speed.joints_ns, speed.nearest_m, speed.valid_ms) == (stamp_ns, 0.8, 250.0)
+    expected = Separation(reaction_s=0.25 + ROBOT_S).speed_max_m_s(0.8)
+    assert speed.limit_m_s == pytest.approx(expected)
+    assert 0.0 < speed.scale < 1.0
+    assert cell.get(SYSTEM, SAFETY).state == "slow"
+
+
+def test_share_is_that_of_the_speed_on_the_path(cell):
+    """On a slow path the same limit is a larger share."""
+    cell.joints(time.time_ns())
+    cell.path(HOME_RAD, AWAY)
+    quick = cell.judge(0.8)
+    cell.path(HOME_RAD, np.array(HOME_RAD) + np.array([0, 0, 0, 0, 0, 0, 2.0]), number=2)
+
+    slow = cell.judge(0.8)
+
+    assert quick.limit_m_s == slow.limit_m_s
+    assert quick.scale < 1.0
+    assert slow.scale == 1.0
+    assert quick.scale >= quick.limit_m_s / NOMINAL_M_S
+
+
+def test_reaction_time_is_measured(cell):
+    """Quick images shorten it; a hull that comes too late stops the robot."""
+    cell.joints(time.time_ns())
+    cell.path(HOME_RAD, AWAY)
+    first = cell.judge(1.0, age_ms=20)
+    for _ in range(20):
+        quick = cell.judge(1.0, age_ms=20)
+
+    late = cell.judge(1.0, age_ms=400)
+
+    assert quick.valid_ms < first.valid_ms
+    assert quick.limit_m_s > first.limit_m_s
+    assert late.valid_ms == 250.0
+    assert late.limit_m_s == 0.0
+    assert cell.get(SYSTEM, SAFETY).reason == "the images come late"
+
+
+def test_silent_robot_and_missing_path_are_said(cell):
+    """Without joints there is a fault; without a path a stop with the planner's reason."""
+    fault = cell.judge(math.inf)
+    state_before = cell.get(SYSTEM, SAFETY)
+    cell.joints(time.time_ns())
+    cell.path(number=3, reason="the goal is where something is in the way")
+
+    cell.judge(math.inf)
+
+    assert (fault.limit_m_s, state_before.state) == (0.0, "fault")
+    state = cell.get(SYSTEM, SAFETY)
+    assert (state.state, state.reason) == (
+        "stop",
+        "no path: the goal is where something is in the way",
+    )
+
+
+def test_cameras_are_named(cell):
+    """A camera for which another stands in is named; three that do not fit are a fault."""
+    cell.joints(time.time_ns())
+    cell.path(HOME_RAD, AWAY)
+    states = {
+        f"camera/{n}": CameraState(n != 3, 0, 0, "silent" if n == 3 else "") for n in range(8)
+    }
+    cell.put(SYSTEM, CAMERA_STATES, states)
+    without = cell.judge(2.0)
+    misfit = CameraState(alive=True, last_ns=0, sets_missed=0, trouble="background no longer fits")
+    cell.put(SYSTEM, CAMERA_STATES, {**states, **{f"camera/{n}": misfit for n in range(3)}})
+
+    fault = cell.judge(2.0)
+
+    assert without.reason == "2.00 m to the robot; without camera/3"
+    assert fault.limit_m_s == 0.0
+    assert cell.get(SYSTEM, SAFETY).state == "fault"
+
+
+def test_safety_is_written_when_it_changes(cell):
+    """The state keeps the exposure since which it holds, however the figures change."""
+    cell.joints(time.time_ns())
+    cell.path(HOME_RAD, AWAY)
+    first = cell.judge(0.8)
+    cell.judge(0.75)
+    since = cell.get(SYSTEM, SAFETY)
+    last = cell.judge(0.2)
+
+    assert (since.state, since.since_ns) == ("slow", first.captured_ns)
+    assert cell.get(SYSTEM, SAFETY).since_ns == last.captured_ns
+    assert len(cell.online.history(SYSTEM, SAFETY)) == 2
