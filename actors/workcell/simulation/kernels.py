@@ -119,18 +119,33 @@ def draw(
 
 
 @numba.njit(cache=True, fastmath=True, nogil=True)
+def _covered(lamp_depth_m: F32, column: float, row: float, below_m: float) -> float:
+    """Return which share of the four texels around a place is nearer to the lamp than `below_m`."""
+    left, top = int(column), int(row)
+    right, down = column - left, row - top
+    dark = 0.0
+    if lamp_depth_m[top, left] < below_m:
+        dark += (1.0 - right) * (1.0 - down)
+    if lamp_depth_m[top, left + 1] < below_m:
+        dark += right * (1.0 - down)
+    if lamp_depth_m[top + 1, left] < below_m:
+        dark += (1.0 - right) * down
+    if lamp_depth_m[top + 1, left + 1] < below_m:
+        dark += right * down
+    return dark
+
+
+@numba.njit(cache=True, fastmath=True, nogil=True)
 def cast_shadows(
     image: npt.NDArray[np.uint8],
     depth_m: F32,
     still_depth_m: F32,
     light: F32,
-    lamp_depth_m: F32,
-    first_column: int,
-    first_row: int,
-    last_column: int,
-    last_row: int,
+    before_m: F32,
+    after_m: F32,
+    window: tuple[int, int, int, int],
 ) -> None:
-    """Darken what stands still where something between it and the lamp was drawn.
+    """Darken what stands still where something new between it and the lamp was drawn.
 
     Args:
         image: (H, W, 3), darkened.
@@ -138,31 +153,20 @@ def cast_shadows(
         still_depth_m: (H, W), of what stands still.
         light: (H, W, 4) per pixel of what stands still: column and row in the lamp's image, its
             depth there (0: never lit), the factor of full shadow.
-        lamp_depth_m: (L, L), the lamp's image of what moves.
-        first_column: Of the window that is looked at.
-        first_row: Likewise.
-        last_column: Likewise, + 1.
-        last_row: Likewise, + 1.
+        before_m: (L, L), the lamp's image of what has thrown its shadow already.
+        after_m: (L, L), the same and what throws its shadow now.
+        window: First column, first row, last column + 1, last row + 1 of what is looked at.
     """
-    size = lamp_depth_m.shape[0]
-    for v in range(first_row, last_row):
-        for u in range(first_column, last_column):
-            below = light[v, u, 2] - 0.04
-            column, row = int(light[v, u, 0]), int(light[v, u, 1])
-            if below < 0.0 or column < 0 or row < 0 or column >= size - 1 or row >= size - 1:
+    last = after_m.shape[0] - 1
+    for v in range(window[1], window[3]):
+        for u in range(window[0], window[2]):
+            column, row, below = light[v, u, 0], light[v, u, 1], light[v, u, 2] - 0.04
+            if below < 0.0 or not (0.0 <= column < last and 0.0 <= row < last):
                 continue
-            right, down = light[v, u, 0] - column, light[v, u, 1] - row
-            dark = 0.0
-            if lamp_depth_m[row, column] < below:
-                dark += (1.0 - right) * (1.0 - down)
-            if lamp_depth_m[row, column + 1] < below:
-                dark += right * (1.0 - down)
-            if lamp_depth_m[row + 1, column] < below:
-                dark += (1.0 - right) * down
-            if lamp_depth_m[row + 1, column + 1] < below:
-                dark += right * down
+            dark = _covered(after_m, column, row, below)
             if dark == 0.0 or depth_m[v, u] < still_depth_m[v, u]:
                 continue
-            factor = 1.0 - dark * (1.0 - light[v, u, 3])
+            lost = 1.0 - light[v, u, 3]
+            factor = (1.0 - dark * lost) / (1.0 - _covered(before_m, column, row, below) * lost)
             for channel in range(3):
                 image[v, u, channel] = image[v, u, channel] * factor + 0.5

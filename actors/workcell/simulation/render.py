@@ -52,11 +52,19 @@ class Rendered:
         image: (H, W, 3) uint8, BGR.
         depth_m: (H, W) float32, along the optical axis.
         names: (H, W) int16: 0 is what stands still, then the capsules from 1 on, as they came.
+        lamp_m: (L, L) float32, the lamp's image of what moves: depth below the lamp.
+        count: Number of capsules drawn.
     """
 
     image: Image
     depth_m: F32
     names: npt.NDArray[np.int16]
+    lamp_m: F32
+    count: int = 0
+
+
+_NO_IMAGE: Final = np.empty((0, 0, 3), np.uint8)
+_NO_NAMES: Final = np.empty((0, 0), np.int16)
 
 
 class Painter:
@@ -80,75 +88,41 @@ class Painter:
         self._lamp = (matrix, np.zeros(5), pose)
         self._lamp_m = np.array(LAMP_M)
 
-    def paint(self, drawn: Rendered, backdrop: Backdrop, capsules: F64, colours: F64) -> None:
-        """Draw capsules and their shadows into a view.
+    def paint(
+        self, onto: Rendered, backdrop: Backdrop, capsules: F64, colours: F64 | None
+    ) -> Rendered:
+        """Return a view with more capsules in it, and their shadows; `onto` is used up.
 
         Args:
-            drawn: Changed in place; its names are 0 where nothing was drawn before.
+            onto: Drawn into, but for its lamp's image.
             backdrop: What stands still in it.
             capsules: (n, 7), cell.
-            colours: (n, 3), blue, green, red, 0 to 1.
+            colours: (n, 3), blue, green, red, 0 to 1; None: the image shows them already, and only
+                their depth and their places before the lamp are drawn.
         """
-        from actors.workcell.simulation.kernels import draw
+        from actors.workcell.simulation.kernels import cast_shadows, draw
 
         if not len(capsules):
-            return
-        height, width = drawn.depth_m.shape
+            return onto
+        height, width = onto.depth_m.shape
         both = np.concatenate([capsules, _on_floor(capsules)])
         around = outlines(both, [self._camera, self._lamp], sides=8)
         spans = image_boxes(around[0], height, width)
-        windows, landed = spans[: len(capsules)], spans[spans[:, 2] > 0]
-        if not len(landed):
-            return
         above = image_boxes(around[1, : len(capsules)], LAMP_PX, LAMP_PX)
-        window = (*landed[:, :2].min(0).tolist(), *landed[:, 2:].max(0).tolist())
-        self._shadow(drawn, backdrop, capsules, above, window)
-        first = int(drawn.names.max()) + 1 if drawn.names.any() else 1
-        draw(
-            drawn.image,
-            drawn.depth_m,
-            drawn.names,
-            self._origin,
-            self._rays,
-            windows,
-            capsules,
-            colours,
-            self._lamp_m,
-            first,
-        )
-
-    def _shadow(
-        self,
-        drawn: Rendered,
-        backdrop: Backdrop,
-        capsules: F64,
-        above: npt.NDArray[np.int32],
-        window: tuple[int, ...],
-    ) -> None:
-        """Darken what lies behind capsules as the lamp sees them: `above` there, `window` here."""
-        from actors.workcell.simulation.kernels import cast_shadows, draw
-
-        lamp_depth = np.full((LAMP_PX, LAMP_PX), np.inf, np.float32)
-        draw(
-            np.empty((0, 0, 3), np.uint8),
-            lamp_depth,
-            np.empty((0, 0), np.int16),
-            self._lamp_m,
-            self._lamp_rays,
-            above,
-            capsules,
-            np.empty((len(capsules), 3)),
-            self._lamp_m,
-            0,
-        )
-        cast_shadows(
-            drawn.image,
-            drawn.depth_m,
-            backdrop.depth_m,
-            backdrop.light,
-            lamp_depth,
-            *window,
-        )
+        shades = np.empty((len(capsules), 3)) if colours is None else colours
+        lamp_m, at, rays = onto.lamp_m.copy(), self._lamp_m, self._lamp_rays
+        draw(_NO_IMAGE, lamp_m, _NO_NAMES, at, rays, above, capsules, shades, at, 0)
+        image, names, first = onto.image, onto.names, onto.count + 1
+        landed = spans[spans[:, 2] > 0]
+        if colours is None:
+            image, names = _NO_IMAGE, _NO_NAMES
+        elif len(landed):
+            window = (*landed[:, :2].min(0).tolist(), *landed[:, 2:].max(0).tolist())
+            still_m, light = backdrop.depth_m, backdrop.light
+            cast_shadows(image, onto.depth_m, still_m, light, onto.lamp_m, lamp_m, window)
+        windows, depth_m, rays = spans[: len(capsules)], onto.depth_m, self._rays
+        draw(image, depth_m, names, self._origin, rays, windows, capsules, shades, at, first)
+        return Rendered(onto.image, depth_m, onto.names, lamp_m, onto.count + len(capsules))
 
 
 def _on_floor(capsules: F64) -> F64:
@@ -219,22 +193,34 @@ class View:
             self._backdrops[key] = backdrop_of(self.calibration, key)
         return self._backdrops[key]
 
-    def render(self, capsules: F64, colours: F64, boxes: Sequence[Box] = BOXES) -> Rendered:
+    def empty(self, boxes: Sequence[Box] = BOXES) -> Rendered:
+        """Return the view of the room in which nothing moves, to draw into."""
+        backdrop = self.backdrop(boxes)
+        return Rendered(
+            backdrop.image.copy(),
+            backdrop.depth_m.copy(),
+            np.zeros(backdrop.depth_m.shape, np.int16),
+            np.full((LAMP_PX, LAMP_PX), np.inf, np.float32),
+        )
+
+    def render(
+        self,
+        capsules: F64,
+        colours: F64 | None,
+        boxes: Sequence[Box] = BOXES,
+        *,
+        onto: Rendered | None = None,
+    ) -> Rendered:
         """Return the view of capsules in the room, without noise.
 
         Args:
             capsules: (n, 7), cell.
-            colours: (n, 3), blue, green, red, 0 to 1.
+            colours: (n, 3), blue, green, red, 0 to 1; None: see `Painter.paint`.
             boxes: What stands in the room.
+            onto: A view of the same boxes with others in it, which is used up.
         """
-        backdrop = self.backdrop(boxes)
-        drawn = Rendered(
-            backdrop.image.copy(),
-            backdrop.depth_m.copy(),
-            np.zeros(backdrop.depth_m.shape, np.int16),
-        )
-        self._painter.paint(drawn, backdrop, capsules, colours)
-        return drawn
+        onto = self.empty(boxes) if onto is None else onto
+        return self._painter.paint(onto, self.backdrop(boxes), capsules, colours)
 
     def exposed(self, image: Image, stamp_ns: int, brightness: float = 1.0) -> Image:
         """Return an image as the sensor gives it: with the light of the moment, and with noise."""

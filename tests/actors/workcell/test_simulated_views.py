@@ -170,6 +170,21 @@ def test_shadow_falls_behind_a_thing_as_the_lamp_sees_it():
     assert away.max() < 40
 
 
+def test_drawing_in_two_steps_is_drawing_at_once():
+    """First the people, then the arm over them: same depth, same shadows where both fall."""
+    scene = Stage(scenario_of("visit", 1)).scene_at(5.0, capsules_at(ARM, np.array(HOME_RAD))[0])
+    one, arm = view(7), slice(None, 5)
+    at_once = one.render(scene.capsules, scene.colours)
+    people = one.render(scene.capsules[5:], scene.colours[5:])
+    steps = one.render(scene.capsules[arm], scene.colours[arm], onto=people)
+    np.testing.assert_array_equal(steps.depth_m, at_once.depth_m)
+    np.testing.assert_allclose(steps.image, at_once.image.astype(int), atol=2.0)
+    np.testing.assert_array_equal(steps.lamp_m, at_once.lamp_m)
+    unseen = one.render(scene.capsules, None)
+    np.testing.assert_array_equal(unseen.depth_m, at_once.depth_m)
+    np.testing.assert_array_equal(unseen.image, one.backdrop().image)
+
+
 def test_nothing_moves_nothing_changes():
     drawn = view(0).render(np.empty((0, 7)), np.empty((0, 3)))
     np.testing.assert_array_equal(drawn.image, view(0).backdrop().image)
