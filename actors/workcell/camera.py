@@ -1,0 +1,197 @@
+"""The `Camera` actor: an image of one camera per tick.
+
+A thread of its own captures, as in the paper: a driver that hangs holds up neither the actor's
+lock nor its shutdown, and what can be made ready before a tick is ready by then.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+from concurrent.futures import Future
+from typing import TYPE_CHECKING, Any, Final, TypeVar
+
+from actors.workcell.sources import PERIOD_NS, CameraEndedError, CameraError, source_of
+from actors.workcell.vocabulary import CALIBRATION, CAMERAS, IMAGE, PERIOD_S
+from enact_dist import Actor, Lock, View, World, Write
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    import numpy as np
+    import numpy.typing as npt
+
+    from actors.workcell.sources import CameraSource
+    from actors.workcell.vocabulary import Calibration
+
+    Image = npt.NDArray[np.uint8]
+
+T = TypeVar("T")
+
+OPEN_S: Final = 60.0
+"""How long a source may take to open; a simulated one draws its room and compiles its loops."""
+FRAME_S: Final = 1.0
+"""A source that gives no image for so long hangs."""
+
+
+class Capture:
+    """A thread that takes the images of a source.
+
+    Args:
+        source: Used by this thread only.
+        name: Name of the camera, for messages.
+    """
+
+    def __init__(self, source: CameraSource, name: str) -> None:
+        self._source, self._name = source, name
+        self._asked: queue.SimpleQueue[tuple[Future[Any], Callable[[], Any]] | None] = (
+            queue.SimpleQueue()
+        )
+        self._hangs: Future[Any] | None = None
+        self._thread = threading.Thread(target=self._run, name=f"capture-{name}", daemon=True)
+        self._thread.start()
+
+    def open(self, calibration: Calibration) -> None:
+        """Open the source for a calibration.
+
+        Raises:
+            CameraError: It cannot be opened, or not in time.
+        """
+        self._result(self._ask(lambda: self._source.open(calibration)), OPEN_S)
+
+    def frame(self, stamp_ns: int, wait_s: float = FRAME_S) -> tuple[Image, int]:
+        """Return the image of a tick, and when it was exposed, ns since 1970.
+
+        Raises:
+            CameraError: There is none, or not in time.
+        """
+
+        def take() -> tuple[Image, int]:
+            image = self._source.frame(stamp_ns)
+            return image, self._source.exposed_ns or stamp_ns
+
+        return self._result(self._ask(take), wait_s)
+
+    def prepare(self, stamp_ns: int) -> None:
+        """Let a source that can get ready for a tick to come do so; its `frame` waits for it."""
+        prepare: Callable[[int], None] | None = getattr(self._source, "prepare", None)
+        if prepare is not None:
+            self._ask(lambda: prepare(stamp_ns))
+
+    def close(self) -> None:
+        """Close the source and end the thread; a driver that hangs is left to itself."""
+        self._ask(self._source.close)
+        self._asked.put(None)
+        self._thread.join(timeout=1.0)
+
+    def _ask(self, call: Callable[[], T]) -> Future[T]:
+        future: Future[T] = Future()
+        self._asked.put((future, call))
+        return future
+
+    def _result(self, future: Future[T], wait_s: float) -> T:
+        if self._hangs is not None and not self._hangs.done():
+            future.cancel()
+            raise CameraError(f"{self._name}: its source still hangs; no image was taken")
+        self._hangs = None
+        try:
+            return future.result(wait_s)
+        except TimeoutError:
+            self._hangs = future
+            raise CameraError(
+                f"{self._name}: asked its source for an image; found no answer within {wait_s:g} s;"
+                " the device or its driver hangs"
+            ) from None
+
+    def _run(self) -> None:
+        while (asked := self._asked.get()) is not None:
+            future, call = asked
+            if not future.set_running_or_notify_cancel():
+                continue
+            try:
+                future.set_result(call())
+            except BaseException as error:  # noqa: BLE001 - it goes to who asked
+                future.set_exception(error)
+
+
+class Camera(Actor):
+    """Publishes what one camera sees, ten times per second, all cameras at the same ticks.
+
+    A camera that fails writes nothing: its error is reported, the tick stays without its image,
+    and at the next tick its source is opened again.
+
+    Attributes:
+        source: Address of its images, see `sources`.
+    """
+
+    online = World("online")
+    calibration = View(online, CAMERAS, CALIBRATION)
+    image = Write(online, CAMERAS, IMAGE)
+    every_s = PERIOD_S
+
+    def __init__(self, source: str = "v4l2:/dev/video{camera}") -> None:
+        self.source = source
+        self._capture: Capture | None = None
+        self._opened: Calibration | None = None
+
+    def start(self) -> None:
+        """Look at the address, before anything is locked.
+
+        Raises:
+            CameraError: It is no address of a source.
+        """
+        self._capture = Capture(self.make_source(), self.only_entity_name())
+
+    def only_entity_name(self) -> str:
+        """Return the name of the camera's entity, `camera/3`."""
+        assert self.only_entity is not None, "an actor of one camera: set only_entity"
+        return self.only_entity.name
+
+    def make_source(self) -> CameraSource:
+        """Return the source at the actor's address."""
+        return source_of(self.source, self.only_entity_name().partition("/")[2])
+
+    def look(self, lock: Lock) -> None:
+        """See what the source needs beside the tick; a real one needs nothing."""
+
+    def update(self, lock: Lock) -> None:
+        """Publish the image of the tick.
+
+        Raises:
+            CameraError: There is none.
+        """
+        assert self._capture is not None
+        calibration = lock.get(self.calibration)
+        if calibration is None:
+            raise CameraError(
+                f"{self.only_entity_name()}: asked for its calibration; found none in the context;"
+                " write it first (the actor Setup, or `enact workcell calibrate`)"
+            )
+        if self._opened is None or not _same(self._opened, calibration):
+            self._capture.open(calibration)
+            self._opened = calibration
+        self.look(lock)
+        try:
+            image, exposed_ns = self._capture.frame(lock.tick_ns)
+        except CameraEndedError:
+            raise
+        except CameraError:
+            self._opened = None
+            raise
+        lock.put(self.image, image, stamp_ns=exposed_ns)
+        self._capture.prepare(lock.tick_ns + PERIOD_NS)
+
+    def stop(self) -> None:
+        """Close the source."""
+        if self._capture is not None:
+            self._capture.close()
+
+
+def _same(one: Calibration, other: Calibration) -> bool:
+    """Say whether two calibrations are equal."""
+    return one is other or (
+        (one.width, one.height) == (other.width, other.height)
+        and bool((one.camera_matrix == other.camera_matrix).all())
+        and bool((one.distortion == other.distortion).all())
+        and bool((one.camera_from_cell == other.camera_from_cell).all())
+    )

@@ -1,0 +1,248 @@
+"""Live and played views of a scenario are the same but for noise; recordings come back whole."""
+
+import dataclasses
+import importlib.util
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from actors.geometry.kinematics import capsules_at
+from actors.workcell.scenarios import scenario_of
+from actors.workcell.simulation.arm import ARM, HOME_RAD, shown_at
+from actors.workcell.simulation.camera import SimulatedCamera
+from actors.workcell.simulation.recording import kept_recording, read_info, record
+from actors.workcell.simulation.render import NOISE_LEVELS
+from actors.workcell.simulation.room import cameras
+from actors.workcell.simulation.stage import Stage
+from actors.workcell.simulation.truth import TruthHuman, TruthRobot
+from actors.workcell.sources import PERIOD_NS, CameraError, source_of
+from actors.workcell.vocabulary import (
+    BODY,
+    CALIBRATION,
+    HUMANS,
+    IMAGE,
+    JOINTS,
+    PLAYING,
+    ROBOT,
+    SCENARIO,
+    Body,
+    Joints,
+    Playing,
+    camera_entity,
+    human_entity,
+)
+from enact_dist import View, ViewEach, testing
+
+BEGIN_NS = 1_000_000 * PERIOD_NS
+VIEWS = cameras(0.25)[:2]
+SECONDS = 4.0
+
+
+def joints_of(q, dq=None, end_ns=BEGIN_NS, period_s=0.01):
+    count = 30
+    dq = np.zeros(7) if dq is None else np.asarray(dq, float)
+    back_s = np.arange(count - 1, -1, -1)[:, None] * period_s
+    stamps = end_ns - np.rint(back_s[:, 0] * 1e9).astype(np.int64)
+    return Joints(np.asarray(q, float) - back_s * dq, np.tile(dq, (count, 1)), stamps)
+
+
+def playing(name="visit", seed=3, robot=True, seconds=SECONDS):
+    return Playing(name, seed, BEGIN_NS, seconds, robot)
+
+
+def opened(address, what, joints=None, camera="0"):
+    source = source_of(address, camera)
+    source.open(VIEWS[int(camera)])
+    source.look(what, joints)
+    return source
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    root = tmp_path_factory.mktemp("recordings")
+    told = []
+    scenario = scenario_of("visit", 3, SECONDS)
+    folder = kept_recording(
+        root, scenario, calibrations=VIEWS, progress=lambda done, of: told.append((done, of))
+    )
+    assert sorted(told) == [(n, 80) for n in range(1, 81)]
+    return root, folder
+
+
+def test_live_view_is_the_same_for_the_same_stamp_and_has_the_arm_where_its_joints_are():
+    away = np.add(HOME_RAD, [1.2, 0, 0, 0, 0, 0, 0])
+    one, same, other, bare = (
+        opened("live", what, joints).frame(BEGIN_NS + 20 * PERIOD_NS)
+        for what, joints in (
+            (playing(), joints_of(HOME_RAD)),
+            (playing(), joints_of(HOME_RAD)),
+            (playing(), joints_of(away)),
+            (playing(robot=False), None),
+        )
+    )
+    np.testing.assert_array_equal(one, same)
+    assert (np.abs(one.astype(int) - other).max(2) > 40).sum() > 100
+    assert (np.abs(one.astype(int) - bare).max(2) > 40).sum() > 100
+
+
+def test_prepared_view_is_the_view():
+    ready, unready = (opened("live", playing(), joints_of(HOME_RAD)) for _ in range(2))
+    stamp_ns = BEGIN_NS + 25 * PERIOD_NS
+    ready.prepare(stamp_ns)
+    np.testing.assert_array_equal(ready.frame(stamp_ns), unready.frame(stamp_ns))
+
+
+def test_nobody_is_there_before_and_after():
+    source = opened("live", playing(robot=False))
+    empty = opened("live", None).frame(BEGIN_NS - PERIOD_NS)
+    np.testing.assert_array_equal(source.frame(BEGIN_NS - PERIOD_NS), empty)
+    inside = source.frame(BEGIN_NS + 30 * PERIOD_NS)
+    after = source.frame(BEGIN_NS + 40 * PERIOD_NS)
+    limit = 8 * NOISE_LEVELS
+    assert (np.abs(inside.astype(int) - empty).max(2) > limit).sum() > 50
+    assert (np.abs(after.astype(int) - empty).max(2) > limit).sum() == 0
+
+
+def test_scenario_must_begin_at_a_tick():
+    late = dataclasses.replace(playing(), start_ns=BEGIN_NS + 1)
+    with pytest.raises(CameraError, match="asked for a scenario that begins at a tick"):
+        opened("live", late).frame(BEGIN_NS)
+
+
+def test_stuck_camera_repeats_its_image():
+    source = opened("live", playing(), joints_of(HOME_RAD))
+    first = source.frame(BEGIN_NS)
+    source.look(playing(), joints_of(HOME_RAD), stuck=True)
+    np.testing.assert_array_equal(source.frame(BEGIN_NS + PERIOD_NS), first)
+    source.look(playing(), joints_of(HOME_RAD))
+    assert (source.frame(BEGIN_NS + 2 * PERIOD_NS) != first).any()
+
+
+@pytest.mark.parametrize("frame", [0, 15, 30])
+def test_played_view_with_the_live_arm_is_the_live_view_but_for_noise_and_jpeg(recording, frame):
+    stamp_ns, joints = BEGIN_NS + frame * PERIOD_NS, joints_of(HOME_RAD)
+    live = opened("live", playing(), joints).frame(stamp_ns)
+    played = opened(f"playback+robot:{recording[1]}", playing(), joints).frame(stamp_ns)
+    difference = cv2.blur(live, (3, 3)).astype(int) - cv2.blur(played, (3, 3))
+    assert np.abs(difference).mean() < 0.3
+    assert (np.abs(difference).max(2) > 20).sum() < 12  # JPEG at the outline of a small person
+
+
+def test_recording_is_made_once_and_again_if_it_is_of_something_else(recording):
+    root, folder = recording
+    made_ns = (folder / "recording.json").stat().st_mtime_ns
+    scenario = scenario_of("visit", 3, SECONDS)
+    assert kept_recording(root, scenario, calibrations=VIEWS) == folder
+    assert (folder / "recording.json").stat().st_mtime_ns == made_ns
+    assert [path.name for path in root.iterdir()] == [folder.name]
+
+
+def test_recording_knows_its_truth(recording):
+    truth = np.load(recording[1] / "truth.npz")
+    stage = Stage(scenario_of("visit", 3, SECONDS))
+    np.testing.assert_array_equal(truth["bodies"][30, 0], stage.bodies_at(3.0)[0])
+    assert np.isnan(truth["bodies"][0]).all()
+    assert truth["joints"].shape == (0, 7)
+
+
+def test_recording_with_the_arm_plays_as_it_was(tmp_path):
+    scenario = scenario_of("S1", 1, 0.3)
+
+    def motion(at_s):
+        return np.add(HOME_RAD, [at_s, 0, 0, 0, 0, 0, 0])
+
+    folder = record(tmp_path / "swing", scenario, calibrations=VIEWS[:1], motion=motion)
+    what = playing("S1", 1, seconds=0.3)
+    played = opened(f"playback:{folder}", what).frame(BEGIN_NS + 2 * PERIOD_NS)
+    live = opened("live", what, joints_of(motion(0.2))).frame(BEGIN_NS + 2 * PERIOD_NS)
+    assert np.abs(cv2.blur(played, (3, 3)).astype(int) - cv2.blur(live, (3, 3))).mean() < 0.3
+    with pytest.raises(CameraError, match="asked for a recording without the arm"):
+        opened(f"playback+robot:{folder}", what)
+
+
+def test_recordings_that_do_not_fit_are_one_line_each(recording, tmp_path):
+    address = f"playback+robot:{recording[1]}"
+    with pytest.raises(CameraError, match="asked for a recording of visit, seed 4"):
+        opened(address, playing(seed=4)).frame(BEGIN_NS)
+    source = source_of(address, "0")
+    with pytest.raises(CameraError, match="asked for 640 x 480 pixels"):
+        source.open(cameras()[0])
+    with pytest.raises(CameraError, match="asked for camera 5; found 2 cameras"):
+        source_of(address, "5").open(VIEWS[0])
+    broken = kept_recording(tmp_path, scenario_of("visit", 3, 3.0), calibrations=VIEWS)
+    next((broken / "camera_0").glob("*.jpg")).unlink()
+    with pytest.raises(CameraError, match="found no such file; record it again"):
+        source_of(f"playback:{broken}", "0").open(VIEWS[0])
+    info = json.loads((broken / "recording.json").read_text())
+    (broken / "recording.json").write_text(json.dumps(info | {"format": 99}))
+    with pytest.raises(CameraError, match="found format 99"):
+        read_info(broken)
+
+
+def test_mujoco_draws_the_same_scene_or_says_why_not():
+    """Where MuJoCo can draw, arm and people stand where the composite renderer puts them."""
+    if importlib.util.find_spec("mujoco") is None:
+        pytest.skip("MuJoCo is not installed")
+    from actors.workcell.simulation.mujoco_views import mujoco_draws
+    from actors.workcell.simulation.render import View as Composite
+
+    stage = Stage(scenario_of("visit", 3, 8.0))
+    draw = mujoco_draws(VIEWS, stage)[1]
+    try:
+        empty = draw(stage.scene_at(-1.0)).astype(int)
+    except CameraError as error:
+        assert "renderer mujoco: it cannot draw here" in str(error)  # noqa: PT017
+        pytest.skip(str(error))
+    scene = stage.scene_at(5.0, capsules_at(ARM, np.array(HOME_RAD))[0])
+    shown = Composite(VIEWS[1], 0).render(scene.capsules, scene.colours, scene.boxes).names > 0
+    changed = np.abs(draw(scene).astype(int) - empty).max(2) > 25
+    assert shown.sum() > 150
+    assert (shown & changed).sum() > 0.85 * shown.sum()
+    near = cv2.dilate(shown.astype(np.uint8), np.ones((3, 3))) > 0
+    assert (changed & ~near).sum() < 1.5 * shown.sum()  # shadows
+
+
+def test_arm_is_shown_between_its_samples_and_ahead_of_them():
+    speed = np.array([1.0, 0, 0, 0, 0, 0, -0.5])
+    joints = joints_of(HOME_RAD, speed)
+    np.testing.assert_allclose(
+        shown_at(joints, BEGIN_NS - 105_000_000), np.array(HOME_RAD) - 0.105 * speed, atol=1e-9
+    )
+    np.testing.assert_allclose(
+        shown_at(joints, BEGIN_NS + PERIOD_NS), np.array(HOME_RAD) + 0.1 * speed, atol=1e-9
+    )
+    braking = dataclasses.replace(joints, dq=joints.dq * np.linspace(30.0, 1.0, 30)[:, None] / 30.0)
+    ahead = shown_at(braking, BEGIN_NS + PERIOD_NS)
+    assert 0.0 < ahead[0] - HOME_RAD[0] < 0.001
+
+
+def test_simulated_camera_and_truth_write_what_plays():
+    with testing.worlds("online", "truth") as cell:
+        online, truth = cell.world("online"), cell.world("truth")
+        start_ns = 1_000 * 1_000_000_000 - 3 * 1_000_000_000
+        truth.init(SCENARIO, PLAYING, dataclasses.replace(playing(), start_ns=start_ns))
+        online.init(camera_entity(0), CALIBRATION, VIEWS[0])
+        online.init(ROBOT, JOINTS, joints_of(HOME_RAD))
+        truth.init(human_entity(1), BODY, Body(np.zeros((17, 7), "f4"), np.zeros(2), np.zeros(2)))
+        camera = SimulatedCamera("live")
+        camera.only_entity = camera_entity(0)
+        testing.run_once(camera, cell)
+        testing.run_once(TruthRobot(), cell)
+        testing.run_once(TruthHuman(), cell)
+        image, joints = View(online, camera_entity(0), IMAGE), View(truth, ROBOT, JOINTS)
+        bodies = ViewEach(truth, HUMANS, BODY)
+        assert online.view(image)[image].shape == (120, 160, 3)
+        np.testing.assert_allclose(truth.view(joints)[joints].q[-1], HOME_RAD)
+        found = truth.view(bodies)[bodies]
+        assert list(found) == [human_entity(0)]
+        stage = Stage(scenario_of("visit", 3, SECONDS))
+        np.testing.assert_allclose(
+            found[human_entity(0)].capsules, stage.bodies_at(3.0)[0], atol=1e-6
+        )
+        assert 0.8 < np.linalg.norm(found[human_entity(0)].velocity_m_s) < 1.4
+        wrong = SimulatedCamera("v4l2:/dev/video0")
+        wrong.only_entity = camera_entity(0)
+        with pytest.raises(CameraError, match="asked for a simulated source"):
+            testing.run_once(wrong, cell)
