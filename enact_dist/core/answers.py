@@ -390,7 +390,11 @@ class Dropped:
 
 @dataclass(frozen=True, slots=True)
 class Kept:
-    """What a label keeps now, and which of the asked versions were forgotten before."""
+    """What a label keeps now, and which of the asked versions were forgotten before.
+
+    Of what it keeps one page, by slot and version.
+    """
 
     versions: tuple[SlotVersion, ...]
     forgotten: tuple[SlotVersion, ...]
+    more: Cursor = START

@@ -18,12 +18,14 @@ from enact_dist.core.beliefs import Sendings
 from enact_dist.core.datum import LockId
 from enact_dist.core.lock_parts import Plan
 from enact_dist.core.messages import (
+    START,
     Alive,
     Answer,
     EpochChanged,
     Granted,
     Hello,
     KeepAlive,
+    KeepVersions,
     LaneView,
     PlacementMap,
     Welcome,
@@ -338,4 +340,7 @@ _GRANTS_COUNT = frozenset((Phase.ACQUIRING, Phase.VIEWING, Phase.HELD))
 def _epoch_of(request: Request) -> int | None:
     """Return the epoch that a request was made for (that of its grant, token or cursor)."""
     made_in = getattr(request, "token", None) or getattr(request, "after", None)
-    return getattr(request, "epoch", None) if made_in is None else made_in.epoch
+    if made_in is None or (made_in == START and isinstance(request, KeepVersions)):
+        return getattr(request, "epoch", None)
+    epoch: int = made_in.epoch
+    return epoch

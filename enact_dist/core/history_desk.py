@@ -7,13 +7,15 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.admission import wrong_label, wrong_patterns
 from enact_dist.core.messages import (
+    START,
+    Cursor,
     EpochChanged,
     KeepVersions,
     Kept,
     ListHistory,
     Refused,
 )
-from enact_dist.core.pages import VERSIONS_OF_A_LOOK, over_slots
+from enact_dist.core.pages import VERSIONS_OF_A_LOOK, bytes_in_frame, over_slots, page_of
 from enact_dist.core.records import KeptRecord, Persist, Reply, Story
 from enact_dist.core.version_list import bytes_of, entries_of, version_of, versions
 from enact_dist.terms import Durability
@@ -78,6 +80,9 @@ class HistoryDesk:
 
     def on_keep_versions(self, message: KeepVersions, reply_to: int) -> Iterator[Effect]:
         """Keep versions under a label, or let go of all that it keeps."""
+        if message.after != START:
+            yield Reply(reply_to, self._page(message.label, (), message.after))
+            return
         answer = self._state.answered_before(message)
         records: tuple[Record, ...] = ()
         if answer is None:
@@ -99,8 +104,20 @@ class HistoryDesk:
         forgotten = self._keep_each(label, message.versions)
         kept = tuple(history.labels.get(label, ()))
         if kept == before:
-            return Kept(kept, forgotten), ()
-        return Kept(kept, forgotten), (self._record(label), *history.take_forgotten())
+            return self._page(label, forgotten), ()
+        return self._page(label, forgotten), (self._record(label), *history.take_forgotten())
+
+    def _page(self, label: str, forgotten: tuple[SlotVersion, ...], after: Cursor = START) -> Kept:
+        """Return what a label keeps beyond a cursor, as much of it as one answer may have."""
+        before = after.names, after.version
+        epoch, kept = self._state.epoch, self._state.slots.history.labels.get(label, ())
+        steps = (
+            (each, bytes_in_frame(each), 1, Cursor(epoch, tuple(each.slot), 0, each.version))
+            for each in sorted(kept)
+            if (tuple(each.slot), each.version) > before
+        )
+        versions, more = page_of(steps)
+        return Kept(versions, forgotten, more)
 
     def _keep_each(self, label: str, versions: tuple[SlotVersion, ...]) -> tuple[SlotVersion, ...]:
         """Keep versions; return those that are forgotten, or are about to be."""

@@ -410,7 +410,8 @@ class KeepVersions:
     """Keep versions from being forgotten under a label; no versions: let go of the label's.
 
     Answer: `Kept`.  Asked again with the same label, versions are added.  `epoch` and `count` are
-    those of `Fork`: a late copy keeps nothing that was let go of since.
+    those of `Fork`: a late copy keeps nothing that was let go of since.  With `after` it changes
+    nothing and asks for the next page of what the label keeps.
     """
 
     session: str
@@ -418,3 +419,4 @@ class KeepVersions:
     versions: tuple[SlotVersion, ...]
     epoch: int = 0
     count: int = 0
+    after: Cursor = START

@@ -15,6 +15,8 @@ from enact_dist.core.messages import (
     FindEffects,
     Hello,
     KeepAlive,
+    KeepVersions,
+    Kept,
     ListAudit,
     ListHistory,
     ListLocks,
@@ -38,9 +40,11 @@ BYTES_PER_S_MIN: Final = 10e6
 """A call that carries data gets this much more time per byte."""
 _WITH_DATA: Final = (Commit, Prepare)
 _SIGNS_OF_LIFE: Final = (Hello, KeepAlive)
-_LISTINGS: Final = (Survey, ListLocks, ListSessions, ListAudit, ListHistory, Explain, FindEffects)
-_Page = Surveyed | Locks | Sessions | Audited | Versions
-_ANSWERS: Final = (Surveyed, Locks, Sessions, Audited, Versions)
+_LISTINGS: Final = (
+    Survey, ListLocks, ListSessions, ListAudit, ListHistory, Explain, FindEffects, KeepVersions,
+)  # fmt: skip
+_Page = Surveyed | Locks | Sessions | Audited | Versions | Kept
+_ANSWERS: Final = (Surveyed, Locks, Sessions, Audited, Versions, Kept)
 
 
 class Calls:
@@ -97,6 +101,7 @@ _ENTRIES: Final[dict[type, str]] = {
     Sessions: "sessions",
     Audited: "entries",
     Versions: "entries",
+    Kept: "versions",
 }
 """The field of each answer that grows."""
 

@@ -8,19 +8,24 @@ from hypothesis import strategies as st
 from shard_bench import ShardBench, item, lock_id, pages_of, slot
 
 from enact_dist.core import inspection, pages, version_list
+from enact_dist.core.client import Client
 from enact_dist.core.messages import (
     START,
     AspectEntry,
     Cursor,
     EpochChanged,
     FindEffects,
+    KeepVersions,
     ListAudit,
     ListHistory,
     ListLocks,
     ListSessions,
+    PlacementMap,
     Register,
+    SlotVersion,
     Survey,
     Surveyed,
+    Welcome,
 )
 from enact_dist.core.records import AuditRecord
 from enact_dist.terms import Access
@@ -195,3 +200,46 @@ def test_page_of_a_slot_with_very_many_versions_has_many_of_them(monkeypatch, re
     field = "states" if isinstance(request_, Survey) else "entries"
     assert sum(len(getattr(page, field)) for page in listed) == 400
     assert len(listed) <= 40
+
+
+def test_what_a_label_keeps_comes_in_pages(bench, monkeypatch):
+    """By slot and version, whatever the order of keeping; a further page changes nothing."""
+    monkeypatch.setattr(pages, "WORK_MAX", 3)
+    versions = [SlotVersion(slot(entity, "mask"), one) for one in (3, 1, 2) for entity in ENTITIES]
+    keep = KeepVersions("ann", "all", tuple(versions), 1, 1)
+    answer = first = bench.ask(keep)
+    written, found = len(bench.log), [answer.versions]
+    while answer.more != START:
+        answer = bench.ask(replace(keep, after=answer.more))
+        found.append(answer.versions)
+
+    assert [len(page) for page in found] == 7 * [3]
+    assert [one for page in found for one in page] == sorted(versions)
+    assert len(bench.log) == written
+    assert bench.ask(keep) == first
+    stale = answer.more._replace(epoch=9)
+    assert bench.ask(replace(keep, after=stale)) == EpochChanged(1)
+
+
+def test_pages_of_a_label_go_on_behind_what_was_let_go_of(bench, monkeypatch):
+    """What stays comes exactly once."""
+    monkeypatch.setattr(pages, "WORK_MAX", 3)
+    versions = [SlotVersion(slot(entity, "mask"), 3) for entity in ENTITIES]
+    keep = KeepVersions("ann", "all", tuple(versions), 1, 1)
+    answer = bench.ask(keep)
+    bench.ask(KeepVersions("ann", "all", (), 1, 2))
+    bench.ask(KeepVersions("ann", "all", tuple(versions[2:6]), 1, 3))
+
+    assert bench.ask(replace(keep, after=answer.more)).versions == tuple(versions[3:6])
+
+
+def test_session_that_a_shard_has_forgotten_greets_it_before_it_keeps_again():
+    """The refusal is of this epoch, not of an earlier one: without a greeting it came for ever."""
+    client = Client("ann", ttl_ns=10**9)
+    welcome = Welcome("s0", 1, True, 10**9, 1, 0, PlacementMap(1, (), ()), (), ())
+    client.answered("s0", client.hello("s0"), welcome, 0)
+    assert not client.needs_hello("s0")
+
+    client.answered("s0", KeepVersions("ann", "all", (), 1, 1), EpochChanged(1), 0)
+
+    assert client.needs_hello("s0")

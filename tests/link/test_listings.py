@@ -13,6 +13,8 @@ from enact_dist.core.messages import (
     AwaitStamp,
     Hello,
     KeepAlive,
+    KeepVersions,
+    Kept,
     OutcomeIs,
     Refused,
     SlotVersion,
@@ -122,3 +124,35 @@ def test_lock_that_shows_more_than_an_answer_holds_is_refused_and_held_by_nobody
                 Lock(WriteEach(online, Entities("tray/*"), count), wait_s=30.0).__enter__()
 
         assert cell.locks() == ()
+
+
+@both
+def test_label_that_keeps_more_than_a_page_is_told_whole(daemon, endpoint, monkeypatch):
+    """One answer with all of it would outgrow a frame."""
+    count = Aspect("count", int, Durability.VOLATILE)
+    daemon(endpoint)
+    monkeypatch.setattr(pages, "WORK_MAX", 3)
+    sent = []
+    with connect(endpoint) as cell:
+        online = cell.world("online")
+        for number in range(8):
+            online.init(Entity(f"tray/{number}"), count, number)
+        versions = [one for n in range(8) for one in online.history(Entity(f"tray/{n}"), count)]
+        cell.keep("all", versions)
+        asked = [SlotVersion(one.slot, one.version) for one in versions]
+        client = cell._client
+        take = client.carrier.request
+
+        def counted(shard, message, *, timeout_s):
+            answer = take(shard, message, timeout_s=timeout_s)
+            sent.append(len(answer.versions))
+            return answer
+
+        monkeypatch.setattr(client.carrier, "request", counted)
+        epoch, number = client.core.epoch("s0"), client.core.sendings.next(client._now_ns())
+        again = KeepVersions(client.core.session, "all", tuple(asked[:1]), epoch, number)
+        kept = client.call("s0", again)
+        monkeypatch.undo()
+
+    assert sent == [3, 3, 2]
+    assert kept == Kept(tuple(asked), ())
