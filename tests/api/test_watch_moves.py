@@ -1,5 +1,6 @@
 """A watch that is open while the cell gets another shard, and entities move there."""
 
+import threading
 import time
 
 import pytest
@@ -11,6 +12,8 @@ from enact_dist.core.messages import Pin, PlacementMap, ShardEntry
 from enact_dist.core.shard_state import ShardSettings
 from enact_dist.link.rebalance import rebalance
 from enact_dist.link.shard_daemon import DaemonSettings, start_shard
+from enact_dist.recording import Recorder
+from enact_dist.recording.reading import Recording
 from enact_dist.terms import Aspect, Durability, Entities, Entity, View, Write
 
 pytestmark = pytest.mark.carrier("socket", "zenoh")
@@ -37,7 +40,7 @@ class GrowingCell:
     def start(self, placement):
         """Start its shards."""
         for name, endpoints in placement.shards:
-            settings = ShardSettings(name, placement, worlds=("online",))
+            settings = ShardSettings(name, placement, worlds=("online", "planned"))
             daemon = DaemonSettings(
                 "cell", settings, endpoints, self.folder / name, carrier=self.carrier
             )
@@ -101,6 +104,62 @@ def test_open_watch_sees_what_is_on_a_shard_that_was_added(growing):
                 ("part/right/new", 1, 0, False, "right"),
             ]
             assert watch.next(1.0) is None
+
+
+def test_open_diff_sees_what_is_on_a_shard_that_was_added(growing):
+    """What moved there differs when it is written, what is new there at once."""
+    with connect(growing.endpoints["left"]) as cell:
+        online, planned = cell.world("online"), cell.world("planned")
+        for world in (online, planned):
+            put(world, STAYS, 1)
+            put(world, MOVES, 1)
+        with online.watch_diff(planned, Entities("part/**"), COUNT) as watch:
+            assert watch.next(0.0) is None
+
+            growing.grow()
+            with connect(growing.endpoints["right"]) as other:
+                for number, entity in enumerate((MOVES, NEW, STAYS), 2):
+                    put(other.world("online"), entity, number)
+            rows = [watch.next(WAIT_S) for _ in range(3)]
+
+        assert sorted((row.entity.name, row.kind.value) for row in rows) == [
+            ("part/left", "changed"),
+            ("part/right", "changed"),
+            ("part/right/new", "only left"),
+        ]
+
+
+def test_recorder_follows_a_shard_that_was_added(growing, tmp_path):
+    """Its recording has what was written there, and misses nothing."""
+    path, stop, begun = tmp_path / "run.mcap", threading.Event(), threading.Event()
+    with connect(growing.endpoints["left"]) as cell:
+        for entity in (STAYS, MOVES):
+            put(cell.world("online"), entity, 1)
+        recorder = Recorder(cell, path)
+        whole = threading.Event()
+
+        def tell(summary):
+            begun.set()
+            if summary.versions == 5:
+                whole.set()
+
+        thread = threading.Thread(target=lambda: recorder.run(stop, tell=tell))
+        thread.start()
+        try:
+            assert begun.wait(WAIT_S)
+            growing.grow()
+            with connect(growing.endpoints["right"]) as other:
+                for number, entity in enumerate((MOVES, NEW, STAYS), 1):
+                    put(other.world("online"), entity, number)
+            assert whole.wait(WAIT_S)
+        finally:
+            stop.set()
+            thread.join(WAIT_S)
+
+        versions = [version for commit in Recording(path).commits() for version in commit.versions]
+        assert recorder.summary.missing == 0
+        shards = {version.slot.entity: version.shard for version in versions}
+        assert shards["part/right/new"] == shards["part/right"] == "right"
 
 
 class Doubling(Actor):
