@@ -13,6 +13,7 @@ not pass in silence.  The lost shard may come back after years; asking costs one
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
@@ -45,42 +46,54 @@ if TYPE_CHECKING:
 ASK_NS: Final = 2_000_000_000
 """How often a shard that was given up is asked what it had decided."""
 ENTRIES_MAX: Final = 1_000
-"""Operators' acts that are told; the store keeps all."""
+"""Operators' acts that a shard remembers and lists, the newest ones; the store keeps all."""
 
 BROKEN, FORCED, CONFIRMED, ALARM, SETTLED = "broken", "forced", "confirmed", "alarm", "settled"
 
 
 class Audit:
-    """What operators did here, newest last, and which alarms nobody has settled."""
+    """What operators did here, newest last, and how many alarms nobody has settled.
+
+    Attributes:
+        alarms: How many alarms came after the last time that somebody settled them.
+    """
 
     def __init__(self, recovered: Iterable[AuditRecord]) -> None:
-        self._records = sorted(recovered, key=lambda record: record.wall_ns)
+        self._records: deque[AuditRecord] = deque(maxlen=ENTRIES_MAX)
+        self._count = 0
+        self._newest_alarm_ns = 0
+        self.alarms = 0
+        for record in sorted(recovered, key=lambda record: record.wall_ns):
+            self.keep(record)
 
     def keep(self, record: AuditRecord) -> AuditRecord:
         """Remember a record and return it, for the store."""
         self._records.append(record)
+        self._count += 1
+        if record.kind == ALARM:
+            self.alarms += 1
+            self._newest_alarm_ns = max(self._newest_alarm_ns, record.wall_ns)
+        elif record.kind == SETTLED:
+            self.alarms = 0
         return record
-
-    @property
-    def alarms(self) -> int:
-        """How many alarms came after the last time that somebody settled them."""
-        kinds = [record.kind for record in self._records]
-        settled = len(kinds) - kinds[::-1].index(SETTLED) if SETTLED in kinds else 0
-        return kinds[settled:].count(ALARM)
 
     def may_settle(self, seen_ns: int) -> bool:
         """Whether there are alarms, and none that came after `seen_ns` (0: whenever)."""
-        newest_ns = max((r.wall_ns for r in self._records if r.kind == ALARM), default=0)
-        return self.alarms > 0 and (not seen_ns or newest_ns <= seen_ns)
+        return self.alarms > 0 and (not seen_ns or self._newest_alarm_ns <= seen_ns)
 
     def __len__(self) -> int:
-        return len(self._records)
+        return self._count
+
+    @property
+    def left_out(self) -> int:
+        """How many acts are too old to be listed."""
+        return self._count - len(self._records)
 
     def entries(self) -> tuple[AuditEntry, ...]:
         """Return the newest records, for people."""
         return tuple(
             AuditEntry(record.wall_ns, record.kind, record.text, record.identity)
-            for record in self._records[-ENTRIES_MAX:]
+            for record in self._records
         )
 
 

@@ -169,6 +169,7 @@ def counted(state: ShardState) -> dict[str, int]:
     history = state.slots.history
     others = {
         "alarms": state.audit.alarms,
+        "audit_left_out": state.audit.left_out,
         "catalogue_left_out": state.catalogue.left_out,
         "draining": int(state.draining),
         "namesakes": len(state.doubled),

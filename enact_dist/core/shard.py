@@ -23,7 +23,6 @@ from enact_dist.core.history_desk import HistoryDesk
 from enact_dist.core.lineage_desk import LineageDesk
 from enact_dist.core.lock_desk import LockDesk
 from enact_dist.core.messages import (
-    START,
     Acquire,
     AwaitStamp,
     Break,
@@ -91,6 +90,8 @@ if TYPE_CHECKING:
     from enact_dist.core.messages import Request
     from enact_dist.core.records import Event
 
+LISTINGS: Final = (Survey, ListLocks, ListSessions, ListAudit, ListHistory, Explain, FindEffects)
+"""What is answered in pages: requests with a cursor."""
 _DECIDE: Final = frozenset((Persisted, Called, Drain))
 """After these, what was undecided may be decided; after no other message."""
 
@@ -154,6 +155,21 @@ class Shard:
             MakeRoom: self._history.on_make_room,
         }
 
+        for kind in LISTINGS:
+            self._handlers[kind] = self._listing(self._handlers[kind])
+
+    def _listing(self, handler: Callable[..., Iterator[Effect]]) -> Callable[..., Iterator[Effect]]:
+        """Return the handler of a listing that refuses a cursor of another epoch."""
+
+        def listed(message: Request, reply_to: int) -> Iterator[Effect]:
+            if message.after.epoch in (0, self.epoch):  # type: ignore[union-attr]  # a listing
+                yield from handler(message, reply_to)
+            else:
+                self.state.count("epoch_refusals")
+                yield Reply(reply_to, EpochChanged(self.epoch))
+
+        return listed
+
     # ---------------------------------------------------------------- the one mutator
 
     def handle(
@@ -180,8 +196,6 @@ class Shard:
         refusal = (
             owners.refusal(message, identity, state.sessions, state.epoch) if identity else None
         )
-        if refusal is None and getattr(message, "after", START).epoch not in (0, self.epoch):
-            refusal = EpochChanged(self.epoch)
         if refusal is None:
             effects = list(self._handlers[type(message)](message, reply_to))
         else:

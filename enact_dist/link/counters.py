@@ -109,6 +109,10 @@ OF_A_SHARD: Final[dict[str, Counter]] = {
     "namesakes": Counter(
         "shards of the cell that several daemons serve now", "enact doctor", now=True
     ),
+    "audit_left_out": Counter(
+        "acts of operators that are too old for enact lock audit, which lists the newest 1,000",
+        now=True,
+    ),
     "catalogue_left_out": Counter(
         "world contexts and aspects that the catalogue has no room to show",
         "stop the cell and run enact shard forget --unused",

@@ -58,7 +58,7 @@ from enact_dist.core.shard import Shard
 from enact_dist.errors import StoreError
 from enact_dist.link.clock import Clock, SystemClock
 from enact_dist.link.host_figures import figures_of, latencies_of
-from enact_dist.link.payload_desk import PayloadDesk, half_of
+from enact_dist.link.payload_desk import PayloadDesk, half_of, names_payloads
 from enact_dist.link.stalls import Stalls
 from enact_dist.link.uninterrupted import Uninterrupted
 
@@ -245,8 +245,9 @@ class ShardHost:
         """
         kind = type(message)
         if kind is Commit or kind is Prepare:
-            if self._refusal(message, identity) is None:  # else nothing staged is used up by it
-                message = self._payloads.with_bodies(cast("Commit", message))
+            commit = cast("Commit", message)
+            if names_payloads(commit) and self._refusal(commit, identity) is None:
+                message = self._payloads.with_bodies(commit)  # else nothing staged is used up
         elif kind is Stage:
             self._stage(cast("Stage", message), reply, identity)
             return

@@ -368,7 +368,7 @@ class PayloadDesk:
 
         What is not here stays without: the shard then says what that means for this lock.
         """
-        if not any(write.datum is not None and write.datum.file for write in message.writes):
+        if not names_payloads(message):
             return message
         session = message.lock.session
         return replace(
@@ -477,6 +477,11 @@ class PayloadDesk:
     def _count(self, name: str, count: int = 1) -> None:
         with self._mutex:
             self.counters[name] = self.counters.get(name, 0) + count
+
+
+def names_payloads(message: Commit | Prepare) -> bool:
+    """Whether a commit or prepare names data that were sent ahead of it."""
+    return any(write.datum is not None and write.datum.file for write in message.writes)
 
 
 def half_of(folder: SharedFolder | None) -> int:

@@ -24,6 +24,7 @@ from enact_dist.core.messages import (
     Item,
     KeepAlive,
     LaneView,
+    ListPlaces,
     PlacementMap,
     Register,
     Request,
@@ -110,6 +111,7 @@ class ShardBench:
         self.notices: list[object] = []
         self.stories: list[Story] = []
         self.calls: list[tuple[str, object]] = []
+        self.calls_about_places: list[tuple[str, object]] = []
         self.answers: dict[int, Answer] = {}
         self._handles = count(1)
         self._counts: dict[str, count[int]] = {}
@@ -168,7 +170,9 @@ class ShardBench:
             elif isinstance(effect, Persist):
                 self.pending.append(effect)
             elif isinstance(effect, Call):
-                self.calls.append((effect.shard, effect.request))
+                about_places = isinstance(effect.request, ListPlaces)
+                calls = self.calls_about_places if about_places else self.calls
+                calls.append((effect.shard, effect.request))
             elif isinstance(effect, Publish):
                 self.notices.append(effect.notice)
             elif isinstance(effect, Story):

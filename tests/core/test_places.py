@@ -29,7 +29,7 @@ def test_shard_that_comes_into_reach_hears_our_places(bench):
     """It may expect a shard elsewhere, and nobody else would say so."""
     bench.event(ShardReturned("far"))
 
-    assert bench.calls == [("far", ListPlaces("s0", OURS))]
+    assert bench.calls_about_places == [("far", ListPlaces("s0", OURS))]
 
 
 def test_what_everybody_expects_asks_nobody(bench):

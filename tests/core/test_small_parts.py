@@ -12,9 +12,10 @@ from shard_bench import S, datum, slot
 from enact_dist.core.beliefs import SENDINGS_KEPT, Sendings, shortened_ns
 from enact_dist.core.catalogue import Catalogue
 from enact_dist.core.datum import Column, Datum, Position, Slot
+from enact_dist.core.forced import ALARM, ENTRIES_MAX, SETTLED, Audit
 from enact_dist.core.messages import AspectEntry, Item, Pin, PlacementMap, ShardEntry
 from enact_dist.core.placement import shard_of
-from enact_dist.core.records import SlotRecord
+from enact_dist.core.records import AuditRecord, SlotRecord
 from enact_dist.core.sessions import Session
 from enact_dist.core.slots import INLINE_BYTES_MAX, NOTHING, Content, SlotMap
 from enact_dist.core.stamps import AHEAD_NS_MAX, Stamps
@@ -246,3 +247,16 @@ def test_positions_are_ordered_by_time():
     """A position can be compared with another one."""
     assert Position(1, "s1") < Position(2, "s0")
     assert Slot("a", "b", "c") == ("a", "b", "c")
+
+
+def test_audit_remembers_the_newest_acts_and_every_alarm():
+    """Locks that somebody breaks in a loop fill no memory; an alarm outlasts its own entry."""
+    audit = Audit([AuditRecord(1, "torn", ALARM)])
+    for number in range(2, 2 * ENTRIES_MAX):
+        audit.keep(AuditRecord(number, "broken"))
+
+    assert len(audit._records) == len(audit.entries()) == ENTRIES_MAX
+    assert (len(audit), audit.left_out, audit.alarms) == (2 * ENTRIES_MAX - 1, ENTRIES_MAX - 1, 1)
+    assert audit.may_settle(1)
+    audit.keep(AuditRecord(3 * ENTRIES_MAX, "seen to", SETTLED))
+    assert audit.alarms == 0

@@ -7,7 +7,7 @@ import pytest
 import zenoh
 
 from enact_dist.core import messages as m
-from enact_dist.core import parked, quotas, sessions
+from enact_dist.core import owners, parked, quotas, sessions
 from enact_dist.core.datum import Datum, LockId, Position, Slot
 from enact_dist.errors import PermissionDeniedError, ProtocolError
 from enact_dist.link import payload_desk, socket_service
@@ -238,6 +238,21 @@ def test_commit_that_carries_more_than_it_may_is_refused_and_the_lock_stays(
     assert (refused.code, "in slices (Stage)" in refused.text) == ("protocol", True)
     assert isinstance(taken, m.Committed)
     assert isinstance(large, m.Committed)
+
+
+def test_identity_of_a_commit_is_compared_once(daemon, carry, make_peer, endpoint, monkeypatch):
+    """Only one that names data sent ahead of it is looked at before they are taken, too."""
+    daemon(endpoint)
+    peer = peer_over(carry(endpoint), make_peer)
+    kinds = []
+    refusal = owners.refusal
+    monkeypatch.setattr(
+        owners, "refusal", lambda *words: (kinds.append(type(words[0])), refusal(*words))[1]
+    )
+
+    assert isinstance(peer.commit(peer.acquire("cup"), "cup", b"1"), m.Committed)
+
+    assert kinds.count(m.Commit) == 1
 
 
 def test_frame_beyond_the_bound_is_not_kept_and_the_next_one_served(daemon, endpoint, stranger):

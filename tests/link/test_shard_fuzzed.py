@@ -168,7 +168,7 @@ def test_shard_hears_on_after_a_request_that_fails_before_the_core(
     def fails(*_):
         raise OSError("the folder is gone")
 
-    monkeypatch.setattr(shard.host._payloads, "with_bodies", fails)
+    monkeypatch.setattr("enact_dist.link.host.names_payloads", fails)
     commit = encode_frame(m.Commit(LockId("session", 0, 1), Token(1, 1), (), 0))[0]
     *unanswered, answered = raw(*[(commit, b"")] * 3, (encode_frame(m.ListLocks())[0], b""))
 
