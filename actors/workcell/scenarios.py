@@ -10,7 +10,7 @@ visit  the default: a person enters, reaches over the table, goes around the cab
 S1     the cell stays empty
 S2     a person enters at 1.2 m/s, walks past and leaves; another one at 1.6 m/s
 S3     a person reaches over the table towards the tool and stays
-S4     a person hides behind the cabinet and comes out towards the robot
+S4     a person hides in a walk-in cabinet, where no camera sees, and comes out towards the robot
 S5     a person stands still for a long time
 S6     a person leaves a box and goes
 S7     while a person walks, a camera dies, another freezes, the image of a third is stuck
@@ -125,6 +125,7 @@ class Scenario:
         things: Boxes that are left in the cell.
         light: (seconds, factor): from when on all images are that much brighter or darker.
         faults: What breaks.
+        walk_in: The cabinet is one that a person can walk into.
     """
 
     name: str
@@ -134,6 +135,7 @@ class Scenario:
     things: tuple[Thing, ...] = ()
     light: tuple[float, float] | None = None
     faults: tuple[Fault, ...] = ()
+    walk_in: bool = False
 
 
 _ROUND: Final = (
@@ -152,7 +154,8 @@ _PAST: Final = ((1.75, -2.9), (1.65, 0.0), (1.75, 2.9))
 _WEST: Final = ((-1.6, -2.9), (-1.5, 0.0), (-1.6, 2.9))
 _ACROSS: Final = ((2.9, 1.2), (1.6, 1.0), (1.5, -1.0), (2.9, -1.4))
 _TO_TABLE: Final = ((2.9, -0.9), (1.75, -0.3))
-_TO_CABINET: Final = ((-2.9, 1.85), (-1.0, 1.72))
+_INTO_CABINET: Final = ((-2.9, 1.5), (-0.9, 1.5))
+_TO_ROBOT: Final = ((-2.15, 1.5), (-2.1, 0.25), (-0.95, -0.25), (-2.9, -0.4))
 _REACH: Final = Pause(2, 6.0, reach_m=(0.75, -0.25, 1.0), lean_rad=0.25, facing_rad=np.pi)
 
 
@@ -167,7 +170,7 @@ def _walks(name: str, seconds: float) -> tuple[Walk, ...]:
         "S3": (Walk((*_TO_TABLE, _TO_TABLE[0]), pauses=(table,)),),
         "S4": (
             Walk(
-                (*_TO_CABINET, (-1.6, 1.72), (-1.45, 0.6), (-2.9, 0.3)),
+                (*_INTO_CABINET, *_TO_ROBOT),
                 pauses=(Pause(1, min(20.0, seconds / 2.0)),),
             ),
         ),
@@ -205,7 +208,7 @@ def scenario_of(name: str, seed: int, seconds: float = SECONDS) -> Scenario:
     generator = np.random.default_rng([seed, SCENARIOS.index(name)])
     walks = tuple(_moved(walk, generator) for walk in _walks(name, seconds))
     left = (
-        (Thing((1.5, -1.45, 0.15), (0.15, 0.15, 0.15), _arrival_s(walks[0], 1)),)
+        (Thing((1.5, -1.05, 0.15), (0.15, 0.15, 0.15), _arrival_s(walks[0], 1) + 1.0),)
         if name == "S6"
         else ()
     )
@@ -216,6 +219,7 @@ def scenario_of(name: str, seed: int, seconds: float = SECONDS) -> Scenario:
         seconds=seconds,
         walks=walks,
         things=left,
+        walk_in=name == "S4",
         light=(5.0 * share, 0.7) if name == "S10" else None,
         faults={
             "S7": (

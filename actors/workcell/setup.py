@@ -14,8 +14,7 @@ import numpy as np
 
 from actors.workcell.scenarios import DEFAULT, SECONDS, scenario_of
 from actors.workcell.simulation.arm import ARM
-from actors.workcell.simulation.room import BOXES as ROOM
-from actors.workcell.simulation.room import cameras
+from actors.workcell.simulation.room import boxes_of, cameras
 from actors.workcell.vocabulary import (
     BOXES,
     CALIBRATION,
@@ -24,6 +23,7 @@ from actors.workcell.vocabulary import (
     GRID,
     MODEL,
     OBSTACLES,
+    PERIOD_S,
     PLAYING,
     ROBOT,
     SCENARIO,
@@ -49,6 +49,8 @@ GOALS_RAD: Final = (
     (0.9, 0.9, 0.0, -1.1, 0.0, 1.1, 0.0),
 )
 """Over the front of the table, and over its back."""
+PERIOD_NS: Final = round(PERIOD_S * 1e9)
+"""A scenario begins at a tick, so that its images show its seconds 0, 0.1, 0.2 …"""
 DWELL_S: Final = 0.4
 """How long the tool stays at each goal."""
 
@@ -112,13 +114,15 @@ class Setup(Actor):
         """Write it."""
         for number, calibration in enumerate(cameras()):
             lock[self.calibrations][camera_entity(number)] = calibration
-        for number, box in enumerate(ROOM):
+        scenario = scenario_of(self.scenario, self.seed, self.seconds)
+        for number, box in enumerate(boxes_of(scenario)):
             lock[self.boxes][obstacle_entity(number)] = box.row()[None]
         lock[self.grid] = grid_of(self.voxel_m)
         lock[self.model] = ARM
         lock[self.task] = task_of()
         now_ns = time.time_ns()
-        begin_ns = now_ns + round(self.confirm * 1e9) if self.confirm > 0.0 else NEVER_NS
+        ticks = -(-(now_ns + round(self.confirm * 1e9)) // PERIOD_NS)
+        begin_ns = ticks * PERIOD_NS if self.confirm > 0.0 else NEVER_NS
         if self.confirm > 0.0:
             lock[self.empty] = now_ns
         lock[self.playing] = Playing(

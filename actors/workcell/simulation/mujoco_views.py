@@ -165,7 +165,7 @@ def _xml(
     return f"""<mujoco><statistic extent="5" center="0 0 1"/>
 <visual><quality shadowsize="{SHADOW_PX}" offsamples="{SAMPLES}"/>
 <global offwidth="{first.width}" offheight="{first.height}"/><map znear="0.01" zfar="30"/>
-<headlight ambient=".45 .45 .45" diffuse=".25 .25 .25" specular="0 0 0"/></visual>
+<headlight ambient=".6 .6 .6" diffuse=".25 .25 .25" specular="0 0 0"/></visual>
 <asset><texture name="floor" type="2d" builtin="checker" rgb1=".56 .55 .52" rgb2=".5 .5 .47"
  width="256" height="256"/><material name="floor" texture="floor" texrepeat="12 12" specular="0"/>
 <texture name="wall" type="2d" builtin="flat" rgb1=".66 .68 .7" width="64" height="64"
@@ -173,6 +173,6 @@ def _xml(
 <material name="wall" texture="wall" texrepeat="3 3" specular="0"/>
 <texture name="box" type="2d" builtin="gradient" rgb1="1 1 1" rgb2=".85 .85 .85" width="128"
  height="128"/><material name="box" texture="box" specular="0"/></asset>
-<worldbody><light pos="{words(LAMP_M)}" dir="0 0 -1" diffuse=".4 .4 .4" specular="0 0 0"
+<worldbody><light pos="{words(LAMP_M)}" dir="0 0 -1" diffuse=".6 .6 .6" specular="0 0 0"
  cutoff="80"/><geom type="plane" size="6 6 .1" material="floor"/>
 {newline.join(parts)}</worldbody></mujoco>"""

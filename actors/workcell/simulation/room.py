@@ -17,6 +17,8 @@ from actors.workcell.vocabulary import CAMERA_COUNT, Calibration
 if TYPE_CHECKING:
     import numpy.typing as npt
 
+    from actors.workcell.scenarios import Scenario
+
 HALF_M: Final = 3.6
 """The room reaches from minus this to this along x and y."""
 HEIGHT_M: Final = 4.0
@@ -55,7 +57,34 @@ BOXES: Final = (
     Box("cabinet", (-0.9, 1.1, 0.6), (0.3, 0.25, 0.6), (0.56, 0.52, 0.48)),
     Box("conveyor", (-0.5, -1.3, 0.45), (0.5, 0.2, 0.45), (0.40, 0.44, 0.42)),
 )
-"""What stands in the cell, whatever the scenario."""
+"""What stands in the cell, but for scenarios with a walk-in cabinet."""
+
+
+def _walk_in() -> tuple[Box, ...]:
+    """Return a cabinet of 1.4 x 0.9 m and 2 m height, open to the side of minus x.
+
+    Both cameras on that side look across its opening: further in than 0.7 m none sees anything.
+    """
+    west, east, south, north, top, wall = -1.95, -0.55, 1.05, 1.95, 2.0, 0.04
+    x, y, up = (west + east) / 2.0, (south + north) / 2.0, top / 2.0
+    deep, wide = (east - west) / 2.0, (north - south) / 2.0
+    colour = (0.56, 0.52, 0.48)
+    return (
+        Box("cabinet-north", (x, north, up), (deep, wall / 2.0, up), colour),
+        Box("cabinet-south", (x, south, up), (deep, wall / 2.0, up), colour),
+        Box("cabinet-east", (east, y, up), (wall / 2.0, wide, up), colour),
+        Box("cabinet-top", (x, y, top), (deep, wide, wall / 2.0), colour),
+    )
+
+
+WALK_IN: Final = (*(box for box in BOXES if box.name != "cabinet"), *_walk_in())
+"""What stands in the cell of a scenario in which somebody hides."""
+
+
+def boxes_of(scenario: Scenario) -> tuple[Box, ...]:
+    """Return what stands in the cell from the start and is known to it."""
+    return WALK_IN if scenario.walk_in else BOXES
+
 
 THING_COLOUR: Final = (0.35, 0.55, 0.72)
 """Cardboard: of what a scenario leaves in the cell."""

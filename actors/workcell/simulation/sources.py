@@ -95,10 +95,13 @@ class LiveSource:
         Raises:
             CameraError: This source cannot play it.
         """
+        assert self._view is not None, "open first"
         playing = self._seen[0]
         if playing != self._playing:
             self._stage = None if playing is None else self.stage_of(playing)
             self._playing = playing
+            for boxes in () if self._stage is None else self._stage.rooms:
+                self._view.backdrop(boxes)  # half a second each: now, not while somebody walks
 
     def stage_of(self, playing: Playing) -> Stage:
         """Return what a scenario puts where.
@@ -128,8 +131,8 @@ class LiveSource:
         Raises:
             CameraError: There is none.
         """
-        assert self._view is not None, "open first"
         self._follow()
+        assert self._view is not None
         playing, joints, stuck = self._playing, *self._seen[1:]
         if stuck and self._last is not None:
             return self._last

@@ -9,7 +9,7 @@ import numpy as np
 
 from actors.workcell.simulation.human import Person
 from actors.workcell.simulation.render import person_colours, robot_colours
-from actors.workcell.simulation.room import BOXES, THING_COLOUR, Box
+from actors.workcell.simulation.room import THING_COLOUR, Box, boxes_of
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -47,7 +47,6 @@ class Stage:
     def __init__(self, scenario: Scenario) -> None:
         self.scenario = scenario
         self.people = tuple(Person(walk) for walk in scenario.walks)
-        self._boxes = BOXES
         self._things = tuple(
             Box(f"thing-{number}", thing.centre_m, thing.half_m, THING_COLOUR)
             for number, thing in enumerate(scenario.things)
@@ -56,7 +55,13 @@ class Stage:
     @property
     def boxes(self) -> tuple[Box, ...]:
         """What stands in the room from the start and is known to the cell."""
-        return self._boxes
+        return boxes_of(self.scenario)
+
+    @property
+    def rooms(self) -> tuple[tuple[Box, ...], ...]:
+        """What stands in the room one after the other, with what is left there."""
+        times = sorted(thing.from_s for thing in self.scenario.things)
+        return (self.boxes, *(self.boxes + self.things_at(at_s) for at_s in times))
 
     def things_at(self, at_s: float) -> tuple[Box, ...]:
         """Return what was left in the cell until a time of the scenario."""

@@ -208,11 +208,24 @@ def test_light_that_drops_darkens_the_image():
     assert dark.mean() == pytest.approx(0.7 * still.mean(), rel=0.01)
 
 
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_no_camera_sees_who_hides_in_the_cabinet(seed):
+    stage = Stage(scenario_of("S4", seed, 20.0))
+    hidden = stage.scene_at(8.0)
+    out = stage.scene_at(15.5)
+    for number in range(8):
+        names = view(number).render(hidden.capsules, hidden.colours, hidden.boxes).names
+        assert not names.any(), number
+    seen = [view(n).render(out.capsules, out.colours, out.boxes).names.any() for n in range(8)]
+    assert sum(seen) >= 6
+
+
 def test_stage_says_what_was_left_and_how_bright_it_is():
     left, dark = Stage(scenario_of("S6", 1, 20.0)), Stage(scenario_of("S10", 1, 20.0))
     from_s = left.scenario.things[0].from_s
     assert left.things_at(from_s - 0.01) == ()
     assert [box.name for box in left.things_at(from_s)] == ["thing-0"]
+    assert left.rooms == (left.boxes, left.boxes + left.things_at(from_s))
     assert (dark.brightness_at(9.9), dark.brightness_at(10.1)) == (1.0, 0.7)
     assert len(Stage(scenario_of("S11", 1, 20.0)).bodies_at(3.0)) == 2
     assert Stage(scenario_of("S1", 1)).scene_at(5.0).capsules.shape == (0, 7)
