@@ -393,6 +393,8 @@ BACKGROUND: Final = Aspect("background", Background, Durability.OS)
 """The empty cell (camera/*)."""
 SILHOUETTE: Final = Aspect("silhouette", Silhouette, _FLOW, retention=Retention(versions=16))
 """Foreground of the image with the same stamp (camera/*)."""
+ABSENT: Final = Aspect("absent_ns", int, _FLOW, retention=1)
+"""Stamp of the newest set for which another has to stand in (camera/*)."""
 GRID: Final = Aspect("grid", Grid, Durability.DURABLE)
 """The voxels (workspace)."""
 EMPTY: Final = Aspect("empty_ns", int, Durability.OS)

@@ -1,0 +1,157 @@
+"""Camera watch: which cameras give images, and silhouettes that stand in for those that do not.
+
+A stand-in is all foreground: it vetoes nothing, so the hull only grows.  A set needs no stand-in to
+be used, but it would wait for a missing camera; with one, a dead camera costs no time.
+
+Two actors, since the watch looks at all cameras at every tick and must not keep one of them from
+writing: `CameraWatch` only looks; `StandIn` locks the silhouette of one dead camera at a time.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+
+from actors.workcell.vocabulary import (
+    ABSENT,
+    CALIBRATION,
+    CAMERA_COUNT,
+    CAMERA_STATES,
+    CAMERAS,
+    PERIOD_S,
+    SILHOUETTE,
+    SYSTEM,
+    CameraState,
+    Silhouette,
+    camera_entity,
+)
+from enact_dist import Actor, View, ViewEach, World, Write, WriteEach
+
+if TYPE_CHECKING:
+    from enact_dist import Entity, Lock
+
+SILENT: Final = "silent"
+STUCK: Final = "stuck"
+MISFIT: Final = "background no longer fits"
+
+
+class Seen(NamedTuple):
+    """What is known of a camera from its own silhouettes.
+
+    Attributes:
+        last_ns: Stamp of the newest.
+        checksum: Of its image.
+        alike: How many before it, in a row, were of the same image.
+        foreground: Share of the image that is foreground.
+        missed: Sets without it, since its first.
+    """
+
+    last_ns: int = 0
+    checksum: int = 0
+    alike: int = 0
+    foreground: float = 0.0
+    missed: int = 0
+
+    def after(self, silhouette: Silhouette, captured_ns: int) -> Seen:
+        """Return what is known when another silhouette has come."""
+        if silhouette.stand_in or captured_ns <= self.last_ns:
+            return self
+        same = silhouette.image_checksum != 0 and silhouette.image_checksum == self.checksum
+        share = silhouette.foreground_px / (8 * silhouette.packed.size)
+        return Seen(
+            captured_ns,
+            silhouette.image_checksum,
+            self.alike + 1 if same else 0,
+            share,
+            self.missed,
+        )
+
+
+class CameraWatch(Actor):
+    """Tell how each calibrated camera does, at every tick.
+
+    A camera is silent if it gave no silhouette for the tick before: it is dead, frozen, or its
+    stamps stand still.  It is stuck if its images are the same bit by bit, and its background no
+    longer fits if too much of the image is foreground.  `absent_ns` asks for a stand-in for each
+    silent camera, as long as one camera lives.
+    """
+
+    online = World("online")
+    silhouette_0 = View(online, camera_entity(0), SILHOUETTE)
+    silhouette_1 = View(online, camera_entity(1), SILHOUETTE)
+    silhouette_2 = View(online, camera_entity(2), SILHOUETTE)
+    silhouette_3 = View(online, camera_entity(3), SILHOUETTE)
+    silhouette_4 = View(online, camera_entity(4), SILHOUETTE)
+    silhouette_5 = View(online, camera_entity(5), SILHOUETTE)
+    silhouette_6 = View(online, camera_entity(6), SILHOUETTE)
+    silhouette_7 = View(online, camera_entity(7), SILHOUETTE)
+    calibrations = ViewEach(online, CAMERAS, CALIBRATION)
+    states = Write(online, SYSTEM, CAMERA_STATES)
+    absent = WriteEach(online, CAMERAS, ABSENT)
+    every_s = PERIOD_S
+
+    late_s: float = 0.15
+    """Longest time between a tick and the stamp of the newest silhouette."""
+    alike_max: int = 1
+    """Silhouettes of one image in a row, after the first, that are no trouble yet."""
+    foreground_max: float = 0.3
+    """Greatest share of foreground that a background still fits."""
+
+    def __init__(self) -> None:
+        self._seen: dict[Entity, Seen] = {}
+
+    def update(self, lock: Lock) -> None:
+        """Look at the newest silhouettes."""
+        calibrated = lock[self.calibrations].keys()
+        states: dict[str, CameraState] = {}
+        silent = []
+        for number in range(CAMERA_COUNT):
+            camera = camera_entity(number)
+            if camera not in calibrated:
+                continue
+            view: View[Silhouette] = getattr(self, f"silhouette_{number}")
+            seen = self._seen.get(camera, Seen())
+            newest = lock.get(view)
+            if newest is not None:
+                seen = seen.after(newest, lock.stamp_ns(view))
+            trouble = self._trouble(seen, lock.tick_ns)
+            if trouble in {SILENT, STUCK} and seen.last_ns:
+                seen = seen._replace(missed=seen.missed + 1)
+            if trouble == SILENT:
+                silent.append(camera)
+            alive = trouble not in {SILENT, STUCK}
+            states[camera.name] = CameraState(alive, seen.last_ns, seen.missed, trouble)
+            self._seen[camera] = seen
+        lock[self.states] = states
+        if len(silent) < len(states):
+            for camera in silent:
+                lock[self.absent][camera] = lock.tick_ns
+
+    def _trouble(self, seen: Seen, tick_ns: int) -> str:
+        if tick_ns - seen.last_ns > self.late_s * 1e9:
+            return SILENT
+        if seen.alike > self.alike_max:
+            return STUCK
+        return MISFIT if seen.foreground > self.foreground_max else ""
+
+
+class StandIn(Actor):
+    """Give the silhouette of a camera that is silent: all foreground, with the stamp of the set."""
+
+    online = World("online")
+    absent = View(online, CAMERAS, ABSENT)
+    calibration = View(online, CAMERAS, CALIBRATION)
+    silhouette = Write(online, CAMERAS, SILHOUETTE)
+    triggers = (absent,)
+    shared = (silhouette,)
+
+    def update(self, lock: Lock) -> None:
+        """Stand in, unless the camera's own silhouette has come after all."""
+        stamp_ns = lock[self.absent]
+        if lock.is_null(self.calibration) or lock.stamp_ns(self.silhouette) >= stamp_ns:
+            return
+        camera = lock[self.calibration]
+        packed = np.full((camera.height, (camera.width + 7) // 8), 255, np.uint8)
+        stand_in = Silhouette(packed, camera.width * camera.height, stand_in=True)
+        lock.put(self.silhouette, stand_in, stamp_ns=stamp_ns)
