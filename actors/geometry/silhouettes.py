@@ -65,6 +65,10 @@ class BackgroundStatistics:
         self._sum = np.empty(0)
         self._squares = np.empty(0)
 
+    def fits(self, image: Image) -> bool:
+        """Return whether an image is of the size of those until now."""
+        return not self.frames or image.shape == self._sum.shape
+
     def add(self, image: Image) -> None:
         """Take one more image.
 

@@ -46,11 +46,12 @@ class Masks:
         self._pools = self.cells[:-1].reshape(len(POOLS), *table.pool_shape)
         self._dirty = (slice(0, 0), slice(0, 0))
 
-    def load(self, bits: Bits) -> None:
+    def load(self, bits: Bits, name: str) -> None:
         """Take the silhouette of a set.
 
         Args:
             bits: (H, W / 8) uint8, as `silhouettes.packed` makes them.
+            name: What an error calls it.
 
         Raises:
             ValueError: The silhouette is not of the size of the calibration.
@@ -61,8 +62,8 @@ class Masks:
         asked = (table.height, -(-table.width // 8))
         if bits.shape != asked or bits.dtype != np.uint8:
             raise ValueError(
-                f"silhouette: asked for {table.width} x {table.height} pixels as in the"
-                f" calibration, (uint8 of shape {asked}), found {bits.dtype} of shape {bits.shape}"
+                f"{name}: asked for {table.width} x {table.height} pixels as in the"
+                f" calibration (uint8 of shape {asked}), found {bits.dtype} of shape {bits.shape}"
             )
         self._load_pools(bits)
         rows = np.flatnonzero(bits.any(1))
@@ -131,7 +132,7 @@ class VisualHull:
         given = []
         for number, bits in enumerate(silhouettes):
             if bits is not None:
-                self._masks[number].load(bits)
+                self._masks[number].load(bits, f"silhouette {number}")
                 given.append(number)
         self._given = tuple(given)
 
@@ -189,18 +190,19 @@ class VisualHull:
         return result
 
     def on_masks(self, rows: Rows, masks: Sequence[npt.NDArray[np.uint8]]) -> npt.NDArray[np.bool_]:
-        """Return which voxels lie on given masks for every camera that has a say about them.
+        """Return which voxels lie on given masks for every camera that sees them.
+
+        Cameras without a silhouette count, too: so a camera that dies takes no voxel away.
 
         Args:
             rows: Any voxels.
             masks: (H, W) uint8 per camera, not 0 where it is.
         """
         left = np.arange(len(rows))
-        for number in self._given:
-            table = self.tables[number]
+        for table, mask in zip(self.tables, masks, strict=True):
             index = table.pixel[rows[left]]
             silent = index == table.sentinel
-            left = left[silent | (masks[number].ravel()[index % table.mask_px] > 0)]
+            left = left[silent | (mask.ravel()[index % table.mask_px] > 0)]
         result = np.zeros(len(rows), bool)
         result[left] = True
         return result

@@ -1,0 +1,213 @@
+"""Reconstruction (ENACT 4.1): which voxels are occupied, of a set of silhouettes of one stamp."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from actors.geometry.kinematics import capsules_at
+from actors.geometry.refinement import Refinement
+from actors.geometry.visibility import camera_table, check_calibration
+from actors.geometry.visual_hull import VisualHull
+from actors.geometry.voxels import VoxelBlocks
+from actors.workcell.background import one_thread
+from actors.workcell.vocabulary import (
+    BOXES,
+    CALIBRATION,
+    CAMERA_COUNT,
+    CAMERAS,
+    GRID,
+    HULL,
+    JOINTS,
+    MODEL,
+    OBSTACLES,
+    RAW_HULL,
+    ROBOT,
+    SILHOUETTE,
+    SURFACE,
+    WANTED,
+    WORKSPACE,
+    Calibration,
+    Hull,
+    Joints,
+    Silhouette,
+    camera_entity,
+)
+from enact_dist import Actor, Together, View, ViewEach, World, Write
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
+
+    from enact_dist import Lock
+
+    Bits = npt.NDArray[np.uint8]
+    F64 = npt.NDArray[np.float64]
+
+AHEAD_NS_MAX: Final = 100_000_000
+"""So long after the newest sample of the joints their speed still tells where they are."""
+
+_ONLINE: Final = World("online")
+_SILHOUETTES: Final = Together(
+    [View(_ONLINE, camera_entity(number), SILHOUETTE) for number in range(CAMERA_COUNT)], least=1
+)
+
+
+class Reconstruction(Actor):
+    """Intersect the silhouettes of all cameras, and take out what is known.
+
+    A camera that gives no silhouette, a stand-in, or the image of the last set once more, vetoes
+    nothing: its rays count as occupied, the hull can only grow.  `Hull.cameras` names those that
+    did.  Without joints that tell where the robot was at the exposure nothing is taken for the
+    robot, and everything is at distance 0.
+
+    Attributes:
+        robot: There is one; False for a cell of cameras only: everything is infinitely far from it.
+        stuck: An image that equals the last one counts as none; False for pictures without noise.
+    """
+
+    online = _ONLINE
+    silhouettes = _SILHOUETTES
+    calibrations = ViewEach(online, CAMERAS, CALIBRATION)
+    boxes = ViewEach(online, OBSTACLES, BOXES)
+    surfaces = ViewEach(online, OBSTACLES, SURFACE)
+    grid = View(online, WORKSPACE, GRID)
+    model = View(online, ROBOT, MODEL)
+    joints = View(online, ROBOT, JOINTS)
+    wanted = View(online, WORKSPACE, WANTED)
+    hull = Write(online, WORKSPACE, HULL)
+    raw_hull = Write(online, WORKSPACE, RAW_HULL)
+    triggers = (silhouettes,)
+
+    robot: bool = True
+    stuck: bool = True
+
+    def __init__(self, *, robot: bool = True, stuck: bool = True) -> None:
+        self.robot, self.stuck = robot, stuck
+        self._made_of: object = None
+        self._made: tuple[Refinement, VoxelBlocks] | None = None
+        self._last_ns = 0
+        self._checksums: dict[str, int] = {}
+
+    def start(self) -> None:
+        """Let OpenCV work in the actor's own thread."""
+        one_thread()
+
+    def update(self, lock: Lock) -> None:
+        """Write what is occupied, with the stamp of the set."""
+        refinement, blocks = self._prepared(lock)
+        given = self._given(lock[self.silhouettes])
+        stamp_ns = lock.stamp_ns(self.silhouettes)
+        elapsed_s = (stamp_ns - self._last_ns) / 1e9 if self._last_ns else math.inf
+        found = refinement.step(
+            [given.get(name) for name in self._names], self._arm(lock, stamp_ns), elapsed_s
+        )
+        self._last_ns = stamp_ns
+        nearest = found.nearest
+        lock[self.hull] = Hull(
+            voxels=blocks.indices(found.rows),
+            clearance_m=found.clearance_m,
+            tight=found.tight,
+            component=found.component,
+            counts=found.counts,
+            cameras=tuple(name for name in self._names if name in given),
+            nearest_m=float(found.clearance_m[nearest]) if nearest >= 0 else math.inf,
+            nearest_voxel=nearest,
+        )
+        if lock.get(self.wanted, 0) > 0:
+            lock[self.raw_hull] = blocks.indices(found.raw)
+
+    def _prepared(self, lock: Lock) -> tuple[Refinement, VoxelBlocks]:
+        """Return refinement and grid; make the tables anew where something of the cell changed.
+
+        Raises:
+            ValueError: Grid or calibration of a camera are missing or wrong, or an obstacle has a
+                surface and no boxes; in one line.
+        """
+        found = {entity.name: one for entity, one in lock[self.calibrations].items()}
+        of_obstacle = dict(lock[self.boxes].items())
+        bare = set(lock[self.surfaces]) - set(of_obstacle)
+        missing = [name for name in self._names if name not in found]
+        if lock.is_null(self.grid) or missing:
+            what = f"calibration of {', '.join(missing)}" if missing else "workspace/grid"
+            raise ValueError(f"{what} is null; write it before the first image")
+        if bare:
+            raise ValueError(
+                f"{', '.join(sorted(one.name for one in bare))}: a surface without boxes; cameras"
+                " would be taken to see through it, so write its boxes, too"
+            )
+        calibrations = [found[name] for name in self._names]
+        boxes = [of_obstacle[entity] for entity in sorted(of_obstacle, key=str)]
+        made_of = (lock.version(self.grid), _bytes_of(calibrations, boxes))
+        if self._made is not None and made_of == self._made_of:
+            return self._made
+        for name, calibration in zip(self._names, calibrations, strict=True):
+            check_calibration(name, calibration)
+        grid = lock[self.grid]
+        blocks = VoxelBlocks(grid.origin_m, grid.voxel_m, grid.shape)
+        tables = [camera_table(blocks, calibration, boxes) for calibration in calibrations]
+        self._made = Refinement(VisualHull(blocks, tables), calibrations, boxes), blocks
+        self._made_of, self._last_ns = made_of, 0
+        return self._made
+
+    @property
+    def _names(self) -> list[str]:
+        """The names of the cameras, in the order of their silhouettes."""
+        return [str(view.entity) for view in self.silhouettes.requests]
+
+    def _given(self, found: tuple[Silhouette | None, ...]) -> dict[str, Bits]:
+        """Return the silhouettes that come of a new image, by name of the camera.
+
+        Raises:
+            ValueError: One is not of the size of its camera's calibration.
+        """
+        given = {}
+        for name, silhouette in zip(self._names, found, strict=True):
+            if silhouette is None or silhouette.stand_in:
+                continue
+            checksum = silhouette.image_checksum
+            again = self.stuck and checksum and checksum == self._checksums.get(name)
+            self._checksums[name] = checksum
+            if not again:
+                given[name] = silhouette.packed
+        return given
+
+    def _arm(self, lock: Lock, stamp_ns: int) -> F64 | None:
+        """Return the robot's capsules at the exposure; None if they are not known."""
+        if not self.robot:
+            return np.empty((0, 7))
+        if lock.is_null(self.model) or lock.is_null(self.joints):
+            return None
+        q_rad = joints_at(lock[self.joints], stamp_ns)
+        return None if q_rad is None else capsules_at(lock[self.model], q_rad)[0]
+
+
+def joints_at(joints: Joints, stamp_ns: int) -> F64 | None:
+    """Return where the joints were, (7,) rad.
+
+    Args:
+        joints: The robot's last samples.
+        stamp_ns: When; up to `AHEAD_NS_MAX` after the newest sample.
+
+    Returns:
+        Interpolated, or carried on by the newest speed; None for a stamp that the samples do not
+        reach.
+    """
+    stamps = joints.stamp_ns
+    if not len(stamps) or not stamps[0] <= stamp_ns <= stamps[-1] + AHEAD_NS_MAX:
+        return None
+    if stamp_ns > stamps[-1]:
+        return np.asarray(joints.q[-1] + joints.dq[-1] * ((stamp_ns - stamps[-1]) / 1e9))
+    since_s = (stamps - stamps[0]) / 1e9
+    at_s = (stamp_ns - stamps[0]) / 1e9
+    return np.array([np.interp(at_s, since_s, joint) for joint in joints.q.T])
+
+
+def _bytes_of(calibrations: list[Calibration], boxes: list[F64]) -> bytes:
+    """Return what tells whether calibrations and boxes are those of before."""
+    parts = [box.tobytes() for box in boxes]
+    for one in calibrations:
+        parts += [one.camera_matrix.tobytes(), one.distortion.tobytes()]
+        parts += [one.camera_from_cell.tobytes(), f"{one.width} {one.height}".encode()]
+    return b"|".join(parts)

@@ -1,0 +1,189 @@
+"""Background actors: learn on the operator's word, subtract with the image's stamp."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from actors.geometry.silhouettes import unpacked
+from actors.workcell.background import BackgroundLearning, BackgroundSubtraction, checksum
+from actors.workcell.vocabulary import (
+    BACKGROUND,
+    EMPTY,
+    IMAGE,
+    SILHOUETTE,
+    WORKSPACE,
+    Background,
+    camera_entity,
+)
+from enact_dist import Lock, View, Write, testing
+
+pytest.importorskip("cv2", exc_type=ImportError)
+
+CAMERA = camera_entity(2)
+PERIOD_NS = 100_000_000
+SHAPE = (48, 64, 3)
+PERSON = np.s_[10:40, 20:35]
+
+
+@pytest.fixture
+def random():
+    """Noise of the images."""
+    return np.random.default_rng(1)
+
+
+@pytest.fixture
+def cell():
+    """A cell with one context."""
+    with testing.worlds("online") as cell:
+        yield cell
+
+
+def image_of(random, *, person=False, shape=SHAPE):
+    """Return an image of a grey cell with noise, and with a person in it."""
+    image = np.full(shape, 120.0)
+    if person:
+        image[PERSON] = (160, 60, 40)
+    return np.rint(image + random.normal(0, 2.5, shape)).clip(0, 255).astype(np.uint8)
+
+
+def put(cell, entity, aspect, datum, stamp_ns=0):
+    """Write a datum."""
+    request = Write(cell.world("online"), entity, aspect)
+    with Lock(request) as lock:
+        lock.put(request, datum, stamp_ns=stamp_ns)
+
+
+def seen(cell, entity, aspect):
+    """Return a datum and its capture stamp, or None."""
+    request = View(cell.world("online"), entity, aspect)
+    with Lock(request) as lock:
+        return None if lock.is_null(request) else (lock[request], lock.stamp_ns(request))
+
+
+def actor_of(kind, *args, **options):
+    """Return an actor of the one camera."""
+    actor = kind(*args, **options)
+    actor.only_entity = CAMERA
+    return actor
+
+
+def learn(cell, learning, random, first, count, **options):
+    """Let a camera give images with stamps from a period on, each seen by the learning."""
+    for number in range(first, first + count):
+        put(cell, CAMERA, IMAGE, image_of(random, **options), number * PERIOD_NS)
+        testing.run_once(learning, cell)
+
+
+def test_a_background_is_learned_after_the_word_and_not_before(cell, random):
+    """Images from before the word do not count; the background bears the stamp of its last image."""
+    learning = actor_of(BackgroundLearning, images=5)
+    learn(cell, learning, random, 1, 8, person=True)
+    assert seen(cell, CAMERA, BACKGROUND) is None
+    put(cell, WORKSPACE, EMPTY, 10 * PERIOD_NS)
+    learn(cell, learning, random, 9, 6)
+    assert seen(cell, CAMERA, BACKGROUND) is None
+    learn(cell, learning, random, 15, 1)
+    found, stamp_ns = seen(cell, CAMERA, BACKGROUND)
+    assert stamp_ns == found.captured_ns == 15 * PERIOD_NS
+    assert found.frames == 5
+    assert np.abs(found.mean.astype(int) - 120).max() <= 3
+    assert found.spread.min() >= 0
+
+
+def test_the_same_image_twice_is_one_image(cell, random):
+    """A tick without a new image teaches nothing."""
+    learning = actor_of(BackgroundLearning, images=3)
+    put(cell, WORKSPACE, EMPTY, 1)
+    put(cell, CAMERA, IMAGE, image_of(random), PERIOD_NS)
+    for _ in range(5):
+        testing.run_once(learning, cell)
+    assert seen(cell, CAMERA, BACKGROUND) is None
+
+
+def test_after_a_restart_a_background_is_kept_until_the_next_word(cell, random):
+    """Learning goes on where it was needed only; a new word learns anew."""
+    put(cell, WORKSPACE, EMPTY, 1)
+    learn(cell, actor_of(BackgroundLearning, images=3), random, 1, 3)
+    _, first_ns = seen(cell, CAMERA, BACKGROUND)
+    again = actor_of(BackgroundLearning, images=3)
+    learn(cell, again, random, 4, 5, person=True)
+    assert seen(cell, CAMERA, BACKGROUND)[1] == first_ns
+    put(cell, WORKSPACE, EMPTY, 20 * PERIOD_NS)
+    learn(cell, again, random, 21, 3)
+    assert seen(cell, CAMERA, BACKGROUND)[1] == 23 * PERIOD_NS
+
+
+def test_images_of_another_size_begin_anew(cell, random):
+    """A camera that was set to another resolution while it learned mixes no sizes."""
+    learning = actor_of(BackgroundLearning, images=3)
+    put(cell, WORKSPACE, EMPTY, 1)
+    learn(cell, learning, random, 1, 2)
+    learn(cell, learning, random, 3, 3, shape=(24, 32, 3))
+    assert seen(cell, CAMERA, BACKGROUND)[0].mean.shape == (24, 32, 3)
+
+
+def test_one_image_teaches_no_spread():
+    """Fewer than two images are refused when the actor is made."""
+    with pytest.raises(ValueError, match="images is 1; a spread takes 2 or more"):
+        BackgroundLearning(images=1)
+
+
+@pytest.mark.parametrize("subtractor", ["gaussian", "mog2", "knn"])
+def test_a_silhouette_bears_the_stamp_of_its_image(cell, random, subtractor):
+    """Person in, silhouette out: packed, counted, with the checksum of the image."""
+    put(cell, WORKSPACE, EMPTY, 1)
+    learn(cell, actor_of(BackgroundLearning, images=10), random, 1, 10)
+    subtraction = actor_of(BackgroundSubtraction, subtractor=subtractor)
+    image = image_of(random, person=True)
+    put(cell, CAMERA, IMAGE, image, 11 * PERIOD_NS)
+    assert testing.run_once(subtraction, cell) == 1
+    found, stamp_ns = seen(cell, CAMERA, SILHOUETTE)
+    mask = unpacked(found.packed, 64) > 0
+    assert stamp_ns == 11 * PERIOD_NS
+    assert mask[PERSON].mean() > 0.97
+    assert found.foreground_px == mask.sum() < 1.3 * 30 * 15
+    assert found.image_checksum == checksum(image) != 0
+    assert not found.stand_in
+
+
+def test_without_a_background_there_is_no_silhouette(cell, random):
+    """An image alone makes nothing."""
+    put(cell, CAMERA, IMAGE, image_of(random), PERIOD_NS)
+    testing.run_once(actor_of(BackgroundSubtraction), cell)
+    assert seen(cell, CAMERA, SILHOUETTE) is None
+
+
+def test_a_new_background_and_other_parameters_count_from_the_next_image(cell, random):
+    """What the subtraction was made of is compared at each image."""
+    subtraction = actor_of(BackgroundSubtraction)
+    mean = np.full(SHAPE, 120, np.uint8)
+    put(cell, CAMERA, BACKGROUND, Background(mean, np.ones_like(mean), 20, 1), 1)
+    put(cell, CAMERA, IMAGE, image_of(random, person=True), PERIOD_NS)
+    testing.run_once(subtraction, cell)
+    assert seen(cell, CAMERA, SILHOUETTE)[0].foreground_px > 300
+    learned = image_of(random, person=True)
+    put(cell, CAMERA, BACKGROUND, Background(learned, np.ones_like(mean) * 4, 20, 2), 2)
+    put(cell, CAMERA, IMAGE, image_of(random, person=True), 2 * PERIOD_NS)
+    testing.run_once(subtraction, cell)
+    assert seen(cell, CAMERA, SILHOUETTE)[0].foreground_px < 200
+    subtraction.subtractor = "median"
+    put(cell, CAMERA, IMAGE, image_of(random), 3 * PERIOD_NS)
+    with pytest.raises(ValueError, match="gaussian, mog2, knn, found 'median'"):
+        testing.run_once(subtraction, cell)
+
+
+def test_an_image_of_another_size_than_the_background_is_one_line(cell, random):
+    """The error names both sizes."""
+    mean = np.full(SHAPE, 120, np.uint8)
+    put(cell, CAMERA, BACKGROUND, Background(mean, np.ones_like(mean), 20, 1), 1)
+    put(cell, CAMERA, IMAGE, image_of(random, shape=(24, 32, 3)), PERIOD_NS)
+    with pytest.raises(ValueError, match=r"64 x 48 pixels .* found uint8 of shape") as refused:
+        testing.run_once(actor_of(BackgroundSubtraction), cell)
+    assert "\n" not in str(refused.value)
+
+
+def test_checksums_differ_by_noise_and_are_never_zero(random):
+    """Two images of the same scene differ; 0 is kept for stand-ins."""
+    assert checksum(image_of(random)) != checksum(image_of(random))
+    assert checksum(np.zeros((0, 8, 3), np.uint8)) == 1
