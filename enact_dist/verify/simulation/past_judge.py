@@ -76,8 +76,14 @@ class PastJudge:
         return (NullReason.NEVER_SET.name,)
 
     def check_forgotten(self, answer: Forgotten, asked: TakeView, picture: Picture) -> None:
-        """Only what may be forgotten is, and what is said to be known is."""
+        """Only what may be forgotten is, and what is said to be known is.
+
+        A restart may know a slot from a prepared commit alone, whose data a power cut took: this
+        picture lacks it, so the slot that the answer names counts as asked for.
+        """
         slots = [slot for slot, _ in self._asked(asked.items, picture)]
+        if answer.slot not in slots and any(_names(item, answer.slot) for item in asked.items):
+            slots.append(answer.slot)
         latest_ns = max((self._since_ns(slot, picture) for slot in slots), default=0)
         if all(self._must_know(slot, asked.at_ns, picture) for slot in slots):
             self._fail("what is retained is not forgotten", answer, asked, latest_ns)
@@ -196,3 +202,10 @@ class PastJudge:
         picture.labels = {
             label: {key: self._state(key, picture) for key in kept} for label, kept in found.items()
         }
+
+
+def _names(item: Item, slot: Slot) -> bool:
+    """Whether an item asks for a slot, by its name or by a pattern."""
+    return (item.context, item.aspect) == (slot.context, slot.aspect) and (
+        pattern_matches(item.entity, slot.entity)
+    )
