@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.link.store_rows import Key, Kind, key_of, outcome_key
@@ -26,7 +27,8 @@ class Outcomes:
     __slots__ = ("_ended", "_lanes")
 
     def __init__(self, locks: Iterable[LockId], ended: Mapping[str, int]) -> None:
-        self._ended = dict(sorted(ended.items(), key=lambda entry: entry[1]))
+        # A plain dict would walk over what was taken from its front each time.
+        self._ended = OrderedDict(sorted(ended.items(), key=lambda entry: entry[1]))
         self._lanes: dict[str, set[int]] = {}
         for lock in locks:
             self.add(lock)
@@ -45,9 +47,10 @@ class Outcomes:
 
     def expired(self, wall_ns: int) -> Iterator[Key]:
         """Yield the rows of sessions that ended long before `wall_ns`, and forget them."""
-        for session, ended_ns in list(self._ended.items()):
+        while self._ended:
+            session, ended_ns = next(iter(self._ended.items()))
             if ended_ns > wall_ns - OUTCOMES_KEPT_NS:
-                break
+                return
             del self._ended[session]
             yield key_of(Kind.ENDED, session)
             for lane in self._lanes.pop(session, ()):
