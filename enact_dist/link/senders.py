@@ -28,11 +28,13 @@ from enact_dist.core.messages import (
     Audited,
     Granted,
     Locks,
+    Registered,
     Sessions,
     Slice,
     Surveyed,
     Versions,
     Viewed,
+    Welcome,
 )
 from enact_dist.core.pages import bytes_in_frame
 from enact_dist.wire.frames import encode_answer
@@ -46,6 +48,8 @@ SURVEYED_BYTES: Final = 160
 """Estimated length of one slot in the answer to a `Survey`."""
 VERSION_BYTES: Final = 1024
 """Estimated length of one version, its cause included, in a listing."""
+CATALOGUE_BYTES: Final = 64
+"""Estimated length of one world context or aspect in a catalogue."""
 QUEUED_ANSWERS_MAX: Final = 1024
 """Answers that wait for one client; a client has some calls per thread in flight."""
 QUEUED_BYTES_MAX: Final = 256 << 20
@@ -257,9 +261,15 @@ def _size_of_states(answer: Granted | Viewed) -> int:
     return size
 
 
+def _size_of_catalogue(answer: Welcome | Registered) -> int:
+    return CATALOGUE_BYTES * (len(answer.worlds) + len(answer.aspects))
+
+
 _SIZE_OF: Final[dict[type, Callable[[Any], int]]] = {
     Granted: _size_of_states,
     Viewed: _size_of_states,
+    Welcome: _size_of_catalogue,
+    Registered: _size_of_catalogue,
     Slice: lambda answer: answer.body.size,
     Surveyed: lambda answer: SURVEYED_BYTES * len(answer.states),
     Versions: lambda answer: VERSION_BYTES * len(answer.entries),

@@ -5,8 +5,9 @@ from collections import Counter
 
 import pytest
 
+from enact_dist.core.messages import Registered
 from enact_dist.link import senders as module
-from enact_dist.link.senders import OUTSTANDING_BYTES_MAX, QUEUED_ANSWERS_MAX, Senders
+from enact_dist.link.senders import OUTSTANDING_BYTES_MAX, QUEUED_ANSWERS_MAX, Senders, size_of
 
 
 class FakeParcel:
@@ -133,6 +134,13 @@ def test_senders_take_a_request_that_has_waited_for_no_proof_of_what_was_sent_si
     assert early.done.wait(30)
 
     assert late.thread != threading.get_ident()
+
+
+def test_answers_with_a_long_catalogue_are_left_to_the_senders():
+    """A client that does not read its welcome must not keep the dispatcher waiting."""
+    names = tuple(f"world{index}" for index in range(4096))
+
+    assert size_of(Registered(names, (), 0)) > OUTSTANDING_BYTES_MAX
 
 
 def test_senders_drop_and_count_what_is_too_much_for_one_client(senders, counts):
