@@ -35,11 +35,10 @@ from enact_dist.core.records import (
     Story,
     WorldRecord,
 )
-from enact_dist.core.sessions import SESSIONS_MAX
 from enact_dist.terms import Durability
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Generator, Iterator
 
     from enact_dist.core.shard_state import ShardState
 
@@ -70,10 +69,10 @@ class SessionDesk:
                 bound = f"{quotas.SESSIONS_MAX} sessions"
                 yield from self._state.quotas.refuse(reply_to, asker, bound)
                 return
-            if len(sessions.by_id) >= SESSIONS_MAX:
-                yield from self._make_room()
-            if len(sessions.by_id) >= SESSIONS_MAX:
-                yield Reply(reply_to, Refused("overload", f"{SESSIONS_MAX} sessions are open"))
+            if sessions.full(self._state.now_ns) and not (yield from self._make_room()):
+                yield Reply(
+                    reply_to, Refused("overload", f"{len(sessions.by_id)} sessions are open")
+                )
                 return
         ttl_ns = max(TTL_NS_MIN, min(message.ttl_ns, self._state.settings.ttl_ns_max))
         session, unrecorded = self._state.sessions.hello(
@@ -109,13 +108,14 @@ class SessionDesk:
             session.present = session.present or not unrecorded
             yield from self.answer_when_durable(reply_to, welcome, ())
 
-    def _make_room(self) -> Iterator[Effect]:
-        """End the oldest session that has done nothing since its hello, if there is one."""
-        for session in self._state.sessions.unproven():
+    def _make_room(self) -> Generator[Effect, None, bool]:
+        """End the oldest session that has done nothing since its hello; False if there is none."""
+        for session in self._state.sessions.unproven(self._state.now_ns):
             if session.session not in self._state.tenures.by_session:
                 self._state.count("sessions_displaced")
                 yield from self.end(session.session, "it made room for another session")
-                return
+                return True
+        return False
 
     def answer_when_durable(
         self,

@@ -117,6 +117,7 @@ class SessionTable:
 
     __slots__ = (
         "_of_identity",
+        "_recovered",
         "_retired",
         "_tokens",
         "_ttls",
@@ -149,6 +150,7 @@ class SessionTable:
                 )
             )
             self._of_identity.setdefault(record.identity, set()).add(record.session)
+        self._recovered = len(self.by_id)
         for outcome in outcomes:
             session = self.by_id.get(outcome.lock.session)
             lanes = (
@@ -194,13 +196,23 @@ class SessionTable:
         if not mine:
             self._of_identity.pop(session.identity, None)
 
-    def unproven(self) -> Iterator[Session]:
+    def full(self, now_ns: int) -> bool:
+        """Whether one more session has to wait for room.
+
+        Those that a restarted shard waits for take none until the grace is over.
+        """
+        awaited = self._recovered if self.in_grace(now_ns) else 0
+        return len(self.by_id) >= SESSIONS_MAX + min(awaited, SESSIONS_MAX)
+
+    def unproven(self, now_ns: int) -> Iterator[Session]:
         """Yield sessions, the oldest first, that showed no sign of life since their hello.
 
         Only the oldest of all are looked at: it is asked for each hello beyond the bound.
         """
+        awaited = self.in_grace(now_ns)
         for session in islice(self.by_id.values(), LOOKED_AT_MAX):
-            if session.present and not session.token_present and not session.count_seen:
+            away = awaited and not session.present
+            if not away and not session.token_present and not session.count_seen:
                 yield session
 
     def hello(

@@ -55,7 +55,7 @@ def test_recovered_sessions_count_for_their_identity():
 
 def test_full_table_makes_room_for_who_shows_a_sign_of_life(monkeypatch):
     """Sessions opened in a loop, under ever new names, keep nobody out, nor displace who works."""
-    monkeypatch.setattr("enact_dist.core.session_desk.SESSIONS_MAX", 20)
+    monkeypatch.setattr("enact_dist.core.sessions.SESSIONS_MAX", 20)
     bench = ShardBench()
     epoch = bench.shard.epoch
     bench.ask_as("alive@h:1", hello("alive"))
@@ -78,7 +78,7 @@ def test_full_table_makes_room_for_who_shows_a_sign_of_life(monkeypatch):
 
 def test_table_full_of_living_sessions_refuses_by_name(monkeypatch):
     """Nobody who works is displaced."""
-    monkeypatch.setattr("enact_dist.core.session_desk.SESSIONS_MAX", 5)
+    monkeypatch.setattr("enact_dist.core.sessions.SESSIONS_MAX", 5)
     bench = ShardBench()
     for number in range(5):
         bench.ask_as(f"a@h:{number}", hello(f"s{number}"))
@@ -88,6 +88,30 @@ def test_table_full_of_living_sessions_refuses_by_name(monkeypatch):
 
     assert isinstance(answer, Refused)
     assert answer.text == "5 sessions are open"
+
+
+def test_table_that_was_full_before_a_restart_keeps_nobody_out_after_it(monkeypatch):
+    """Neither while the shard waits for those that it knew, nor when they have not come back."""
+    monkeypatch.setattr("enact_dist.core.sessions.SESSIONS_MAX", 20)
+    bench = ShardBench()
+    for number in range(20):
+        bench.ask_as(f"x@h:{number}", hello(f"flood{number}", observer=False))
+    bench.restart()
+    known = bench.shard.state.sessions.by_id
+    before = set(known)
+    in_grace = bench.shard.state.sessions.in_grace(bench.shard.state.now_ns)
+
+    early = bench.ask_as(MODEST, hello("early"))
+    waited_for = before - set(known)
+    bench.wait(3 * S)
+    late = [bench.ask_as(f"y@h:{number}", hello(f"late{number}")) for number in range(5)]
+
+    assert len(before) == 20
+    assert in_grace
+    assert all(isinstance(answer, Welcome) for answer in (early, *late))
+    assert waited_for == set()
+    assert bench.counter("sessions_displaced") == 5
+    assert len(known) == 21
 
 
 def test_process_with_all_its_locks_is_refused_and_the_others_are_granted(monkeypatch):
