@@ -1,0 +1,277 @@
+"""PathPlanning leads from goal to goal, around whoever is there, or waits and says why."""
+
+import time
+
+import numpy as np
+import pytest
+
+from actors.geometry.capsules import distance_to_points
+from actors.geometry.joint_paths import JointPath
+from actors.geometry.kinematics import capsules_at
+from actors.workcell.planning import PathPlanning, PlanningWithSpeed
+from actors.workcell.simulation.arm import ARM
+from actors.workcell.vocabulary import (
+    BOXES,
+    GRID,
+    HULL,
+    JOINTS,
+    MODEL,
+    PATH,
+    PREDICTION,
+    ROBOT,
+    SAFETY,
+    SPEED,
+    SYSTEM,
+    TASK,
+    WORKSPACE,
+    Grid,
+    Hull,
+    Joints,
+    Prediction,
+    Task,
+    human_entity,
+    obstacle_entity,
+)
+from enact_dist import Lock, View, Write, testing
+
+LEFT = np.array([-1.0, 0.9, 0.0, -1.1, 0.0, 1.1, 0.0])
+RIGHT = np.array([0.9, 0.9, 0.0, -1.1, 0.0, 1.1, 0.0])
+START = LEFT - np.array([0.1, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0])
+FURTHER = RIGHT + np.array([0.2, -0.2, 0.0, 0.0, 0.0, 0.0, 0.0])
+ORIGIN_M, VOXEL_M, SHAPE = np.array([-2.0, -2.0, 0.0]), 0.025, (160, 160, 88)
+TABLE = np.r_[[0.95, 0.0, 0.375], [0.35, 0.6, 0.375], np.eye(3).ravel()]
+PERIOD_NS = 100_000_000
+
+
+def person(hand=(0.62, -0.15, 1.1), foot=(1.2, -0.75)):
+    """Return the voxels of a body with an arm that reaches to `hand`."""
+    shares = np.linspace(0.0, 1.0, 120)[:, None]
+    body = np.r_[foot, 0.0] + shares * [0.0, 0.0, 1.7]
+    arm = np.r_[foot, 1.4] + shares * (np.array(hand) - np.r_[foot, 1.4])
+    return np.unique(np.floor((np.concatenate([body, arm]) - ORIGIN_M) / VOXEL_M), axis=0)
+
+
+NOBODY = np.empty((0, 3))
+
+
+class Cell:
+    """A robot that is put anywhere, and hulls one period apart."""
+
+    def __init__(self, cell, actor=None, goals=(LEFT, RIGHT), dwell_s=0.0, cyclic=True):
+        self.cell, self.online = cell, cell.world("online")
+        self.actor = actor or PathPlanning()
+        self.actor.limit_s = 60.0
+        self.now_ns = time.time_ns()
+        self.online.init(ROBOT, MODEL, ARM)
+        self.online.init(WORKSPACE, GRID, Grid(ORIGIN_M, VOXEL_M, SHAPE))
+        self.online.init(obstacle_entity(0), BOXES, TABLE[None])
+        self.online.init(ROBOT, TASK, Task(np.array(goals), np.full(len(goals), dwell_s), cyclic))
+
+    def put(self, entity, aspect, value, stamp_ns=0):
+        request = Write(self.online, entity, aspect)
+        with Lock(request) as lock:
+            lock.put(request, value, stamp_ns=stamp_ns)
+
+    def get(self, entity, aspect):
+        request = View(self.online, entity, aspect)
+        return self.online.view(request).get(request)
+
+    def see(self, q, voxels=NOBODY, dq=None):
+        """Let one set come while the arm is at `q`; return the path."""
+        self.now_ns += PERIOD_NS
+        dq = np.zeros(7) if dq is None else dq
+        stamps = self.now_ns - 10_000_000 * np.arange(29, -1, -1)
+        self.put(ROBOT, JOINTS, Joints(np.tile(q, (30, 1)), np.tile(dq, (30, 1)), stamps))
+        count = len(voxels)
+        hull = Hull(
+            np.asarray(voxels, np.int16), np.zeros(count, np.float32), np.ones(count, bool),
+            np.zeros(count, np.int16), {}, (), np.inf, -1,
+        )  # fmt: skip
+        self.put(WORKSPACE, HULL, hull, self.now_ns)
+        testing.run_once(self.actor, self.cell)
+        return self.get(ROBOT, PATH)
+
+
+@pytest.fixture
+def worlds():
+    with testing.worlds("online") as cell:
+        yield cell
+
+
+def touches(path, voxels):
+    """Say whether the arm touches the middle of a voxel anywhere on a path, every 2 mrad."""
+    line = JointPath(path.waypoints)
+    points = ORIGIN_M + (np.asarray(voxels) + 0.5) * VOXEL_M
+    states = line.states(0.0, line.length_rad, 0.002)[::3]
+    return any(
+        distance_to_points(capsules[1:], points).min() <= 0.0
+        for capsules in capsules_at(ARM, states)
+    )
+
+
+def test_path_leads_from_goal_to_goal(worlds):
+    """To the first goal, then to the second one, and back to the first of a cyclic task."""
+    cell = Cell(worlds)
+
+    first = cell.see(START)
+    second = cell.see(LEFT)
+    third = cell.see(RIGHT)
+
+    np.testing.assert_allclose(first.waypoints, [START, LEFT])
+    np.testing.assert_allclose(second.waypoints[[0, -1]], [LEFT, RIGHT])
+    np.testing.assert_allclose(third.waypoints[[0, -1]], [RIGHT, LEFT])
+    ends = [(path.from_goal, path.to_goal, path.number) for path in (first, second, third)]
+    assert ends == [(-1, 0, 1), (0, 1, 2), (1, 0, 3)]
+
+
+def test_path_carries_the_stamp_of_its_hull(worlds):
+    """So that `why` leads from the path to the images."""
+    cell = Cell(worlds)
+    cell.see(START)
+    request = View(cell.online, ROBOT, PATH)
+
+    with Lock(request) as lock:
+        assert lock.stamp_ns(request) == cell.now_ns
+
+
+def test_robot_dwells_at_a_goal(worlds):
+    """It stays there for as long as the task says."""
+    cell = Cell(worlds, dwell_s=0.35)
+    cell.see(START)
+
+    numbers = [cell.see(LEFT).number for _ in range(6)]
+
+    assert numbers == [1, 1, 1, 1, 2, 2]
+
+
+def test_task_that_is_not_cyclic_ends(worlds):
+    """After the last goal there is no further path."""
+    cell = Cell(worlds, goals=(LEFT, RIGHT), cyclic=False)
+    for q in (START, LEFT, RIGHT, RIGHT, RIGHT):
+        last = cell.see(q)
+
+    assert (last.number, last.to_goal) == (2, 1)
+
+
+def test_path_leads_around_a_person(worlds):
+    """Planned beside someone who reaches over the table, it touches neither of them."""
+    cell = Cell(worlds)
+    cell.see(START, person())
+
+    path = cell.see(LEFT, person())
+
+    assert path.reason == ""
+    assert len(path.waypoints) > 2
+    assert not touches(path, person())
+
+
+def test_blocked_path_is_replaced_after_two_sets(worlds):
+    """One set could be noise; the new path begins where the arm can stop, on the old one."""
+    cell = Cell(worlds)
+    cell.see(START)
+    old = cell.see(LEFT)
+    on_way = LEFT + (RIGHT - LEFT) * 0.02
+    dq = (RIGHT - LEFT) / np.linalg.norm(RIGHT - LEFT) * 0.1
+    once = cell.see(on_way, person(), dq)
+
+    cell.actor.limit_s = 0.08
+    cell.see(on_way, NOBODY, dq)
+    cell.see(on_way, person(), dq)
+    cell.actor.limit_s = 0.5
+    new = cell.see(on_way, person(), dq)
+
+    assert (once.number, new.number) == (old.number, old.number + 1)
+    assert new.reason == "someone is in the way"
+    assert new.to_goal == old.to_goal
+    start = new.waypoints[0]
+    along = (start - on_way) @ (RIGHT - LEFT) / np.linalg.norm(RIGHT - LEFT)
+    np.testing.assert_allclose(start, on_way + along * dq / 0.1, atol=1e-9)
+    assert 0.0 < along < 0.4
+    assert not touches(new, person())
+
+
+def test_without_a_path_it_waits_and_says_why(worlds):
+    """A goal that someone stands in is named; when they leave, the path comes."""
+    tool = capsules_at(ARM, RIGHT)[0, -1, 3:6]
+    there = person(hand=tool, foot=(1.2, 0.9))
+    cell = Cell(worlds)
+    cell.see(START, there)
+
+    blocked = cell.see(LEFT, there)
+    waits = [cell.see(LEFT, there) for _ in range(6)]
+    free = [cell.see(LEFT) for _ in range(4)][-1]
+
+    assert len(blocked.waypoints) == 0
+    assert blocked.reason == "the goal is where something is in the way"
+    assert {path.number for path in waits} == {blocked.number}
+    assert len(free.waypoints) == 2
+    assert free.to_goal == 1
+
+
+def test_arm_off_its_path_gets_another_one(worlds):
+    """At rest beside the path, it is planned anew from there."""
+    cell = Cell(worlds)
+    cell.see(START)
+    cell.see(LEFT)
+    aside = LEFT + np.array([0.0, -0.4, 0, 0, 0, 0, 0])
+
+    path = cell.see(aside)
+
+    np.testing.assert_allclose(path.waypoints[[0, -1]], [aside, RIGHT])
+    assert path.reason == "the arm is off its path"
+
+
+def test_prediction_is_avoided_but_never_stops(worlds):
+    """Where someone will be is gone around if there is a way; else the path stays."""
+    cell = Cell(worlds)
+    cell.see(START)
+    straight = cell.see(LEFT)
+    at_s = np.linspace(0.1, 1.0, 10)
+    middle = capsules_at(ARM, (LEFT + RIGHT) / 2)[0, -1, 3:5]
+    walls = Prediction(at_s, np.tile(middle, (10, 1)), np.full(10, 0.15))
+    cell.put(human_entity(0), PREDICTION, walls)
+
+    for _ in range(6):
+        kept = cell.see(LEFT + (RIGHT - LEFT) * 0.25)
+
+    assert len(straight.waypoints) == 2
+    assert len(kept.waypoints) >= 2
+    ignoring = PathPlanning(predict=False)
+    ignoring.limit_s = 60.0
+    cell.actor = ignoring
+    assert cell.see(LEFT + (RIGHT - LEFT) * 0.25).number == kept.number
+
+
+def test_changed_task_is_planned_for(worlds):
+    """A goal that moved is gone to from where the arm rests."""
+    cell = Cell(worlds)
+    cell.see(START)
+    cell.see(LEFT)
+    cell.put(ROBOT, TASK, Task(np.array([LEFT, FURTHER]), np.zeros(2), cyclic=True))
+
+    path = cell.see(LEFT + 0.01)
+
+    np.testing.assert_allclose(path.waypoints[-1], FURTHER)
+
+
+def test_nothing_is_planned_before_there_is_a_task(worlds):
+    """A hull alone makes no path."""
+    cell = Cell(worlds)
+    request = Write(cell.online, ROBOT, TASK)
+    with Lock(request) as lock:
+        del lock[request]
+
+    assert cell.see(LEFT) is None
+
+
+def test_both_in_one_actor(worlds):
+    """As in the paper's Figure 4: path and speed by one actor, from one set."""
+    cell = Cell(worlds, PlanningWithSpeed())
+
+    cell.see(START)
+
+    path = cell.see(START)
+
+    assert len(path.waypoints) == 2
+    assert cell.get(ROBOT, SPEED).captured_ns == cell.now_ns
+    assert cell.get(SYSTEM, SAFETY).state in {"run", "stop"}
