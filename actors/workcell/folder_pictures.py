@@ -52,12 +52,15 @@ class Shot:
         mask: (H, W), true is foreground.
         image: (H, W, 3) uint8 BGR; None where the folder has only masks.
         file: Where it comes from.
+        background: Mean and spread of the empty scene, (H, W, 3) uint8 each, if the mask was made
+            by them.
     """
 
     camera: SetCamera
     mask: Mask
     image: Image | None
     file: Path
+    background: tuple[Image, Image] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,12 +186,17 @@ def _shot(
     how: tuple[str, Path | None, tuple[int, int, int] | None],
 ) -> Shot:
     source, picture, key = how
+    background = None
     if source == "masks":
         mask = np.asarray(_read(file, camera, colour=False) > 0)
         image = None if picture is None else _read(picture, camera, colour=True)
     else:
         image = _read(file, camera, colour=True)
-        mask = _of_key(image, key) if key is not None else _of_background(folder, camera, image)
+        if key is not None:
+            mask = _of_key(image, key)
+        else:
+            background = _background(folder, camera, image)
+            mask = Subtraction(*background)(image) > 0
     share = float(mask.mean())
     if not 0.0 < share < FOREGROUND_MOST:
         raise InputFileError(
@@ -197,7 +205,8 @@ def _shot(
             found=f"{share:.0%} of it ({source})",
             remedy="give masks/, the right background/, or --key COLOUR",
         )
-    return Shot(camera.of_size(mask.shape[1], mask.shape[0]), mask, image, file)
+    sized = camera.of_size(mask.shape[1], mask.shape[0])
+    return Shot(sized, mask, image, file, background)
 
 
 def _read(file: Path, camera: SetCamera, *, colour: bool) -> Image:
@@ -249,7 +258,8 @@ def _of_key(image: Image, key: tuple[int, int, int]) -> Mask:
     return filled > 0
 
 
-def _of_background(folder: Path, camera: SetCamera, image: Image) -> Mask:
+def _background(folder: Path, camera: SetCamera, image: Image) -> tuple[Image, Image]:
+    """Return mean and spread of a camera's pictures of the empty scene."""
     place = folder / "background"
     files = [*_files_of(place, camera.name).values()]
     if not files:
@@ -263,4 +273,4 @@ def _of_background(folder: Path, camera: SetCamera, image: Image) -> Mask:
     sized = camera.of_size(image.shape[1], image.shape[0])
     for file in files:
         statistics.add(_read(file, sized, colour=True))
-    return Subtraction(statistics.mean, statistics.spread)(image) > 0
+    return statistics.mean, statistics.spread

@@ -29,6 +29,7 @@ from actors.geometry.space_carving import (
 )
 from actors.geometry.surface_files import ply_bytes
 from actors.geometry.voxel_surface import surface_of
+from actors.workcell.folder_cell import fits, hull_by_actors
 from actors.workcell.folder_pictures import read_shots
 
 if TYPE_CHECKING:
@@ -38,17 +39,16 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from actors.geometry.camera_sets import CameraSet, SetCamera
-    from actors.geometry.space_carving import Carved
     from actors.geometry.voxels import VoxelBlocks
     from actors.workcell.folder_pictures import Shot, Shots
 
     Numbers = npt.NDArray[np.float64]
+    Rows = npt.NDArray[np.int64]
     Say = Callable[[str], None]
 
 GRID: Final = 160
 """Voxels along the longest edge of the hull's box."""
-GRID_LEAST: Final = 16
-GRID_MOST: Final = 360
+ACTORS: Final = "BackgroundSubtraction and Reconstruction"
 AGREES: Final = 0.6
 """Below this mean IoU of hull and masks, cameras and pictures do not belong together."""
 BETTER: Final = 0.15
@@ -91,6 +91,7 @@ class FolderReport:
         masks_from: Where the masks come from.
         frame: The moment, of `frames`.
         frames: How many there are.
+        made_by: What made the hull: the cell's actors, or, of very many cameras, carving alone.
         centre_in_front: Share of the cameras ahead of which the middle lies.
         low_m: Lowest corner of the box, metres.
         high_m: Highest corner.
@@ -111,6 +112,7 @@ class FolderReport:
     frame: str
     frames: int
     centre_in_front: float
+    made_by: str = "carving, voxel by voxel"
     low_m: list[float] = field(default_factory=list)
     high_m: list[float] = field(default_factory=list)
     voxel_m: float = 0.0
@@ -167,12 +169,16 @@ def _make(folder: Path, out: Path, options: FolderOptions, say: Say) -> FolderRe
     carver = Carver([shot.camera for shot in shots.shots], [shot.mask for shot in shots.shots])
     box = _bounds(folder, cameras, carver, options.unit)
     clock.lap("bounds")
-    grid, carved = _judged(folder, cameras, carver, box, _carved(folder, carver, box, options.grid))
+    grid, rows = _judged(folder, cameras, carver, box, _carved(folder, carver, box, options.grid))
     clock.lap("carved")
-    _measure(report, carver, grid, carved)
+    if fits(shots.shots, grid):
+        found = hull_by_actors(shots.shots, grid)
+        rows, report.made_by = (found, ACTORS) if len(found) else (rows, report.made_by)
+        clock.lap("actors")
+    _measure(report, carver, grid, rows)
     _suspect(report, carver, box)
     clock.lap("measured")
-    contents = _files(out, shots.shots, carver, grid, carved)
+    contents = _files(out, shots.shots, carver, grid, rows)
     clock.lap("drawn")
     report.seconds = clock.laps
     contents[out / "report.json"] = json.dumps(report.as_json(), indent=1).encode()
@@ -227,7 +233,7 @@ def _last_lines(report: FolderReport, out: Path) -> list[str]:
     )
     lines = [
         f"box          {size_m} m, voxels of {1e3 * report.voxel_m:.3g} mm",
-        f"hull         {report.voxels:,} voxels, {report.volume_l:.4g} l",
+        f"hull         {report.voxels:,} voxels, {report.volume_l:.4g} l, by {report.made_by}",
         f"agreement    IoU {report.iou_mean:.3f}, least {report.iou[worst]:.3f} (camera {worst})",
     ]
     if report.suspicious:
@@ -263,7 +269,7 @@ def _bounds(
 
 def _carved(
     folder: Path, carver: Carver, box: tuple[Numbers, Numbers] | None, count: int
-) -> tuple[VoxelBlocks, Carved] | None:
+) -> tuple[VoxelBlocks, Rows] | None:
     if box is None:
         return None
     try:
@@ -272,8 +278,8 @@ def _carved(
         raise InputFileError(
             folder, asked="a box for the hull", found=str(error), remedy="give bounds.json"
         ) from error
-    carved = carver.carve(grid)
-    return (grid, carved) if len(carved.tight_rows) else None
+    rows = carver.carve(grid).tight_rows
+    return (grid, rows) if len(rows) else None
 
 
 def _judged(
@@ -281,8 +287,8 @@ def _judged(
     cameras: CameraSet,
     carver: Carver,
     box: tuple[Numbers, Numbers] | None,
-    found: tuple[VoxelBlocks, Carved] | None,
-) -> tuple[VoxelBlocks, Carved]:
+    found: tuple[VoxelBlocks, Rows] | None,
+) -> tuple[VoxelBlocks, Rows]:
     """Return what was found if hull and masks agree; else name a way of reading that does better.
 
     Raises:
@@ -290,7 +296,7 @@ def _judged(
     """
     mean = 0.0
     if found is not None:
-        mean = float(np.mean(carver.agreement(found[0], found[1].tight_rows)))
+        mean = float(np.mean(carver.agreement(*found)))
         if mean >= AGREES:
             return found
     others = {
@@ -336,8 +342,7 @@ def _flipped(camera: SetCamera) -> SetCamera:
 # ---------------------------------------------------------------- what comes of it
 
 
-def _measure(report: FolderReport, carver: Carver, grid: VoxelBlocks, carved: Carved) -> None:
-    rows = carved.tight_rows
+def _measure(report: FolderReport, carver: Carver, grid: VoxelBlocks, rows: Rows) -> None:
     iou = carver.agreement(grid, rows)
     report.low_m = grid.origin_m.tolist()
     report.high_m = (grid.origin_m + grid.voxel_m * np.array(grid.shape)).tolist()
@@ -373,9 +378,8 @@ def _files(
     shots: Sequence[Shot],
     carver: Carver,
     grid: VoxelBlocks,
-    carved: Carved,
+    rows: Rows,
 ) -> dict[Path, bytes]:
-    rows = carved.tight_rows
     vertices, triangles = surface_of(grid, rows)
     contents = {out / "hull.ply": ply_bytes(vertices, triangles)}
     for number, shot in enumerate(shots):
