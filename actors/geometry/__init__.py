@@ -22,6 +22,7 @@ surface_distance        how far two surfaces or clouds are apart
 joint_paths             waypoints -> rounded path; how fast an arm may be along it
 arm_clearance           which states of an arm touch what is occupied, in batches
 joint_planning          collision-free paths by RRT-Connect and shortcuts
+people                  voxels -> persons: where they are, walk, and stretch their limbs
 separation              distance to a person <-> speed of a robot (ISO/TS 15066)
 ======================  ==========================================================
 

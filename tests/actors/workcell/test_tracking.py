@@ -1,0 +1,236 @@
+"""Exact bodies that walk: found again, told apart, predicted; hidden ones come out again."""
+
+import numpy as np
+import pytest
+
+from actors.geometry.people import associated, body_of, limbs
+from actors.workcell.tracking import HumanTracking
+from actors.workcell.vocabulary import (
+    GRID,
+    HULL,
+    HUMANS,
+    LIMBS,
+    PREDICTION,
+    TRACK,
+    WORKSPACE,
+    Grid,
+    Hull,
+    human_entity,
+)
+from enact_dist import Lock, ViewEach, Write, testing
+
+ORIGIN_M, VOXEL_M, SHAPE = np.array([-2.0, -2.0, 0.0]), 0.025, (160, 160, 88)
+START_NS, PERIOD_NS = 10**18, 100_000_000
+DRAW = np.random.default_rng(1)
+
+
+def body(centre, height_m=1.7, radius_m=0.15):
+    """Return voxels of an upright cylinder whose middle is exactly at `centre`, one array."""
+    index = np.stack(np.mgrid[: SHAPE[0], : SHAPE[1]], -1).reshape(-1, 2)
+    middle = ORIGIN_M[:2] + (index + 0.5) * VOXEL_M
+    disc = index[
+        np.linalg.norm(middle - np.round(np.array(centre) / VOXEL_M) * VOXEL_M, axis=1) < radius_m
+    ]
+    z = np.arange(round(height_m / VOXEL_M))
+    return np.concatenate([np.column_stack([disc, np.full(len(disc), k)]) for k in z])
+
+
+def hull_of(*parts, loose=()):
+    """Return a hull whose components are `parts`, all tight, and `loose`, which is not."""
+    everything = [*parts, *loose]
+    voxels = np.concatenate(everything) if everything else np.empty((0, 3))
+    numbers = np.repeat(np.arange(len(everything)), [len(part) for part in everything])
+    tight = numbers < len(parts)
+    return Hull(
+        voxels.astype(np.int16), np.zeros(len(voxels), np.float32), tight,
+        numbers.astype(np.int16), {}, (), np.inf, -1,
+    )  # fmt: skip
+
+
+class Cell:
+    def __init__(self, cell):
+        self.cell, self.online, self.actor = cell, cell.world("online"), HumanTracking()
+        self.now_ns = START_NS
+        self.online.init(WORKSPACE, GRID, Grid(ORIGIN_M, VOXEL_M, SHAPE))
+
+    def see(self, *parts, loose=()):
+        """Let a set come; return the tracks by name."""
+        self.now_ns += PERIOD_NS
+        request = Write(self.online, WORKSPACE, HULL)
+        with Lock(request) as lock:
+            lock.put(request, hull_of(*parts, loose=loose), stamp_ns=self.now_ns)
+        testing.run_once(self.actor, self.cell)
+        return self.each(TRACK)
+
+    def each(self, aspect):
+        request = ViewEach(self.online, HUMANS, aspect)
+        return {entity.name: datum for entity, datum in self.online.view(request)[request].items()}
+
+
+@pytest.fixture
+def cell():
+    with testing.worlds("online") as worlds:
+        yield Cell(worlds)
+
+
+def line(start, end, sets):
+    return np.linspace(start, end, sets)
+
+
+def test_person_is_found_where_they_are(cell):
+    """Position, height and volume of an exact body; nobody else."""
+    for _ in range(5):
+        tracks = cell.see(body((0.5, -0.75)))
+
+    track = tracks["human/0"]
+    np.testing.assert_allclose(track.position_m, [0.5, -0.75, 1.7], atol=0.02)
+    np.testing.assert_allclose(track.velocity_m_s, 0.0, atol=0.02)
+    assert track.volume_m3 == pytest.approx(np.pi * 0.15**2 * 1.7, rel=0.05)
+    assert (list(tracks), track.hidden) == (["human/0"], False)
+    assert track.first_ns == START_NS + PERIOD_NS
+
+
+def test_walker_is_tracked_and_predicted(cell):
+    """Within half a voxel and a little: 4 cm, 0.1 m/s, and 12 cm half a second ahead."""
+    positions, velocities, ahead = [], [], []
+    walk = line((-1.4, -1.2), (1.4, -1.0), 30)
+    velocity = (walk[1] - walk[0]) / 0.1
+    for place in walk:
+        tracks = cell.see(body(place))
+        prediction = cell.each(PREDICTION)["human/0"]
+        track = tracks["human/0"]
+        positions.append(np.linalg.norm(track.position_m[:2] - place))
+        velocities.append(np.linalg.norm(track.velocity_m_s[:2] - velocity))
+        ahead.append(np.linalg.norm(prediction.centre_m[4] - place - 0.5 * velocity))
+
+    assert len(tracks) == 1
+    assert np.median(positions) <= 0.02
+    assert np.median(velocities[5:]) <= 0.1
+    assert np.median(ahead[5:]) <= 0.06
+    np.testing.assert_allclose(prediction.at_s, np.arange(1, 11) / 10.0)
+    assert prediction.centre_m.shape == (10, 2)
+    assert (np.diff(prediction.radius_m) > 0.0).all()
+    assert prediction.radius_m[0] >= 0.25
+
+
+def test_two_people_cross_and_stay_themselves(cell):
+    """Where they pass each other they are one component; behind it, each goes on."""
+    one, other = line((-1.2, 0.2), (1.2, 0.2), 25), line((1.2, -0.2), (-1.2, -0.2), 25)
+    for a, b in zip(one, other, strict=True):
+        parts = [body(a), body(b)]
+        near = np.linalg.norm(a - b) < 0.6
+        tracks = cell.see(np.concatenate(parts)) if near else cell.see(*parts)
+
+    assert sorted(tracks) == ["human/0", "human/1"]
+    assert tracks["human/0"].velocity_m_s[0] > 0.5
+    assert tracks["human/1"].velocity_m_s[0] < -0.5
+    np.testing.assert_allclose(tracks["human/0"].position_m[:2], (1.2, 0.2), atol=0.06)
+
+
+def test_nearer_of_two_is_nobody_elses(cell):
+    """The sum of the distances decides, not who comes first."""
+    pairs = associated(
+        np.array([[0.0, 0.0], [0.3, 0.0]]),
+        np.array([0.5, 0.5]),
+        np.array([[0.25, 0.0], [-0.2, 0.0]]),
+    )
+
+    assert sorted(pairs) == [(0, 1), (1, 0)]
+    assert associated(np.zeros((1, 2)), np.ones(1), np.array([[1.5, 0.0]])) == []
+
+
+def test_small_and_loose_things_are_nobody(cell):
+    """Less than 20 litres, or not in the tight hull: no track."""
+    small = body((0.0, 0.0), height_m=0.2)
+
+    assert cell.see(small, loose=[body((1.0, 1.0))]) == {}
+
+
+def test_hidden_person_is_kept_and_found_again(cell):
+    """Gone in the middle of the workspace: hidden, growing; the same track when they come out."""
+    for place in line((-1.2, 0.0), (-0.6, 0.0), 8):
+        cell.see(body(place))
+    sizes = []
+    for _ in range(20):
+        tracks = cell.see()
+        sizes.append(cell.each(PREDICTION)["human/0"].radius_m[0])
+    hidden = tracks["human/0"]
+
+    back = cell.see(body((0.8, 0.6)))
+
+    assert hidden.hidden
+    assert (np.diff(sizes[:6]) > 0.1).all()
+    assert max(sizes) <= 1.5
+    np.testing.assert_allclose(hidden.position_m[:2], (-0.6, 0.0), atol=0.12)
+    assert cell.each(LIMBS).keys() == {"human/0"}
+    assert list(back) == ["human/0"]
+    assert not back["human/0"].hidden
+    np.testing.assert_allclose(back["human/0"].position_m[:2], (0.8, 0.6), atol=0.1)
+
+
+def test_person_who_leaves_is_gone(cell):
+    """At a side of the workspace the track ends with all that was known; a new one is new."""
+    for place in line((1.0, 0.0), (1.85, 0.0), 9):
+        cell.see(body(place))
+    gone = cell.see()
+    left = [cell.each(aspect) for aspect in (LIMBS, PREDICTION)]
+
+    again = cell.see(body((1.5, 0.0)))
+
+    assert gone == {}
+    assert left == [{}, {}]
+    assert list(again) == ["human/1"]
+
+
+def test_hiding_ends(cell):
+    """A track that was hidden for longer than allowed ends."""
+    cell.actor.hidden_s_max = 0.5
+    cell.see(body((0.0, 0.0)))
+
+    counts = [len(cell.see()) for _ in range(9)]
+
+    assert counts[0] == 1
+    assert counts[-1] == 0
+
+
+def test_restarted_tracking_goes_on(cell):
+    """Another process finds the tracks in the world context."""
+    for place in line((-1.2, 0.0), (-0.8, 0.0), 5):
+        cell.see(body(place))
+    cell.actor = HumanTracking()
+
+    tracks = cell.see(body((-0.7, 0.0)))
+
+    assert list(tracks) == ["human/0"]
+    assert tracks["human/0"].first_ns == START_NS + PERIOD_NS
+    assert human_entity(0).name in tracks
+
+
+def test_limbs_of_a_cross_are_its_arms():
+    """A trunk with two stretched arms: an end of a capsule at each hand, head and foot."""
+    t = np.linspace(0.0, 1.0, 120)[:, None]
+    shake = DRAW.normal(0.0, 0.03, (120, 3))
+    trunk = np.array([0.0, 0.0, 0.0]) + t * [0.0, 0.0, 1.8] + shake
+    arms = np.array([-0.8, 0.0, 1.4]) + t * [1.6, 0.0, 0.0] + shake
+    points = np.concatenate([trunk, arms])
+
+    capsules = limbs(points)
+
+    assert capsules.dtype == np.float32
+    assert capsules.shape[1] == 7
+    ends = capsules[:, :6].reshape(-1, 3)
+    for tip in ([-0.8, 0, 1.4], [0.8, 0, 1.4], [0, 0, 0], [0, 0, 1.8]):
+        assert np.linalg.norm(ends - tip, axis=1).min() < 0.25
+    assert limbs(np.empty((0, 3))).shape == (0, 7)
+
+
+def test_body_is_measured_exactly():
+    """Middle, top, volume and radius of a box of voxels."""
+    grid = np.stack(np.mgrid[:10, :10, :20], -1).reshape(-1, 3) * 0.1 + 0.05
+
+    seen = body_of(grid, 0.1)
+
+    np.testing.assert_allclose(seen.centre_m, [0.5, 0.5])
+    assert seen.top_m == pytest.approx(2.0)
+    assert seen.volume_m3 == pytest.approx(2.0)
+    assert 0.5 < seen.radius_m < 0.71
