@@ -6,6 +6,7 @@ that is killed, and such a run starts from an empty data folder of its own.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
@@ -59,6 +60,18 @@ class DemoCell:
 
     def check(self) -> None:
         """Raise `DemoError` if it is known to be gone."""
+
+    def shard_pid(self, name: str) -> int:
+        """Return the process of a shard.
+
+        Raises:
+            DemoError: It does not run, or not under this process.
+        """
+        raise DemoError(f"the process of shard {name} is not known; see {self.log}")
+
+    def processor_s(self) -> dict[str, float]:
+        """Return the processor time of each process by name, where they are known."""
+        return {}
 
     def joined(self) -> Cell:
         """Join the cell as soon as its shards answer.
@@ -134,6 +147,41 @@ class RunningCell(DemoCell):
         for each in self._ports:
             each.close()
         shutil.rmtree(self._data, ignore_errors=True)
+
+    def shard_pid(self, name: str) -> int:
+        """Return the process of a shard, a child of `enact up`.
+
+        Raises:
+            DemoError: It does not run.
+        """
+        for (kind, first), pid in self._children().items():
+            if (kind, first) == ("shard", name):
+                return pid
+        raise DemoError(f"shard {name} does not run; see {self.log}")
+
+    def processor_s(self) -> dict[str, float]:
+        """Return the processor time that each process has used, seconds, by its first name."""
+        used = {}
+        for (_, name), pid in self._children().items():
+            with contextlib.suppress(OSError, ValueError):
+                fields = (Path("/proc") / str(pid) / "stat").read_text().rpartition(")")[2].split()
+                used[name] = (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+        return used
+
+    def _children(self) -> dict[tuple[str, str], int]:
+        """Return the processes under `enact up`: kind and first name, and the process's number."""
+        supervisor = self._process.pid if self._process is not None else 0
+        found = {}
+        for folder in Path("/proc").glob("[0-9]*"):
+            try:
+                parent = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
+                words = (folder / "cmdline").read_bytes().decode(errors="replace").split("\0")
+            except (OSError, ValueError, IndexError):
+                continue  # it ended meanwhile
+            if parent == supervisor and "run" in words[3:6]:
+                run = words.index("run")
+                found[words[run - 1], words[run + 1]] = int(folder.name)
+        return found
 
     def check(self) -> None:
         """Raise `DemoError` with the end of the log if the processes are gone."""

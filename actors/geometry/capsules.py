@@ -202,14 +202,10 @@ def _tangent_circles(centres: Numbers, radius: Numbers, around: Numbers) -> Numb
     radius = np.broadcast_to(radius[..., None], far.shape)
     inside = np.minimum((radius / far) ** 2, 0.999)
     normal = centres / far
-    x, y, z = normal[..., 0], normal[..., 1], normal[..., 2]
-    steep, zero = np.abs(y) >= 0.9, np.zeros_like(x)
-    first = np.stack(
-        [np.where(steep, zero, -z), np.where(steep, z, zero), np.where(steep, -y, x)], -1
-    )
+    helper = np.where(np.abs(normal[..., 1:2]) < 0.9, [0.0, 1.0, 0.0], [1.0, 0.0, 0.0])
+    first = np.cross(normal, helper)
     first /= np.linalg.norm(first, axis=-1, keepdims=True)
-    a, b, c = first[..., 0], first[..., 1], first[..., 2]
-    second = np.stack([y * c - z * b, z * a - x * c, x * b - y * a], -1)
+    second = np.cross(normal, first)
     reach = (radius * np.sqrt(1.0 - inside))[..., None, :]
     turned = around[:, :1] * first[..., None, :] + around[:, 1:] * second[..., None, :]
     return np.asarray((centres * (1.0 - inside))[..., None, :] + reach * turned)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import queue
 import threading
+import time
 from concurrent.futures import Future
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
@@ -30,6 +31,8 @@ T = TypeVar("T")
 
 OPEN_S: Final = 60.0
 """How long a source may take to open; a simulated one draws its room and compiles its loops."""
+PREPARE_AFTER_NS: Final = 65_000_000
+"""So long after a tick its images have become a hull, and the next ones are prepared."""
 FRAME_S: Final = 1.0
 """A source that gives no image for so long hangs."""
 
@@ -48,6 +51,7 @@ class Capture:
             queue.SimpleQueue()
         )
         self._hangs: Future[Any] | None = None
+        self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"capture-{name}", daemon=True)
         self._thread.start()
 
@@ -73,13 +77,25 @@ class Capture:
         return self._result(self._ask(take), wait_s)
 
     def prepare(self, stamp_ns: int) -> None:
-        """Let a source that can get ready for a tick to come do so; its `frame` waits for it."""
+        """Let a source that can get ready for a tick to come do so; its `frame` waits for it.
+
+        It begins when the stages that work on this tick's images are about to be done: on few
+        processors it would hold them up.
+        """
         prepare: Callable[[int], None] | None = getattr(self._source, "prepare", None)
-        if prepare is not None:
-            self._ask(lambda: prepare(stamp_ns))
+        if prepare is None:
+            return
+
+        def later() -> None:
+            begin_ns = stamp_ns - PERIOD_NS + PREPARE_AFTER_NS
+            self._closing.wait(min(max(0.0, (begin_ns - time.time_ns()) / 1e9), PERIOD_S))
+            prepare(stamp_ns)
+
+        self._ask(later)
 
     def close(self) -> None:
         """Close the source and end the thread; a driver that hangs is left to itself."""
+        self._closing.set()
         self._ask(self._source.close)
         self._asked.put(None)
         self._thread.join(timeout=1.0)

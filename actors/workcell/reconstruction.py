@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -47,6 +48,8 @@ if TYPE_CHECKING:
 
 AHEAD_NS_MAX: Final = 100_000_000
 """So long after the newest sample of the joints their speed still tells where they are."""
+GAP_S: Final = 0.5
+"""After so long without a hull a late one is better than none: it says why the robot stands."""
 
 _ONLINE: Final = World("online")
 _SILHOUETTES: Final = Together(
@@ -82,12 +85,15 @@ class Reconstruction(Actor):
 
     robot: bool = True
     stuck: bool = True
+    late_s: float = math.inf
+    """A set this old is passed over while hulls come: no robot may move on it, and the next sets
+    would be late, too.  After `GAP_S` without a hull it is taken all the same."""
 
     def __init__(self, *, robot: bool = True, stuck: bool = True) -> None:
         self.robot, self.stuck = robot, stuck
         self._made_of: object = None
         self._made: tuple[Refinement, VoxelBlocks] | None = None
-        self._last_ns = 0
+        self._last_ns = self._written_ns = 0
         self._checksums: dict[str, int] = {}
 
     def start(self) -> None:
@@ -95,15 +101,18 @@ class Reconstruction(Actor):
         one_thread()
 
     def update(self, lock: Lock) -> None:
-        """Write what is occupied, with the stamp of the set."""
+        """Write what is occupied, with the stamp of the set; nothing for one that is too late."""
+        stamp_ns, now_ns = lock.stamp_ns(self.silhouettes), time.time_ns()
+        fresh = now_ns - self._written_ns < GAP_S * 1e9
+        if fresh and now_ns - stamp_ns > self.late_s * 1e9:
+            return
         refinement, blocks = self._prepared(lock)
         given = self._given(lock[self.silhouettes])
-        stamp_ns = lock.stamp_ns(self.silhouettes)
         elapsed_s = (stamp_ns - self._last_ns) / 1e9 if self._last_ns else math.inf
         found = refinement.step(
             [given.get(name) for name in self._names], self._arm(lock, stamp_ns), elapsed_s
         )
-        self._last_ns = stamp_ns
+        self._last_ns, self._written_ns = stamp_ns, now_ns
         nearest = found.nearest
         lock[self.hull] = Hull(
             voxels=blocks.indices(found.rows),

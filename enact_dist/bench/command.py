@@ -27,6 +27,7 @@ from enact_dist.bench.run import Run
 from enact_dist.bench.tables import table
 from enact_dist.bench.updates import run_durable, run_multi, run_update, run_waiters
 from enact_dist.bench.visit import PEAK_BYTES, without_room
+from enact_dist.bench.workcell import run_workcell
 from enact_dist.cli.bench import BENCHES as TOLD
 from enact_dist.cli.output import print_json, print_table
 from enact_dist.cli.verbs import DONE, FAILED
@@ -68,6 +69,7 @@ BENCHES: Final[dict[str, Callable[[Run], None]]] = {
     "stopped": run_stopped,
     "memory": run_memory,
     "recovery": run_recovery,
+    "workcell": run_workcell,
 }
 BETWEEN_PROCESSES: Final = frozenset(name for name, told in TOLD.items() if not told.alone)
 """Benches that mean nothing within one process."""
@@ -98,7 +100,7 @@ def names_of(arguments: argparse.Namespace) -> list[str]:
             f"--embedded with --carrier {arguments.carrier}: within one process calls travel over"
             " none; leave out one of both"
         )
-    asked = set(arguments.names or BENCHES)
+    asked = set(arguments.names or (name for name in BENCHES if not TOLD[name].named))
     for option, given, cannot, why in (
         ("--embedded", arguments.embedded, BETWEEN_PROCESSES, "needs several processes"),
         ("--connect", arguments.connect, OWN_DAEMONS, "needs daemons of its own"),

@@ -1,10 +1,14 @@
-"""`enact demo palletizing`: the application of ENACT 4.2, simulated or on real recordings."""
+"""`enact demo palletizing`: the application of ENACT 4.2, simulated or on real recordings.
+
+`enact demo workcell` stands in `demo_workcell`.
+"""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from enact_dist.cli import demo_workcell
 from enact_dist.cli.verbs import add_noun, add_verb, verbs_of, whole
 from enact_dist.errors import ConfigError
 
@@ -18,8 +22,9 @@ _EXTRA: Final = ("open3d", "scipy", "cv2")
 
 
 def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
-    """Add the noun and its one verb."""
+    """Add the noun and its verbs."""
     verbs = verbs_of(add_noun(nouns, "demo", "run a demonstration"))
+    demo_workcell.add_to(verbs)
     demo = add_verb(
         verbs,
         "palletizing",

@@ -46,3 +46,38 @@ def test_missing_extra_is_named_with_its_command(enact, monkeypatch):
         "enact: the demo needs open3d, which is not installed; install the actors extra:"
         " pip install -e '.[actors]' in the clone of enact-dist\n"
     )
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (("--scenario", "S13"), "no scenario 'S13'; there are visit, S1,"),
+        (("--scenario", "S8", "--embedded"), "--embedded has one"),
+    ],
+)
+def test_options_of_the_workcell_that_do_not_fit_are_refused(enact, words, reason, tmp_path):
+    """Nothing is started for a scenario that does not exist."""
+    result = enact("demo", "workcell", "--out", str(tmp_path / "out"), *words)
+
+    assert result.status == 2
+    assert reason in result.err
+    assert not (tmp_path / "out").exists()
+
+
+def test_missing_extra_of_the_workcell_is_named_with_its_command(enact, monkeypatch):
+    """Without OpenCV the error says which extras to install."""
+    error = ModuleNotFoundError("No module named 'cv2'", name="cv2")
+
+    class Finder:
+        @staticmethod
+        def find_spec(name, *_):
+            if name == "actors.workcell.demo":
+                raise error
+
+    monkeypatch.delitem(sys.modules, "actors.workcell.demo", raising=False)
+    monkeypatch.setattr(sys, "meta_path", [Finder, *sys.meta_path])
+
+    result = enact("demo", "workcell")
+
+    assert result.status == 2
+    assert "pip install -e '.[workcell,record]'" in result.err

@@ -330,8 +330,11 @@ def _record_camera(
     windows = np.zeros((info.frames, 4), np.int32)
     for frame in range(info.frames):
         image = draw(_scene(stage, frame, motion))
-        windows[frame] = left, top, right, bottom = _differing(image, still)
-        if right:
+        differs = cv2.absdiff(image, still)
+        rows, columns = np.flatnonzero(differs.any((1, 2))), np.flatnonzero(differs.any((0, 2)))
+        if len(rows):
+            left, top, right, bottom = columns[0], rows[0], columns[-1] + 1, rows[-1] + 1
+            windows[frame] = left, top, right, bottom
             part = image[top:bottom, left:right]
             options = [cv2.IMWRITE_JPEG_QUALITY, QUALITY]
             if not cv2.imwrite(str(own / f"{frame:06d}.jpg"), part, options):
@@ -340,18 +343,6 @@ def _record_camera(
                 )
         tell()
     np.save(own / "windows.npy", windows)
-
-
-def _differing(image: Image, still: Image) -> tuple[int, int, int, int]:
-    """Return the window in which two images differ: first column, row, last + 1 of both; or 0s."""
-    import cv2
-
-    flat = cv2.absdiff(image, still).reshape(len(image), -1)
-    rows = np.flatnonzero(flat.max(1))
-    if not len(rows):
-        return 0, 0, 0, 0
-    columns = np.flatnonzero(flat.max(0)) // 3
-    return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
 
 
 def _truth(stage: Stage, info: RecordingInfo, motion: Motion | None) -> tuple[F64, F64]:

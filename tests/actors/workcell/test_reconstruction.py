@@ -175,6 +175,21 @@ def test_each_complete_set_runs_once_and_in_order(cell):
     assert testing.run_once(actor, cell) == 0
 
 
+def test_a_late_set_is_passed_over_while_hulls_come(cell, monkeypatch):
+    """It would only make the next ones late, too; after a gap a late hull is better than none."""
+    now_ns = [FIRST_NS + 10_000_000_000]
+    monkeypatch.setattr("actors.workcell.reconstruction.time.time_ns", lambda: now_ns[0])
+    actor = Reconstruction()
+    actor.late_s = 0.3
+    written = []
+    for number, waited_s in enumerate((0.0, 0.1, 0.6)):
+        now_ns[0] += round(waited_s * 1e9)
+        give_all(cell, FIRST_NS + number * PERIOD_NS)
+        testing.run_once(actor, cell)
+        written.append((seen(cell)[1] - FIRST_NS) // PERIOD_NS)
+    assert written == [0, 0, 2]
+
+
 def test_a_stand_in_and_a_stuck_image_veto_nothing_and_are_not_named(cell):
     """A camera that stands in, or gives the image of the last set again, only adds voxels."""
     whole = Reconstruction()

@@ -1,0 +1,96 @@
+"""The cell of one run of the workcell: processes under `enact up`, or all of it in this process."""
+
+from __future__ import annotations
+
+import contextlib
+import tomllib
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Self
+
+from actors import running_cell
+from actors.geometry.files import write_whole
+from actors.running_cell import DemoCell, placed, toml_of
+from enact_dist import local
+from enact_dist.actor_load import configured_actor
+from enact_dist.actor_process import ActorThread
+from enact_dist.config import load_config
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from actors.workcell.demo_options import Options
+    from enact_dist import Cell
+
+TEMPLATE: Final = Path(__file__).with_name("cell.toml")
+SETUP: Final = "setup"
+"""The actor that is done once it has written what is known; all others go on."""
+
+
+def configured(template: str, options: Options) -> dict[str, Any]:
+    """Return the parsed `cell.toml` of a run: scenario, seed, source of the images, grid.
+
+    Args:
+        template: The text of the `cell.toml` of the application.
+        options: What was asked for.
+    """
+    config = tomllib.loads(template)
+    actors = config["actors"]
+    actors[SETUP]["args"] = {
+        "scenario": options.scenario,
+        "seed": options.seed,
+        "seconds": options.seconds,
+        "voxel_m": options.voxel_m,
+    }
+    for table in actors.values():
+        if table["class"].endswith(":SimulatedCamera"):
+            table["args"] = {**table.get("args", {}), "source": options.source}
+    return config
+
+
+class RunningCell(running_cell.RunningCell):
+    """A workcell of processes that is up between entering and leaving the block.
+
+    Args:
+        options: What was asked for.
+    """
+
+    def __init__(self, options: Options) -> None:
+        def of_this_run(template: str, data: Path, ports: Sequence[int]) -> str:
+            config = configured(template, options)
+            placed(config, data, ports)
+            return toml_of(config)
+
+        super().__init__(options.out, name="workcell", template=TEMPLATE, configured=of_this_run)
+
+
+class EmbeddedCell(DemoCell):
+    """A workcell in this process: one shard, a thread per actor.
+
+    Args:
+        options: What was asked for.
+    """
+
+    def __init__(self, options: Options) -> None:
+        super().__init__(options.out / "cell.toml", log="this process's output")
+        self._options = options
+        self._open = contextlib.ExitStack()
+
+    def __enter__(self) -> Self:
+        config = configured(TEMPLATE.read_text(), self._options)
+        config.pop("data_folder", None)
+        write_whole({self.config: toml_of(config).encode()})
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._open.close()
+
+    def joined(self) -> Cell:
+        """Start the shard and the actors, and return the cell."""
+        config = load_config(self.config)
+        cell = self._open.enter_context(local(config=config, actor="demo"))
+        for actor in config.actors:
+            thread = ActorThread(
+                configured_actor(actor), cell, dict(actor.worlds) or None, name=actor.name
+            )
+            self._open.enter_context(thread)
+        return cell

@@ -1,0 +1,312 @@
+"""Conduct a run: wait until all are ready, confirm the empty cell, start, break things, record.
+
+The world contexts are the only way to the actors: the operator's word and the scenario's begin are
+data like all others.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Final, TypeVar
+
+from actors.running_cell import DemoError
+from actors.workcell import vocabulary as words
+from actors.workcell.demo_cell import SETUP
+from actors.workcell.scenarios import scenario_of
+from actors.workcell.trace import ONLINE, RECORDED, TRUTH
+from enact_dist import Lock, View, Write
+from enact_dist.config import load_config
+from enact_dist.errors import EnactError, ForgottenError, NullDatumError, ShardUnreachableError
+from enact_dist.recording import Recorder
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+    from actors.running_cell import DemoCell
+    from actors.workcell.demo_options import Options
+    from actors.workcell.scenarios import Fault
+    from enact_dist import Aspect, Cell, Entity
+    from enact_dist.lineage import CauseTree
+
+T = TypeVar("T")
+
+READY_S: Final = 90.0
+"""How long actors and backgrounds may take; on two cores they take a quarter of that."""
+LOOK_S: Final = 0.1
+"""How often the run is looked at."""
+LEAD_S: Final = 2.0
+"""Between the word that starts the scenario and its second 0: pictures show the arm by then."""
+FRESH_S: Final = 0.5
+"""A hull that is not older shows that all stages run."""
+WHAT_IF: Final = "what_if"
+"""The fork in which another planner tries the same seconds."""
+WHAT_IF_S: Final = 10.0
+"""How many seconds it tries."""
+DEPTH: Final = 3
+"""From the speed over the hull to the masks and the images."""
+KEPT_EVERY_S: Final = 1.0
+"""At most so often the nearest approach is kept anew."""
+NEARER_M: Final = 0.05
+"""The nearest approach is kept anew only if it is so much nearer."""
+
+
+@dataclass(slots=True)
+class Notes:
+    """What was seen while a run went on.
+
+    Attributes:
+        start_ns: Stamp of second 0.
+        stop: Where the first stop came from; None without one.
+        nearest_m: Nearest estimated distance.
+        nearest_ns: Exposure of it.
+        forked_ns: When the fork was made; 0: it was not.
+        lines: What was told, with the second.
+        faults: What was done to which process.
+        cores: Processor time per second of each process.
+    """
+
+    start_ns: int = 0
+    stop: CauseTree | None = None
+    nearest_m: float = math.inf
+    nearest_ns: int = 0
+    forked_ns: int = 0
+    lines: list[str] = field(default_factory=list)
+    faults: list[str] = field(default_factory=list)
+    cores: dict[str, float] = field(default_factory=dict)
+
+
+class Conductor:
+    """Conducts one run in a cell that is up.
+
+    Args:
+        cell: The cell.
+        running: What it runs in.
+        options: What was asked for.
+        tell: Called with each line of progress.
+    """
+
+    def __init__(
+        self, cell: Cell, running: DemoCell, options: Options, tell: Callable[[str], None]
+    ) -> None:
+        self._cell, self._running, self._options, self._tell = cell, running, options, tell
+        self._online, self._truth = cell.world(ONLINE), cell.world(TRUTH)
+        self.notes = Notes()
+        self._kept_s = 0.0
+
+    def prepare(self) -> None:
+        """Wait for the actors, confirm that the cell is empty, wait for the backgrounds, start.
+
+        Raises:
+            DemoError: The cell went down, or something was not ready within `READY_S`.
+        """
+        config = load_config(self._running.config)
+        actors = {actor.name for actor in config.actors} - {SETUP}
+        if not self._options.embedded:
+            self._wait(lambda: actors - self._running_actors(), "actors that do not run")
+        grid = View(self._online, words.WORKSPACE, words.GRID)
+        self._wait(
+            lambda: [] if self._online.view(grid).get(grid) is not None else ["setup"], "missing"
+        )
+        self._write(ONLINE, words.WORKSPACE, words.EMPTY, time.time_ns())
+        cameras = {words.camera_entity(number).name for number in range(words.CAMERA_COUNT)}
+        self._wait(lambda: cameras - self._with("background"), "cameras without a background")
+        self._tell("the operator confirmed the empty cell; backgrounds are learned")
+        period_ns = round(words.PERIOD_S * 1e9)
+        start_ns = (time.time_ns() + round(LEAD_S * 1e9)) // period_ns * period_ns
+        options = self._options
+        self._play(start_ns + round(READY_S * 1e9))  # the arm is seen, nobody comes yet
+        self._wait(self._stale, "stages without a fresh datum")
+        start_ns = (time.time_ns() + round(LEAD_S * 1e9)) // period_ns * period_ns
+        self._play(start_ns)
+        self.notes.start_ns = start_ns
+        self._tell(f"scenario {options.scenario}, seed {options.seed}, {options.seconds:g} s")
+
+    def _play(self, start_ns: int) -> None:
+        options = self._options
+        playing = words.Playing(
+            options.scenario, options.seed, start_ns, options.seconds, robot=True
+        )
+        self._write(TRUTH, words.SCENARIO, words.PLAYING, playing)
+
+    def _running_actors(self) -> set[str]:
+        return {name for info in self._cell.actors() for name in info.names()}
+
+    def _with(self, aspect: str) -> set[str]:
+        """Return the cameras that have an aspect."""
+        return {slot.entity.name for slot in self._online.survey(words.CAMERAS, (aspect,))}
+
+    def _stale(self) -> list[str]:
+        """Return which stages have no fresh datum."""
+        stale = []
+        stages: tuple[tuple[str, Entity, Aspect[Any]], ...] = (
+            ("hull", words.WORKSPACE, words.HULL),
+            ("speed", words.ROBOT, words.SPEED),
+            ("robot", words.ROBOT, words.EXECUTION),
+            ("path", words.ROBOT, words.PATH),
+        )
+        for name, entity, aspect in stages:
+            newest = self._online.history(entity, aspect, count=1)
+            age_s = (time.time_ns() - newest[0].stamp_ns) / 1e9 if newest else math.inf
+            if age_s > FRESH_S and not (name == "path" and newest):
+                stale.append(name)
+        return stale
+
+    def _wait(self, missing: Callable[[], object], what: str) -> None:
+        deadline_s = time.monotonic() + READY_S
+        left: object = ["?"]
+        while left:
+            self._running.check()
+            try:
+                left = missing()
+            except (ShardUnreachableError, NullDatumError):
+                left = ["the shard"]
+            if left and time.monotonic() > deadline_s:
+                names = ", ".join(sorted(str(each) for each in left))  # type: ignore[attr-defined]
+                raise DemoError(f"{what} after {READY_S:.0f} s: {names}; see {self._running.log}")
+            time.sleep(LOOK_S if left else 0.0)
+
+    def _write(self, world: str, entity: Entity, aspect: Aspect[T], datum: T) -> None:
+        request = Write(self._cell.world(world), entity, aspect)
+        with Lock(request) as lock:
+            lock[request] = datum
+
+    def follow(self) -> None:
+        """Look at the run until it is over, keep what is worth it, and break what shall break.
+
+        Raises:
+            DemoError: The cell went down.
+        """
+        options, notes = self._options, self.notes
+        faults = list(scenario_of(options.scenario, options.seed, options.seconds).faults)
+        fork_at_s = min(0.3 * options.seconds, max(0.0, options.seconds - WHAT_IF_S))
+        state, undo = "", []
+        while (now_s := (time.time_ns() - notes.start_ns) / 1e9) < options.seconds + 0.5:
+            self._running.check()
+            while faults and now_s >= faults[0].at_s:
+                undo += self._break(faults.pop(0), now_s)
+            for due_s, act in [each for each in undo if now_s >= each[0]]:
+                undo.remove((due_s, act))
+                act()
+            try:
+                if not notes.forked_ns and now_s >= fork_at_s:
+                    self._online.fork(WHAT_IF)
+                    notes.forked_ns = time.time_ns()
+                state = self._look(now_s, state)
+            except EnactError as error:
+                self._say(now_s, f"cannot look: {str(error).splitlines()[0]}")
+            time.sleep(LOOK_S)
+        for _, act in undo:
+            act()
+
+    def _look(self, now_s: float, before: str) -> str:
+        """Note the state of safety and the nearest approach; return the state."""
+        safety = View(self._online, words.SYSTEM, words.SAFETY)
+        speed = View(self._online, words.ROBOT, words.SPEED)
+        seen = self._online.view(safety, speed)
+        found, newest = seen.get(safety), seen.get(speed)
+        near = newest is not None and newest.nearest_m < self.notes.nearest_m - NEARER_M
+        if newest is not None and near and now_s > self._kept_s + KEPT_EVERY_S:
+            self._kept_s = now_s
+            self._keep("nearest", newest)
+        if found is None or found.state == before:
+            return before
+        self._say(now_s, f"{found.state}: {found.reason}")
+        if found.state == "stop" and self.notes.stop is None and now_s > 0.0:
+            self.notes.stop = self._tree("first-stop")
+        return found.state
+
+    def _keep(self, label: str, speed: words.Speed) -> None:
+        if self._tree(label) is not None:
+            self.notes.nearest_m, self.notes.nearest_ns = speed.nearest_m, speed.captured_ns
+
+    def _tree(self, label: str) -> CauseTree | None:
+        """Return where the newest speed comes from, and keep all versions of it under a label."""
+        try:
+            tree = self._cell.why(ONLINE, words.ROBOT, words.SPEED, depth=DEPTH)
+            if label in self._cell.kept():
+                self._cell.let_go(label)
+            self._cell.keep(label, (cause for cause in tree.walk() if cause.known))
+        except ForgottenError:
+            return None  # an image has left its retention meanwhile; the next set comes soon
+        return tree
+
+    def _say(self, now_s: float, text: str) -> None:
+        line = f"{now_s:6.1f} s  {text}"
+        self.notes.lines.append(line)
+        self._tell(line)
+
+    def _break(self, fault: Fault, now_s: float) -> list[tuple[float, Callable[[], None]]]:
+        """Do to a process what the scenario says; return what is to be undone, and when."""
+        self._say(now_s, f"{fault.kind} {fault.target}")
+        self.notes.faults.append(f"{fault.kind} {fault.target}")
+        end_s = fault.at_s + fault.seconds
+        if fault.kind == "stuck":
+            self._set(fault.target, "stuck=true")
+            return [(end_s, lambda: self._set(fault.target, "stuck=false"))]
+        pid = self._pid(fault.target)
+        if fault.kind == "kill":
+            os.kill(pid, signal.SIGKILL)
+            return []
+        os.kill(pid, signal.SIGSTOP)
+        return [(end_s, lambda: os.kill(pid, signal.SIGCONT))]
+
+    def _set(self, actor: str, value: str) -> None:
+        """Change an attribute of a running actor, as an operator would, without waiting for it."""
+        command = [sys.executable, "-m", "enact_dist.cli.main", "actor", "set", actor, value]
+        subprocess.Popen(
+            [*command, "--cell", str(self._running.config)],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+        )
+
+    def _pid(self, name: str) -> int:
+        """Return the process of an actor, or else of a shard.
+
+        Raises:
+            DemoError: Nothing of that name runs.
+        """
+        for info in self._cell.actors():
+            if name in info.names():
+                return info.pid
+        return self._running.shard_pid(name)
+
+
+@contextmanager
+def recording(cell: Cell, path: Path) -> Iterator[None]:
+    """Record a cell exactly, without messages for viewers, while the block runs.
+
+    Args:
+        cell: The cell.
+        path: The file; an older one is replaced.
+
+    Raises:
+        DemoError: The recording failed.
+    """
+    path.unlink(missing_ok=True)
+    recorder = Recorder(cell, path, worlds=(ONLINE, TRUTH), aspects=RECORDED, pictures=False)
+    stop, errors = threading.Event(), []
+
+    def run() -> None:
+        try:
+            recorder.run(stop)
+        except (EnactError, OSError) as error:
+            errors.append(error)
+
+    thread = threading.Thread(target=run, name="recorder", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
+    if errors:
+        raise DemoError(f"the recording {path} failed: {errors[0]}") from errors[0]

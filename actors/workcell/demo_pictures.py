@@ -1,0 +1,188 @@
+"""The pictures of a run, of the versions of its recording."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from actors.geometry.kinematics import capsules_at, end_velocities, tool_poses
+from actors.geometry.picture import png_bytes
+from actors.geometry.separation import Separation
+from actors.workcell import plots
+from actors.workcell import vocabulary as words
+from actors.workcell.evaluation import along
+from actors.workcell.figures import hull_figure, masks_figure, world_figure
+from actors.workcell.truth_of_run import PERIOD_NS, truth_of
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
+
+    from actors.workcell.demo_conduct import Notes
+    from actors.workcell.trace import Trace
+    from actors.workcell.truth_of_run import Truth
+    from enact_dist import Aspect
+
+    F64 = npt.NDArray[np.float64]
+    Picture = npt.NDArray[np.uint8]
+
+
+def pictures_of(trace: Trace, notes: Notes) -> dict[str, bytes]:
+    """Draw a run: its nearest approach, and its whole course.
+
+    Args:
+        trace: What was recorded.
+        notes: With the stamp of the nearest approach.
+
+    Returns:
+        PNG by name of the file; pictures for which the run has no data are left out.
+    """
+    truth = truth_of(trace)
+    hulls = {kept.stamp_ns: kept.datum for kept in trace.of(words.WORKSPACE.name, words.HULL)}
+    found = {"timeline.png": _timeline(trace, truth)}
+    during = [stamp for stamp in hulls if truth.covers(stamp)]
+    if during:
+        stamp_ns = notes.nearest_ns if notes.nearest_ns in hulls else max(during)
+        found |= _moment(trace, truth, hulls, stamp_ns)
+    return {name: png_bytes(picture) for name, picture in found.items()}
+
+
+def _datum(trace: Trace, entity: str, aspect: Aspect[Any], stamp_ns: int) -> Any:
+    """Return the datum of a slot that was the newest at a stamp, None where there is none."""
+    before = [kept for kept in trace.of(entity, aspect) if kept.stamp_ns <= stamp_ns]
+    return before[-1].datum if before else None
+
+
+def _masks(trace: Trace, stamp_ns: int) -> dict[str, words.Silhouette]:
+    return {
+        camera: kept.datum
+        for camera in trace.entities(words.SILHOUETTE)
+        for kept in trace.of(camera, words.SILHOUETTE)
+        if kept.stamp_ns == stamp_ns
+    }
+
+
+def _moment(
+    trace: Trace, truth: Truth, hulls: dict[int, words.Hull], stamp_ns: int
+) -> dict[str, Picture]:
+    """Draw what was at one exposure."""
+    grid = trace.newest(words.WORKSPACE.name, words.GRID)
+    parts = [trace.newest(name, words.BOXES) for name in trace.entities(words.BOXES)]
+    boxes = np.concatenate([np.empty((0, 15)), *parts])
+    hull, before = hulls[stamp_ns], hulls.get(stamp_ns - PERIOD_NS)
+    arm = capsules_at(truth.arm, trace.joints().at(stamp_ns))[0]
+    humans = trace.entities(words.TRACK)
+    limbs = [_datum(trace, human, words.LIMBS, stamp_ns) for human in humans]
+    shown = np.concatenate([np.empty((0, 7)), *[each for each in limbs if each is not None]])
+    second = truth.at_s(stamp_ns)
+    found = {
+        "plan.png": _plan(trace, truth, (grid, boxes, hull, arm), stamp_ns),
+        "figure1.png": world_figure(
+            grid, boxes, arm, hull, shown, _properties(trace, stamp_ns, second)
+        ),
+    }
+    raw = _datum(trace, words.WORKSPACE.name, words.RAW_HULL, stamp_ns)
+    voxels = raw if raw is not None else hull.voxels
+    found["figure3_bottom.png"] = hull_figure(grid, boxes, arm, (voxels, hull), before)
+    masks = _masks(trace, stamp_ns)
+    if masks:
+        found["figure3_top.png"] = masks_figure(masks, _masks(trace, stamp_ns - PERIOD_NS))
+    return found
+
+
+def _properties(trace: Trace, stamp_ns: int, second: float) -> list[str]:
+    """Return the high-level properties of a moment, a line each."""
+    lines = [f"second {second:.1f}"]
+    speed = _datum(trace, words.ROBOT.name, words.SPEED, stamp_ns)
+    safety = _datum(trace, words.SYSTEM.name, words.SAFETY, stamp_ns)
+    path = _datum(trace, words.ROBOT.name, words.PATH, stamp_ns)
+    if speed is not None:
+        lines += [f"speed: {speed.scale:.0%} of nominal", f"nearest: {speed.nearest_m:.2f} m"]
+    if safety is not None:
+        lines.append(f"safety: {safety.state}")
+    if path is not None:
+        lines.append(f"path {path.number}: {len(path.waypoints)} points to goal {path.to_goal}")
+    for human in trace.entities(words.TRACK):
+        track = _datum(trace, human, words.TRACK, stamp_ns)
+        x, y = track.position_m[:2] if track is not None else (math.nan, math.nan)
+        if track is not None:
+            fast = float(np.linalg.norm(track.velocity_m_s))
+            lines.append(f"{human}: at {x:.1f}, {y:.1f} m, {fast:.1f} m/s, {track.height_m:.2f} m")
+    return lines
+
+
+def _plan(
+    trace: Trace, truth: Truth, scene: tuple[words.Grid, F64, words.Hull, F64], stamp_ns: int
+) -> Picture:
+    grid, boxes, hull, arm = scene
+    path = _datum(trace, words.ROBOT.name, words.PATH, stamp_ns)
+    tool = np.empty((0, 3))
+    if path is not None and len(path.waypoints):
+        tool = tool_poses(truth.arm, along(path.waypoints))[:, :3, 3]
+    ways, tracks, predictions = [], [], []
+    for human in trace.entities(words.TRACK):
+        past = [
+            kept
+            for kept in trace.of(human, words.TRACK)
+            if 0 <= stamp_ns - kept.stamp_ns < 100 * PERIOD_NS
+        ]
+        if past and stamp_ns - past[-1].stamp_ns < 5 * PERIOD_NS:
+            ways.append(np.array([kept.datum.position_m[:2] for kept in past]))
+            tracks.append(past[-1].datum)
+            prediction = _datum(trace, human, words.PREDICTION, stamp_ns)
+            predictions += [prediction] if prediction is not None else []
+    shown = plots.Plan(
+        grid, boxes, hull, arm, tool, ways, tracks, predictions, truth.bodies_at(stamp_ns)
+    )
+    return plots.plan_figure(shown, f"second {truth.at_s(stamp_ns):.1f}")
+
+
+def _timeline(trace: Trace, truth: Truth) -> Picture:
+    """Draw distance and speed over the whole run."""
+    motion = trace.joints()
+    chosen = np.array([truth.covers(int(stamp)) for stamp in motion.stamp_ns], np.bool_)
+    stamps, q, dq = motion.stamp_ns[chosen][::5], motion.q[chosen][::5], motion.dq[chosen][::5]
+    at_s = (stamps - truth.start_ns) / 1e9
+    true_m = np.array([truth.distance_m(int(s), one) for s, one in zip(stamps, q, strict=True)])
+    fast = np.empty(0)
+    if len(q):
+        fast = np.linalg.norm(end_velocities(truth.arm, q, dq), axis=-1).max((1, 2))
+    spent = Separation(reaction_s=0.0)
+    limit = np.array([spent.speed_max_m_s(float(one)) for one in true_m])
+    speeds = [
+        kept for kept in trace.of(words.ROBOT.name, words.SPEED) if truth.covers(kept.stamp_ns)
+    ]
+    seen_s = np.array([truth.at_s(kept.stamp_ns) for kept in speeds])
+    top = max(1.0, 1.2 * float(fast.max(initial=0.5)))
+    return plots.timeline(
+        [
+            (
+                "distance of the nearest to the arm, m",
+                3.0,
+                [
+                    plots.Line("true", at_s, np.where(true_m < 3.0, true_m, np.nan), plots.TRUE),
+                    plots.Line(
+                        "estimated",
+                        seen_s,
+                        np.array([k.datum.nearest_m for k in speeds]),
+                        plots.ARM,
+                    ),
+                ],
+            ),
+            (
+                "speed of the quickest point, m/s",
+                top,
+                [
+                    plots.Line("allowed for the true distance", at_s, limit, plots.TRUE),
+                    plots.Line(
+                        "commanded limit",
+                        seen_s,
+                        np.array([k.datum.limit_m_s for k in speeds]),
+                        plots.ARM,
+                    ),
+                    plots.Line("actual", at_s, fast, plots.TRACK),
+                ],
+            ),
+        ]
+    )

@@ -1,0 +1,60 @@
+"""Bench `workcell`: the application of ENACT 4.1 as processes, scored on its simulated truth.
+
+A run of `enact demo workcell` whose pictures are thrown away: every score with its goal, and the
+processor time of its processes.  Scenario `visit`, seed 1, views played, arm drawn.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.bench.rows import value_row
+from enact_dist.errors import MisuseError
+
+if TYPE_CHECKING:
+    from enact_dist.bench.run import Run
+
+NAME: Final = "workcell"
+TIMES: Final = 20
+"""The cell runs this many times as long as a line of another bench: 60 s by default."""
+
+
+def run_workcell(run: Run) -> None:
+    """Measure one run of the cell.
+
+    Raises:
+        MisuseError: The extras of the workcell are not installed, or the cell failed.
+    """
+    try:
+        from actors.running_cell import DemoError
+        from actors.workcell.demo import run_quietly
+        from actors.workcell.demo_options import Options
+        from actors.workcell.demo_report import value_text
+        from actors.workcell.evaluation import GOALS, missed
+    except ImportError as error:
+        raise MisuseError(
+            f"bench workcell needs {error.name}, which is not installed; install its extras:"
+            " pip install -e '.[workcell,record]' in the clone of enact-dist"
+        ) from error
+    seconds = TIMES * run.seconds_s
+    run.told(f"workcell: {seconds:g} s, after about a minute of preparation")
+    with tempfile.TemporaryDirectory(prefix="enact-bench-workcell-") as folder:
+        try:
+            report = run_quietly(Options(Path(folder), seconds=seconds, quiet=True))
+        except DemoError as error:
+            raise MisuseError(str(error)) from error
+    failed = set(missed(report.scores))
+    sets = round(report.scores.get("sets", 0.0))
+    for name, value in report.scores.items():
+        goal = GOALS[name]
+        met = name not in failed if str(goal) else None
+        note = value_text(name, value)
+        run.add_row(value_row(NAME, goal.what, value, "", sets, str(goal), met=met, note=note))
+    cores = report.cores
+    run.add_row(value_row(NAME, "processors, all processes", sum(cores.values()), "cores", sets))
+    for name in ("cell", "reconstruction", "camera-0"):
+        if name in cores:
+            title = "the shard" if name == "cell" else name
+            run.add_row(value_row(NAME, f"of it: {title}", cores[name], "cores", sets))
