@@ -139,8 +139,8 @@ class Scenario:
 
 
 _ROUND: Final = (
-    (-2.8, -1.75),
-    (1.6, -1.75),
+    (-2.8, -1.85),
+    (1.6, -1.85),
     (1.75, -0.3),
     (1.6, 0.9),
     (0.2, 1.75),
@@ -152,10 +152,11 @@ _ROUND: Final = (
 """Around the robot, past conveyor, table and cabinet, and out again."""
 _PAST: Final = ((1.75, -2.9), (1.65, 0.0), (1.75, 2.9))
 _WEST: Final = ((-1.6, -2.9), (-1.5, 0.0), (-1.6, 2.9))
-_ACROSS: Final = ((2.9, 1.2), (1.6, 1.0), (1.5, -1.0), (2.9, -1.4))
+_ACROSS: Final = ((2.9, 1.2), (1.75, 1.0), (1.7, -1.0), (2.9, -1.4))
 _TO_TABLE: Final = ((2.9, -0.9), (1.75, -0.3))
+_TO_CORNER: Final = ((-2.9, -1.9), (0.3, -1.9), (1.5, -1.6))
 _INTO_CABINET: Final = ((-2.9, 1.5), (-0.9, 1.5))
-_TO_ROBOT: Final = ((-2.15, 1.5), (-2.1, 0.25), (-0.95, -0.25), (-2.9, -0.4))
+_TO_ROBOT: Final = ((-2.35, 1.5), (-2.3, 0.25), (-0.95, -0.25), (-2.9, -0.4))
 _REACH: Final = Pause(2, 6.0, reach_m=(0.75, -0.25, 1.0), lean_rad=0.25, facing_rad=np.pi)
 
 
@@ -175,7 +176,7 @@ def _walks(name: str, seconds: float) -> tuple[Walk, ...]:
             ),
         ),
         "S5": (Walk(((2.9, 1.6), (1.55, 1.5)), pauses=(Pause(1, seconds),)),),
-        "S6": (Walk(((-2.9, -1.8), (1.5, -1.6), (-2.9, -1.8)), pauses=(Pause(1, 2.0),)),),
+        "S6": (Walk((*_TO_CORNER, *_TO_CORNER[1::-1]), pauses=(Pause(2, 2.0),)),),
         "S7": (cross,),
         "S8": (cross,),
         "S9": (cross,),
@@ -208,7 +209,7 @@ def scenario_of(name: str, seed: int, seconds: float = SECONDS) -> Scenario:
     generator = np.random.default_rng([seed, SCENARIOS.index(name)])
     walks = tuple(_moved(walk, generator) for walk in _walks(name, seconds))
     left = (
-        (Thing((1.5, -1.05, 0.15), (0.15, 0.15, 0.15), _arrival_s(walks[0], 1) + 1.0),)
+        (Thing((1.5, -1.05, 0.15), (0.15, 0.15, 0.15), _arrival_s(walks[0], 2) + 1.0),)
         if name == "S6"
         else ()
     )

@@ -85,7 +85,7 @@ def test_capsules_of_arm_and_person_fill_their_outlines():
     assert not (shown & ~mask).any()
     assert (mask & ~shown).sum() < 0.2 * shown.sum()  # outlines are drawn with their border
     eroded = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    assert (eroded & ~shown).sum() < 0.01 * shown.sum()
+    assert (eroded & ~shown).sum() < 0.02 * shown.sum()  # gaps between limbs
 
 
 @pytest.mark.parametrize("number", [1, 6])
