@@ -181,6 +181,11 @@ def _along(waypoints: F64, at_rad: F64, place_rad: float) -> F64:
     return np.array([np.interp(place_rad, at_rad, joint) for joint in waypoints.T])
 
 
+def load() -> None:
+    """Load OMPL, which takes half a second, before the first search."""
+    _ompl()
+
+
 @lru_cache(maxsize=1)
 def _ompl() -> tuple[Any, Any, Any]:
     """Load OMPL once, silent: that a seed is set anew is meant, and failures are returned."""

@@ -30,6 +30,8 @@ BLOCK_M: Final = 0.1
 """Edge of the blocks along which distances within a body are measured."""
 LIMBS: Final = 5
 """Ends of a body at most: head, hands, feet."""
+POINTS: Final = 1500
+"""As many of a body's points, or up to twice as many, are enough for its limbs."""
 LIMB_M: Final = 0.3
 """Least distance of an end from the middle and from the other ends, within the body."""
 
@@ -156,15 +158,19 @@ def limbs(points_m: F64) -> npt.NDArray[np.float32]:
 
     if not len(points_m):
         return np.empty((0, 7), np.float32)
-    blocks, which = np.unique(
-        np.floor(points_m / BLOCK_M).astype(np.int32), axis=0, return_inverse=True
-    )
-    which = which.ravel()
-    apart = np.abs(blocks[:, None] - blocks[None]).max(-1)
-    one, other = np.nonzero(apart == 1)
+    points_m = points_m[:: max(1, len(points_m) // POINTS)]
+    index = np.floor(points_m / BLOCK_M).astype(np.int64)
+    index -= index.min(0)
+    shape = tuple((index.max(0) + 1).tolist())
+    cells, which = np.unique(np.ravel_multi_index(tuple(index.T), shape), return_inverse=True)
+    blocks = np.stack(np.unravel_index(cells, shape), 1)
+    near = np.ones((len(blocks), len(blocks)), bool)
+    for along in blocks.astype(np.int16).T:
+        near &= np.abs(along[:, None] - along) <= 1
+    one, other = np.nonzero(near)
     lengths = np.linalg.norm(blocks[one] - blocks[other], axis=1) * BLOCK_M
     graph = csr_array((lengths, (one, other)), shape=(len(blocks), len(blocks)))
-    middle = points_m.mean(0) / BLOCK_M - 0.5
+    middle = index.mean(0)
     ends = [int(np.linalg.norm(blocks - middle, axis=1).argmin())]
     distances = [dijkstra(graph, indices=ends[0])]
     while len(ends) <= LIMBS:

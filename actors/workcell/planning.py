@@ -9,7 +9,7 @@ import numpy as np
 
 from actors.geometry.arm_clearance import ArmSpheres, CellGrid, Clearance, GrownGrid
 from actors.geometry.joint_paths import JointPath, PathSpeeds
-from actors.geometry.joint_planning import Plan, plan
+from actors.geometry.joint_planning import Plan, load, plan
 from actors.workcell.motion import NOMINAL_M_S
 from actors.workcell.speed import SpeedControl
 from actors.workcell.vocabulary import (
@@ -137,6 +137,10 @@ class PathPlanning(Actor):
         self._blocked = 0
         self._pause = 0
         self._there_since_ns = 0
+
+    def start(self) -> None:
+        """Load the planner before any lock is held."""
+        load()
 
     def update(self, lock: Lock) -> None:
         """Look at the path; plan another one where that is due."""

@@ -61,6 +61,7 @@ class HumanTracking(Actor):
 
     Attributes:
         hidden_s_max: How long someone stays hidden before the track ends.
+        limbs_every: Of so many sets, limbs are found in one: they take longer than all else.
     """
 
     online = World("online")
@@ -72,10 +73,10 @@ class HumanTracking(Actor):
     triggers = (hull,)
 
     hidden_s_max: float = 300.0
+    limbs_every: int = 3
 
     def __init__(self) -> None:
-        self._last_ns = 0
-        self._next = 0
+        self._last_ns = self._next = self._sets = 0
         self._hidden_since_ns: dict[Entity, int] = {}
 
     def update(self, lock: Lock) -> None:
@@ -86,7 +87,7 @@ class HumanTracking(Actor):
         seconds = (now_ns - self._last_ns) / 1e9 if self._last_ns else PERIOD_S
         if seconds <= 0.0:
             return
-        self._last_ns = now_ns
+        self._last_ns, self._sets = now_ns, self._sets + 1
         known = dict(lock[self.tracks].items())
         names = sorted(known)
         expected = {name: _moved(known[name], seconds) for name in names}
@@ -144,7 +145,8 @@ class HumanTracking(Actor):
         height_m = body.top_m if before is None else 0.8 * before.height_m + 0.2 * body.top_m
         first_ns = now_ns if before is None else before.first_ns
         lock[self.tracks][name] = _track(state, body.top_m, height_m, body.volume_m3, first_ns)
-        lock[self.limbs][name] = limbs(body.points_m)
+        if before is None or before.hidden or self._sets % self.limbs_every == 0:
+            lock[self.limbs][name] = limbs(body.points_m)
         radius_m = float(np.clip(body.radius_m, *RADIUS_M))
         lock[self.predictions][name] = Prediction(
             np.array(AT_S), *predicted(*state, AT_S, radius_m)

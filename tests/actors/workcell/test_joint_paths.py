@@ -106,7 +106,7 @@ limits = st.lists(
 )
 
 
-@settings(max_examples=60)
+@settings(max_examples=40)
 @given(st.integers(0, 200), st.integers(2, 6), limits)
 def test_follower_keeps_every_limit_while_the_limit_jumps(seed, points, changes):
     """Never back, never beyond the end, joints within speed and acceleration, at last arrived."""

@@ -21,15 +21,15 @@ from enact_dist import Lock, ViewEach, Write, testing
 
 ORIGIN_M, VOXEL_M, SHAPE = np.array([-2.0, -2.0, 0.0]), 0.025, (160, 160, 88)
 START_NS, PERIOD_NS = 10**18, 100_000_000
+INDEX = np.stack(np.mgrid[: SHAPE[0], : SHAPE[1]], -1).reshape(-1, 2)
+MIDDLE = ORIGIN_M[:2] + (INDEX + 0.5) * VOXEL_M
 DRAW = np.random.default_rng(1)
 
 
 def body(centre, height_m=1.7, radius_m=0.15):
     """Return voxels of an upright cylinder whose middle is exactly at `centre`, one array."""
-    index = np.stack(np.mgrid[: SHAPE[0], : SHAPE[1]], -1).reshape(-1, 2)
-    middle = ORIGIN_M[:2] + (index + 0.5) * VOXEL_M
-    disc = index[
-        np.linalg.norm(middle - np.round(np.array(centre) / VOXEL_M) * VOXEL_M, axis=1) < radius_m
+    disc = INDEX[
+        np.linalg.norm(MIDDLE - np.round(np.array(centre) / VOXEL_M) * VOXEL_M, axis=1) < radius_m
     ]
     z = np.arange(round(height_m / VOXEL_M))
     return np.concatenate([np.column_stack([disc, np.full(len(disc), k)]) for k in z])
