@@ -35,6 +35,7 @@ import numpy as np
 
 from actors.geometry.capsules import distance_to_points, fill, outlines
 from actors.geometry.pockets import Pockets
+from actors.geometry.silhouettes import packed
 from actors.geometry.visibility import seen_by, static_voxels
 
 if TYPE_CHECKING:
@@ -135,8 +136,8 @@ class Refinement:
         Raises:
             ValueError: Silhouettes of another number or size than the calibrations.
         """
-        self._hull.load(silhouettes)
         self._note_live(tuple(n for n, bits in enumerate(silhouettes) if bits is not None))
+        self._hull.load(self._with_robot(silhouettes, robot))
         raw = self._hull.carve(self._all_blocks)
         counts = {"raw": len(raw)}
         rows = raw[~self._static[raw]]
@@ -157,6 +158,32 @@ class Refinement:
         rows, near_m, tight = rows[away], near_m[away], tight[away]
         clearance = near_m - np.float32(self._grid.half_diagonal_m)
         return self._components(rows, clearance, tight, counts, raw)
+
+    def _with_robot(
+        self, silhouettes: Sequence[Bits | None], robot: Numbers | None
+    ) -> Sequence[Bits | None]:
+        """Return silhouettes in which the robot is foreground, whatever the camera took it for.
+
+        What lies behind the robot no camera sees; a link of the colour of the wall, taken for a
+        shadow on it, would say that it is free.
+        """
+        if robot is None or not len(robot):
+            return silhouettes
+        masks = self._drawn(np.asarray(robot, np.float64))
+        result = []
+        for bits, mask in zip(silhouettes, masks, strict=True):
+            drawn = packed(mask)
+            fits = bits is not None and bits.shape == drawn.shape
+            result.append(bits | drawn if bits is not None and fits else bits)
+        return result
+
+    def _drawn(self, robot: Numbers) -> list[npt.NDArray[np.uint8]]:
+        """Return the masks of capsules in all cameras."""
+        lines = outlines(robot, self._cameras)
+        return [
+            fill(of_camera[None], *size)[0]
+            for of_camera, size in zip(lines, self._sizes, strict=True)
+        ]
 
     def _note_live(self, live: tuple[int, ...]) -> None:
         """Count anew who has a say where, if other cameras than before gave a silhouette."""
@@ -214,11 +241,7 @@ class Refinement:
         if len(candidates):
             larger = np.array(robot, np.float64)
             larger[:, 6] += EXPLAINED_GROWN_M
-            lines = outlines(larger, self._cameras)
-            masks = [
-                fill(of_camera[None], *size)[0]
-                for of_camera, size in zip(lines, self._sizes, strict=True)
-            ]
+            masks = self._drawn(larger)
             explained[candidates] = self._hull.on_masks(rows[candidates], masks)
             counts["explained"] = int(explained.sum())
         return near_m, explained
