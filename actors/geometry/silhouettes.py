@@ -7,7 +7,7 @@ foreground.
 
 Rules a change must keep: masks are (H, W) uint8, 0 or 255; what is in doubt is foreground; the
 background never changes while something is looked for, so that who stands still does not fade.
-OpenCV and integers only: about 0.8 ms of one core per image of 640 x 480, half of it for shadows.
+OpenCV and integers only: about 1.1 ms of one core per image of 640 x 480, 0.4 of it for shadows.
 """
 
 from __future__ import annotations
@@ -32,6 +32,9 @@ LEVELS_MIN: Final = 6
 """A pixel that differs by no more than this is background, however still it was."""
 SPREADS: Final = 6
 """A pixel that differs by no more than so many standard deviations is background."""
+EDGE_FACTOR: Final = 2
+"""Smoothing blurs an edge by a pixel.  There a pixel counts only if it differs by so many times
+what a smoothed one may, before smoothing: about five standard deviations of its noise."""
 SHADOW_DARKEST: Final = 0.45
 """A shadow leaves at least this share of the light."""
 SHADOW_LIGHTEST: Final = 0.98
@@ -127,11 +130,12 @@ class Subtraction:
         check_image(spread, mean.shape, name="spread of the background")
         self._shape = mean.shape
         self._differs = (
-            _gaussian(mean, spread)
+            _beyond(mean, _limits(spread))
             if subtractor == "gaussian"
             else _learned(subtractor, mean, spread)
         )
         self._shaded = _shadow_test(mean) if shadows else None
+        self._clearly = _beyond(mean, EDGE_FACTOR * _limits(spread))
 
     def __call__(self, image: Image) -> Mask:
         """Return the foreground of an image.
@@ -148,14 +152,15 @@ class Subtraction:
         import cv2
 
         check_image(image, self._shape)
-        image = smoothed(image)
-        mask = self._differs(image)
+        smooth = smoothed(image)
+        mask = self._differs(smooth)
         if self._shaded is not None:
-            shaded = cv2.bitwise_and(self._shaded(image), mask)
+            shaded = cv2.bitwise_and(self._shaded(smooth), mask)
             if cv2.countNonZero(shaded) <= SHADOW_SHARE_MAX * shaded.size:
                 mask = np.asarray(cv2.bitwise_xor(mask, shaded), np.uint8)
         closed = cv2.morphologyEx(_majority(mask), cv2.MORPH_CLOSE, NEIGHBOURS)
-        return np.asarray(closed, np.uint8)
+        clear = cv2.bitwise_and(closed, self._clearly(image))
+        return np.asarray(cv2.bitwise_or(cv2.erode(closed, NEIGHBOURS), clear), np.uint8)
 
 
 def check_image(image: object, shape: tuple[int, ...], *, name: str = "image") -> None:
@@ -196,12 +201,16 @@ def _worst(difference: Image) -> Mask:
     return np.asarray(cv2.max(cv2.max(blue, green), red), np.uint8)
 
 
-def _gaussian(mean: Image, spread: Image) -> Callable[[Image], Mask]:
-    """Return the test of each channel against its own mean and spread."""
+def _limits(spread: Image) -> npt.NDArray[np.uint16]:
+    """Return by how many levels a smoothed channel may differ from its mean."""
+    return np.maximum(SPREADS * spread.astype(np.uint16), LEVELS_MIN).astype(np.uint16)
+
+
+def _beyond(mean: Image, limits: npt.NDArray[np.uint16]) -> Callable[[Image], Mask]:
+    """Return the test of each channel against its own mean and limit."""
     import cv2
 
-    limits = np.maximum(SPREADS * spread.astype(np.uint16), LEVELS_MIN).clip(0, 255)
-    limits_u8 = limits.astype(np.uint8)
+    limits_u8 = limits.clip(0, 255).astype(np.uint8)
 
     def differs(image: Image) -> Mask:
         beyond = cv2.subtract(cv2.absdiff(image, mean), limits_u8)

@@ -60,9 +60,10 @@ def entered(cell, capsules=BODY, arm=NO_ARM):
     return cell.step(capsules, arm, elapsed_s=5.0)
 
 
-def test_a_body_is_kept_with_its_distance_and_its_parts(cell):
+def test_a_body_is_kept_with_its_distance_and_its_parts():
     """Safe holds tight holds the body's core; the nearest voxel is at most as far as the body."""
-    found = entered(cell, arm=FAR_ARM)
+    cell = Cell(voxel_m=0.025)
+    found = entered(cell, np.concatenate([BODY, FAR_ARM]), FAR_ARM)
     body, true_m = set(cell.rows_in(BODY).tolist()), distance_between(BODY, FAR_ARM)
     assert body <= set(found.rows.tolist())
     assert found.tight.any()
@@ -170,6 +171,20 @@ def test_a_longer_step_reaches_farther(cell):
     again = Cell()
     again.step(NOBODY)
     assert len(again.step(walking, elapsed_s=0.3).rows) > 0
+
+
+def test_a_robot_that_is_taken_for_background_hides_who_is_behind_it(cell):
+    """Where the robot is drawn a camera says nothing: a missed link frees no one behind it."""
+    behind = np.array([[-0.6, -0.6, 0.1, -0.6, -0.6, 0.8, 0.12]])
+    bits = bits_of(behind, cell.cameras)
+    arm = bits_of(FAR_ARM, cell.cameras)
+    missed = [one & ~other for one, other in zip(bits, arm, strict=True)]
+    found = cell.step(behind, FAR_ARM, 5.0, missed)
+    body = cell.rows_in(behind)
+    body = body[distance_to_points(FAR_ARM, cell.grid.centres(body)) > 0.11]
+    assert set(body.tolist()) <= set(found.rows.tolist())
+    unaware = Cell().step(behind, NO_ARM, 5.0, missed)
+    assert not set(body.tolist()) <= set(unaware.rows.tolist())
 
 
 def blind(bits, cameras, share=1.0):

@@ -87,6 +87,17 @@ def test_a_person_is_found_whole_and_nothing_else(subtractor, background, cell, 
     assert not subtraction(taken(cell, random)).any()
 
 
+def test_edges_lie_where_they_are(background, cell, random):
+    """Smoothing widens nothing: of the ring of pixels around the person at most a tenth is taken."""
+    mask = Subtraction(background.mean, background.spread)(
+        taken(changed(cell, PERSON, (150, 60, 40)), random)
+    )
+    wider = np.zeros((HEIGHT, WIDTH), bool)
+    wider[29:91, 59:91] = True
+    wider[PERSON] = False
+    assert (mask[wider] > 0).mean() < 0.1
+
+
 @pytest.mark.parametrize("light", [0.55, 0.75, 0.9])
 def test_a_shadow_is_no_foreground(light, background, cell, random):
     """A shadow beside the person goes, over either colour of the floor; without the test it stays."""
