@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import mutants_directed
+import mutants_growth as growth
 import mutants_history as history
 import mutants_one_shard as one
 import mutants_over_shards as over
@@ -42,6 +43,7 @@ SIMULATED = (
     *_of(payloads),
     *_of(worlds),
     *_of(history),
+    *_of(growth),
 )
 """Those that the simulator catches."""
 ALL = (*SIMULATED, *DIRECTED)

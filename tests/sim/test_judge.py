@@ -6,11 +6,13 @@ from dataclasses import replace
 
 import pytest
 
-from enact_dist.core.datum import LockId, Token
+from enact_dist.core.datum import Datum, LockId, Token
+from enact_dist.core.messages import AspectEntry, Refused, Register
 from enact_dist.core.phase import Phase
 from enact_dist.core.records import Persist, Persisted, PreparedEnded, PreparedRecord, Tick
 from enact_dist.terms import Durability
 from enact_dist.verify.simulation.faults import NONE
+from enact_dist.verify.simulation.growth_judge import NEWER, NEWER_ENCODING, OLDER
 from enact_dist.verify.simulation.scenario import Scenario
 from enact_dist.verify.simulation.world import S, SimulationError
 
@@ -162,6 +164,25 @@ def test_lost_promise_is_seen(scene):
     with pytest.raises(SimulationError, match="a promise survives"):
         model._check_promises([Persist(1, (record,), Durability.DURABLE)], picture)
     del picture.prepared[STRANGER]
+
+
+def test_dropped_field_and_refused_newer_writer_are_seen(scene):
+    """No older datum replaces a newer one, and a refusal of the newer type is an error."""
+    scenario, host, model, picture = scene
+    slot = a_slot(picture, "count")
+    entry = next(iter(scenario.history.entries.values()))
+    older, newer = Datum(b"text", b"1", 1), Datum(NEWER_ENCODING, b"1", 1)
+    grown = AspectEntry("count", NEWER, "durable", 6, older=(OLDER,))
+    asked = Register("a", (), (grown._replace(older=()),))
+    picture.grown["count"] = grown
+
+    with pytest.raises(SimulationError, match="a new field is not dropped"):
+        model.growth.committed(entry, slot, newer, older, picture)
+    with pytest.raises(SimulationError, match="a writer of the newer type is let in"):
+        model.growth._check_refused(host, asked, Refused("datum_type", ""), picture)
+    with pytest.raises(SimulationError, match="a newer type stays"):
+        model.growth.booted(host, picture)
+    picture.grown.clear()
 
 
 def test_stalled_dispatcher_handles_afterwards_what_came_while_its_disk_went_on():

@@ -23,6 +23,7 @@ from enact_dist.core.messages import (
     Registered,
     Request,
 )
+from enact_dist.link.catalogue import CATALOGUES, KnownCatalogue
 from enact_dist.verify.simulation.world import MS, Host, S
 
 if TYPE_CHECKING:
@@ -86,6 +87,7 @@ class ClientHost(Host):
         super().__init__(world, name, drift_ppm=faults.drift_ppm, wall_offset_ns=0)
         session = f"{world.schedule.stream(f'session of {name}').getrandbits(64):016x}"
         self.client = Client(session, ttl_ns=ttl_ns, actor=name)
+        self.catalogue = KnownCatalogue()
         self.generation = 0
         self.starves_until_ns = 0
         self.cache: dict[Slot, tuple[str, int, int, Datum]] = {}
@@ -189,6 +191,7 @@ class ClientHost(Host):
             self.world.tally["late answers"] += 1
             text = f"{type(answer).__name__} comes after its caller gave up"
             self.world.befell(self._late_answers.fault, text)
+            self.learn(call.shard, answer)
             if call.lock is not None and call.lock.phase.busy:
                 call.lock.answered(call.shard, call.request, answer, self.local_ns)
             else:
@@ -205,10 +208,13 @@ class ClientHost(Host):
                 request: Request = self.client.hello(shard)
                 if not self.client.needs_hello(shard):
                     request = Register(self.client.session, (), aspects)
+                epoch = self.client.epoch(shard)
                 (answer,) = yield Calls([(shard, request)])
                 if answer is None:
                     yield Sleep(50 * MS)
-                elif isinstance(answer, Registered):
+                    continue
+                self.learn(shard, answer, sent_in=epoch)
+                if isinstance(answer, Registered):
                     registered = True
                 elif isinstance(answer, Refused):
                     self.world.violation("nothing is refused", answer)
@@ -232,7 +238,14 @@ class ClientHost(Host):
 
     def _renewed(self, shard: str, request: Request, answer: Answer | None) -> None:
         if answer is not None:
+            self.learn(shard, answer)
             self.client.answered(shard, request, answer, self.local_ns)
+
+    def learn(self, shard: str, answer: Answer, *, sent_in: int = 0) -> None:
+        """Take the catalogue that an answer carries, as `link.session_client` does."""
+        if isinstance(answer, CATALOGUES):
+            self.catalogue.learn(shard, answer, sent_in=sent_in)
+            self.client.knows_types(shard, self.catalogue.successions(shard))
 
     def drive(self, lock: MultiLock) -> Thread:
         """Make the lock's calls until it rests, then send what it says on leaving."""
@@ -246,6 +259,8 @@ class ClientHost(Host):
                 continue
             answers = yield Calls(calls, lock)
             for (shard, request), answer in zip(calls, answers, strict=True):
+                if answer is not None:
+                    self.learn(shard, answer)
                 lock.answered(shard, request, answer, self.local_ns)
             self._model.of_clients.check_beliefs(self)
         for shard, farewell in lock.take_farewells():

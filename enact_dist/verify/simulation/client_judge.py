@@ -101,7 +101,8 @@ class ClientJudge:
         applied = any(entry.id in picture.applied for picture in self._model.pictures.values())
         refusal = entry.lock.refusal
         skewed = self._model.clocks_were_set and getattr(refusal, "code", "") == "clock_skew"
-        if refusal is not None and not skewed and not isinstance(refusal, Forgotten):
+        explained = skewed or isinstance(refusal, Forgotten) or self._model.growth.explains(entry)
+        if refusal is not None and not explained:
             self._fail("nothing is refused", entry.id, refusal)
         applied = applied or entry.id in self._model.permitted_losses
         if entry.told is Phase.COMMITTED and entry.lock.versions and not applied:

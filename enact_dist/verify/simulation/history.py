@@ -38,6 +38,7 @@ class Entry:
         begun_ns: When it was asked for, in true time.
         ended_ns: When its thread was told how it ended (None: never, its process died).
         told: What its thread was told.
+        newer: The aspect that it writes with the newer type ("": none).
     """
 
     lock: MultiLock
@@ -47,6 +48,7 @@ class Entry:
     ended_ns: int | None = None
     told: Phase | None = None
     expects: bool = False
+    newer: str = ""
 
     @property
     def id(self) -> LockId:

@@ -47,6 +47,7 @@ from enact_dist.core.retaining import limits_of
 from enact_dist.terms import Durability
 from enact_dist.verify.simulation.cause_judge import CauseJudge
 from enact_dist.verify.simulation.client_judge import ClientJudge
+from enact_dist.verify.simulation.growth_judge import GrowthJudge
 from enact_dist.verify.simulation.history import TOLD_NOT, History
 from enact_dist.verify.simulation.lock_judge import LockJudge
 from enact_dist.verify.simulation.past_judge import PastJudge
@@ -84,6 +85,7 @@ class Model:
         self.absent: dict[LockId, dict[tuple[str, Slot], tuple[int, tuple[int, int]]]] = {}
         self.labels: dict[tuple[str, str], Slot] = {}
         self._worlds = WorldJudge(self)
+        self.growth = GrowthJudge(world)
         self.permitted_losses: dict[LockId, None] = {}
         self.decided: dict[LockId, DecisionRecord] = {}
         self.clocks_were_set = False
@@ -199,6 +201,7 @@ class Model:
                 self._fail("a datum keeps its capture stamp", slot, content, before)
             picture.restarted_at[slot] = len(picture.chains[slot]) - 1
         self._causes.booted(host, picture)
+        self.growth.booted(host, picture)
         self._pasts.booted(host, recovered, picture)
         if len(recovered.outcomes) > len(picture.lanes):
             self._fail("I14 one outcome per lane", len(recovered.outcomes), len(picture.lanes))
@@ -231,6 +234,7 @@ class Model:
         self._worlds.judge(host, effects, picture)
         self._check_commits(host, effects, picture)
         self._worlds.check_told()
+        self.growth.handled(host, message, effects, picture)
         self._locks.judge(host, message, picture)
         if isinstance(message, KeepVersions):
             self._pasts.take_keep(host, message, picture)
@@ -440,6 +444,8 @@ class Model:
                 self._fail("stamps grow", slot, stamp_ns, before)
             if stamp_ns <= picture.promised.get(slot, 0):
                 self._fail("the past does not change", slot, stamp_ns, picture.promised[slot])
+            if entry is not None:
+                self.growth.committed(entry, slot, before.datum, datum, picture)
             if datum is not None:
                 self._check_content(lock, slot, before, datum)
             picture.put(slot, State(version, stamp_ns, lock, picture.epoch, datum))

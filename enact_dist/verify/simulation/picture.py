@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from enact_dist.core.datum import Datum, LockId, Slot, Token
 
 if TYPE_CHECKING:
-    from enact_dist.core.messages import SlotVersion, WorldEntry
+    from enact_dist.core.messages import AspectEntry, SlotVersion, WorldEntry
     from enact_dist.core.records import Persist, PreparedRecord
 
 
@@ -41,7 +41,8 @@ class Picture:
     forks, and `bases` from where on the versions of dropped contexts are free.  `started_ns` is the
     stamp at which this epoch began, `promised` up to which stamp the past of a slot was shown in
     it, and `labels` what each label keeps.  `vanished` are the slots of which the last crash has
-    taken even that they were there.
+    taken even that they were there.  `grown` are the aspects with a newer type that the shard has
+    acknowledged, and `late` the locks that it has queued since then.
     """
 
     epoch: int = 0
@@ -71,6 +72,8 @@ class Picture:
     promised: dict[Slot, int] = field(default_factory=dict)
     labels: dict[str, dict[SlotVersion, State]] = field(default_factory=dict)
     confirmed_labels: dict[str, None] = field(default_factory=dict)
+    grown: dict[str, AspectEntry] = field(default_factory=dict)
+    late: dict[LockId, None] = field(default_factory=dict)
 
     def now(self, slot: Slot) -> State:
         """Return the newest committed state of a slot."""

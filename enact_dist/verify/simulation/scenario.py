@@ -147,7 +147,7 @@ class Scenario:
             if self.historian.takes_place:
                 host.start(self.historian.thread(host, self.cell.lanes + 1))
 
-        host.start(host.open(ASPECTS, work))
+        host.start(host.open(self.workload.growth.registered(ASPECTS), work))
 
     # ---------------------------------------------------------------- the run
 

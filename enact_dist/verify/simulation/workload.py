@@ -29,6 +29,8 @@ from enact_dist.verify.simulation.captures import Captures, drawn_stamp_ns
 from enact_dist.verify.simulation.cause_judge import reads_of
 from enact_dist.verify.simulation.cells import CONTEXTS
 from enact_dist.verify.simulation.client_host import Calls, ClientHost, Sleep, Steps, Thread
+from enact_dist.verify.simulation.growth import ATTEMPTS_MAX, Growth
+from enact_dist.verify.simulation.growth_judge import OLDER
 from enact_dist.verify.simulation.history import Entry, History
 from enact_dist.verify.simulation.payloads import DRAFT_NS, Stager
 from enact_dist.verify.simulation.world import MS, S
@@ -40,9 +42,9 @@ if TYPE_CHECKING:
     from enact_dist.verify.simulation.world import World
 
 ASPECTS = (
-    AspectEntry("count", "int", "durable", 6),
-    AspectEntry("note", "int", "os", 3),
-    AspectEntry("frame", "int", "volatile", 4),
+    AspectEntry("count", OLDER, "durable", 6),
+    AspectEntry("note", OLDER, "os", 3),
+    AspectEntry("frame", OLDER, "volatile", 4),
     AspectEntry("made", "str", "durable"),
 )
 PLAIN = ("count", "note", "frame")
@@ -102,6 +104,7 @@ class Workload:
         self._world, self._history, self._model = world, history, model
         self._stager = Stager(world)
         self._captures = Captures(world, model)
+        self.growth = Growth(world, model, ASPECTS)
         self._entities = ENTITIES[:entities]
         # With one entity nearly all locks want the same few slots.
         one = world.schedule.stream("the one aspect").choice(PLAIN)
@@ -248,9 +251,14 @@ class Workload:
             else:
                 yield Sleep(job.work_ns + MS)
 
-    def do(self, host: ClientHost, lane: int, job: Job, *, lock_views: bool = False) -> Thread:
+    def do(
+        self, host: ClientHost, lane: int, job: Job, *, lock_views: bool = False, attempt: int = 1
+    ) -> Thread:
         """Do one job under one lock; where its views were of no moment, again with them locked."""
-        client = host.client
+        client, growth = host.client, self.growth
+        newer, lapses = growth.written_newer(host, job.items), host.catalogue.lapses
+        if not (yield from growth.compared(host, job.items, newer, job.luck)):
+            return
         items = tuple(self._with_known(host, item) for item in job.items)
         if job.kind in SETS:
             items = yield from self._captures.stamped(host, items, job.luck)
@@ -262,7 +270,7 @@ class Workload:
             hold_ns=job.hold_ns,
         )
         own = dict(host.own)
-        entry = Entry(lock, items, job.kind, self._world.now_ns)
+        entry = Entry(lock, items, job.kind, self._world.now_ns, newer=newer)
         self._history.begin(entry)
         self._world.tell(job.name, "asks for", *map(told_of, items))
         yield from host.drive(lock)
@@ -270,12 +278,16 @@ class Workload:
             self._world.tell(job.name, "has its lock")
             self._model.of_clients.holds(host, entry)
             self._model.of_clients.shows_own(own, entry)
+            fits = host.catalogue.lapses == lapses or (
+                yield from growth.compared(host, items, newer, job.luck)
+            )
             data = yield from self.data(host, lock)
+            growth.shown(newer, (data or {}).values())
             if lock.phase is Phase.HELD and job.work_ns:
                 yield Sleep(job.work_ns)
             if job.meanwhile is not None:
                 yield from job.meanwhile()
-            if data is None or job.abandons:
+            if data is None or job.abandons or not fits:
                 lock.release()
             elif lock.phase is Phase.HELD:
                 yield from self._finish(host, entry, job, data)
@@ -286,6 +298,8 @@ class Workload:
         if lock.no_cut:
             self._world.tally["views that became reads"] += 1
             yield from self.do(host, lane, job, lock_views=True)
+        elif (yield from growth.looks_again(host, lock)) and attempt < ATTEMPTS_MAX:
+            yield from self.do(host, lane, job, lock_views=lock_views, attempt=attempt + 1)
 
     @staticmethod
     def _with_known(host: ClientHost, item: Item) -> Item:
@@ -346,7 +360,9 @@ class Workload:
         writes: dict[str, list[WriteItem]] = {}
         for slot in self._slots_to_write(job, data):
             shard = shard_of(slot.entity, host.client.placement)
-            writes.setdefault(shard, []).append(WriteItem(slot, self._datum(lock, job, slot, data)))
+            writes.setdefault(shard, []).append(
+                WriteItem(slot, self._datum(entry, job, slot, data))
+            )
         for shard, items in writes.items():
             writes[shard] = yield from self._stager.staged(
                 host, shard, items, job.luck, rests_ns=job.rests_ns
@@ -388,9 +404,9 @@ class Workload:
         ]
 
     def _datum(
-        self, lock: MultiLock, job: Job, slot: Slot, data: dict[Slot, Datum | None]
+        self, entry: Entry, job: Job, slot: Slot, data: dict[Slot, Datum | None]
     ) -> Datum | None:
-        random = job.luck
+        random, lock = job.luck, entry.lock
         if job.kind == "create":
             return datum_of(f"{lock.lock}|{job.label}")
         if job.kind == "increment" and random.random() < 0.05:
@@ -399,7 +415,9 @@ class Workload:
         value = 1 if old is None else value_of(old) + 1
         large = job.rests_ns or (slot.aspect == "frame" and random.random() < 0.2)
         datum = datum_of(f"{lock.lock}|{value}", size=LARGE if large else 0)
-        return replace(datum, stamp_ns=drawn_stamp_ns(random, self._world.now_ns))
+        encoding = self.growth.encoding(entry.newer, slot)
+        stamp_ns = drawn_stamp_ns(random, self._world.now_ns)
+        return replace(datum, encoding=encoding, stamp_ns=stamp_ns)
 
 
 def told_of(item: Item) -> str:
