@@ -1,7 +1,7 @@
-"""What the counters of a shard and of a connection mean, and what to do where one grows.
+"""What the counters of a shard and of a connection mean, and what to do if one grows.
 
 A shard counts from its start (`enact shard ls --counters`, `--json`, `/metrics`), a connection from
-its own (`Cell.statistics`).  An empty remedy: that is work done, or harmless by itself.
+its own (`Cell.statistics`).  A counter without a remedy counts work done, or is harmless.
 """
 
 from __future__ import annotations
@@ -13,8 +13,10 @@ from enact_dist.wire.limits import INLINE_BYTES_MAX
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-BODIES: Final = f"arrays, texts and bytes over {INLINE_BYTES_MAX} B, long lists; all else counts 0"
-"""What of a datum counts where bytes of data are told: its body (see `enact_dist.wire`)."""
+BODIES: Final = (
+    f"arrays, long lists, texts and bytes over {INLINE_BYTES_MAX} B; other data count as 0"
+)
+"""The part of a datum that counters of bytes count: its body (see `enact_dist.wire`)."""
 
 
 class Counter(NamedTuple):
@@ -22,8 +24,8 @@ class Counter(NamedTuple):
 
     Attributes:
         meaning: What it counts.
-        remedy: What to do where it grows; empty where that is as it should be.
-        now: Whether it is a figure of this moment, which falls again, and no count.
+        remedy: What to do if it grows; empty if growth is normal.
+        now: Whether it is a current value, which may fall again, instead of a count.
     """
 
     meaning: str
@@ -32,201 +34,224 @@ class Counter(NamedTuple):
 
 
 _BUSY: Final = "look for a busy host: top, and the shard's log"
-_DYING: Final = "see why actors die or freeze: enact actor ls, and their log"
-_NETWORK: Final = "look at the network between these hosts: enact doctor"
-_SLOW_READER: Final = "find the client that is stopped or too slow: enact actor ls"
+_DYING: Final = "find out why actors die or freeze: enact actor ls, and their logs"
+_NETWORK: Final = "check the network between these hosts: enact doctor"
+_SLOW_READER: Final = "find the client that has stopped or is too slow: enact actor ls"
 
 OF_A_SHARD: Final[dict[str, Counter]] = {
     # Work
-    "commits": Counter("commits that were applied here"),
-    "bytes_written": Counter(f"bytes of data in them: {BODIES}"),
-    "bytes_fetched": Counter("bytes that were fetched in slices"),
-    "locks_granted": Counter("locks that were granted"),
-    "locks_validated": Counter("locks without a write here that were confirmed at their end"),
-    "lock_waits": Counter("locks that had to wait", "where too many: shorter locks, or View"),
-    "locks_bypassed": Counter("grants to one who came later than somebody who still waits"),
-    "prepared": Counter("commits over several shards that were prepared here"),
-    "decisions": Counter("commits over several shards that were decided here"),
-    "commits_finished": Counter("prepared commits that were applied"),
-    "views_waited": Counter("views that waited for a commit over several shards to be decided"),
+    "commits": Counter("commits applied here"),
+    "bytes_written": Counter(f"bytes of data in these commits: {BODIES}"),
+    "bytes_fetched": Counter("bytes that clients fetched in slices"),
+    "locks_granted": Counter("locks granted"),
+    "locks_validated": Counter("locks without a write here, confirmed when they ended"),
+    "lock_waits": Counter(
+        "locks that had to wait", "if too many: hold locks for less time, or use View"
+    ),
+    "locks_bypassed": Counter("locks granted before an earlier request that still waits"),
+    "prepared": Counter("commits over several shards that this shard prepared"),
+    "decisions": Counter("commits over several shards that this shard decided"),
+    "commits_finished": Counter("prepared commits that this shard applied"),
+    "views_waited": Counter("views that waited for the decision on a commit over several shards"),
     "views_forgotten": Counter(
-        "views of a past that has left its retention",
+        "views of a time that is beyond retention",
         "retain more: Aspect(…, retention=…) or cell.toml",
     ),
-    "worlds_forked": Counter("world contexts that were forked"),
-    "worlds_dropped": Counter("world contexts that were dropped"),
-    "forks_waited": Counter("forks that waited for a commit over several shards to be decided"),
-    # Things that happen where messages are lost
-    "commits_repeated": Counter("commits that came again and got their first answer", _NETWORK),
-    "prepares_repeated": Counter("prepares that came again and got their first answer", _NETWORK),
-    "finishes_repeated": Counter("decisions that were told again", _NETWORK),
-    "stale": Counter("lock requests that came too late to count", _NETWORK),
-    "superseded": Counter("locks ended by the next one of their thread: a lost release", _NETWORK),
-    "orphans_freed": Counter("locks that their client did not know of: a lost grant", _NETWORK),
-    "grants_without_listener": Counter("locks granted between two questions of their client"),
-    # Commits and locks that came to nothing
+    "worlds_forked": Counter("world contexts forked"),
+    "worlds_dropped": Counter("world contexts dropped"),
+    "forks_waited": Counter("forks that waited for the decision on a commit over several shards"),
+    # Events that follow from lost messages
+    "commits_repeated": Counter("repeated commits, answered as the first time", _NETWORK),
+    "prepares_repeated": Counter("repeated prepares, answered as the first time", _NETWORK),
+    "finishes_repeated": Counter("decisions that another shard sent again", _NETWORK),
+    "stale": Counter("lock requests ignored because they arrived too late", _NETWORK),
+    "superseded": Counter("locks ended by the next lock of their thread: a lost release", _NETWORK),
+    "orphans_freed": Counter("locks whose client did not know of them: a lost grant", _NETWORK),
+    "grants_without_listener": Counter("locks granted between two requests of their client"),
+    # Commits and locks that failed
     "commits_changed": Counter(
-        "locks refused because an expected view had changed", "where many: Read instead of View"
+        "locks refused because an expected view had changed", "if many: use Read instead of View"
     ),
     "fenced": Counter("commits refused because their lock was lost", _DYING),
-    "epoch_refusals": Counter("requests of clients from before this start, or of ended sessions"),
+    "epoch_refusals": Counter(
+        "requests from sessions that ended, or that began before the last start"
+    ),
     "newer_types_missed": Counter(
-        "locks asked with an aspect's older type: the client was to compare types first",
-        "bring programs up to date that only read now: enact actor ls, and their log",
+        "locks refused until their client compares its type with the newer one",
+        "update programs that write an older type: enact actor ls, and their logs",
     ),
-    "types_succeeded": Counter("aspects whose type a newer one has succeeded, with more fields"),
+    "types_succeeded": Counter("times that an aspect got a newer type, with more fields"),
     "wrong_shard": Counter(
-        "requests made with another shard list", "start all shards with the same cell.toml"
+        "requests from clients with a different list of shards",
+        "start all shards with the same cell.toml",
     ),
-    "fetches_gone": Counter("slices asked for after their datum had gone: a lost lock", _DYING),
+    "fetches_gone": Counter("slices requested after their datum was removed: a lost lock", _DYING),
     "leases_expired": Counter("locks lost because their client was silent for a TTL", _DYING),
-    "held_too_long": Counter("locks that went over hold_s", "raise hold_s, or do less in the lock"),
-    "sessions_died": Counter("clients that went without a goodbye", _DYING),
-    "waiters_dropped": Counter("waiting locks of clients that went or were silent", _DYING),
-    "locks_broken": Counter("locks that somebody ended by enact lock break"),
-    # Commits in doubt
-    "prepared_restored": Counter("commits in doubt that were found at the start"),
-    "resolves_asked": Counter(
-        "questions to other shards how a commit ended", "enact lock ls; start the shard it names"
+    "held_too_long": Counter(
+        "locks held longer than hold_s", "raise hold_s, or do less under the lock"
     ),
-    "resolved_committed": Counter("commits in doubt that turned out as committed"),
-    "resolved_aborted": Counter("commits in doubt that turned out as aborted"),
+    "sessions_died": Counter("clients whose process died without closing its session", _DYING),
+    "waiters_dropped": Counter(
+        "waiting locks dropped because their client was gone or silent", _DYING
+    ),
+    "locks_broken": Counter("locks ended with enact lock break"),
+    # Commits in doubt
+    "prepared_restored": Counter("commits in doubt found at the start"),
+    "resolves_asked": Counter(
+        "requests to other shards for the outcome of a commit",
+        "enact lock ls; start the shard that it names",
+    ),
+    "resolved_committed": Counter("commits in doubt that the deciding shard had committed"),
+    "resolved_aborted": Counter("commits in doubt that the deciding shard had aborted"),
     "decisions_refused": Counter(
-        "decisions of other shards with a stamp that is far ahead of the clock here",
+        "decisions from other shards with a timestamp far ahead of the local clock",
         "set the clocks of both hosts: enact doctor",
     ),
-    "prepared_forced": Counter("commits in doubt aborted by hand (enact lock resolve)"),
-    "forced_confirmed": Counter("such that had not been committed elsewhere: all is well"),
-    "forced_but_committed": Counter(
-        "such that had been committed elsewhere: they stand in part", "enact lock audit"
+    "prepared_forced": Counter("commits in doubt that an operator aborted (enact lock resolve)"),
+    "forced_confirmed": Counter(
+        "of these, commits that no other shard had committed: no harm done"
     ),
-    "alarms": Counter("of these, those that nobody has settled yet", "enact lock audit", now=True),
+    "forced_but_committed": Counter(
+        "of these, commits that another shard had committed: only a part took effect",
+        "enact lock audit",
+    ),
+    "alarms": Counter(
+        "of these, conflicts that no operator has acknowledged yet", "enact lock audit", now=True
+    ),
     # This process and its host
     "namesakes_found": Counter(
-        "times that two daemons were found under the name of one shard of the cell",
-        "see the shard's log for where they are; stop all but the one whose data you want to keep",
+        "times that the shard found two daemons with the same shard name",
+        "the shard's log names their hosts; stop all but the one whose data you want to keep",
     ),
     "namesakes": Counter(
-        "shards of the cell that several daemons serve now", "enact doctor", now=True
+        "shards of the cell that more than one daemon serves now", "enact doctor", now=True
     ),
     "audit_left_out": Counter(
-        "acts of operators that are too old for enact lock audit, which lists the newest 1,000",
+        "operator actions too old for enact lock audit, which lists the newest 1,000",
         now=True,
     ),
     "catalogue_left_out": Counter(
-        "world contexts and aspects that the catalogue has no room to show",
+        "world contexts and aspects that do not fit into the catalogue sent to clients",
         "stop the cell and run enact shard forget --unused",
         now=True,
     ),
-    "draining": Counter("1 while this shard ends and grants nothing new", now=True),
-    "stalls": Counter("times this host stood still; no lease paid for it", _BUSY),
+    "draining": Counter("1 while the shard shuts down and grants no new locks", now=True),
+    "stalls": Counter("times that this host stood still; leases were extended by that time", _BUSY),
     "disk_stalls": Counter(
-        "times a write took more than a second",
-        "move the shard's folder to another disk; see its log for when",
+        "disk writes that took more than a second",
+        "move the shard's folder to another disk; its log says when",
     ),
-    "overloads": Counter("requests refused because too many wait", "find who asks: enact lock ls"),
+    "overloads": Counter(
+        "requests refused because too many wait", "find their clients: enact lock ls"
+    ),
     "quota_refused": Counter(
-        "requests refused because their process has its whole share of the shard",
-        "see the shard's log for whose; a program that connects in a loop does that",
+        "requests refused because their process used up its share of the shard",
+        "the shard's log names the process; a typical cause is a program that connects in a loop",
     ),
     "sessions_displaced": Counter(
-        "sessions that did nothing after their hello and made room where the table was full",
-        "see the shard's log: somebody opens sessions in a loop, under ever new names",
+        "idle sessions ended to make room in a full table",
+        "see the shard's log: some program opens new sessions in a loop",
     ),
     "views_displaced": Counter(
-        "views whose large data a shard keeps no longer, since their client had too many of them",
-        "find the client that takes views in ever new lanes; it is none of this library's",
+        "views whose large data the shard no longer keeps: their client had too many",
+        "find the client that opens views in ever new lanes; this library never does",
     ),
     "requests_refused": Counter(
-        "requests in the name of another's session or of another shard, or that name no epoch",
-        "see the error at who sent them; the same session or process may be copied",
+        "requests that named another client's session, another shard, or no epoch",
+        "see the error that the sender got; a copied process or session is a likely cause",
     ),
     "frames_refused": Counter(
-        "messages that could not be read", "run the same release everywhere; see the shard's log"
+        "messages that the shard could not read", "run the same release everywhere; see its log"
     ),
     "requests_dropped": Counter(
-        "requests that had no room beside all that wait: their clients ask again",
-        "see the shard's log for whose; a program that asks without an end does that",
+        "requests dropped because the queue was full; their clients repeat them",
+        "the shard's log names the client; a typical cause is a program that never stops asking",
     ),
     "connections_refused": Counter(
         "sockets refused: too many, another user, or no greeting", "see the shard's log"
     ),
     "metrics_readers_refused": Counter(
-        "readers of /metrics that were not taken: too many, or no descriptor or thread was free",
+        "readers of /metrics refused: too many, or no free descriptor or thread",
         "see the shard's log; raise LimitNOFILE",
     ),
-    "answers_dropped": Counter("answers to clients that did not read them", _SLOW_READER),
+    "answers_dropped": Counter(
+        "answers dropped because their client did not read them", _SLOW_READER
+    ),
     "answers_refused": Counter(
-        "answers longer than a frame, in place of which the request was refused",
-        "ask for less at once: a narrower pattern",
+        "requests refused because the answer would be longer than a frame",
+        "request less at once, for example with a narrower pattern",
     ),
     "notices_dropped": Counter(
-        "notices to watchers that did not read them; a watch tells its gap", _SLOW_READER
+        "notices dropped because a watcher did not read them; its watch reports a gap", _SLOW_READER
     ),
     "fetches_damaged": Counter(
-        "data asked for whose bytes on the disk are not those that were written",
-        "check the disk; see the shard's log for which",
+        "requested data whose bytes on the disk differ from what was written",
+        "check the disk; the shard's log names the data",
     ),
     # History
-    "retained_bytes": Counter("bytes of older versions that are kept now", now=True),
+    "retained_bytes": Counter("bytes of older versions kept now", now=True),
     "retained_dropped": Counter(
-        "older versions let go early: the limit of 256 MiB", "retain fewer versions of large data"
+        "older versions removed early: the limit of 256 MiB", "retain fewer versions of large data"
     ),
     "history_dropped": Counter(
-        "older versions let go early for the room of a new datum",
+        "older versions removed early to make room for a new datum",
         "raise shared_bytes_max, or retain fewer versions of large data",
     ),
     # Large data
-    "payload_files": Counter("payloads that lie here now", now=True),
-    "payload_bytes": Counter("bytes of these and of drafts now", now=True),
-    "payload_bytes_max": Counter(
-        "the cap of the shared folder in bytes; 0 where there is none", now=True
-    ),
-    "payload_drafts": Counter("payloads now that no commit has named yet", now=True),
+    "payload_files": Counter("payloads stored here now", now=True),
+    "payload_bytes": Counter("bytes of payloads and drafts now", now=True),
+    "payload_bytes_max": Counter("limit of the shared folder in bytes; 0 if it has none", now=True),
+    "payload_drafts": Counter("payloads here now that no commit has named yet", now=True),
     "payloads_adopted": Counter("payloads that a commit has named"),
-    "payloads_missing": Counter("payloads named by a commit and not here; they came again"),
+    "payloads_missing": Counter(
+        "payloads that a commit named before they arrived; the client sent them again"
+    ),
     "payloads_refused": Counter(
-        "payloads refused because of the cap",
-        "raise shared_bytes_max, or let go of arrays that hold old versions",
+        "payloads refused because the shared folder was at its limit",
+        "raise shared_bytes_max, or release arrays that still reference old versions",
     ),
     "slices_dropped": Counter(
-        "slices dropped since too many wait for their place; they came again", _BUSY
+        "slices dropped because too many were waiting; the client sent them again", _BUSY
     ),
     "payload_fallbacks": Counter(
-        "payloads that are no file of the shared folder: it is full",
+        "payloads stored outside the shared folder because it is full",
         "enlarge the folder: mount -o remount,size=…; docker run --shm-size=…",
     ),
     "drafts_displaced": Counter(
-        "large data on their way that were given up for a client with less than its share",
-        "see who stages much and commits nothing: enact actor ls; or raise shared_bytes_max",
+        "unfinished large data dropped to make room for a client below its share",
+        "find the client that stages much and commits nothing: enact actor ls; or raise the limit",
     ),
-    "drafts_swept": Counter("drafts whose client went or gave them up", _DYING),
+    "drafts_swept": Counter("drafts removed because their client was gone or gave them up", _DYING),
 }
 
 OF_A_CONNECTION: Final[dict[str, Counter]] = {
-    "connects_failed": Counter("tries to connect to further shards that failed", "see the log"),
+    "connects_failed": Counter("failed attempts to connect to further shards", "see the log"),
     "shards_doubted": Counter(
-        "shards that more than one daemon serves; none of them is trusted",
+        "shards that more than one daemon serves; the client uses none of these daemons",
         "stop all daemons of that name but one: enact doctor",
     ),
-    "keep_alives_failed": Counter("answers to keep-alives that made no sense", "see the log"),
-    "keep_alives_unanswered": Counter("keep-alives without an answer in time", _NETWORK),
-    "releases_unsent": Counter("locks whose release could not be sent; the next one ends them"),
-    "views_locked": Counter("views that took a lock, since their shards did not agree"),
-    "slices_repeated": Counter("slices of large data that were asked or sent again", _NETWORK),
-    "maps_failed": Counter("payloads that could not be mapped and were fetched", "see the log"),
-    "payload_fallbacks": Counter("data that travelled though the folder is shared", "see the log"),
+    "keep_alives_failed": Counter("invalid answers to keep-alives", "see the log"),
+    "keep_alives_unanswered": Counter("keep-alives that got no answer in time", _NETWORK),
+    "releases_unsent": Counter(
+        "releases that could not be sent; the thread's next lock replaces them"
+    ),
+    "views_locked": Counter("views that took read locks because their shards did not agree"),
+    "slices_repeated": Counter("slices of large data requested or sent again", _NETWORK),
+    "maps_failed": Counter("payloads fetched because they could not be mapped", "see the log"),
+    "payload_fallbacks": Counter(
+        "data sent through the connection although the folder is shared", "see the log"
+    ),
     "payload_folders_elsewhere": Counter(
-        "shards whose shared folder this process does not see",
+        "shards whose shared folder this process cannot see",
         "for containers: mount one tmpfs in all of them, see Large data in the README",
     ),
 }
 
 
 def told(counters: Mapping[str, int]) -> Iterator[tuple[str, int, str, str]]:
-    """Yield name, value, meaning and remedy of all that are not 0, as they stand in the table."""
+    """Yield name, value, meaning and remedy of each counter above 0, in the order of the table."""
     order = {name: number for number, name in enumerate(OF_A_SHARD)}
     for name in sorted(counters, key=lambda name: (order.get(name, len(order)), name)):
         if counters[name]:
-            known = OF_A_SHARD.get(name, Counter("of a newer release"))
+            known = OF_A_SHARD.get(name, Counter("unknown: from a newer release"))
             yield name, counters[name], known.meaning, known.remedy

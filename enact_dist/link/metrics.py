@@ -1,8 +1,8 @@
-"""What a shard tells Prometheus: its counters and what there is now, in text format 0.0.4.
+"""The metrics that a shard serves to Prometheus: counters and gauges, in text format 0.0.4.
 
-Each counter of `link.counters` is ``enact_NAME_total``, each of its figures of the moment
-``enact_NAME``; their meanings there are the help here.  All samples bear `cell` and `shard`.
-`deploy/metrics.md` is `table()`.
+Each counter of `link.counters` becomes ``enact_NAME_total``, and each current value ``enact_NAME``,
+with the meaning given there as help text.  All samples have the labels `cell` and `shard`.
+The table in `deploy/metrics.md` is `table()`.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ class Metric(NamedTuple):
     """One metric.
 
     Attributes:
-        name: As Prometheus knows it.
+        name: Its name in Prometheus.
         kind: "counter", "gauge" or "histogram".
         meaning: What it is.
-        remedy: What to do where it grows; empty where that is as it should be.
+        remedy: What to do if it grows; empty if growth is normal.
         figure: Its name among the figures, or latencies, of a `ShardHost`.
     """
 
@@ -41,23 +41,29 @@ class Metric(NamedTuple):
 
 
 _NOW: Final = {
-    "ready": ("1 while locks are granted, 0 after a start and before an end", ""),
-    "epoch": ("number of this start; a change is a restart", "see the shard's log for why"),
+    "ready": (
+        "1 while the shard grants locks, 0 right after its start and while it shuts down",
+        "",
+    ),
+    "epoch": ("number of this start; it changes with each restart", "the shard's log says why"),
     "uptime_seconds": ("time since this start", ""),
-    "sessions": ("clients that are connected, or have been a moment ago", ""),
-    "slots": ("slots that lie here, null ones too", ""),
-    "slot_bytes": (f"bytes of their newest data: {BODIES}", "enact world tree shows which"),
-    "locks_held": ("locks that are held", ""),
-    "locks_waiting": ("locks that wait", "enact lock ls shows for whom"),
-    "requests_parked": ("requests that wait for their answers", ""),
+    "sessions": ("clients that are connected, or were until a moment ago", ""),
+    "slots": ("slots on this shard, including null ones", ""),
+    "slot_bytes": (
+        f"bytes of the newest data of all slots: {BODIES}",
+        "enact world tree shows each",
+    ),
+    "locks_held": ("locks held now", ""),
+    "locks_waiting": ("locks waiting now", "enact lock ls shows who holds them up"),
+    "requests_parked": ("requests waiting for an answer", ""),
 }
 _TOOK: Final = {
     "lock_wait_seconds": (
-        "how long locks that were granted had waited here since they were first asked for",
-        "enact lock ls shows who holds; hold locks shorter, or View",
+        "time from the first request of a lock to its grant here",
+        "enact lock ls shows the holders; hold locks for less time, or use View",
     ),
     "store_write_seconds": (
-        "how long batches of records took to be kept, on the disk where an aspect asks for it",
+        "time to store a batch of records, on the disk if an aspect is durable",
         "move the shard's folder to a faster disk",
     ),
 }
@@ -74,11 +80,11 @@ def _metrics() -> Iterator[Metric]:
 
 
 METRICS: Final = tuple(_metrics())
-"""All metrics of a shard, in the order in which they are served."""
+"""All metrics of a shard, in the order in which it serves them."""
 
 
 def page(host: ShardHost, cell: str) -> str:
-    """Return all metrics of a shard as Prometheus reads them; takes no lock of the shard."""
+    """Return all metrics of a shard in the format of Prometheus, without locking the shard."""
     labels = f'cell="{_escaped(cell)}",shard="{_escaped(host.name)}"'
     figures, latencies = host.figures(), host.latencies()
     lines: list[str] = []
@@ -109,8 +115,8 @@ def _escaped(text: str) -> str:
 
 
 def table() -> str:
-    """Return the metrics as a table of a Markdown file."""
+    """Return the metrics as a Markdown table."""
     rows = (f"| `{m.name}` | {m.kind} | {m.meaning} | {m.remedy or '-'} |" for m in METRICS)
     return "\n".join(
-        ("| metric | kind | meaning | what to do where it grows |", "|---|---|---|---|", *rows, "")
+        ("| metric | kind | meaning | what to do if it grows |", "|---|---|---|---|", *rows, "")
     )
