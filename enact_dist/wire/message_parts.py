@@ -237,6 +237,11 @@ def too_long(cls: type[Any], index: int, length: int, length_max: int) -> Protoc
     return ProtocolError(f"{_at(cls, index)} has the length {length}; at most {length_max}")
 
 
+def miscounted(cls: type[Any], count: int) -> ProtocolError:
+    """Return the error for another number of fields than a class has."""
+    return ProtocolError(f"{cls.__name__} has {len(annotated(cls))} fields, {count} came")
+
+
 def _at(cls: type[Any], index: int) -> str:
     return f"{cls.__name__}.{annotated(cls)[index][0]}"
 
@@ -247,7 +252,7 @@ def _mismatch(cls: type[Any], raw: Any) -> str:
         return f"{cls.__name__} came as {_shown(raw)} instead of a list"
     fields = annotated(cls)
     if len(raw) != len(fields):
-        return f"{cls.__name__} has {len(fields)} fields, {len(raw)} came"
+        return str(miscounted(cls, len(raw)))
     for (name, kind), one in zip(fields, raw, strict=True):
         if type(one) not in _raw_types(kind):
             asked = getattr(kind, "__name__", str(kind))

@@ -67,6 +67,16 @@ def test_request_of_too_many_values_is_refused():
         decode_request(header_of(m.Register, "s", nested, []))
 
 
+def test_request_of_too_many_fields_is_refused_before_they_are_read():
+    """Ten million of them fit into a header, and its end is never come to here."""
+    header = header_of(m.Survey, (), (), (), False, m.START)
+    count = limits.HEADER_BYTES_MAX - 100
+    header = b"\xdd" + count.to_bytes(4, "big") + header[1:] + b"\xc0" * LONG
+
+    with pytest.raises(ProtocolError, match=f"Survey has 5 fields, {count - 2} came"):
+        decode_request(header)
+
+
 def test_long_header_with_a_code_that_no_request_has_is_refused_unread():
     """Neither an answer's code nor another type in its place lets the rest be read."""
     for code in (CODES[m.Sessions], 32, "x" * 60):
