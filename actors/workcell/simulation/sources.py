@@ -76,10 +76,20 @@ class LiveSource:
         return 0
 
     def open(self, calibration: Calibration) -> None:
-        """Draw the room and compile the loops."""
+        """Draw the room and compile the loops.
+
+        Raises:
+            CameraError: What draws is not installed.
+        """
         self._view = View(calibration, seed=self._number)
         away = np.array([[0.0, 0.0, 1.5, 0.0, 0.0, 1.6, 0.1]])
-        self._view.render(away, robot_colours(1))
+        try:
+            self._view.render(away, robot_colours(1))
+        except ImportError as error:
+            raise CameraError(
+                f"camera/{self._number}: asked for a simulated camera; found that it cannot draw"
+                f" ({error}); install the extra workcell"
+            ) from None
         self._ahead = None
 
     def look(self, playing: Playing | None, joints: Joints | None, *, stuck: bool = False) -> None:

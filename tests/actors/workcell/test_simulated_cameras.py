@@ -3,6 +3,7 @@
 import dataclasses
 import importlib.util
 import json
+import sys
 
 import cv2
 import numpy as np
@@ -109,6 +110,12 @@ def test_scenario_must_begin_at_a_tick():
     late = dataclasses.replace(playing(), start_ns=BEGIN_NS + 1)
     with pytest.raises(CameraError, match="asked for a scenario that begins at a tick"):
         opened("live", late).frame(BEGIN_NS)
+
+
+def test_without_numba_a_simulated_camera_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "actors.workcell.simulation.kernels", None)
+    with pytest.raises(CameraError, match=r"camera/0: .*install the extra workcell"):
+        opened("live", None)
 
 
 def test_stuck_camera_repeats_its_image():
