@@ -276,7 +276,7 @@ def narrowed(request: Declared, only: Entity | None) -> Declared:
 
 
 def name_of(actor: Actor) -> str:
-    """Return how an actor is called that nobody has named: as its class, and its one entity."""
+    """Return the default name of an actor: its class, and its entity if it has only one."""
     only = actor.only_entity
     own = f"-{only.name.replace('/', '-')}" if isinstance(only, Entity) else ""
     return f"{type(actor).__name__}{own}"

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 DRAIN_S: Final = 8.0
 """How long an update may still take after the first signal; `docker stop` kills after 10 s."""
 SAY_S: Final = 1.5
-"""How long the last line may take where nobody reads the log."""
+"""How long writing the last line may block if the log has no reader."""
 CUT_OFF: Final = 1
 """Exit status of a process that has cut something off."""
 

@@ -98,7 +98,7 @@ def _says_stamps(actor: ActorDeclaration) -> bool:
     try:
         return "stamp_ns" in inspect.getsource(module or actor.actor_class)
     except (OSError, TypeError):
-        return True  # its source is not here: nothing is said against it
+        return True  # its source is not here: assume that it does
 
 
 def _triggers(use: Use) -> bool:

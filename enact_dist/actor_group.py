@@ -165,7 +165,7 @@ class ActorGroup:
         """Cut off all actors that still run."""
         with self._changed:
             lives = list(self._lives.values())
-        for life in lives:  # each may have to wait for a log that nobody reads
+        for life in lives:  # each may block on a log without a reader
             threading.Thread(target=life.hurry, args=(why,), daemon=True).start()
 
     def _keep(self, name: str) -> None:

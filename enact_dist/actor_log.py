@@ -1,8 +1,8 @@
-"""What an actor's log says of what repeats: the first at once, the others as a count.
+"""Repeated events in an actor's log: the first is logged at once, the others as a count.
 
-PURE, as `actor_triggers`: time arrives as an argument.  A camera that is dead leaves one set after
-the other incomplete, an update that always fails does so at each trigger; told one by one they
-hide all else.  Nothing is passed over unsaid: whoever tells asks for `left` at its end.
+PURE, as `actor_triggers`: time arrives as an argument.  A dead camera leaves every set incomplete,
+and a broken update fails at each trigger; logged one by one, such events hide everything else.  No
+event is lost: the logger writes the counts of `left` when it ends.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ PAUSE_NS_MIN: Final = 5_000_000_000
 PAUSE_NS_MAX: Final = 300_000_000_000
 """Between two lines of one kind; doubles while there is something to count."""
 KINDS_MAX: Final = 64
-"""Kinds that are told apart at once."""
+"""Kinds that are counted separately at one time."""
 
 _DIGITS: Final = re.compile(r"[0-9]+")
 
@@ -33,7 +33,7 @@ class _Kind:
 
 
 class Repeated:
-    """When what repeats is told, kind by kind.  One thread at a time."""
+    """Decides when to log repeated events, kind by kind.  One thread at a time."""
 
     __slots__ = ("_kinds",)
 

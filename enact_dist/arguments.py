@@ -1,7 +1,7 @@
-"""What a call is given: refused at once, by name, where it is of no use.
+"""Checks of arguments: a call refuses a wrong argument at once, by its name.
 
-Entities, aspects and names are told apart by their types alone: an aspect in place of an entity
-would be looked for by its name, and nothing found.
+Entities, aspects and names differ only by their types: a call with an aspect in place of an entity
+would look for an entity of that name and find none.
 """
 
 from __future__ import annotations

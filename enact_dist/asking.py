@@ -37,7 +37,7 @@ def await_stamp(
     """Wait until a shard shows every commit up to a stamp, one slice at most; say whether it does.
 
     Args:
-        client: Who asks.
+        client: The client that asks.
         shard: Whom it asks.
         stamp_ns: Up to which stamp.
         wait_s: How long the shard may wait for it.

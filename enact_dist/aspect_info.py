@@ -51,7 +51,7 @@ def aspect_infos(session: Session, world: str = "") -> tuple[AspectInfo, ...]:
     """Return the aspects of all shards; one that shards know differently comes once for each way.
 
     Args:
-        session: Who asks.
+        session: The session that asks.
         world: Only slots of this world context count; "": those of all.
 
     Raises:

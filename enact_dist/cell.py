@@ -58,18 +58,18 @@ if TYPE_CHECKING:
 _open: weakref.WeakKeyDictionary[CellClient, Any] = weakref.WeakKeyDictionary()
 """The sessions of cells that were not closed, with the shard inside this process, if it has one.
 
-Handles made by a cell work on when nobody keeps the cell itself.
+Handles made by a cell go on working after the program has dropped its last reference to the cell.
 """
 
 
 class Cell(Closing):
     """A connection to a cell.  Use as a context manager, or `close` it.
 
-    A cell left open does not hang the interpreter's exit.  One that nobody refers to any more, nor
-    anything made by it, is closed with a `ResourceWarning` that says where it was opened.
+    A cell left open does not block the interpreter's exit.  Once neither a cell nor what it made is
+    referenced any more, it is closed with a `ResourceWarning` that says where it was opened.
 
-    A process that has connected over a network cannot hand that on to a child that it forks: there
-    the cell and every `connect` raise `MisuseError`, also where the cell was closed before.
+    A network connection does not survive a fork of the process: in the child the cell and every
+    `connect` raise `MisuseError`, even if the parent had closed the cell before.
     Connect for the first time after the fork, or start the child with
     ``multiprocessing.get_context("spawn")``.  `local` works in both.
     """
@@ -126,10 +126,10 @@ class Cell(Closing):
         return WorldContext(name, self._session)
 
     def drop_world(self, name: str) -> int:
-        """Forget a world context: its data, their history, what is kept of it, on every shard.
+        """Delete a world context on every shard: its data, their history and its pinned versions.
 
-        Whoever watches it is told, whoever uses a handle of it gets `UnknownWorldError`.  Forks of
-        it stay as they are.  A context of the same name may be made anew; no version comes twice.
+        Its watchers get a change for each slot; its handles raise `UnknownWorldError`.  Forks of it
+        stay as they are.  A new context may have the same name; version numbers never repeat.
 
         Returns:
             How many slots went.
@@ -306,7 +306,7 @@ class Cell(Closing):
         )
 
     def break_lock(self, number: int, *, shard: str, reason: str = "") -> LockInfo | None:
-        """Take a lock away from its holder, who is told why; audited by the shard.
+        """Take a lock away from its holder, who learns the reason; the shard audits the act.
 
         Returns:
             What the lock was, or None if no such lock is held or awaited.
@@ -353,14 +353,14 @@ class Cell(Closing):
         return tuple(sorted(found, key=lambda entry: entry.stamp_s))
 
     def settle_alarms(self, *, shard: str, how: str) -> None:
-        """Say that somebody has seen to all alarms of a shard so far; audited by the shard.
+        """Acknowledge all alarms of a shard so far; the shard audits the act.
 
         Raises:
-            MisuseError: The cell has no such shard, or `how` says nothing, or too much.
+            MisuseError: The cell has no such shard, or `how` is empty or too long.
             ShardUnreachableError: The shard does not answer.
         """
         if not how.strip():
-            raise MisuseError("alarms are settled by saying how: how='' says nothing")
+            raise MisuseError("how= is empty: state how the alarms were settled")
         check_reason("how", how)
         self._check_shard(shard)
         seen = self._client.call(shard, ListAudit(""))

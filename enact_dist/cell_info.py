@@ -102,7 +102,7 @@ class ActorInfo:
 
     @property
     def silent(self) -> bool:
-        """Whether its lease is over: what it reported last says nothing of how it is now."""
+        """Whether its lease is over, so that its last report no longer describes its state."""
         return self.lease_left_s < 0.0
 
     def names(self) -> frozenset[str]:
@@ -230,7 +230,7 @@ def lock_info(shard: str, holder: Holder) -> LockInfo:
 
 
 def shard_info(client: CellClient, shard: str) -> ShardInfo:
-    """Return what is known of a shard: what is wrong with one says nothing of the others."""
+    """Return what is known of a shard.  A shard that fails does not affect the others' results."""
     try:
         return _asked_info(client, shard)
     except LinkError as error:

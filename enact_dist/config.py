@@ -53,18 +53,17 @@ shared_bytes_max       none           cap of each shard's large data in the memo
   metrics              none           ``host:port``, or a port of the loopback, at which
                                       Prometheus may ask for `/metrics` (deploy/metrics.md)
   drain_s              0.8            how long holders of locks may still finish after SIGTERM,
-                                      seconds (0 to 3600); whoever stops it has to wait longer
+                                      seconds (0 to 3600); a process manager must wait longer
 [[pins]]               none           entities kept on one shard; the first match wins
   entities             required       name pattern, ``tray/**``
   shard                required       name of a shard
-[aspects.NAME]         none           an aspect about which the cell decides something
-  durability           the actors'    "durable", "os" or "volatile"; where nobody says anything:
-                                      "durable"
+[aspects.NAME]         none           an aspect that the cell configures
+  durability           the actors'    "durable", "os" or "volatile"; default: "durable"
   retention            the actors'    how much of each datum's history stays: a number of
                                       versions, the newest included (1: none), or a table of
                                       `versions`, `age_s` (since it was replaced) and `size_bytes`
-                                      (replaced data per datum), unlimited where unsaid; where
-                                      nobody says anything: 16 versions, 600 s, 16 MiB
+                                      (replaced data per datum); a key left out means no limit;
+                                      default: 16 versions, 600 s, 16 MiB
   compare              none           what `enact world diff` compares its data by,
                                       ``package.module:NAME``: the `Aspect` that says it (then its
                                       type is known, too), or a comparator
@@ -289,7 +288,7 @@ def _shard(name: str, table: Table, file: Path, data_folder: Path | None) -> Sha
             key = "advertise" if "advertise" in table.values else "listen"
             table.refuse(
                 key,
-                f"nobody can connect to {endpoint}; write in {table.title} an advertise endpoint"
+                f"no client can connect to {endpoint}; write in {table.title} an advertise endpoint"
                 " that names the host",
             )
     folder = _folder(table, "folder", file) or (data_folder and data_folder / name)

@@ -169,9 +169,9 @@ def _with_overrides(shard: ShardConfig, ours: Mapping[str, str]) -> ShardConfig:
         shard = dataclasses.replace(shard, advertise=advertise)
     if any(is_wildcard(endpoint) for endpoint in shard.advertise):
         raise ConfigError(
-            f"shard {shard.name} would advertise {', '.join(shard.advertise)}, to which nobody can"
-            f" connect; set {variable_of(shard.name, 'ADVERTISE')} too (or say --advertise of"
-            " `enact shard run`)"
+            f"shard {shard.name} would advertise {', '.join(shard.advertise)}, to which no"
+            f" client can connect; set {variable_of(shard.name, 'ADVERTISE')} too (or give"
+            " `enact shard run` the option --advertise)"
         )
     folder = ours.get(variable_of(shard.name, "FOLDER"))
     if folder:

@@ -32,8 +32,8 @@ kind             takes the first part of the datum, in the order of its fields, 
 
 ``of = "acquisition.camera"`` starts at that part instead; ``encoding = "bgr8"`` names the colours
 of an image (``rgb8``, ``rgba8``, ``mono8``, ``16UC1`` and ``32FC1`` by shape and dtype).  In a
-frame ``{entity}`` stands for the entity's name and ``{1}``, ``{2}`` … for its segments; without one
-it is the entity's name, as nobody said more.
+frame ``{entity}`` stands for the entity's name and ``{1}``, ``{2}`` … for its segments; without a
+frame the entity's name is used.
 
 Nothing said: an array (H, W, 3) or (H, W, 4) of uint8 is an image, a rigid (4, 4) a pose, a
 dataclass with ``points_m`` a cloud, with ``vertices_m`` and ``triangles`` a mesh, with ``voxels``
@@ -114,7 +114,7 @@ class Shows:
     def __post_init__(self) -> None:
         for kind in self.kinds:
             if kind not in KINDS:
-                raise ConfigError(f"nothing is shown as {kind!r}; known: {', '.join(KINDS)}")
+                raise ConfigError(f"unknown kind of display {kind!r}; known: {', '.join(KINDS)}")
         if self.encoding and self.encoding not in ENCODINGS:
             known = ", ".join(ENCODINGS)
             raise ConfigError(f"unknown encoding {self.encoding!r} of an image; known: {known}")
@@ -164,7 +164,7 @@ def _segment(name: str, entity: str) -> str:
 
 
 GUESSED: Final = Shows()
-"""What holds for aspects of which nothing is said."""
+"""The default for aspects that the configuration does not mention."""
 
 
 def take_shows(table: Table) -> Shows:

@@ -55,6 +55,6 @@ def metrics_address(text: str) -> tuple[str, int]:
 
 
 def is_wildcard(endpoint: str) -> bool:
-    """Say whether an endpoint means every address of a host, so that nobody can connect to it."""
+    """Return whether an endpoint means every address of a host; no client can connect to that."""
     found = _ENDPOINT.match(endpoint)
     return found is not None and found[1] in _WILDCARDS

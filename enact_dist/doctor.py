@@ -371,7 +371,10 @@ def knock(endpoint: str, *, timeout_s: float = 2.0) -> tuple[str, str]:
     try:
         socket.create_connection((host, int(port)), timeout_s).close()
     except socket.gaierror:
-        return f"nobody knows the host {host}", f"correct the endpoint, or add {host} to /etc/hosts"
+        return (
+            f"the host name {host} is unknown",
+            f"correct the endpoint, or add {host} to /etc/hosts",
+        )
     except ConnectionRefusedError:
         return f"nothing listens at port {port}", "start the shard: enact up, or enact shard run"
     except TimeoutError:

@@ -89,9 +89,9 @@ class ConfigError(MisuseError):
 
 
 class PermissionDeniedError(EnactError):
-    """Who asks may not do that; the message names who asked and whose it is.
+    """The caller may not do that; the message names the caller and the owner.
 
-    Asking again does not help, so an actor ends on it at once.
+    Repeating the request does not help, so an actor that gets this error ends at once.
     """
 
 

@@ -1,9 +1,9 @@
-"""Forks and ends of world contexts: one step on each shard, told as one.
+"""Forks and ends of world contexts: one step on each shard, reported as one.
 
-Every shard forks as of the same stamp.  A fork that some shards have and others lack is no world
-context yet: nobody is given a handle of it, and asking again with the same source and stamp
-completes it.  One that cannot be completed, because a shard has forgotten that stamp, is taken
-back where it was made.
+Every shard forks as of the same stamp.  A fork that only some shards have is not a world
+context yet: no caller gets a handle of it, and a repeated call with the same source and stamp
+completes it.  If a shard no longer has the data of that stamp, the fork cannot be completed; the
+client then drops it on the other shards.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from enact_dist.session import Session
 
 UNDO_S: Final = 2.0
-"""How long taking back a fork may take that cannot be completed; what is left is told."""
+"""Time to drop a fork that cannot be completed; the log names shards that may still have it."""
 
 PAUSE_S: Final = 0.05
 """Pause before a shard is asked again that could not do it yet."""

@@ -52,7 +52,7 @@ class Version(Generic[T]):
     Attributes:
         world: Its world context.
         entity: Its entity.
-        aspect: Its aspect; of the type `object` where nobody has named the aspect's type.
+        aspect: Its aspect; of the type `object` if the program has not named the aspect's type.
         version: Its number, counted from 1 by slot.
         position: Where its commit stands in time.
         until_ns: Stamp of the version that replaced it, 0 where it is the newest one.

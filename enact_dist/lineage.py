@@ -43,7 +43,7 @@ UNKNOWN: Final = "unknown"
 NULL: Final = "null"
 
 DEPTH_MAX: Final = 200
-"""Most steps of one tree: whoever goes through it by recursion stays within Python's limit."""
+"""Most steps of one tree: a recursive walk stays within Python's recursion limit."""
 ASKED_MAX: Final = 256
 """So many data are asked about by one question; each may name a thousand others."""
 

@@ -220,7 +220,7 @@ class Lock(Triggered):
                 client.finish(lock, writes, tuple(self._expects.values()), *reads)
                 self.position = lock.position
         finally:
-            # After a commit this is nothing; after an exception, an interrupt too, nothing is held.
+            # A commit leaves nothing to release; after an exception or interrupt this releases all.
             if not client.forked:
                 client.release(lock)
                 self._writing.end(committed=lock.phase in (Phase.COMMITTED, Phase.UNKNOWN))
@@ -458,16 +458,16 @@ class Lock(Triggered):
         return state.captured_ns if state is not None else 0
 
     def valid(self) -> bool:
-        """Whether this process may still believe that it holds the lock; asks nobody."""
+        """Whether this process may still believe that it holds the lock; contacts no shard."""
         return self._lock is not None and not self._over and self._session.client.valid(self._lock)
 
     def check(self) -> None:
-        """Make sure that the lock is held, asking its shards where belief has run out.
+        """Make sure that the lock is held; asks the shards whose lease may be over.
 
         Raises:
             LeaseLostError: It is lost.
             LockReleasedError: The block is not running.
-            ShardUnreachableError: A shard does not answer, so nobody can say.
+            ShardUnreachableError: A shard does not answer, so the state of the lock is unknown.
         """
         if self._lock is None or self._over:
             raise LockReleasedError(f"{self!r} is used outside its `with` block")

@@ -109,7 +109,7 @@ class OnceLock(ActorLock):
         super().expect(view)
 
     def valid(self) -> bool:
-        """Whether nothing is known against acting on; while it is held, as `Lock.valid`."""
+        """Whether the actor may go on, as far as is known; while it is held, as `Lock.valid`."""
         return not self._lost if self._taken is not None else super().valid()
 
     def check(self) -> None:

@@ -6,10 +6,10 @@
     lowest = View(before, piece, LOWEST)
     before.view(lowest)[lowest]
 
-Making one asks nobody.  Each view of it is one cut over all shards that lies exactly at its stamp:
-every commit stamped up to it, none after, whatever restarts meanwhile; so is every later view.
-Reading what was waits for nobody's lock: at most a moment, until commits that are stamped before
-and under way are decided.
+Making one contacts no shard.  Each view through it is a consistent snapshot of all shards at its
+timestamp: it contains every commit up to that timestamp and none after, even if shards restart in
+between.  Reading the past never waits for a lock.  It waits at most a moment, until the commits
+under way that bear an earlier timestamp are decided.
 """
 
 from __future__ import annotations

@@ -123,7 +123,7 @@ class Readings:
             return self._fetched([slot])[slot]
         self._fetched_alone += 1
         others = self._asked_alone() if self._fetched_alone > 1 else []
-        # Whoever has read two of them reads the others, too.
+        # A program that has read two of them is likely to read the others, too.
         self.fetch(ahead(slot, others, self.bytes_to_come) if slot in others else [slot])
         return self._kept[slot]
 
@@ -157,7 +157,7 @@ class Readings:
         self._kept.update(self._fetched(named))
 
     def value(self, slot: Slot, aspect: Aspect[T]) -> T:
-        """Return the decoded datum of a slot; whoever asks has made sure that it is `usable`.
+        """Return the decoded datum of a slot; the caller has made sure that it is `usable`.
 
         Raises:
             NullDatumError: The slot is null.
@@ -250,8 +250,8 @@ def slot_of(request: LockRequest[Any]) -> Slot:
 class EachData(Mapping[Entity, T]):
     """The data of a pattern request by entity; decoded when they are looked at.
 
-    A single look-up fetches one datum.  Whoever goes through them in order, by `values()` or
-    otherwise, gets those that follow with it.
+    A single look-up fetches one datum.  An iteration, by `values()` or otherwise, fetches those
+    that follow as well.
     """
 
     def __init__(self, readings: Readings, request: LockRequest[T]) -> None:

@@ -26,7 +26,7 @@ class Retention:
         size_bytes: How many bytes of replaced data stay, per datum.
 
     Raises:
-        ValueError: A figure is none that can be kept to, or nothing is said at all.
+        ValueError: A limit is out of range, or all three are missing.
     """
 
     versions: int | None = None
@@ -36,8 +36,8 @@ class Retention:
     def __post_init__(self) -> None:
         if self.versions is None and self.age_s is None and self.size_bytes is None:
             raise ValueError(
-                "Retention() says nothing; name versions, age_s or size_bytes, or leave the"
-                " retention away"
+                "Retention() has no limit; give versions, age_s or size_bytes, or leave the"
+                " retention out"
             )
         _check_count("versions", self.versions, VERSIONS_MAX)
         _check_count("size_bytes", self.size_bytes, SIZE_BYTES_MAX)

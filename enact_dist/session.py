@@ -59,11 +59,11 @@ class Session:
 
         Args:
             requests: The requests; only their shards are asked.
-            wait_s: How long the caller would wait at most; no shard gets less than one call's
-                time.
+            wait_s: How long the caller would wait at most; each shard gets at least the time of
+                one call.
 
         Returns:
-            What `check_shown` is told of this, once a grant or view is there.
+            The value to pass to `check_shown` once a grant or view has arrived.
 
         Raises:
             DatumTypeError: A shard knows one of the aspects with another type.
@@ -172,9 +172,8 @@ class Session:
     ) -> None:
         """Check aspects that came into use after they were looked up, by what is shown of them.
 
-        Only those of these requests, at the shards that show them.  All are checked again where a
-        shard has restarted in between and does not know some aspect as it did: within an epoch no
-        type changes, and nothing is granted in one before its catalogue is known.
+        Checks only the aspects of these requests, at the shards that show them.  If a shard has
+        forgotten an aspect or changed its type in between, all are checked again.
 
         Args:
             readings: What is shown.
@@ -304,7 +303,7 @@ class Session:
 
 
 def unknown_aspect(name: str, known: Iterable[str]) -> MisuseError:
-    """Return the error for an aspect that nobody has registered."""
+    """Return the error for an aspect that no program has registered."""
     names = sorted(known)
     return MisuseError(
         f"no aspect {name!r} is registered{suggestion(name, names)} (known:"

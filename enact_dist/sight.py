@@ -1,7 +1,7 @@
 """Slots of one or two world contexts as of one cut: their versions first, their data on demand.
 
-What is in sight stays fetchable until it is let go of, whatever is committed meanwhile; small data
-came with it (up to 8 MiB per shard), large ones are fetched when they are asked for.
+The data stay fetchable until the program releases them, even if newer ones are committed.  Small
+data arrive with the versions (up to 8 MiB per shard); large ones are fetched on demand.
 """
 
 from __future__ import annotations
@@ -121,8 +121,8 @@ def look(worlds: Sequence[Viewable], places: Iterable[Place], *, each: bool) -> 
     past_ns = past_ns_of(worlds[0])
     lock = client.acquire(items, wait_s=client.patience_s, hold_s=SIGHT_S, past_ns=past_ns)
     if lock.parts:
-        # For all the commits there was no cut to be had, and read locks stand in for it; nobody
-        # shall wait for a comparison, so what they show is looked at as the past that it is now.
+        # Commits came too fast for a consistent snapshot, so read locks replaced it.  No writer
+        # should wait for a comparison: release the locks and look at that moment as the past.
         client.release(lock)
         past_ns = client.core.seen_stamp_ns
         lock = client.acquire(items, wait_s=client.patience_s, hold_s=SIGHT_S, past_ns=past_ns)

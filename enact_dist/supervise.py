@@ -2,8 +2,8 @@
 
 Rules a change must keep
   * Shards are up before actors start, and actors are gone before shards stop: an actor that stops
-    can still commit, and a shard that stops has nobody left to wait for.
-  * The death of a child is that of its process: what it has started may hold its output for ever.
+    can still commit, and a shard that stops has no clients left to wait for.
+  * A child ends when its process ends: processes that it started may keep its output open.
   * A child never outlives its supervisor, even one that was killed: the kernel sends it SIGTERM.
   * A child is restarted unless it ended as it should (an actor: 0) or can never run (2: usage or
     configuration); pauses double up to `PAUSE_S_MAX` and start again after a good while.
@@ -159,12 +159,12 @@ class _Child:
                 self._process.send_signal(number)
 
     def _read(self, process: subprocess.Popen[bytes]) -> None:
-        """Follow a child to its end, which is told whatever becomes of its output."""
+        """Follow a child to its end, and report that end even if reading its output fails."""
         told = threading.Event()
         try:
             self._follow(process, told)
-        except Exception as error:  # noqa: BLE001 - nobody else would notice its end
-            self._say(self.task.name, f"its output is not read any more: {error}")
+        except Exception as error:  # noqa: BLE001 - its end must be noticed all the same
+            self._say(self.task.name, f"cannot read its output any more: {error}")
         if not told.is_set():
             self._events.put(_Ended(self, process.wait()))
 
@@ -215,7 +215,7 @@ class _Lines:
         return whole
 
     def rest(self) -> list[str]:
-        """Return a last line that nobody has ended, if there is one."""
+        """Return the last line if it has no line end."""
         rest = self._begun + self._decoder.decode(b"", final=True)
         self._begun = ""
         return [rest.rstrip("\n")] if rest else []
@@ -299,7 +299,7 @@ class Supervisor:
                     self._lost = 0
                 self._sink(name, line)
             except BrokenPipeError:
-                # Nobody reads the log any more; that is no reason to stop a robot.
+                # The reader of the log is gone; that is no reason to stop a robot.
                 self._sink = _say_nothing
             except (OSError, ValueError):  # a full disk, a character that it does not have
                 self._lost += 1
@@ -326,7 +326,7 @@ class Supervisor:
             self._judge(event.child, event.status)
 
     def _judge(self, child: _Child, status: int) -> None:
-        """Decide what the end of a child means while nobody asked for it."""
+        """Decide what the unexpected end of a child means."""
         how = ended_how(status)
         if child.task.kind == "actor" and status == 0:
             child.over = True

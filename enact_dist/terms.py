@@ -89,7 +89,7 @@ class Entity:
 
     @staticmethod
     def fresh(prefix: str) -> Entity:
-        """Return an entity whose name nobody else has: `prefix`/ and 64 random bits.
+        """Return an entity whose name is unique: `prefix`/ and 64 random bits.
 
         Names replace the paper's heap addresses (3.3), which were unique for the same purpose.
         """

@@ -159,7 +159,7 @@ def run_once(actor: Actor, cell: Cell, worlds: Mapping[str, str] | None = None) 
 
 
 def _act(actor: Actor, bound: BoundActor, pending: PendingTriggers) -> int:
-    """Let an actor act on each version that is new, and that nobody has acted on."""
+    """Let an actor act on each new version that it has not acted on."""
     once = Once(bound, name_of(actor), Doing(type(actor).__name__))
     updates = 0
     while trigger := pending.take(0):

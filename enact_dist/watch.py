@@ -9,7 +9,7 @@ A shard that is added to the cell is listed as soon as this client knows of it. 
 entities that have moved there stays known: a state that moved unchanged is no change.
 
 Versions that a restarted shard did not keep begin anew, so its new epoch makes each of its states a
-new one: the next number follows nothing, and nobody knows what was lost with the old ones.
+new one: its number does not continue the old count, and how many versions were lost is unknown.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class Change:
         version: The slot's version; starts again for volatile aspects when their shard restarts.
         position: Where the commit stands in time.
         gap: How many versions of this slot were skipped before this one; at least 1 where its
-            versions began anew, since the last ones of before may have been seen by nobody.
+            versions began anew, since this watch may have missed the last ones before that.
         null: Whether the slot is null now.
         captured_ns: When the datum was captured, as its writer said (0: not said, or null).
         world: Name of the world context.
@@ -311,7 +311,7 @@ class Watch(Following[Change]):
     def _goes_on(self, shard: str, slot: Slot, epoch: int) -> bool:
         """Whether a restarted shard goes on counting the versions of a slot."""
         if slot.aspect not in self._client.aspect_entries():
-            # It came into use after the shard was greeted, and nobody has registered it here.
+            # Another program registered it after this client had greeted the shard.
             self._client.call_once([(shard, self._client.core.hello(shard))])
         entry = self._client.aspect_entries().get(slot.aspect)
         kept = entry is not None and entry.durability != Durability.VOLATILE.value

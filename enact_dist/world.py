@@ -48,7 +48,7 @@ class WorldContext(Context):
         Args:
             entity: The entity; it exists from here on.
             aspect: The aspect.
-            datum: The initial value; arrays are copied, as nobody can take them away in Python.
+            datum: The initial value; arrays are copied, since the caller keeps references to them.
 
         Returns:
             Whether this call set it; False leaves the datum that was there.  One that was deleted,
@@ -134,7 +134,7 @@ class WorldContext(Context):
             LockHeldError: This thread holds a lock.
             ForgottenError: A past one has left its retention.
             TypeError: An argument is of another type.
-            MisuseError: An aspect is named that nobody has registered.
+            MisuseError: No program has registered one of the named aspects.
             UnknownWorldError: The cell has one of them no more.
             DatumTypeError: An aspect is registered with another type.
             ShardUnreachableError: A shard does not answer.
@@ -244,7 +244,7 @@ class WorldContext(Context):
     def at(
         self, when: When | None = None, /, *, stamp_ns: int | None = None, nearest: bool = False
     ) -> PastContext:
-        """Return this world context as it was, read-only; asks nobody yet.
+        """Return a read-only handle of this world context as it was; contacts no shard yet.
 
         Args:
             when: As of this moment: the `Position` of a commit (this one included), an aware
@@ -302,7 +302,7 @@ class WorldContext(Context):
     def forked_from(self) -> tuple[str, int] | None:
         """Of which context it is a fork and as of which stamp (ns since 1970); None if of none.
 
-        As this connection has last learned of the cell's contexts; asks nobody.
+        Answers from what this connection last learned; contacts no shard.
         """
         entry = self.session.client.worlds().get(self.name)
         return (entry.source, entry.at_ns) if entry is not None and entry.source else None

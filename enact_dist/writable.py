@@ -27,8 +27,8 @@ T = TypeVar("T")
 class WritableEach(EachData[T], MutableMapping[Entity, T]):
     """The data of a `WriteEach` by entity; assigning one publishes it when the block ends.
 
-    Assigning to an entity that did not exist creates it: the pattern is locked, so nobody else
-    could have.
+    Assigning to an entity that did not exist creates it: the pattern is locked, so no other
+    process can have created it.
     """
 
     def __init__(self, lock: Lock, readings: Readings, request: LockRequest[T]) -> None:

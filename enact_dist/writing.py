@@ -1,9 +1,9 @@
 """What a lock writes: data on their way into their shards' memory, until the lock ends.
 
 Large data are written there at once (see `link.payload_client`), small ones, and those of shards
-that share no memory with this process, travel with the commit.  `blank` hands out memory to be
-filled in place; once the block ends nobody can change it any more, not by a view that he has kept
-or by `setflags` either: large memory is cut off (see `Draft.close`), small is copied.
+that share no memory with this process, travel with the commit.  `blank` returns memory to
+fill in place.  Once the block ends, the program cannot change it any more, not even through a view
+that it kept or by `setflags`: large memory is detached (see `Draft.close`), small memory is copied.
 """
 
 from __future__ import annotations
@@ -160,7 +160,7 @@ class Writing:
 
         Raises:
             DatumTypeError: What was asked is not of the type, or has no array.
-            MisuseError: It is more than one lock may write, or there is one that stands.
+            MisuseError: The size exceeds what one lock may write, or this slot has a blank already.
             NoRoomError: The shard's cap is reached.
         """
         held = self._by_slot.get(slot)
@@ -222,7 +222,7 @@ class Writing:
                 self._drop(old.draft)
 
     def fix(self) -> None:
-        """Let nobody change any of it: it is about to be committed."""
+        """Make all of it read-only: it is about to be committed."""
         for slot, written in self._by_slot.items():
             for array in written.arrays:
                 array.flags.writeable = False
@@ -254,7 +254,9 @@ def _plain(encoded: Encoded) -> memoryview:
 
     from enact_dist.wire.limits import ALIGNMENT
 
-    raw = np.zeros(encoded.size + ALIGNMENT, np.uint8)  # what nobody fills is published, too
+    raw = np.zeros(
+        encoded.size + ALIGNMENT, np.uint8
+    )  # zeros: parts left unfilled are published, too
     start = -raw.ctypes.data % ALIGNMENT
     return memoryview(raw.data)[start : start + encoded.size]
 

@@ -111,7 +111,7 @@ def test_knock_tells_why_nobody_answers():
     assert doctor.knock(f"tcp/127.0.0.1:{port}")[0] == f"nothing listens at port {port}"
     assert (
         doctor.knock("tcp/no-such-host.invalid:7447")[0]
-        == "nobody knows the host no-such-host.invalid"
+        == "the host name no-such-host.invalid is unknown"
     )
 
 

@@ -241,7 +241,7 @@ def test_end_of_a_child_is_noticed_though_its_output_cannot_be_read(monkeypatch)
     ended = run_in_time(Supervisor([task("one", "actor", "")], story), story.stop)
 
     assert ended == 0
-    assert "one: its output is not read any more: [Errno 24] too many open files" in story.lines
+    assert "one: cannot read its output any more: [Errno 24] too many open files" in story.lines
 
 
 def run_in_time(supervisor, stop):
