@@ -27,23 +27,31 @@ REPLAYED = ("hull", "prediction", "track", "joints")
 """What the planner of a fork reads; all else is as it was when the fork was made."""
 
 
-def images_of(tree: CauseTree) -> list[CauseTree]:
-    """Return the masks in a tree of causes, by camera."""
-    masks = [cause for cause in tree.walk() if str(cause.aspect) == words.SILHOUETTE.name]
+def masks_of(tree: CauseTree) -> list[CauseTree]:
+    """Return the masks of the hull in a tree of causes of a speed, by camera."""
+    hulls = [cause for cause in tree.children if str(cause.aspect) == words.HULL.name]
+    masks = [
+        cause
+        for hull in hulls
+        for cause in hull.children
+        if str(cause.aspect) == words.SILHOUETTE.name
+    ]
     return sorted(masks, key=lambda cause: str(cause.entity))
 
 
 def show_lineage(tree: CauseTree, console: Console) -> None:
-    """Print where the first stop came from, down to the masks of one stamp.
+    """Print where the first stop came from: its hull, the masks of one stamp, their images.
 
     Args:
         tree: The causes of the speed that stopped the robot.
         console: Where progress and table are printed.
     """
     command = f"enact why online {words.ROBOT}/{words.SPEED}@{tree.version} --depth {DEPTH}"
-    console.print(f"\nwhy the robot stopped: {command}", style="bold")
-    print_tree(drawn(tree))
-    console.print(f"{len(images_of(tree))} masks; kept under the label first-stop")
+    console.print(f"\nwhy the robot stopped: {command}; of it the hull", style="bold")
+    for cause in tree.children:
+        if str(cause.aspect) == words.HULL.name:
+            print_tree(drawn(cause))
+    console.print(f"{len(masks_of(tree))} masks; kept under the label first-stop")
 
 
 def show_past(cell: Cell, notes: Notes, console: Console) -> None:
@@ -111,7 +119,7 @@ def show_what_if(
             f"{summary.versions} versions of {WHAT_IF_S:g} s replayed: {len(there)} paths in the"
             f" fork, {len(here)} online; online never saw them"
         )
-        differ = [str(row.difference) for row in diff.rows]
+        differ = [str(row.difference or row.kind.value) for row in diff.rows]
         console.print("online against the fork: " + ("; ".join(differ) or "no difference"))
         return {"paths_fork": len(there), "paths_online": len(here), "differences": differ}
     except EnactError as error:

@@ -9,7 +9,11 @@ import numpy as np
 
 from actors.geometry.kinematics import capsules_at, end_velocities, tool_poses
 from actors.geometry.picture import png_bytes
+from actors.geometry.refinement import Refinement
 from actors.geometry.separation import Separation
+from actors.geometry.visibility import camera_table
+from actors.geometry.visual_hull import VisualHull
+from actors.geometry.voxels import VoxelBlocks
 from actors.workcell import plots
 from actors.workcell import vocabulary as words
 from actors.workcell.evaluation import along
@@ -82,13 +86,26 @@ def _moment(
             grid, boxes, arm, hull, shown, _properties(trace, stamp_ns, second)
         ),
     }
-    raw = _datum(trace, words.WORKSPACE.name, words.RAW_HULL, stamp_ns)
-    voxels = raw if raw is not None else hull.voxels
-    found["figure3_bottom.png"] = hull_figure(grid, boxes, arm, (voxels, hull), before)
     masks = _masks(trace, stamp_ns)
     if masks:
+        raw = _unrefined(trace, masks, arm)
+        found["figure3_bottom.png"] = hull_figure(grid, boxes, arm, (raw, hull), before)
         found["figure3_top.png"] = masks_figure(masks, _masks(trace, stamp_ns - PERIOD_NS))
     return found
+
+
+def _unrefined(trace: Trace, masks: dict[str, words.Silhouette], arm: F64) -> npt.NDArray[np.int16]:
+    """Return the voxels (n, 3) of a set before the refinement, carved once more."""
+    grid = trace.newest(words.WORKSPACE.name, words.GRID)
+    boxes = [trace.newest(name, words.BOXES) for name in trace.entities(words.BOXES)]
+    names = trace.entities(words.CALIBRATION)
+    calibrations = [trace.newest(name, words.CALIBRATION) for name in names]
+    blocks = VoxelBlocks(grid.origin_m, grid.voxel_m, grid.shape)
+    tables = [camera_table(blocks, calibration, boxes) for calibration in calibrations]
+    refinement = Refinement(VisualHull(blocks, tables), calibrations, boxes)
+    seen = [masks[name] if name in masks and not masks[name].stand_in else None for name in names]
+    found = refinement.step([one.packed if one else None for one in seen], arm, math.inf)
+    return blocks.indices(found.raw)
 
 
 def _properties(trace: Trace, stamp_ns: int, second: float) -> list[str]:
@@ -154,7 +171,7 @@ def _timeline(trace: Trace, truth: Truth) -> Picture:
         kept for kept in trace.of(words.ROBOT.name, words.SPEED) if truth.covers(kept.stamp_ns)
     ]
     seen_s = np.array([truth.at_s(kept.stamp_ns) for kept in speeds])
-    top = max(1.0, 1.2 * float(fast.max(initial=0.5)))
+    top = math.ceil(12.0 * float(fast.max(initial=0.5))) / 10.0
     return plots.timeline(
         [
             (
