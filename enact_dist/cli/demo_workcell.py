@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
+import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from enact_dist.cli.verbs import add_verb, seconds
+from enact_dist.cli.verbs import add_verb, seconds, whole
 from enact_dist.errors import ConfigError
 
 if TYPE_CHECKING:
-    import argparse
-
     from enact_dist.cli.verbs import Verb
 
 _EXTRA: Final = ("cv2", "scipy", "numba", "mujoco", "ompl", "ruckig")
@@ -27,7 +26,8 @@ def add_to(verbs: argparse._SubParsersAction[Verb]) -> None:
         run=run_workcell,
         example="enact demo workcell\n"
         "enact demo workcell --scenario S3 --seconds 30 --seed 2 --out workcell\n"
-        "enact demo workcell --live --json",
+        "enact demo workcell --live --json\n"
+        "enact demo workcell --cameras pictures --out hull",
     )
     demo.add_argument("--scenario", metavar="S", help="visit (the default) or S1 to S12")
     demo.add_argument("--seed", type=int, metavar="N", help="of ways, speeds and noise")
@@ -45,6 +45,22 @@ def add_to(verbs: argparse._SubParsersAction[Verb]) -> None:
     demo.add_argument(
         "--keep-running", action="store_true", help="leave the cell up afterwards, until Ctrl-C"
     )
+    real = demo.add_argument_group("real pictures of calibrated cameras instead of the simulation")
+    real.add_argument("--cameras", type=Path, metavar="FOLDER", help="pictures or masks")
+    real.add_argument("--grid", type=whole, metavar="N", help="voxels along the longest edge")
+    real.add_argument("--unit", metavar="U", help="of a calibration that does not say its own: m")
+    real.add_argument("--frame", metavar="NAME", help="which moment (default: the first)")
+    real.add_argument("--key", type=colour, metavar="R,G,B", help="colour of the backdrop")
+    real.add_argument("--distortion", choices=("pixel",), help="k1, k2, k3 act on radii in pixels")
+
+
+def colour(text: str) -> tuple[int, int, int]:
+    """Read a colour; an `argparse` type."""
+    parts = text.split(",")
+    if len(parts) != 3 or not all(part.isdecimal() and int(part) < 256 for part in parts):
+        raise argparse.ArgumentTypeError(f"{text!r} is no colour such as 0,160,60")
+    red, green, blue = map(int, parts)
+    return red, green, blue
 
 
 def run_workcell(arguments: argparse.Namespace) -> int:
@@ -61,10 +77,13 @@ def run_workcell(arguments: argparse.Namespace) -> int:
 
 
 def _run(arguments: argparse.Namespace) -> int:
+    out: Path = arguments.out or Path("workcell_out")
+    _refuse_mixture(arguments)
+    if arguments.cameras:
+        return _run_folder(arguments, out)
     from actors.workcell.demo import record_views, run_demo
     from actors.workcell.demo_options import Options
 
-    out: Path = arguments.out or Path("workcell_out")
     given: dict[str, Any] = {
         name: getattr(arguments, name, None)
         for name in _CHOICES
@@ -87,3 +106,30 @@ def _run(arguments: argparse.Namespace) -> int:
         return record_views(options, arguments.record, arguments.renderer)
     out.mkdir(parents=True, exist_ok=True)
     return run_demo(options)
+
+
+def _run_folder(arguments: argparse.Namespace, out: Path) -> int:
+    from actors.workcell.folders import FolderOptions, run_folder
+
+    given: dict[str, Any] = {
+        name: getattr(arguments, name)
+        for name in ("grid", "unit", "frame", "key")
+        if getattr(arguments, name) is not None
+    }
+    options = FolderOptions(
+        **given, pixel_distortion=arguments.distortion == "pixel", quiet=arguments.json
+    )
+    return run_folder(arguments.cameras, out, options)
+
+
+def _refuse_mixture(arguments: argparse.Namespace) -> None:
+    simulated = ("scenario", "seed", "seconds", "voxel_m", "live", "play", "record", "embedded")
+    real = ("grid", "unit", "frame", "key", "distortion")
+    for names, fits, where in (
+        (simulated, not arguments.cameras, "the simulated cell, not to --cameras"),
+        (real, bool(arguments.cameras), "--cameras FOLDER"),
+    ):
+        found = [name for name in names if getattr(arguments, name) not in {None, False}]
+        if found and not fits:
+            option = found[0].replace("_", "-")
+            raise ConfigError(f"--{option} belongs to {where}; leave out one of both")

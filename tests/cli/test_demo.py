@@ -53,6 +53,8 @@ def test_missing_extra_is_named_with_its_command(enact, monkeypatch):
     [
         (("--scenario", "S13"), "no scenario 'S13'; there are visit, S1,"),
         (("--scenario", "S8", "--embedded"), "--embedded has one"),
+        (("--cameras", "d", "--live"), "--live belongs to the simulated cell"),
+        (("--grid", "64"), "--grid belongs to --cameras FOLDER"),
     ],
 )
 def test_options_of_the_workcell_that_do_not_fit_are_refused(enact, words, reason, tmp_path):

@@ -1,0 +1,149 @@
+"""Claims about the demonstration around the cell: its configuration, its recording, its faults."""
+
+import dataclasses
+import json
+import tomllib
+
+import numpy as np
+import pytest
+
+pytest.importorskip("cv2", exc_type=ImportError)
+pytest.importorskip("mcap", exc_type=ImportError)
+
+from actors.workcell import demo_conduct
+from actors.workcell import vocabulary as words
+from actors.workcell.demo import run_quietly
+from actors.workcell.demo_cell import TEMPLATE, configured
+from actors.workcell.demo_conduct import recording
+from actors.workcell.demo_options import Options
+from actors.workcell.demo_report import markdown_of, report_of, value_text
+from actors.workcell.scenarios import Fault, scenario_of
+from actors.workcell.setup import Setup, grid_of
+from actors.workcell.trace import trace_of
+from enact_dist import Lock, Write, local, testing
+from enact_dist.errors import ConfigError
+
+
+def test_shipped_cell_fits_together():
+    """No two actors write one slot, every trigger is written, every option can be read."""
+    from enact_dist.actor_check import check_cell
+    from enact_dist.config import load_config
+
+    assert [f.text for f in check_cell(load_config(TEMPLATE)) if f.level == "error"] == []
+
+
+def test_cell_of_a_run_differs_only_in_what_a_run_chooses(tmp_path):
+    """Scenario, seed, length, grid and source are the run's; all else is the shipped cell."""
+    shipped = tomllib.loads(TEMPLATE.read_text())
+    options = Options(tmp_path, scenario="S3", seed=5, seconds=9.0, source="live", voxel_m=0.05)
+
+    run = configured(TEMPLATE.read_text(), options)
+
+    assert run["actors"]["setup"].pop("args") == {
+        "scenario": "S3",
+        "seed": 5,
+        "seconds": 9.0,
+        "voxel_m": 0.05,
+    }
+    shipped["actors"]["setup"].pop("args", None)
+    for number in range(words.CAMERA_COUNT):
+        assert run["actors"][f"camera-{number}"].pop("args")["source"] == "live"
+        shipped["actors"][f"camera-{number}"].pop("args")
+    assert run == shipped
+
+
+def test_decisions_are_made_without_the_truth():
+    """Only what simulates a camera or a body names the context of the truth."""
+    tables = tomllib.loads(TEMPLATE.read_text())["actors"]
+    naming = {name for name, table in tables.items() if "truth" in table["worlds"]}
+    simulators = {name for name, table in tables.items() if ".simulation." in table["class"]}
+    assert naming == simulators | {"setup"}
+
+
+def test_faults_name_processes_of_the_cell():
+    """What a scenario kills is an actor or a shard of the shipped cell."""
+    config = tomllib.loads(TEMPLATE.read_text())
+    for name in ("S7", "S8"):
+        for fault in scenario_of(name, 1).faults:
+            assert fault.target in {*config["actors"], *config["shards"]}
+
+
+def test_set_up_writes_what_is_known_and_lets_nothing_play():
+    """Eight calibrations, boxes, grid, arm, task; the scenario has not begun."""
+    with testing.worlds("online", "truth") as cell:
+        testing.run_once(Setup("S2", 3, 12.0), cell)
+        online, truth = cell.world("online"), cell.world("truth")
+        assert len(online.survey(words.CAMERAS, ("calibration",))) == words.CAMERA_COUNT
+        assert online.history(words.WORKSPACE, words.EMPTY) == ()
+        playing = truth.history(words.SCENARIO, words.PLAYING)[0].datum()
+        assert (playing.scenario, playing.seed, playing.seconds) == ("S2", 3, 12.0)
+        assert playing.start_ns > 1 << 61
+
+
+def test_a_grid_holds_whole_blocks():
+    """Each side is a multiple of four voxels and covers the volume."""
+    grid = grid_of(0.03)
+    assert all(size % 4 == 0 for size in grid.shape)
+    assert (np.array(grid.shape) * 0.03 >= [4.0, 4.0, 2.2]).all()
+    with pytest.raises(ValueError, match="longer than 0"):
+        grid_of(0.0)
+
+
+def test_a_recording_gives_back_what_was_committed(tmp_path):
+    """Data, stamps and order; what is null is left out."""
+    with local(worlds=["online", "truth"]) as cell:
+        speed = Write(cell.world("online"), words.ROBOT, words.SPEED)
+        with recording(cell, tmp_path / "run.mcap"):
+            for number in range(3):
+                with Lock(speed) as lock:
+                    datum = words.Speed(number / 2.0, 1.0, 2.0, "test", 250.0, number, number)
+                    lock.put(speed, datum, stamp_ns=1000 + number)
+
+    kept = trace_of(tmp_path / "run.mcap").of(words.ROBOT.name, words.SPEED)
+
+    assert [one.datum.scale for one in kept] == [0.0, 0.5, 1.0]
+    assert [one.stamp_ns for one in kept] == [1000, 1001, 1002]
+    assert [one.committed_ns for one in kept] == sorted(one.committed_ns for one in kept)
+
+
+def test_faults_do_not_go_with_one_process(tmp_path):
+    """A scenario that kills processes needs them."""
+    with pytest.raises(ConfigError, match="--embedded has one"):
+        Options(tmp_path, scenario="S7", embedded=True)
+
+
+def test_report_names_what_was_missed():
+    """Infinities are no JSON; a table for a document has a column per run."""
+    scores = {"robot_p99_ms": 120.0, "violations": 0.0, "distance_max_m": float("inf")}
+    report = report_of(scores, {"seed": 1}, {"holds": True})
+    assert json.loads(json.dumps(report))["missed"] == ["robot_p99_ms", "distance_max_m"]
+    assert report["scores"]["distance_max_m"] is None
+    assert "| ≤ 100 | 120 | 120 |" in markdown_of([scores, scores], ["one", "two"])
+    assert value_text("lost_share", 0.0001) == "0.0100%"
+
+
+@pytest.mark.slow
+def test_the_robot_rests_while_its_reconstruction_is_dead_and_goes_on(tmp_path, monkeypatch):
+    """Real processes: no moment is too fast, commands stop with the hulls, and come back."""
+    killed_s = 4.0
+
+    def with_fault(name, seed, seconds):
+        return dataclasses.replace(
+            scenario_of(name, seed, seconds),
+            faults=(Fault(killed_s, "kill", "reconstruction"),),
+        )
+
+    monkeypatch.setattr(demo_conduct, "scenario_of", with_fault)
+    options = Options(tmp_path, scenario="S2", seconds=16.0, source="live", voxel_m=0.05)
+
+    outcome = run_quietly(options)
+
+    assert outcome.scores["violations"] == 0.0
+    assert outcome.scores["moments"] > 100
+    trace = trace_of(tmp_path / "run.mcap")
+    start_ns = trace.newest(words.SCENARIO.name, words.PLAYING, "truth").start_ns
+    seconds = [(kept.stamp_ns - start_ns) / 1e9 for kept in trace.of(words.ROBOT.name, words.SPEED)]
+    assert max(np.diff(seconds)) > 0.5  # nobody commands while it is away
+    assert max(seconds) > killed_s + 0.5  # and somebody does again
+    for name in ("report.json", "timeline.png", "plan.png", "figure3_top.png", "figure1.png"):
+        assert (tmp_path / name).stat().st_size > 1000
