@@ -159,7 +159,7 @@ def refined_poses(
                 sources.append(world[number][agree])
                 targets.append(world[other][index[agree]])
                 target_normals.append(turned[other][index[agree]])
-            if sources:
+            if any(map(len, sources)):
                 drift = refined[number] @ inverse(np.asarray(poses[number]))
                 step = _step(
                     np.concatenate(sources),
