@@ -6,8 +6,10 @@ rule  in counts    what                                               why it los
 R0    static       voxels within known obstacles go                   nobody is inside of those
 R1    robot        voxels that touch the robot at the exposure go     it is at rest before anybody
                                                                       comes that near
-R2    small        a component with less than 0.5 l of visible        smaller than a hand
-                   volume that the robot does not explain goes
+R2    small        a component with less than 0.5 l of visible        smaller than a hand; of a
+                   volume that the robot does not explain goes, and   body at least one voxel has
+                   so does one of less than 5 l that has no voxel     its centre in all silhouettes
+                   with its centre in all silhouettes
 R3    explained    a voxel within 10 cm of the robot goes if each     a hidden part of a body would
                    camera that sees it sees it on the robot           have to fit into that shell,
                                                                       which is thinner than the
@@ -57,8 +59,12 @@ SHELL_M: Final = 0.10
 """R3: how far from the robot a voxel may be explained by it."""
 EXPLAINED_GROWN_M: Final = 0.06
 """R3: by how much the robot's outlines are grown; its shadows and blurred edges."""
+LOOKED_M: Final = 0.5
+"""R2: what the robot explains within this distance makes no component visible."""
 VISIBLE_M3_MIN: Final = 0.0005
 """R2: half a litre."""
+RIM_M3_MAX: Final = 0.005
+"""R2: a component with no voxel in the tight set is a rim of something; up to so much goes."""
 SPEED_MAX_M_S: Final = 3.0
 """R4: faster than anybody in a workcell."""
 GAP_MAX_S: Final = 1.0
@@ -67,7 +73,7 @@ SAYS_MIN: Final = 5
 """R5: so many cameras must have a say for one to be outvoted."""
 BLIND_SHARE: Final = 0.15
 """R5: a camera that alone denies more than this share of what the others leave is half blind."""
-NEIGHBOURS_MIN: Final = 13
+NEIGHBOURS_MIN: Final = 14
 """A voxel of the tight set has at least so many of its 26 neighbours in it."""
 
 
@@ -95,6 +101,23 @@ class Refined:
     def nearest(self) -> int:
         """Index of the voxel that is nearest to the robot; -1 if nothing is occupied."""
         return int(self.clearance_m.argmin()) if len(self.rows) else -1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Beside:
+    """Voxels that are not the robot: clearance in metres, and whether its outline explains them."""
+
+    rows: Rows
+    clearance_m: npt.NDArray[np.float32]
+    explained: Flags
+
+    def with_more(self, other: _Beside) -> _Beside:
+        """Return these voxels and others behind them."""
+        return _Beside(
+            np.concatenate([self.rows, other.rows]),
+            np.concatenate([self.clearance_m, other.clearance_m]),
+            np.concatenate([self.explained, other.explained]),
+        )
 
 
 class Refinement:
@@ -145,19 +168,15 @@ class Refinement:
         reachable = self._reachable(elapsed_s)
         kept = rows if reachable is None else rows[reachable.ravel()[rows >> 6]]
         counts["unreachable"] = len(rows) - len(kept)
-        forgiven = self._forgiven(kept)
+        counts["robot"] = counts["explained"] = 0
+        outline = self._explaining(robot)
+        away = self._beside_robot(kept, robot, outline, counts)
+        forgiven = self._forgiven(away.rows, len(kept))
         counts["forgiven"] = len(forgiven)
-        rows = np.concatenate([kept, forgiven])
-        seen = self._says[rows] > 0
-        near_m, explained = self._of_robot(rows, seen, robot, counts)
-        away = ~((near_m <= self._grid.half_diagonal_m + ROBOT_MARGIN_M) | explained)
-        if robot is None:
-            away[:] = True
-        tight = np.zeros(len(rows), bool)
-        tight[: len(kept)] = self._hull.tight(kept) & seen[: len(kept)]
-        rows, near_m, tight = rows[away], near_m[away], tight[away]
-        clearance = near_m - np.float32(self._grid.half_diagonal_m)
-        return self._components(rows, clearance, tight, counts, raw)
+        more = self._beside_robot(forgiven, robot, outline, counts)
+        tight = np.zeros(len(away.rows) + len(more.rows), bool)
+        tight[: len(away.rows)] = self._hull.tight(away.rows) & (self._says[away.rows] > 0)
+        return self._components(away.with_more(more), tight, counts, raw)
 
     def _with_robot(
         self, silhouettes: Sequence[Bits | None], robot: Numbers | None
@@ -207,11 +226,15 @@ class Refinement:
         result[:, :reach] = result[:, -reach:] = True
         return result
 
-    def _forgiven(self, kept: Rows) -> Rows:
+    def _forgiven(self, left: Rows, common: int) -> Rows:
         """Return the voxels where something was, and that only one camera says to be free (R5).
 
         They count if they lie between what all cameras leave, so that a limb does not fall apart,
         or if the camera contradicts the others in so many voxels that it must be half blind.
+
+        Args:
+            left: What all cameras leave, and is not the robot.
+            common: How many voxels all cameras leave.
         """
         if self._before is None or not self._before.any():
             return np.empty(0, np.int64)
@@ -220,43 +243,50 @@ class Refinement:
         outvoted = (self._says[rows] >= SAYS_MIN) & ~self._static[rows]
         rows, camera = rows[outvoted], camera[outvoted]
         alone = np.bincount(camera, minlength=len(self._sizes))
-        blind = alone > BLIND_SHARE * max(len(kept), 1)
-        left = np.zeros(self._grid.block_shape, bool)
-        left.ravel()[kept >> 6] = True
-        between = ~grown(~grown(left, 1), 1)
+        blind = alone > BLIND_SHARE * max(common, 1)
+        blocks_left = np.zeros(self._grid.block_shape, bool)
+        blocks_left.ravel()[left >> 6] = True
+        between = ~grown(~grown(blocks_left, 1), 1)
         return np.asarray(rows[between.ravel()[rows >> 6] | blind[camera]])
 
-    def _of_robot(
-        self, rows: Rows, seen: Flags, robot: Numbers | None, counts: dict[str, int]
-    ) -> tuple[npt.NDArray[np.float32], Flags]:
-        """Return distances to the robot (centres, metres), and what it explains (R1, R3)."""
-        counts["robot"] = counts["explained"] = 0
-        explained = np.zeros(len(rows), bool)
-        if robot is None:
-            return np.zeros(len(rows), np.float32), explained
-        near_m = distance_to_points(robot, self._grid.centres(rows))
-        touches = near_m <= self._grid.half_diagonal_m + ROBOT_MARGIN_M
-        counts["robot"] = int(touches.sum())
-        candidates = np.flatnonzero((near_m < SHELL_M) & ~touches & seen)
-        if len(candidates):
-            larger = np.array(robot, np.float64)
-            larger[:, 6] += EXPLAINED_GROWN_M
-            masks = self._drawn(larger)
-            explained[candidates] = self._hull.on_masks(rows[candidates], masks)
-            counts["explained"] = int(explained.sum())
-        return near_m, explained
+    def _explaining(self, robot: Numbers | None) -> list[npt.NDArray[np.uint8]]:
+        """Return where cameras may see the robot, its shadows and blurred edges."""
+        if robot is None or not len(robot):
+            return []
+        larger = np.array(robot, np.float64)
+        larger[:, 6] += EXPLAINED_GROWN_M
+        return self._drawn(larger)
 
-    def _components(
+    def _beside_robot(
         self,
         rows: Rows,
-        clearance: npt.NDArray[np.float32],
-        tight: Flags,
+        robot: Numbers | None,
+        outline: list[npt.NDArray[np.uint8]],
         counts: dict[str, int],
-        raw: Rows,
+    ) -> _Beside:
+        """Return what of voxels is neither robot (R1) nor in the shell that it explains (R3)."""
+        half_m = np.float32(self._grid.half_diagonal_m)
+        explained = np.zeros(len(rows), bool)
+        if robot is None:
+            return _Beside(rows, np.zeros(len(rows), np.float32) - half_m, explained)
+        near_m = distance_to_points(robot, self._grid.centres(rows))
+        touches = near_m <= half_m + ROBOT_MARGIN_M
+        candidates = np.flatnonzero((near_m < LOOKED_M) & ~touches & (self._says[rows] > 0))
+        if len(candidates) and outline:
+            explained[candidates] = self._hull.on_masks(rows[candidates], outline)
+        gone = explained & (near_m < SHELL_M)
+        counts["robot"] += int(touches.sum())
+        counts["explained"] += int(gone.sum())
+        stays = ~(touches | gone)
+        return _Beside(rows[stays], near_m[stays] - half_m, explained[stays])
+
+    def _components(
+        self, beside: _Beside, tight: Flags, counts: dict[str, int], raw: Rows
     ) -> Refined:
         """Join blocks to components, drop the small ones (R2) and what is unseen and untouched."""
         from scipy import ndimage
 
+        rows, clearance = beside.rows, beside.clearance_m
         shape = self._grid.block_shape
         voxel_m3 = self._grid.voxel_m**3
         visible = self._says[rows] > 0
@@ -270,8 +300,10 @@ class Refinement:
         occupied.ravel()[rows[stays] >> 6] = True
         labels, found = ndimage.label(occupied, np.ones((3, 3, 3)))
         label = np.where(stays, labels.ravel()[rows >> 6], 0)
-        volume = np.bincount(label[visible], minlength=found + 1) * voxel_m3
-        good = volume >= VISIBLE_M3_MIN
+        counted = visible & ~beside.explained
+        volume = np.bincount(label[counted], minlength=found + 1) * voxel_m3
+        solid = np.bincount(label[tight], minlength=found + 1) > 0
+        good = (volume >= VISIBLE_M3_MIN) & (solid | (volume >= RIM_M3_MAX))
         good[label[held]] = True
         good[0] = False
         order = np.argsort(np.where(good, -volume, np.inf), kind="stable")
