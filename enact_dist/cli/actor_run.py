@@ -154,13 +154,13 @@ def _run_group(arguments: argparse.Namespace, process: ActorProcess) -> int:
     first: dict[str, _Made | Exception] = {}
     for actor in process.actors:  # in this thread, where a signal ends an import at once
         try:
-            first[actor.name] = _made(arguments, actor.name)
+            first[actor.name] = _made(arguments, actor.name, begun=True)
         except Exception as error:  # noqa: BLE001 - told where that actor begins; others run
             first[actor.name] = error
 
     def live(name: str, life: Life) -> int:
         try:
-            made = first.pop(name, None) or _made(arguments, name)
+            made = first.pop(name, None) or _made(arguments, name, begun=True)
             if isinstance(made, Exception):
                 raise made
             return _lived(arguments, made, life, formatter)
@@ -347,8 +347,14 @@ def _entry(config: CellConfig, name: str) -> ActorConfig:
     )
 
 
-def _made(arguments: argparse.Namespace, target: str) -> _Made:
+def _made(arguments: argparse.Namespace, target: str, *, begun: bool = False) -> _Made:
     """Make an actor that the command names.
+
+    Args:
+        arguments: Those of the command.
+        target: The actor.
+        begun: Whether the process has begun with all variables already; what an actor's module
+            makes of one when it is loaded is its own business.
 
     Raises:
         ConfigError: There is none, or it cannot be made.
@@ -369,7 +375,7 @@ def _made(arguments: argparse.Namespace, target: str) -> _Made:
         entry = _entry(config, target)
         if options:
             raise ConfigError(f"the options of {entry.name} stand in {config.path}; leave --option")
-        if threading.current_thread() is threading.main_thread():
+        if not begun:
             _begin_with(entry.env)
         actor = configured_actor(entry)
         name = entry.name

@@ -166,6 +166,23 @@ def test_process_whose_actors_are_done_ends(rig, spawn, until):
         assert f"actor {name} is done; it is not started again" in rest
 
 
+@pytest.mark.slow
+def test_module_that_sets_a_variable_does_not_make_the_process_begin_for_ever(rig, spawn, until):
+    """As OpenCV sets LD_LIBRARY_PATH when it is loaded, which another actor's `env` gives, too."""
+    source = rig.with_name("rig.py")
+    setting = "with open('begins', 'a') as file:\n    print(file=file)\n"
+    setting += "if len(open('begins').readlines()) > 3:\n    os._exit(9)\n"
+    source.write_text(f"{MODULE}\n{setting}os.environ['GAIN'] += '/own'\n", encoding="utf-8")
+    with rig.open("a") as file:
+        for name in ("first", "second"):
+            file.write(f'\n[actors.{name}]\nclass = "rig:Once"\nprocess = "once"\n')
+            file.write(f'entity = "once/{name}"\nenv = {{ GAIN = "2" }}\n')
+
+    once = spawn("actor", "run", "--process", "once", "--cell", rig, "--timeout", "1")
+
+    until(once, "actor first failed")  # it finds no shard
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
