@@ -14,7 +14,7 @@ from enact_dist.cell import Cell
 from enact_dist.core.client import Client
 from enact_dist.core.messages import PlacementMap, ShardEntry, Welcome
 from enact_dist.errors import ConfigError, LinkError, MisuseError
-from enact_dist.link.endpoints import split_endpoint
+from enact_dist.link.endpoints import PROTOCOLS, split_endpoint
 from enact_dist.terms import checked_name
 from enact_dist.wire.limits import NAME_CHARACTERS_MAX
 from enact_dist.wire.texts import is_safe, shown
@@ -163,7 +163,7 @@ def _is_endpoint(target: str | Path) -> bool:
     if isinstance(target, Path):
         return False
     protocol, host, port = split_endpoint(target)
-    if "/" not in target or protocol not in _PROTOCOLS:
+    if "/" not in target or protocol not in PROTOCOLS:
         return False
     if protocol == "unixsock-stream":
         return True
@@ -182,9 +182,6 @@ def _refuse_no_file(target: str | Path) -> None:
 
 
 _ENDPOINT: Final = "an endpoint looks like 'tcp/host:7447'"
-
-
-_PROTOCOLS: Final = frozenset(("tcp", "udp", "tls", "quic", "ws", "unixsock-stream"))
 
 
 def _checked_actor(actor: str) -> str:

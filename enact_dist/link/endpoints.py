@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Final
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+PROTOCOLS: Final = frozenset(("tcp", "udp", "tls", "quic", "ws", "unixsock-stream"))
+"""How the names of places begin."""
 LISTENS_S: Final = 0.3
 """How long a place may take to say that somebody listens."""
 LOOK_UP_S: Final = 1.0

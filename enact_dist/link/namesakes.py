@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.messages import ListPlaces, Ping, Places, Pong
 from enact_dist.core.records import Served
-from enact_dist.link.endpoints import somebody_listens
+from enact_dist.errors import ConfigError
+from enact_dist.link.endpoints import PROTOCOLS, somebody_listens, split_endpoint
 from enact_dist.link.zenoh_config import to_reach
 from enact_dist.link.zenoh_discovery import FoundShard, ask_shards
 
@@ -54,6 +55,8 @@ def serving(
 ) -> tuple[Serving, ...]:
     """Ask place by place who serves a shard there; return each daemon once.
 
+    A place that cannot be one, whoever has named it, is passed over: the others are asked.
+
     Args:
         cell: Name of the cell.
         shard: Name of the shard.
@@ -61,15 +64,18 @@ def serving(
         timeout_s: How long each may take to answer.
 
     Raises:
-        ConfigError: An endpoint cannot be read.
         ProtocolError: An answer cannot be read.
     """
     found: dict[int, Serving] = {}
     wanted = FoundShard(cell, shard)
     for endpoint in dict.fromkeys(map(to_reach, endpoints)):
-        if not somebody_listens(endpoint):
+        if split_endpoint(endpoint)[0] not in PROTOCOLS or not somebody_listens(endpoint):
             continue
-        answer = ask_shards([endpoint], [wanted], Ping(), timeout_s=timeout_s).get(wanted)
+        try:
+            answer = ask_shards([endpoint], [wanted], Ping(), timeout_s=timeout_s).get(wanted)
+        except ConfigError as error:
+            _log.warning("shard %s is said to be where nobody can be: %s", shard, error)
+            continue
         if isinstance(answer, Pong):
             one = Serving(endpoint, answer.start, answer.epoch, answer.uptime_ns / 1e9)
             found.setdefault(answer.start, one)
@@ -104,11 +110,12 @@ def moved_places(
 
     One that has a place in common is the same shard with another address beside.
     """
-    return {
-        shard: list(dict.fromkeys((*known[shard], *places)))
-        for shard, places in told
-        if known.get(shard) and places and not set(known[shard]) & set(places)
-    }
+    moved: dict[str, dict[str, None]] = {}
+    for shard, places in told:
+        if known.get(shard) and places and not set(known[shard]) & set(places):
+            those = moved.setdefault(shard, dict.fromkeys(known[shard]))
+            those.update(dict.fromkeys(places))
+    return {shard: list(places) for shard, places in moved.items()}
 
 
 def two_daemons(cell: str, shard: str, found: Sequence[Serving]) -> str:
@@ -123,7 +130,8 @@ def two_daemons(cell: str, shard: str, found: Sequence[Serving]) -> str:
 class Comparing:
     """Asks which daemons serve a shard, for a shard that runs: on a thread of its own, in turn.
 
-    A shard that several daemons serve is asked about again until one of them is gone.
+    A shard that several daemons serve is asked about again until one of them is gone, and from time
+    to time after that: one that was stopped, slow or cut off comes back without a word.
 
     Args:
         cell: Name of the cell.
@@ -134,11 +142,14 @@ class Comparing:
     """How long each place may take to answer."""
     AGAIN_S: Final = 5.0
     """After so long a shard that several daemons serve is asked about again."""
+    LATER_S: Final = 30.0
+    """And so long after that, once only one of them answers."""
 
     def __init__(self, cell: str, tell: Callable[[Served], None]) -> None:
         self._cell, self._tell = cell, tell
         self._asked: dict[str, Compare] = {}
         self._doubled: dict[str, Compare] = {}
+        self._were_doubled: dict[str, Compare] = {}
         self._wake = threading.Condition(threading.Lock())
         self._thread: threading.Thread | None = None
         self._closed = False
@@ -171,6 +182,8 @@ class Comparing:
                 self._doubled.pop(compare.shard, None)
                 if len(found) > 1:
                     self._doubled[compare.shard] = compare
+                if compare.shard in self._were_doubled or len(found) > 1:
+                    self._were_doubled[compare.shard] = compare
                 if self._closed:
                     return
             starts = tuple(sorted(one.start for one in found))
@@ -181,8 +194,9 @@ class Comparing:
         """Wait for a question; return None at the end."""
         with self._wake:
             while not self._asked and not self._closed:
-                if not self._wake.wait(self.AGAIN_S if self._doubled else None):
-                    self._asked = self._doubled | self._asked
+                again_s = self.AGAIN_S if self._doubled else self.LATER_S
+                if not self._wake.wait(again_s if self._were_doubled else None):
+                    self._asked = self._were_doubled | self._asked
             return None if self._closed else self._asked.pop(next(iter(self._asked)))
 
     def close(self, join_s: float = 0.5) -> None:

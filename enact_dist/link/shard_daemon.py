@@ -16,6 +16,7 @@ import sys
 import threading
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.messages import ListLocks, Locks
@@ -282,10 +283,8 @@ def refuse_second_daemon(settings: DaemonSettings, *, probe_s: float = PROBE_S) 
             " must not serve one shard: stop the other, or give this one another name"
         )
     others = [entry for entry in shards if entry.name != name]
-    moved: dict[str, list[str]] = {}
-    for told in told_places(cell, others, timeout_s=probe_s) if others else ():
-        moved |= moved_places(expected, told)
-    for shard, places in moved.items():
+    told = told_places(cell, others, timeout_s=probe_s) if others else ()
+    for shard, places in moved_places(expected, chain.from_iterable(told)).items():
         daemons = serving(cell, shard, places, timeout_s=probe_s)
         if shard == name and daemons:
             raise LinkError(

@@ -1,6 +1,7 @@
 """Two daemons under one shard's name: the later one, clients and the doctor see it."""
 
 import logging
+import queue
 from types import SimpleNamespace
 
 import pytest
@@ -15,10 +16,11 @@ from enact_dist.core.messages import (
     Sessions,
     ShardEntry,
 )
+from enact_dist.core.records import Compare
 from enact_dist.core.shard_state import ShardSettings
 from enact_dist.doctor_cell import namesakes
 from enact_dist.errors import LinkError
-from enact_dist.link.namesakes import Comparing, Doubts, moved_places, serving
+from enact_dist.link.namesakes import Comparing, Doubts, Serving, moved_places, serving
 from enact_dist.link.shard_daemon import DaemonSettings, start_shard
 
 COUNT = Aspect("count", int)
@@ -168,6 +170,42 @@ def test_only_places_that_share_nothing_are_looked_into():
     known = {"a": ["x"], "b": ["x", "y"], "c": ["x"], "d": [], "e": ["x"]}
     told = {"a": ["z"], "b": ["y", "z"], "c": [], "d": ["x"], "f": ["x"]}
     assert moved_places(known, told.items()) == {"a": ["x", "z"]}
+
+
+def test_all_places_that_others_name_are_looked_into():
+    """One shard expects it elsewhere and has heard of a third place; another knows a fourth."""
+    told = (("a", ["y"]), ("a", ["z"]), ("a", ["y", "w"]))
+    assert moved_places({"a": ["x"]}, told) == {"a": ["x", "y", "z", "w"]}
+
+
+def test_places_that_cannot_be_do_not_keep_the_others_from_being_asked(begin, free):
+    """Somebody has named them; who serves at the others is known all the same."""
+    first, second = free(), free()
+    begin("left", first, left=first)
+    begin("left", second, left=second)
+    nowhere = ("garbage", "", "foo/127.0.0.1:5", "tcp/127.0.0.1:99999", "tcp/127.0.0.1:1#a=b;c")
+
+    found = serving("cell", "left", (*nowhere, first, second), timeout_s=ASK_S)
+
+    assert len(found) == 2
+
+
+def test_shard_that_ran_twice_is_asked_about_after_one_of_them_was_silent(monkeypatch):
+    """One that was stopped or slow is back without a word of it; the alarm is back with it."""
+    both = tuple(Serving(place, start, 1, 1.0) for start, place in enumerate(("x", "y")))
+    answers = iter((both, both[:1], both[:1], both))
+    monkeypatch.setattr(Comparing, "AGAIN_S", 0.01)
+    monkeypatch.setattr(Comparing, "LATER_S", 0.01)
+    monkeypatch.setattr("enact_dist.link.namesakes.serving", lambda *_, **__: next(answers, both))
+    told = queue.SimpleQueue()
+    comparing = Comparing("cell", told.put)
+    try:
+        comparing.submit(Compare("left", ("x", "y")))
+        starts = [told.get(timeout=30.0).starts for _ in range(4)]
+    finally:
+        comparing.close()
+
+    assert starts == [(0, 1), (0,), (0,), (0, 1)]
 
 
 def places(shard):
