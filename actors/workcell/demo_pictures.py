@@ -45,9 +45,15 @@ def pictures_of(trace: Trace, notes: Notes) -> dict[str, bytes]:
     truth = truth_of(trace)
     hulls = {kept.stamp_ns: kept.datum for kept in trace.of(words.WORKSPACE.name, words.HULL)}
     found = {"timeline.png": _timeline(trace, truth)}
-    during = [stamp for stamp in hulls if truth.covers(stamp)]
+    seen = [
+        {kept.stamp_ns for kept in trace.of(camera, words.SILHOUETTE)}
+        for camera in trace.entities(words.SILHOUETTE)
+    ]
+    whole = set.intersection(*seen) if seen else set()
+    during = sorted(stamp for stamp in hulls if truth.covers(stamp) and stamp in whole)
     if during:
-        stamp_ns = notes.nearest_ns if notes.nearest_ns in hulls else max(during)
+        nearest = min(during, key=lambda stamp: hulls[stamp].nearest_m)
+        stamp_ns = notes.nearest_ns if notes.nearest_ns in during else nearest
         found |= _moment(trace, truth, hulls, stamp_ns)
     return {name: png_bytes(picture) for name, picture in found.items()}
 

@@ -125,7 +125,7 @@ def test_report_names_what_was_missed():
 @pytest.mark.slow
 def test_the_robot_rests_while_its_reconstruction_is_dead_and_goes_on(tmp_path, monkeypatch):
     """Real processes: no moment is too fast, commands stop with the hulls, and come back."""
-    killed_s = 4.0
+    killed_s = 3.0
 
     def with_fault(name, seed, seconds):
         return dataclasses.replace(
@@ -134,7 +134,7 @@ def test_the_robot_rests_while_its_reconstruction_is_dead_and_goes_on(tmp_path, 
         )
 
     monkeypatch.setattr(demo_conduct, "scenario_of", with_fault)
-    options = Options(tmp_path, scenario="S2", seconds=16.0, source="live", voxel_m=0.05)
+    options = Options(tmp_path, scenario="S2", seconds=13.0, source="live", voxel_m=0.05)
 
     outcome = run_quietly(options)
 
@@ -145,5 +145,5 @@ def test_the_robot_rests_while_its_reconstruction_is_dead_and_goes_on(tmp_path, 
     seconds = [(kept.stamp_ns - start_ns) / 1e9 for kept in trace.of(words.ROBOT.name, words.SPEED)]
     assert max(np.diff(seconds)) > 0.5  # nobody commands while it is away
     assert max(seconds) > killed_s + 0.5  # and somebody does again
-    for name in ("report.json", "timeline.png", "plan.png", "figure3_top.png", "figure1.png"):
+    for name in ("report.json", "timeline.png", "cell.toml", "run.mcap"):
         assert (tmp_path / name).stat().st_size > 1000
