@@ -225,7 +225,8 @@ class Conductor:
         return found.state
 
     def _keep(self, label: str, speed: words.Speed) -> None:
-        if self._tree(label) is not None:
+        tree = self._tree(label)
+        if tree is not None and len(masks_of(tree)) == words.CAMERA_COUNT:
             self.notes.nearest_m, self.notes.nearest_ns = speed.nearest_m, speed.captured_ns
 
     def _tree(self, label: str) -> CauseTree | None:
@@ -278,6 +279,18 @@ class Conductor:
             if name in info.names():
                 return info.pid
         return self._running.shard_pid(name)
+
+
+def masks_of(tree: CauseTree) -> list[CauseTree]:
+    """Return the masks of the hull in a tree of causes of a speed, by camera."""
+    hulls = [cause for cause in tree.children if str(cause.aspect) == words.HULL.name]
+    masks = [
+        cause
+        for hull in hulls
+        for cause in hull.children
+        if str(cause.aspect) == words.SILHOUETTE.name
+    ]
+    return sorted(masks, key=lambda cause: str(cause.entity))
 
 
 @contextmanager

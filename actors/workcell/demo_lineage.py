@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from actors.workcell import vocabulary as words
-from actors.workcell.demo_conduct import DEPTH, WHAT_IF, WHAT_IF_S
+from actors.workcell.demo_conduct import DEPTH, WHAT_IF, WHAT_IF_S, masks_of
 from actors.workcell.trace import ONLINE
 from enact_dist import Aspect, View, ViewEach
 from enact_dist.actor_process import ActorThread
@@ -25,18 +25,6 @@ if TYPE_CHECKING:
 
 REPLAYED = ("hull", "prediction", "track", "joints")
 """What the planner of a fork reads; all else is as it was when the fork was made."""
-
-
-def masks_of(tree: CauseTree) -> list[CauseTree]:
-    """Return the masks of the hull in a tree of causes of a speed, by camera."""
-    hulls = [cause for cause in tree.children if str(cause.aspect) == words.HULL.name]
-    masks = [
-        cause
-        for hull in hulls
-        for cause in hull.children
-        if str(cause.aspect) == words.SILHOUETTE.name
-    ]
-    return sorted(masks, key=lambda cause: str(cause.entity))
 
 
 def show_lineage(tree: CauseTree, console: Console) -> None:
