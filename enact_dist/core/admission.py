@@ -1,8 +1,8 @@
-"""What is refused although the wire can carry it: requests that no honest client or shard makes.
+"""Checks that refuse valid messages which no honest client or shard sends.
 
-The wire checks types and lengths, the fence checks who holds what.  What is left would break the
-shard itself (an access that does not exist), everybody else (a name that nobody can read) or keep
-a lock for ever (a primary that nobody can ask).  Each function returns why, or None.
+The wire format checks types and lengths, the fence checks who holds what.  The checks here protect
+the shard itself (an access that does not exist), its clients (an unreadable name) and locks that
+would never end (a primary that cannot be asked).  Each function returns the refusal, or None.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def unknown_world(name: str, worlds: Iterable[str]) -> Refused:
 
 
 def wrong_aspect(entry: AspectEntry) -> Refused | None:
-    """Refuse an aspect whose name, durability or retention nobody could use."""
+    """Refuse an aspect with an unusable name, durability or retention."""
     if entry.durability not in _DURABILITIES:
         return _refused(
             f"durability {entry.durability!r} of aspect {entry.name!r} was asked; there are"
@@ -87,7 +87,7 @@ def wrong_aspect(entry: AspectEntry) -> Refused | None:
 
 
 def wrong_label(label: str) -> Refused | None:
-    """Refuse a label that nobody could name again."""
+    """Refuse a label with an unusable name."""
     return wrong_name("label", label, slashes=True)
 
 

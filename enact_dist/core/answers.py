@@ -150,7 +150,7 @@ class Staged:
     """So much of a payload has come in slices, from its begin on, without a hole.
 
     `shared` says that it is a file in the shard's folder, to be filled there, too.  Until its
-    commit it is called `draft` there ("": `file`), which nobody else is told.
+    commit it is called `draft` there ("": `file`), a name that only this client learns.
     """
 
     file: str
@@ -254,8 +254,8 @@ class Reached:
 class Pong:
     """This shard is there: since when, and whether it grants locks (`state` as in `core.epochs`).
 
-    It stays this small whatever the shard holds.  Every start of a daemon has another `start`, by
-    which two daemons under one name are told apart.
+    It stays this small whatever the shard holds.  Every start of a daemon has another `start`,
+    which tells two daemons with the same name apart.
     """
 
     shard: str
@@ -321,7 +321,7 @@ class Broken:
 
 @dataclass(frozen=True, slots=True)
 class Audited:
-    """The newest acts of operators, oldest first, and how many alarms nobody has seen to."""
+    """The newest acts of operators, oldest first, and the number of unacknowledged alarms."""
 
     alarms: int
     entries: tuple[AuditEntry, ...]

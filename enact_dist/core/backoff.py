@@ -98,7 +98,7 @@ class SignsOfLife:
     def pause_ns(
         self, shards: Iterable[str], away: Callable[[str], bool], ttl_ns: int, now_ns: int
     ) -> int:
-        """Return how long nobody is due: a part of the TTL while a shard is in reach."""
+        """Return the time to the next keep-alive: a part of the TTL while a shard is in reach."""
         usual_ns = ttl_ns // (USED_PARTS if self.is_used(now_ns) else IDLE_PARTS)
         in_reach = any(shard not in self.gone or not away(shard) for shard in shards)
         return usual_ns if in_reach else max(usual_ns, self._at_ns - now_ns)

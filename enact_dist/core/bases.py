@@ -43,7 +43,7 @@ class Bases:
 
 
 class AspectBases(Bases):
-    """The same of aspects, and up to which stamps nobody knows what their slots were."""
+    """The same of aspects, and up to which stamps the contents of their slots are unknown."""
 
     __slots__ = ("_at_ns", "_at_ns_by_entity")
 

@@ -168,9 +168,9 @@ class Catalogue:
         )
 
     def shown(self) -> Shown:
-        """Return what a `Welcome` has room for: all, where nobody has registered too much before.
+        """Return what a `Welcome` has room for: normally the whole catalogue.
 
-        Else the smallest entries: what fills a catalogue is large, or without end.
+        If it is too large, the smallest entries: a few large entries fill it, or very many.
         """
         if self._shown is None:
             self._shown = self._now_shown()

@@ -13,13 +13,13 @@ sends after it lost its lock is refused, so the safety of data depends on no clo
        └─ else committing ── Persist ── Persisted ──> applied, released, answered
                                                       └─ participants told (see `decisions`)
 
-Expected views are compared in the step that commits, prepares or validates, and nobody else may
+Expected views are compared in the step that commits, prepares or validates, and no other lock may
 hold the slot for writing then, unless that lock lies on this shard alone.  So all that a lock has
 read and expected was current together at the moment in which its client began to finish it (or,
-for a lock on one shard alone, at its commit), and these moments are a serial order: whoever
-overwrites something later got its own lock later.
+for a lock on one shard alone, at its commit), and these moments are a serial order: a lock
+that overwrites something later was granted later.
 
-Between `Persist` and `Persisted` the tenure cannot end (I17) and nobody sees its writes.  Writes
+Between `Persist` and `Persisted` the tenure cannot end (I17) and no reader sees its writes.  Writes
 and outcome are one record of the store, so an outcome is known exactly when the writes stand (I5).
 """
 
@@ -228,7 +228,7 @@ class Commits:
     def changed(
         self, tenure: Tenure, moved: SlotVersion, *, reply_to: int, now_ns: int
     ) -> Iterator[Effect]:
-        """End a lock whose expectation does not stand; whoever asks again is told so again."""
+        """End a lock whose expectation does not hold; a repeated request gets the same answer."""
         answer = Changed(tenure.lock, *moved)
         session = self._sessions.known(tenure.lock.session)
         if session is not None:
@@ -265,7 +265,7 @@ class Commits:
         commit.tenure.committing = True
         self._in_flight[ticket] = commit
         if durability is Durability.VOLATILE:
-            # Once per slot: whoever finds it null after a restart is told that it was lost.
+            # Once per slot: a reader that finds it null after a restart learns that it was lost.
             durability = Durability.OS
         else:
             kept = (*kept, commit.outcome)

@@ -4,16 +4,16 @@ Each shard says from when to when (on the clock of commit stamps) its data were 
 intervals have a stamp T in common, the answers are of one cut.  If not, T is the largest lower
 end, and the shards whose interval ended before it are asked again as of T.  That settles it unless
 a shard does not remember so far back, or an undecided commit stays in its way; then T moves on,
-`ROUNDS_MAX` times at most.  Whoever gets no cut takes read locks instead.
+`ROUNDS_MAX` times at most.  A client that gets no cut takes read locks instead.
 
-Who asks about the past names T himself: every shard is asked as of T from the first round on, and
-T never moves.  What a shard has forgotten it says, and what is undecided up to T is waited for.
+A request about the past names T: the client asks every shard as of T from the first round on, and T
+never moves.  A shard reports what it has forgotten, and waits for commits up to T to be decided.
 
 Rule a change must keep: a shard that restarts may give stamps below those that it has answered
-with (its clock is not on its disk), so an answer counts only while nobody can have been granted a
-lock in a later epoch.  For a session that locks this is so until it has acknowledged that epoch
-or a TTL has passed: the shard's grace waits for it.  An observer is not waited for; it asks all
-shards a second time, and the first answers count if nobody has restarted until then.
+with (its clock is not on its disk), so an answer counts only while no lock can have been granted in
+a later epoch.  For a session that locks this holds until it has acknowledged that epoch or a TTL
+has passed: the grace waits for it.  The grace does not wait for an observer, which asks all shards
+a second time; the first answers count if no shard has restarted until then.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The primary's half of a commit over shards: its one record decides, and everybody is told.
+"""The primary's half of a commit over shards: its one record decides for all participants.
 
 ::
 
@@ -6,8 +6,8 @@
                                       └── Finish to each participant, again until Finished
                                                        └── all: DecisionDone (lazily)
 
-There is no record of an abort: a token that is not live can never become live again, so whoever
-asks about a lock that is neither decided nor held is told *aborted* (presumed abort).
+There is no record of an abort: a token that is not live can never become live again, so the
+answer about a lock that is neither decided nor held is *aborted* (presumed abort).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 AGAIN_NS_MIN: Final = 200_000_000
 AGAIN_NS_MAX: Final = 2_000_000_000
-"""Pause before a participant is told again; doubles up to the second figure."""
+"""Pause before `Finish` is sent again; doubles up to the second figure."""
 
 
 @dataclass(slots=True)

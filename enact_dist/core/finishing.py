@@ -112,7 +112,7 @@ class Finishing:
 
         Returns:
             Whether the refused message had named bytes that are here.  Its refusal may come late,
-            when a copy with the bytes is on its way or was applied, and then says nothing.
+            when a copy with the bytes is on its way or was applied, and then does not count.
         """
         self.writes = {
             shard: tuple(

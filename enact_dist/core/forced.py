@@ -52,7 +52,7 @@ BROKEN, FORCED, CONFIRMED, ALARM, SETTLED = "broken", "forced", "confirmed", "al
 
 
 class Audit:
-    """What operators did here, newest last, and how many alarms nobody has settled.
+    """The acts of operators here, newest last, and the number of unacknowledged alarms.
 
     Attributes:
         alarms: How many alarms came after the last time that somebody settled them.

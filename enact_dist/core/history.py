@@ -51,7 +51,7 @@ class Policy(NamedTuple):
 
 
 UNKNOWN: Final = Policy(DEFAULT, stored=False)
-"""What holds for an aspect that nobody has registered."""
+"""The policy of an aspect that is not registered."""
 
 
 class History:
@@ -128,7 +128,7 @@ class History:
         policy = self._policies.get(slot.aspect, UNKNOWN)
         found = self._by_slot.get(slot) or self._opened(slot, stored=policy.stored)
         if policy.limits.versions <= 1 and found.held:
-            self._release_all(found)  # where nobody had said what is retained, more was
+            self._release_all(found)  # an earlier, larger retention may have kept versions
         found.until_ns = until_ns
         found.young += 1
         self._recent.append((until_ns, found))

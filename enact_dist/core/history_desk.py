@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from enact_dist.core.slots import Content
 
 KEPT_MAX: Final = 10_000
-"""Most versions that labels keep at one shard: nothing else lets go of them."""
+"""Most versions that labels pin at one shard: only removing a label releases them."""
 KEPT_BYTES_MAX: Final = 256 << 20
 """Bytes of kept data at most, payloads left out, which have a cap of their own."""
 
@@ -79,7 +79,7 @@ class HistoryDesk:
     # ---------------------------------------------------------------- labels
 
     def on_keep_versions(self, message: KeepVersions, reply_to: int) -> Iterator[Effect]:
-        """Keep versions under a label, or let go of all that it keeps."""
+        """Pin versions under a label, or unpin all that it pins."""
         if message.after != START:
             yield Reply(reply_to, self._page(message.label, (), message.after))
             return

@@ -139,7 +139,7 @@ class LockDesk:
     def refused(
         self, session: Session | None, map_version: int, items: tuple[Item, ...]
     ) -> Answer | None:
-        """Return why nobody can be given these items here, None if that may be."""
+        """Return why this shard cannot grant these items, None if it can."""
         if session is None:
             return EpochChanged(self._state.epoch)
         if map_version != self._state.settings.placement.version:
@@ -160,7 +160,7 @@ class LockDesk:
             if item.context not in worlds:
                 return unknown_world(item.context, worlds)
             if item.aspect not in aspects and ACCESSES[item.access].writes:
-                # Of what nobody has registered there is only null to be read, which is no fault.
+                # Reading an unregistered aspect is no fault: its slots are null.
                 return Refused("unknown_aspect", f"aspect {item.aspect!r} is not registered here")
         return None
 

@@ -3,8 +3,8 @@
 Laws
   1. A claim names all its resources at once and is granted at once or not at all.
   2. A claim is granted when, at each of its resources, its mode agrees with every mode held there
-     and with every mode that an *earlier* claim still waits for.  Nobody overtakes a conflicting
-     earlier claim, so wide claims and writers do not starve; adjacent readers go together.
+     and with every mode that an *earlier* claim still waits for.  No claim overtakes a conflicting
+     earlier one, so wide claims and writers do not starve; adjacent readers go together.
   3. Waits-for edges lead only to holders and earlier claims, so there is no cycle: no deadlock.
 
 Resources are slots (a reader takes S, a writer X) and columns, the set of all slots of an aspect
@@ -97,7 +97,7 @@ class _Queue:
     """Holders and waiters of one resource.
 
     Invariants: `held_modes[m]` counts `held` values; `pending[m]` is the not yet eligible part of
-    `waiting[m]`; all dicts are in ticket order.  A mode that nobody has waited in yet has
+    `waiting[m]`; all dicts are in ticket order.  A mode without any waiter so far has
     `_NOBODY` in both, which stays empty.
     """
 
@@ -118,7 +118,7 @@ class _Queue:
             self.pending[mode][claim.lock] = claim
 
     def admits(self, mode: Mode) -> bool:
-        """Whether a newcomer of `mode` would conflict with nobody here."""
+        """Whether a newcomer of `mode` would conflict with no claim here."""
         held_modes, waiting = self.held_modes, self.waiting
         for other in CONFLICTS[mode]:  # noqa: SIM110 - a generator takes twice as long
             if held_modes[other] or waiting[other]:
@@ -213,7 +213,7 @@ class LockTable:
         return ready
 
     def remove(self, lock: LockId) -> Claim | None:
-        """Forget a claim, granted or waiting, and make eligible whoever it kept out."""
+        """Forget a claim, granted or waiting, and make the claims eligible that it kept out."""
         claim = self.claims.pop(lock, None)
         if claim is None:
             return None
@@ -309,4 +309,4 @@ class LockTable:
 
 
 PLACE_MAX: Final = 1000
-"""Places beyond this are told as this one: a number for people, not worth a longer count."""
+"""Places beyond this are reported as this one: people need no longer count."""

@@ -183,16 +183,16 @@ class GrantLeft(NamedTuple):
 
 
 class AspectEntry(NamedTuple):
-    """An aspect of the catalogue: its type's fingerprint and its durability ("" = unsaid).
+    """An aspect of the catalogue: its type's fingerprint and its durability ("" = not stated).
 
     `older` are the fingerprints of the types that this one has succeeded, the oldest first
-    (`core.datum_types`).  `reads` says in a registration that its client only reads: no type comes
-    to hold by it where there is one.
+    (`core.datum_types`).  `reads` says in a registration that its client only reads: it does not
+    change the type of a known aspect.
 
     The rest says how much of each slot's history stays: `retention` versions, the newest one
-    included, replaced at most `age_ns` ago, of `size` bytes of replaced data.  0 is unsaid: where
-    nothing is said of all three, `terms.Retention()` holds, else what is unsaid has no limit.  Of
-    several that ask, the largest counts.
+    included, replaced at most `age_ns` ago, of `size` bytes of replaced data.  0 means not
+    stated: if all three are 0, `terms.Retention()` holds, else a figure of 0 means no limit.  Of
+    several requests, the largest counts.
     """
 
     name: str
@@ -230,7 +230,7 @@ class PlacementMap(NamedTuple):
 class SessionInfo(NamedTuple):
     """One session at a shard, for `enact actor ls` and `enact shard ls`.
 
-    `lease_left_ns` below 0 says how long its lease has been over: so long nobody has heard of it.
+    `lease_left_ns` below 0 is the time since its lease ended.
     """
 
     session: str

@@ -179,7 +179,7 @@ class MultiLock:
         )
 
     def take_farewells(self) -> list[tuple[str, Request]]:
-        """Return releases to send once, whose answers say nothing: what gets lost is repaired."""
+        """Return releases to send once; their answers do not matter, and lost ones are repaired."""
         farewells, self.farewells = self.farewells, []
         return farewells
 
@@ -376,7 +376,7 @@ class MultiLock:
         """Rest in `phase`; whatever may still be held or awaited is given back."""
         self.phase = phase
         if self._finishing is not None:
-            self._finishing.writes = {}  # they may be large, and whoever has the lock may keep it
+            self._finishing.writes = {}  # they may be large, and the program may keep the lock
         if phase not in (Phase.COMMITTED, Phase.UNKNOWN):
             touched = [part.shard for part in self.parts]
             touched += [shard for shard, _ in self.plan.views if shard not in touched]

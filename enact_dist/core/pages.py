@@ -1,14 +1,14 @@
-"""Listings in pages: no answer outgrows a frame, and none keeps the shard from the others for long.
+"""Listings in pages: every answer fits a frame, and none occupies the shard for long.
 
 ::
 
     ListLocks()               ─> Locks(…, more=Cursor(epoch, …))
     ListLocks(after=that)     ─> Locks(…, more=START)              the end
 
-A page ends at `PAGE_BYTES_MAX`, or after as much looking as `WORK_MAX`, so it may be empty though
-the listing goes on.  The shard keeps nothing between two pages: a cursor says all, and whoever
-stops asking costs nothing.  What stays from one page to the next comes exactly once; what is added
-or goes meanwhile may come or not.
+A page ends at `PAGE_BYTES_MAX`, or after `WORK_MAX` units of work, so it may be empty although
+the listing goes on.  The shard keeps nothing between two pages: the cursor holds all, so a client
+that stops asking costs nothing.  An entry that exists all the time comes exactly once; one that is
+added or removed meanwhile may come or not.
 
 Slots go column by column, by name, and within a column as they came: no slot leaves a column but
 with all of its context, so a place in it names the same slot for a whole epoch.

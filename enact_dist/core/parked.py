@@ -1,7 +1,7 @@
-"""Questions that wait at a shard for something to be decided, or for the end of their wait.
+"""Requests that wait at a shard for a decision, or for the end of their wait.
 
-What a message costs does not grow with what is parked: whoever waits longest is found at once, and
-so is whoever waits for the smallest stamp.
+The cost of a message does not grow with the number of parked requests: the one that waits longest
+is found at once, and so is the one with the smallest stamp.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ Rules a change must keep
     miss a late prepare.
   * `Finished` is said only when the end of the prepared state survives: after that the primary
     may forget, and would answer *aborted*.
-  * Nobody sees the writes before their record is durable (a restart must not take them back).
+  * No reader sees the writes before their record is durable (a restart must not take them back).
   * Promise and end are forced to the disk whatever the class of the data: a power cut that took
     the promise would tear the commit and free reads that the decision relies on; one that took the
     end would let this shard ask a primary that has forgotten.
@@ -350,7 +350,7 @@ class PrepareDesk:
     # ---------------------------------------------------------------- people
 
     def on_force_abort(self, message: ForceAbort, reply_to: int) -> Iterator[Effect]:
-        """Give up a prepared lock by hand; audited, and durable before it is told."""
+        """Abort a prepared lock for an operator; audited, and durable before the answer."""
         state = self._state
         tenure = state.numbered(message.number, message.epoch)
         record = tenure.prepared if tenure is not None else None

@@ -282,7 +282,7 @@ class Persist:
 
 @dataclass(frozen=True, slots=True)
 class Publish:
-    """Publish a notice to whoever watches."""
+    """Publish a notice to the watchers."""
 
     notice: object
 
@@ -364,9 +364,9 @@ class SessionSeen:
 
 @dataclass(frozen=True, slots=True)
 class SessionDied:
-    """The kernel has said that a session's process has ended, which no message can say.
+    """The kernel has reported that a session's process has ended; no message can do that.
 
-    Whoever reports it has to know: a lost connection alone proves nothing.
+    The reporter must be sure: a lost connection alone proves nothing.
     """
 
     session: str
@@ -384,7 +384,7 @@ class Drain:
 
 @dataclass(frozen=True, slots=True)
 class MakeRoom:
-    """The cap of shared memory is reached: let go of so many bytes of history, the oldest first."""
+    """The cap of shared memory is reached: release so many bytes of history, oldest first."""
 
     bytes: int
 

@@ -130,7 +130,7 @@ class KeepAlive:
 class Commit:
     """Publish all writes of a lock and release it.  Answer: `Committed`, `Fenced` or `Changed`.
 
-    Every slot of `expects` must still be at that version, and in nobody's way (see `Commits`).
+    Every slot of `expects` must still be at that version, without a writer (see `Commits`).
     Where other shards have prepared writes, they are the `participants`, and the record of this
     commit decides for them too; it is then forced to the disk, whatever its own data survive.
     `reads` and `reads_left_out` are the lineage of the writes (see `Cause`).
@@ -298,8 +298,8 @@ class ListSessions:
 class Break:
     """Take a lock away by its grant number, by hand.  Answer: `Broken`.
 
-    A restarted shard gives its numbers anew: `epoch` says in which one it was read (0: unsaid), so
-    that a late copy breaks nobody else's lock.
+    A restarted shard starts its numbers again: `epoch` is the one in which the number was read (0:
+    not stated), so a late copy breaks no other lock.
     """
 
     number: int
@@ -407,10 +407,10 @@ class DropWorld:
 
 @dataclass(frozen=True, slots=True)
 class KeepVersions:
-    """Keep versions from being forgotten under a label; no versions: let go of the label's.
+    """Pin versions under a label; without versions: unpin those of the label.
 
     Answer: `Kept`.  Asked again with the same label, versions are added.  `epoch` and `count` are
-    those of `Fork`: a late copy keeps nothing that was let go of since.  With `after` it changes
+    those of `Fork`: a late copy pins nothing that was unpinned since.  With `after` it changes
     nothing and asks for the next page of what the label keeps.
     """
 

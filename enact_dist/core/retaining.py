@@ -1,8 +1,8 @@
-"""The retention that an aspect's catalogue entry bears: what it says, and what several say.
+"""The retention in the catalogue entry of an aspect, and how several entries combine.
 
-In an entry 0 stands for what is unsaid.  Where nothing is said of all three figures, the default
-holds; else what is unsaid has no limit.  Of several entries that say something, the largest figure
-counts, and *no limit* is larger than any.
+In an entry 0 means not stated.  If all three figures are 0, the default holds; otherwise a figure
+of 0 means no limit.  Of several entries that state a retention, the largest figure counts, and *no
+limit* is larger than any.
 """
 
 from __future__ import annotations

@@ -209,7 +209,7 @@ class SessionDesk:
             if tenure.lock.seq < lowest.get(tenure.lock.lane, 0) and not tenure.bound:
                 self._state.count("orphans_freed")
                 told = self._state.tenures.told(tenure, self._state.now_ns)
-                yield Story("lock.orphan", f"{told}, is not wanted any more")
+                yield Story("lock.orphan", f"{told}, freed: its client no longer wants it")
                 yield from self._state.tenures.remove(tenure, now_ns=self._state.now_ns)
         self._state.pins.drop_older(message.session, lowest)
         grants = tuple(
@@ -238,7 +238,7 @@ class SessionDesk:
         yield Reply(reply_to, Released())
 
     def on_session_died(self, message: SessionDied, _: int) -> Iterator[Effect]:
-        """End a session whose process is proven to be gone: nobody believes in its locks."""
+        """End a session whose process is proven to be gone, so no client believes in its locks."""
         found = self._state.sessions.by_id.get(message.session)
         if found is not None:
             self._state.count("sessions_died")

@@ -175,7 +175,7 @@ class SessionTable:
         return now_ns < self.grace_end_ns
 
     def end_grace_if_all_acknowledged(self, now_ns: int) -> None:
-        """End the grace early: nobody can still believe in an older grant."""
+        """End the grace early once no client can still believe in an older grant."""
         if now_ns < self.grace_end_ns and all(
             session.acknowledged for session in self if session.durable
         ):
@@ -253,7 +253,7 @@ class SessionTable:
     def token_seen(self, session: str, present: bool, *, identity: str, now_ns: int) -> bool:
         """Note that a liveliness token appeared or vanished; whether the session is live and its.
 
-        The token of another identity than the session's stands for nothing.
+        A token of an identity other than the session's is ignored.
         """
         found = self.by_id.get(session)
         if found is None or found.identity != identity:

@@ -186,7 +186,7 @@ class Shard:
         Args:
             message: A request of a client, or an event of this host.
             reply_to: Handle under which the request's answer will be asked to be sent.
-            identity: Who asks, as the transport knows it; see `core.owners`.
+            identity: The caller, as the transport knows it; see `core.owners`.
             now_ns: This host's monotonic clock.
             wall_ns: This host's wall clock, since 1970; used for stamps only.
         """
@@ -213,7 +213,7 @@ class Shard:
         return effects
 
     def _advance(self, now_ns: int, wall_ns: int) -> None:
-        """Move the time; if this host itself stood still, nobody's lease pays for it."""
+        """Move the time; if this host itself stood still, extend all leases by that time."""
         state = self.state
         gap_ns = now_ns - state.now_ns
         if gap_ns > state.shortest_ttl_ns // 4:
@@ -243,7 +243,7 @@ class Shard:
             self.state.sessions.by_id[session].lease_end_ns(now_ns)
             for session, tenures in self.state.tenures.by_session.items()
             if session in self.state.sessions.by_id
-            # A lease cannot end what is bound: looking again and again would help nobody.
+            # A lease cannot end what is bound: looking again and again would not help.
             and not all(tenure.bound for tenure in tenures.values())
         ]
         return min(deadlines)
@@ -381,7 +381,7 @@ class Shard:
         )
         broken = Broken(True, holder)
         self.state.by_hand[Break] = message, broken
-        # It holds at once; who did it, and why, is kept before anybody is told.
+        # It holds at once; the record of who did it, and why, is kept before the answer.
         yield from tell(reply_to, broken, (kept,), Durability.OS)
 
     def _on_stage(self, _: Stage, reply_to: int) -> Iterator[Effect]:

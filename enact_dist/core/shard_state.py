@@ -53,7 +53,7 @@ ANSWER_FETCHES: Final = 2
 
 @dataclass(frozen=True, slots=True)
 class ShardSettings:
-    """What a shard is told by its cell.
+    """What a shard learns from the configuration of its cell.
 
     Attributes:
         name: The shard's name.
@@ -230,10 +230,9 @@ class ShardState:
         return next(found, None)
 
     def told_by_hand(self, message: Break | ForceAbort) -> Broken:
-        """Return what is told about a lock that is not there to be ended by hand.
+        """Return the answer to an operator's request to end a lock that does not exist.
 
-        Who asks again in the same words, as a client does that a slow disk kept waiting, is told
-        what the lock was.
+        A repeated request (the client timed out on a slow disk) gets the original answer.
         """
         asked, answer = self.by_hand.get(type(message), (None, None))
         return answer if answer is not None and asked == message else Broken(False, None)

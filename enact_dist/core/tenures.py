@@ -42,13 +42,13 @@ if TYPE_CHECKING:
 WAIT_SLICE_NS_MAX: Final = 1_000_000_000
 """Longest time one request is parked; a client that still waits asks again (long poll)."""
 HOLD_NS_MAX: Final = 24 * 3600 * 1_000_000_000
-"""Nobody holds a lock longer than a day without asking for it anew."""
+"""A lock is held for a day at most; then the client must request it again."""
 HELD_TOO_LONG: Final = "held longer than its limit of"
 """So begins the cause of a lock that ends by its hold limit."""
 STALE_ENDS_MAX: Final = 1024
 """Entries of ended locks that the deadline heaps may hold before they are swept."""
 BLOCKERS_TOLD_MAX: Final = 8
-"""How many of those in the way a waiter is told about."""
+"""How many of the locks ahead of it a waiter learns of."""
 
 
 @dataclass(slots=True, eq=False)
@@ -248,7 +248,7 @@ class Tenures:
                 reply_to, tenure.parked = tenure.parked, None
                 yield Reply(reply_to, self.granted(tenure, now_ns=now_ns, stamp_ns=stamp_ns))
             elif now_ns > tenure.asked_ns:
-                # Nobody is listening right now: the client's next call fetches the grant, or its
+                # No request is parked right now: the client's next call fetches the grant, or its
                 # keep-alive gives it back.
                 self.count("grants_without_listener")
 

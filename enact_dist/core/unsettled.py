@@ -1,10 +1,10 @@
-"""What a process has committed over shards, and a participant may not show yet.
+"""Commits over several shards of this process that a participant may not show yet.
 
-The decision is told by the primary; the others apply it a moment later.  A process must see its own
-commits, so its views of such a slot are not taken from before them.
+The primary announces the decision; the other shards apply it a moment later.  A process must see
+its own commits, so its views of such a slot are never older than them.
 
-Rule a change must keep: an answer about some slots says nothing of the others.  A shard shows one
-slot as of now while a commit on another one still waits for its word.
+Rule a change must keep: an answer about some slots is no answer about the others.  A shard shows
+one slot as of now while a commit on another one still waits for its decision.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from enact_dist.core.messages import Item, SlotState
 
 SLOTS_MAX: Final = 512
-"""Slots of one shard that are told apart; of more, the newest stamp stands for all of its slots."""
+"""Slots of one shard tracked singly; beyond that, the newest stamp counts for all its slots."""
 
 
 class Unsettled:
@@ -40,7 +40,7 @@ class Unsettled:
         return len(self._all) + sum(map(len, self._slots.values()))
 
     def committed(self, shard: str, slots: Iterable[Slot], stamp_ns: int) -> None:
-        """Note a commit.  Threads are told in another order than that of their commits."""
+        """Note a commit.  Threads learn of their commits in any order."""
         known = self._slots.setdefault(shard, {})
         for slot in slots:
             known[slot] = max(known.get(slot, 0), stamp_ns)

@@ -171,7 +171,7 @@ class ViewDesk:
     def _dropped(self, message: TakeView) -> Refused | EpochChanged | None:
         """Refuse a view whose session, or one of whose contexts, ended while it waited.
 
-        What it showed would stay pinned for a session that nobody ends any more.
+        What it showed would stay pinned for a session that has ended.
         """
         if self._state.sessions.known(message.lock.session) is None:
             return EpochChanged(self._state.epoch)

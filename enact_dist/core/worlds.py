@@ -3,7 +3,7 @@
 ::
 
     Fork ──> waits for undecided commits of the source ──> its slots as of then ──┐
-    DropWorld ──> nobody has a lock in it ──> out of the catalogue ───────────────┤
+    DropWorld ──> no lock is left in it ────> out of the catalogue ───────────────┤
                        slots made or gone, watchers told, answered <── Persist ───┘
 
 Rules a change must keep
@@ -11,12 +11,12 @@ Rules a change must keep
     `same_as`, on the disk.  The work is per slot, whatever the size of the data.
   * All slots of a fork bear the stamp that it was forked as of, on every shard: so a view shows all
     of the fork or nothing of it, although each shard makes its part by itself.
-  * While the store works on it the name is nobody's: a context is used from when it survives, and
-    nothing new begins in one that is going.
-  * A dropped context never uses a version again: the null that its watchers are told of counts as
+  * While the store works on it the name is not usable: a new context is usable once it is
+    stored, and no request begins in one that is being dropped.
+  * A dropped context never uses a version again: the null that its watchers get counts as
     the last version of each slot, and later slots of that name start above all of them.
-  * Each fork or drop that a session asks for is done once.  A copy that comes late, when somebody
-    has dropped or made the context since, does nothing.
+  * Each fork or drop that a session asks for is done once.  A late copy does nothing, even if the
+    context has been dropped or made since.
 """
 
 from __future__ import annotations
@@ -326,7 +326,7 @@ class WorldDesk:
         del self._state.busy_worlds[act.message.world]
 
     def _told(self, act: _Act, answer: Answer) -> Iterator[Effect]:
-        """Answer everybody who has asked for it, and whoever asks again."""
+        """Answer all requests for it, and repeated ones."""
         for message, reply_to in act.asked:
             self._state.remember_answer(message, answer)
             yield Reply(reply_to, answer)
@@ -378,7 +378,7 @@ def _fork_of(message: Fork) -> tuple[str, str, int]:
 
 
 def _same(one: Fork | DropWorld, other: Fork | DropWorld) -> bool:
-    """Whether two requests ask for the same, whoever sends them."""
+    """Whether two requests ask for the same, from any sender."""
     if isinstance(one, Fork) and isinstance(other, Fork):
         return _fork_of(one) == _fork_of(other)
     return isinstance(one, DropWorld) and isinstance(other, DropWorld)

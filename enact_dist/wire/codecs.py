@@ -5,7 +5,7 @@ A codec turns a value into plain data (numbers, text, bytes, lists, dicts, array
     register_codec(Pose, "pose", encode=lambda pose: pose.matrix, decode=Pose.from_matrix)
 
 The name travels and is stored; the Python type may be renamed or moved without harm.
-Rule to keep: whoever reads an aspect must have registered the same name before.
+Rule to keep: a program that reads an aspect must have registered the same name before.
 """
 
 from __future__ import annotations
