@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
-from enact_dist.core.datum_types import successions, type_conflict, with_type_of
+from enact_dist.core.datum_types import type_conflict, with_type_of
 from enact_dist.core.history import Policy
 from enact_dist.core.messages import Refused
 from enact_dist.core.pages import bytes_in_frame
@@ -54,7 +54,16 @@ class Catalogue:
         successions: How often the type of some aspect has been succeeded by a newer one.
     """
 
-    __slots__ = ("_configured", "_shown", "aspects", "bytes", "policies", "successions", "worlds")
+    __slots__ = (
+        "_configured",
+        "_forks",
+        "_shown",
+        "aspects",
+        "bytes",
+        "policies",
+        "successions",
+        "worlds",
+    )
 
     def __init__(
         self,
@@ -67,6 +76,7 @@ class Catalogue:
         self.aspects: dict[str, AspectEntry] = {}
         self.policies: dict[str, Policy] = {}
         self.worlds: dict[str, WorldEntry] = {}
+        self._forks: dict[str, WorldEntry] = {}
         self.successions = 0
         self.bytes = 0
         self._shown: Shown | None = None
@@ -122,31 +132,40 @@ class Catalogue:
         """Add a world context, or say that one is a fork."""
         self.drop_world(world.name)
         self.worlds[world.name] = world
+        if world.source:
+            self._forks[world.name] = world
         self.bytes += _world_bytes(world)
 
     def drop_world(self, name: str) -> None:
         """Take away a world context, if it is there."""
         world = self.worlds.pop(name, None)
+        self._forks.pop(name, None)
         self.bytes -= _world_bytes(world) if world is not None else 0
         self._shown = None
 
-    def refusal(self, worlds: int, before: Mapping[str, AspectEntry], size: int) -> Refused | None:
+    def entries(self, names: Iterable[str]) -> dict[str, AspectEntry | None]:
+        """Return the entries of aspects as they are now, None for each that is not here."""
+        return {name: self.aspects.get(name) for name in names}
+
+    def refusal(
+        self, worlds: int, before: Mapping[str, AspectEntry | None], size: int
+    ) -> Refused | None:
         """Return why what was registered just now is too much, None where it is not.
 
         Args:
             worlds: How many world contexts are new.
-            before: The aspects as they were.
+            before: `entries` of the aspects that were registered, as they were.
             size: `bytes` as it was.
         """
         for what, count, new, most in (
             ("world contexts", len(self.worlds), worlds, WORLDS_MAX),
-            ("aspects", len(self.aspects), len(self.aspects) - len(before), ASPECTS_MAX),
+            ("aspects", len(self.aspects), list(before.values()).count(None), ASPECTS_MAX),
             ("bytes of both", self.bytes, self.bytes - size, CATALOGUE_BYTES_MAX),
         ):
             if new > 0 and count > most:
                 return _too_much(f"{new} {what} to the {count - new} that are here; at most {most}")
-        for entry in self.aspects.values() if self.aspects != before else ():
-            known = before.get(entry.name)
+        for name, known in before.items():
+            entry = self.aspects[name]
             length = len(entry.fingerprint)
             changed = known is None or known.fingerprint != entry.fingerprint
             if changed and length > FINGERPRINT_CHARACTERS_MAX:
@@ -185,14 +204,13 @@ class Catalogue:
         return (self._shown or self._now_shown()).left_out
 
     def _now_shown(self) -> Shown:
-        all_aspects, all_worlds = tuple(self.aspects.values()), tuple(self.worlds.values())
-        aspects: Iterable[AspectEntry] = all_aspects
-        worlds: Iterable[WorldEntry] = all_worlds
-        if self.bytes > CATALOGUE_BYTES_MAX:
-            half = CATALOGUE_BYTES_MAX // 2
-            aspects = _that_fit(sorted(aspects, key=bytes_in_frame), bytes_in_frame, half)
-            worlds = _that_fit(worlds, _world_bytes, half)
-        worlds, aspects = tuple(worlds), tuple(aspects)
+        all_aspects = tuple(self.aspects.values())
+        if self.bytes <= CATALOGUE_BYTES_MAX:
+            # Made anew after each registration: no step of Python for each entry.
+            return Shown(tuple(self.worlds), all_aspects, tuple(self._forks.values()), 0)
+        all_worlds, half = tuple(self.worlds.values()), CATALOGUE_BYTES_MAX // 2
+        aspects = tuple(_that_fit(sorted(all_aspects, key=bytes_in_frame), bytes_in_frame, half))
+        worlds = tuple(_that_fit(all_worlds, _world_bytes, half))
         return Shown(
             tuple(world.name for world in worlds),
             aspects,
@@ -200,14 +218,19 @@ class Catalogue:
             len(all_worlds) + len(all_aspects) - len(worlds) - len(aspects),
         )
 
-    def put_back(self, aspects: Mapping[str, AspectEntry]) -> None:
-        """Undo registrations that came to nothing."""
-        for name in [name for name in self.aspects if name not in aspects]:
-            self.bytes -= bytes_in_frame(self.aspects.pop(name))
-            del self.policies[name]
-        for entry in aspects.values():
-            self._set(entry)
-        self.successions = successions(self.aspects.values())
+    def put_back(self, before: Mapping[str, AspectEntry | None]) -> None:
+        """Undo registrations that came to nothing; `before` is `entries` of them, as they were."""
+        for name, entry in before.items():
+            known = self.aspects.get(name)
+            if known is None or known is entry:
+                continue
+            if entry is not None:
+                self._set(entry)
+                continue
+            del self.aspects[name], self.policies[name]
+            self.bytes -= bytes_in_frame(known)
+            self.successions -= len(known.older)
+            self._shown = None
 
     def newer_type(self, aspect: str, known_successions: int) -> AspectEntry | None:
         """Return the entry of an aspect that a client may know with an older type.

@@ -53,6 +53,7 @@ class SessionDesk:
         self._state = state
         self._answers_after: dict[int, list[tuple[int, Answer]]] = {}
         self._recording: dict[str, int] = {}
+        self._recorded: dict[int, str] = {}
         self._ticket = 0
 
     @property
@@ -104,6 +105,7 @@ class SessionDesk:
             record = SessionRecord(session.session, session.ttl_ns, session.identity)
             yield from self.answer_when_durable(reply_to, welcome, (record,))
             self._recording[session.session] = self._ticket
+            self._recorded[self._ticket] = session.session
         else:
             session.present = session.present or not unrecorded
             yield from self.answer_when_durable(reply_to, welcome, ())
@@ -136,12 +138,12 @@ class SessionDesk:
 
     def persisted(self, ticket: int) -> Iterator[Effect]:
         """The records of one of this desk's answers are kept: answer."""
-        for session, recording in list(self._recording.items()):
-            if recording == ticket:
-                del self._recording[session]
-                found = self._state.sessions.by_id.get(session)
-                if found is not None:
-                    found.durable = found.present = True
+        session = self._recorded.pop(ticket, "")
+        if self._recording.get(session) == ticket:
+            del self._recording[session]
+            found = self._state.sessions.by_id.get(session)
+            if found is not None:
+                found.durable = found.present = True
         for reply_to, answer in self._answers_after.pop(ticket):
             yield Reply(reply_to, answer)
 
@@ -151,7 +153,8 @@ class SessionDesk:
         if self._state.sessions.known(message.session) is None:
             yield Reply(reply_to, EpochChanged(self._state.epoch))
             return
-        before, size = dict(catalogue.aspects), catalogue.bytes
+        before = catalogue.entries(entry.name for entry in message.aspects)
+        size = catalogue.bytes
         missing = [name for name in message.worlds if name not in catalogue.worlds]
         for name in missing:
             wrong = wrong_name("world context", name, slashes=False) or self._state.busy_world(name)
@@ -184,8 +187,8 @@ class SessionDesk:
             record.entry
             for record in records
             if isinstance(record, AspectRecord)
-            and record.entry.name in before
-            and record.entry.older != before[record.entry.name].older
+            and (known := before[record.entry.name]) is not None
+            and record.entry.older != known.older
         ]
         for entry in succeeded:
             self._state.count("types_succeeded")
@@ -257,6 +260,7 @@ class SessionDesk:
                 yield from self._state.tenures.take_away(tenure, cause, now_ns=self._state.now_ns)
         self._state.pins.drop_session(session)
         self._state.sessions.forget(session)
+        self._state.tenures.session_ended(session)
         self._state.sessions.end_grace_if_all_acknowledged(self._state.now_ns)
         recording = self._recording.pop(session, None)
         if found.durable or recording is not None:

@@ -16,6 +16,8 @@ from dataclasses import dataclass, field
 from itertools import islice
 from typing import TYPE_CHECKING, Final
 
+from enact_dist.core.due_times import DueTimes
+
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator
 
@@ -100,6 +102,10 @@ class Session:
         seen_ns = now_ns if self.token_present else self.token_seen_ns
         return max(by_message, seen_ns + self.ttl_ns // 2)
 
+    def idle_ns(self, now_ns: int) -> int:
+        """Return from when on the session is forgotten if no further sign of life comes."""
+        return self.lease_end_ns(now_ns) + IDLE_TTLS * self.ttl_ns + 1
+
     def lane(self, lane: int) -> Lane:
         """Return the lane, made on first use."""
         found = self.lanes.get(lane)
@@ -116,6 +122,7 @@ class SessionTable:
     """
 
     __slots__ = (
+        "_idle",
         "_of_identity",
         "_recovered",
         "_retired",
@@ -134,6 +141,7 @@ class SessionTable:
         now_ns: int,
     ) -> None:
         self.by_id: dict[str, Session] = {}
+        self._idle = DueTimes()
         self._tokens: dict[tuple[str, str], None] = {}
         self._retired: dict[str, _Retired] = {}
         self._of_identity: dict[str, set[str]] = {}
@@ -164,6 +172,7 @@ class SessionTable:
 
     def _add(self, session: Session) -> None:
         self.by_id[session.session] = session
+        self._idle.put(session.session, session.idle_ns(session.renewed_ns))
         self._ttls[session.ttl_ns] += 1
         self.shortest_ttl_ns = min(self.shortest_ttl_ns or session.ttl_ns, session.ttl_ns)
 
@@ -281,14 +290,20 @@ class SessionTable:
                 session.token_seen_ns += gap_ns
 
     def idle(self, now_ns: int) -> list[Session]:
-        """Return sessions that have shown no sign of life for `IDLE_TTLS` TTLs."""
+        """Return sessions that have shown no sign of life for `IDLE_TTLS` TTLs.
+
+        They are looked at once more at the next call, unless they are forgotten by then.
+        """
+        idle: list[Session] = []
         if self.in_grace(now_ns):
-            return []
-        return [
-            session
-            for session in self
-            if now_ns - session.lease_end_ns(now_ns) > IDLE_TTLS * session.ttl_ns
-        ]
+            return idle
+        for name in self._idle.take(now_ns):
+            session = self.by_id[name]
+            idle_ns = session.idle_ns(now_ns)
+            if idle_ns <= now_ns:
+                idle.append(session)
+            self._idle.put(name, idle_ns)
+        return idle
 
     def lanes_of(self, session: str) -> dict[int, Lane] | None:
         """Return the lanes of a session, also of one that ended a while ago."""
@@ -303,6 +318,7 @@ class SessionTable:
         found = self.by_id.pop(session, None)
         if found is None:
             return
+        self._idle.drop(session)
         self._disown(found)
         self._ttls[found.ttl_ns] -= 1
         if not self._ttls[found.ttl_ns]:

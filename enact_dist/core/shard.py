@@ -228,24 +228,24 @@ class Shard:
     def next_deadline_ns(self) -> int:
         """Return the monotonic time at which a `Tick` is due at the latest."""
         now_ns = self.state.now_ns
-        deadlines = [now_ns + self.state.shortest_ttl_ns // 8]
+        at_latest_ns = now_ns + self.state.shortest_ttl_ns // 8
+        deadlines = [at_latest_ns]
         if self.state.sessions.in_grace(now_ns):
             deadlines.append(self.state.sessions.grace_end_ns)
-        soonest = self.state.tenures.next_deadline_ns()
-        if soonest is not None:
-            deadlines.append(soonest)
         state = self.state
+        tenures = state.tenures
+        deadlines += [
+            soonest
+            for soonest in (
+                tenures.next_deadline_ns(),
+                tenures.next_lease_end_ns(now_ns, until_ns=at_latest_ns),
+            )
+            if soonest is not None
+        ]
         for desk in (self._prepares, self._stamps, self._views, self._worlds, state.decisions):
             due_ns = desk.next_deadline_ns()
             if due_ns is not None:
                 deadlines.append(due_ns)
-        deadlines += [
-            self.state.sessions.by_id[session].lease_end_ns(now_ns)
-            for session, tenures in self.state.tenures.by_session.items()
-            if session in self.state.sessions.by_id
-            # A lease cannot end what is bound: looking again and again would not help.
-            and not all(tenure.bound for tenure in tenures.values())
-        ]
         return min(deadlines)
 
     @property
@@ -307,7 +307,7 @@ class Shard:
 
     def _on_tick(self, _: Tick, __: int) -> Iterator[Effect]:
         now_ns = self.state.now_ns
-        for session in list(self.state.tenures.by_session):
+        for session in self.state.tenures.leases_over(now_ns):
             yield from self._expire(session)
         for tenure in self.state.tenures.held_too_long(now_ns):
             self.state.count("held_too_long")
@@ -324,8 +324,6 @@ class Shard:
 
     def _expire(self, session: str) -> Iterator[Effect]:
         found = self.state.sessions.by_id.get(session)
-        if found is not None and found.lease_end_ns(self.state.now_ns) > self.state.now_ns:
-            return
         for tenure in self.state.tenures.of_session(session):
             if tenure.bound:
                 continue

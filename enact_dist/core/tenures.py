@@ -24,6 +24,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.datum import Column, Datum, LockId, Slot, Token
+from enact_dist.core.due_times import DueTimes
 from enact_dist.core.latencies import Latencies
 from enact_dist.core.lock_table import Claim, LockTable, Mode, Resource, join
 from enact_dist.core.messages import Acquire, Granted, Item, Waiting
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
 
     from enact_dist.core.messages import Holder
     from enact_dist.core.records import PreparedRecord
-    from enact_dist.core.sessions import SessionTable
+    from enact_dist.core.sessions import Session, SessionTable
 
 WAIT_SLICE_NS_MAX: Final = 1_000_000_000
 """Longest time one request is parked; a client that still waits asks again (long poll)."""
@@ -125,6 +126,8 @@ class Tenures:
         "_epoch",
         "_granted",
         "_hold_ends",
+        "_lease_ends",
+        "_over",
         "_parked_ends",
         "_sessions",
         "_slots",
@@ -145,6 +148,8 @@ class Tenures:
         self._sessions = sessions
         self._granted = 0
         self._hold_ends: list[tuple[int, LockId]] = []
+        self._lease_ends = DueTimes()
+        self._over: dict[str, None] = {}
         self._parked_ends: list[tuple[int, int, LockId]] = []
         self._waiting: dict[str, int] = {}
         self.table = LockTable()
@@ -184,6 +189,36 @@ class Tenures:
         tenure.owner = session.identity if session is not None else ""
         self.by_lock[tenure.lock] = tenure
         self.by_session.setdefault(tenure.lock.session, {})[tenure.lock] = tenure
+        self._expect_end(tenure.lock.session, session, now_ns=tenure.asked_ns)
+
+    def _expect_end(self, name: str, session: Session | None, *, now_ns: int) -> None:
+        """Look at a session that has locks when its lease may end."""
+        if name in self._lease_ends or name in self._over:
+            return
+        if session is None:
+            self._over[name] = None
+        else:
+            self._lease_ends.put(name, session.lease_end_ns(now_ns))
+
+    def leases_over(self, now_ns: int) -> list[str]:
+        """Return the sessions with locks here whose lease has ended, or that have ended."""
+        for name in [*self._over, *self._lease_ends.take(now_ns)]:
+            self._over.pop(name, None)
+            if name in self.by_session:
+                session = self._sessions.by_id.get(name)
+                end_ns = session.lease_end_ns(now_ns) if session is not None else now_ns
+                if end_ns > now_ns:
+                    self._lease_ends.put(name, end_ns)
+                else:
+                    self._over[name] = None
+        return list(self._over)
+
+    def session_ended(self, name: str) -> None:
+        """Look at a session no more if it has no locks, at the next tick if some are bound."""
+        self._lease_ends.drop(name)
+        self._over.pop(name, None)
+        if name in self.by_session:
+            self._over[name] = None
 
     def restore(self, record: PreparedRecord, *, now_ns: int) -> None:
         """Hold again what was prepared before a restart, before anything else is granted."""
@@ -331,6 +366,19 @@ class Tenures:
         heads = [heap[0][0] for heap in (self._hold_ends, self._parked_ends) if heap]
         return min(heads, default=None)
 
+    def next_lease_end_ns(self, now_ns: int, *, until_ns: int) -> int | None:
+        """Return when the next lease of a session with locks ends; exact up to `until_ns`.
+
+        A lease cannot end what is bound, so a session that a tick has found over counts again only
+        once one of its locks is not bound any more.
+        """
+        if any(not t.bound for name in self._over for t in self.of_session(name)):
+            return now_ns
+        for name in self._lease_ends.take(until_ns):
+            if name in self.by_session:
+                self._lease_ends.put(name, self._sessions.by_id[name].lease_end_ns(now_ns))
+        return self._lease_ends.next_ns()
+
     def assert_invariants(self) -> None:
         """Assert I1, I8 and the bookkeeping over all tenures.  For tests and simulation."""
         self.table.assert_invariants()
@@ -347,3 +395,5 @@ class Tenures:
             assert not tenure.bound or tenure.token is not None
             assert not (tenure.claim.granted and tenure.parked is not None)
             assert self.by_session[tenure.lock.session][tenure.lock] is tenure
+            looked_at = tenure.lock.session in self._over
+            assert looked_at is not (tenure.lock.session in self._lease_ends)

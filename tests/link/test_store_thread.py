@@ -7,7 +7,7 @@ from store_writer import outcome_record, persist, reopened, slot_record
 
 from enact_dist.errors import StoreError
 from enact_dist.link.store import open_store
-from enact_dist.link.store_thread import StoreThread
+from enact_dist.link.store_thread import REPORTED_MAX, StoreThread
 
 WAIT_S = 20.0
 
@@ -57,6 +57,21 @@ def test_queued_batches_share_one_commit(gated, tmp_path):
     found = reopened(tmp_path)
     assert max(record.version for record in found.slots) == 500
     assert found.outcomes == [outcome_record(0, 500)]
+
+
+def test_large_batch_is_reported_in_parts(gated):
+    """A host takes its mutex for each part, so that requests come in between."""
+    parts = []
+    thread = StoreThread(gated, parts.append, pytest.fail)
+    for ticket in range(1, 101):
+        thread.submit(persist(slot_record("e", ticket), ticket=ticket))
+        if ticket == 1:
+            assert gated.entered.wait(WAIT_S)
+    gated.gate.set()
+    thread.close()
+    assert gated.batches == [1, 99]
+    assert [ticket for part in parts for ticket in part] == list(range(1, 101))
+    assert max(map(len, parts)) == REPORTED_MAX
 
 
 def test_ticket_zero_is_kept_and_not_reported(gated, tmp_path):
