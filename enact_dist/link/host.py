@@ -119,8 +119,7 @@ def open_host(
             refuse_far_stamps(folder, recovered, wall_ns=wall_ns)
             undo.pop_all()
     shard = Shard(settings, recovered, now_ns=clock.monotonic_ns(), wall_ns=wall_ns)
-    left_out = shard.state.catalogue.shown().left_out
-    if left_out:
+    if left_out := shard.state.catalogue.shown().left_out:
         what = "world contexts and aspects are more than clients can be shown"
         _log.warning("shard %s: %d %s; %s", settings.name, left_out, what, REMEDY)
     return ShardHost(
@@ -278,12 +277,16 @@ class ShardHost:
 
     def _refusal(self, message: Request, identity: str) -> Refused | EpochChanged | None:
         """Return why the shard will refuse a message because of who asks, else None."""
-        sessions = self._shard.state.sessions
-        return owners.refusal(message, identity, sessions, self.epoch) if identity else None
+        state = self._shard.state
+        return owners.refusal(message, identity, state.sessions, self.epoch) if identity else None
 
     def owner_of(self, session: str) -> str:
         """Return the identity of a session; "" where that is not known.  Without the mutex."""
         return self._shard.state.sessions.owner(session) or ""
+
+    def knows(self, identity: str) -> bool:
+        """Whether an identity has a session here.  Without the mutex."""
+        return bool(self._shard.state.sessions.of(identity))
 
     def event(self, event: Event) -> None:
         """Hand an event to the shard (a session's token appeared, for example)."""
@@ -294,14 +297,12 @@ class ShardHost:
     def count(self, name: str, amount: int = 1) -> None:
         """Add to a counter of the shard that `ListSessions` shows; reply callbacks may, too."""
         with self._mutex:
-            counters = self._shard.counters
-            counters[name] = counters.get(name, 0) + amount
+            self._shard.state.count(name, amount)
 
     def _biggest(self) -> str:
         """Name the slots with the largest data, for people."""
         with self._mutex:
-            found = self._shard.biggest(3)
-        names = ", ".join(f"{name} {size}" for name, size in found)
+            names = ", ".join(f"{name} {size}" for name, size in self._shard.biggest(3))
         return f"; the largest: {names}" if names else ""
 
     def call_with(

@@ -6,9 +6,10 @@ in turn (`Turns`), so that one who sends a thousand requests delays the others b
 decodes a query, lets the host decide and sends the answer itself; `Senders` moves it to a thread of
 the client's own only where sending might block.
 
-A client is the identity in the key of its requests here.  Where Zenoh's access rules do not bind
-that to a certificate, a hostile program that gives itself another one for each request has as many
-turns.
+A client is the identity in the key of its requests here; all that have no session yet take their
+turns as one, so that a crowd of newcomers delays the others by one request.  Where Zenoh's access
+rules do not bind an identity to a certificate, a hostile program has as many turns as it opens
+sessions under different ones.
 
 A query is answered once and then dropped; one that is dropped without an answer tells the client
 *unknown*.  A frame that cannot be read is refused and counted, never followed by anything else.
@@ -60,6 +61,8 @@ DATA_SUFFIX: Final = "/data"
 """Slices of a client count, and wait, apart from its other answers."""
 _NOTICES: Final = "@notices"
 """Stands for all watchers together among the clients of `Senders`."""
+NEWCOMERS: Final = "@newcomers"
+"""Stands for all identities without a session together among the clients of `Turns`."""
 STAGED_BYTES_MAX: Final = 256 << 20
 """Bytes of slices that wait for their place: 32 transfers; a client asks again for a lost one."""
 PULLED_MAX: Final = 256
@@ -188,6 +191,8 @@ class ZenohService:
             size += len(payload)
         arrived = _Arrived(query, key, header, payload, self.senders.burst)
         client = key.rpartition("/")[2]
+        if not self._host.knows(client):
+            client = NEWCOMERS
         if not self._turns.put(client, size, arrived):
             query.drop()  # type: ignore[no-untyped-call]  # as Zenoh's stub has it
             self._dropped(client)

@@ -6,7 +6,7 @@ from collections import Counter
 import pytest
 import zenoh
 
-from enact_dist.core.messages import ListLocks, Ping
+from enact_dist.core.messages import Hello, ListLocks, Ping
 from enact_dist.link import turns, zenoh_service
 from enact_dist.link.zenoh_config import close_session, open_session
 from enact_dist.wire.frames import encode_frame
@@ -115,6 +115,10 @@ def stopped(shard, sender):
         sender.ended.clear()
         sender.post("w")
         sender.wait_ended(1)
+    known = "abcx"
+    for name in known:
+        sender.post(name, Hello(f"session of {name}", 0, 60 * 10**9, name, "h", 1, True))
+    sender.wait_ended(1 + len(known))
     sender.answered.clear()
     sender.ended.clear()
     with Stopped(shard, sender) as found:
@@ -137,6 +141,19 @@ def test_request_is_served_after_one_of_each_other_client_however_many_wait(stop
     assert sender.answered[:7] == ["x", "a0", "b0", "c0", "a1", "b1", "c1"]
     for client in "ab":
         assert [name for name in sender.answered if name[0] == client] == names(client, 100)
+
+
+def test_newcomers_of_many_names_delay_a_client_by_one_request(stopped, sender):
+    """Of 20 that have no session each waits for those before it, a client for one of them."""
+    crowd = [f"{chr(ord('A') + number)}0" for number in range(20)]
+    for name in [*crowd, *names("c", 2)]:
+        sender.post(name)
+    stopped.wait_arrived()
+    stopped.go_on()
+    sender.wait_ended(23)
+
+    assert sender.answered[:5] == ["x", "A0", "c0", "B0", "c1"]
+    assert [name for name in sender.answered if name in crowd] == crowd
 
 
 def test_tick_lets_no_request_overtake_an_older_one_of_its_client(stopped, sender, monkeypatch):
