@@ -5,7 +5,7 @@ A carrier decides nothing.  Rules that each one keeps:
 - No answer (None) means *unknown*, never *not executed*: requests are idempotent, ask again.
 - Many threads may use one carrier at once; a slow answer to one never delays another.
 - It belongs to the process that opened it; after a fork it raises `MisuseError` in the child.
-- It never blocks the interpreter's exit, even when nobody closed it.
+- It never blocks the interpreter's exit, even if it was not closed.
 """
 
 from __future__ import annotations
@@ -78,11 +78,11 @@ def read_answer(shard: str, header: bytes, payload: bytes | memoryview) -> Answe
 
 
 class NoticeFeed(Protocol):
-    """Notices of all shards of a cell as they come; best effort, gaps are told by their numbers."""
+    """Notices of all shards of a cell as they come; best effort, their numbers show gaps."""
 
     @property
     def dropped(self) -> int:
-        """How many notices were thrown away because nobody took them in time."""
+        """How many notices were dropped because the watcher did not take them in time."""
 
     @property
     def late_s(self) -> float:
@@ -102,7 +102,7 @@ class NoticeFeed(Protocol):
         """Let notices after this number come: the shard says that it has sent no later one."""
 
     def close(self) -> None:
-        """End the feed and wake whoever waits in `get`; twice is harmless."""
+        """End the feed and wake a thread that waits in `get`; twice is harmless."""
 
 
 class Begun(Protocol):
@@ -120,7 +120,7 @@ class Begun(Protocol):
         """
 
     def abandon(self) -> None:
-        """Let nobody wait for the answer."""
+        """Stop waiting for the answer."""
 
 
 class Carrier(Protocol):
@@ -137,7 +137,7 @@ class Carrier(Protocol):
     def request(self, shard: str, message: Request, *, timeout_s: float) -> Answer | None:
         """Send one request and return its answer, or None if there was none in time.
 
-        None may come at once, where the shard is known to be away; whoever asks again pauses.
+        None may come at once if the shard is known to be away; a caller pauses before it retries.
 
         Raises:
             ProtocolError: The peer sent what this version cannot read, or two daemons answered.
@@ -185,7 +185,7 @@ class Carrier(Protocol):
         """Return how calls to a shard travel now, for people: "zenoh", "socket", …."""
 
     def away(self, shard: str) -> bool:
-        """Whether a shard is known to be out of reach; asks nobody.
+        """Whether a shard is known to be out of reach; contacts no shard.
 
         Once it no longer is, what `tell_returns` was given is called.
         """

@@ -4,7 +4,7 @@ The caller's own thread makes its lock's calls.  Rules a change must keep:
 
   * The mutex of the session guards the pure core and is never held during a call.
   * Whatever ends a thread's way through here, an interrupt too, leaves nothing held at a shard
-    that nobody would give back, and gives the lane back exactly once.
+    for good, and gives the lane back exactly once.
   * A commit that was sent ends in an answer or in `CommitUnknownError`.
 """
 
@@ -384,7 +384,7 @@ class CellClient(SessionClient):
 
         Raises:
             LeaseLostError: It is lost.
-            ShardUnreachableError: A shard does not answer, so nobody can say.
+            ShardUnreachableError: A shard does not answer, so the state of the lock is unknown.
         """
         self.check_usable()
         if self.valid(lock):

@@ -136,11 +136,11 @@ class ShardHost:
     """One shard with its mutex, its store thread and its timer.  Thread-safe.
 
     Args:
-        shard: The shard; nobody else calls it from now on.
+        shard: The shard; only the host calls it from now on.
         store: Where its records go; None keeps nothing beyond this process.
         clock: Read under the mutex, so the shard's time never goes back.
         on_failure: Called once, from whichever thread, when the store or the core has failed;
-            the host is dead then and answers nobody.
+            the host is dead then and answers no request.
         shared: Where large data lie that clients of this host map; None keeps them in memory.
         payload_bytes_max: How many bytes may lie there; None: half of what the file system has,
             and what is beyond in plain memory.
@@ -228,7 +228,7 @@ class ShardHost:
 
     @property
     def ended(self) -> bool:
-        """Whether nobody is answered any more."""
+        """Whether the host has ended and answers no request."""
         return self._ended
 
     @property
@@ -465,7 +465,7 @@ class ShardHost:
     # ---------------------------------------------------------------- end
 
     def drain(self) -> None:
-        """Grant nothing new and answer whoever is parked; may be called again."""
+        """Grant nothing new and answer all parked requests; may be called again."""
         self._draining = True
         self.event(Drain())
 

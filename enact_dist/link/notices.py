@@ -1,10 +1,11 @@
-"""A bounded queue of notices between whoever receives them and whoever watches.
+"""A bounded queue of notices between their receiver and a watcher.
 
-The newest notices win: when nobody takes them, the oldest are dropped and counted.  A watcher
-sees the gap in their numbers and asks for the present state, so nothing is missed unknowingly.
+The newest notices win: if the watcher does not take them, the oldest are dropped and counted.  The
+watcher sees the gap in their numbers and asks for the present state, so it never misses a change
+without knowing.
 
-Who watches says what for (`Interest`).  Notices of anything else wake nobody: of a run of them only
-the numbers are passed on (`Skipped`), so that a gap remains a gap.
+A watcher names its `Interest`.  Other notices do not wake it: of a run of them only the numbers are
+passed on (`Skipped`), so that a gap remains a gap.
 """
 
 from __future__ import annotations
@@ -78,7 +79,7 @@ class Interest:
 
 
 class Source(Protocol):
-    """Where notices can be read by whoever waits for them."""
+    """Where a waiting thread can read notices."""
 
     def fileno(self) -> int:
         """Return the descriptor that becomes readable when something has come."""
@@ -156,7 +157,7 @@ class NoticeQueue:
 
     @property
     def dropped(self) -> int:
-        """How many notices were thrown away because nobody took them in time."""
+        """How many notices were dropped because the watcher did not take them in time."""
         return self._dropped
 
     def put(self, notice: Notice) -> None:
@@ -190,7 +191,7 @@ class NoticeQueue:
                 self._newest[shard] = (epoch, number)
 
     def _wake(self) -> None:
-        """Wake whoever waits in `get`.  The mutex is held."""
+        """Wake the thread that waits in `get`.  The mutex is held."""
         self._changed.notify_all()
         if self._ear is not None and self._polling:
             self._ear.ring()
@@ -235,7 +236,7 @@ class NoticeQueue:
                     self._skip(one)
 
     def _skip(self, skipped: Skipped) -> None:
-        """Add the numbers of notices that were of no interest; wakes nobody."""
+        """Add the numbers of notices that were of no interest; wakes no thread."""
         last = self._notices[-1] if self._notices else None
         if isinstance(last, Skipped) and (last.shard, last.epoch, last.number) == skipped[:3]:
             self._notices[-1] = Skipped(last.shard, last.epoch, last.after, skipped.number)
@@ -306,7 +307,7 @@ class NoticeQueue:
         ear.on_end(error)
 
     def close(self) -> None:
-        """End the feed and wake whoever waits in `get`; twice is harmless."""
+        """End the feed and wake a thread that waits in `get`; twice is harmless."""
         if self._is_inherited():
             return
         with self._mutex:

@@ -5,21 +5,21 @@
     Stage(total) ──> draft ── filled by a client of this host in the shared folder,
                        │      or by slices that come in Stage messages
     Commit, Prepare ───┴──> adopted: read-only, its bytes become the body of the datum
-    last datum gone ──────> the file is removed; whoever has it mapped keeps its content
+    last datum gone ──────> the file is removed; processes that have mapped it keep its content
 
 The desk stands in front of the shard: the core sees bodies and never learns where they lie.  A
 payload lasts as long as somebody looks at its bytes, and a draft as long as its client.
 
 Rules that a change must keep:
 
-- A name is used once.  Nobody is told of a payload before its commit stands, so no half-filled one
-  is ever read.
+- A name is used once.  No reader learns of a payload before its commit stands, so none is ever read
+  half-filled.
 - What is counted against the cap is counted until the file is gone, and before it is made.
 - A client that still has a draft mapped for writing could change it after the commit.  Ours hands
   out read-only arrays then and cuts itself off some milliseconds later; a hostile one of the same
   user could do worse.
 - In a folder of a group, whose users may write what the shard makes for them, a draft has a name
-  that its client alone is told, and nobody can list; it gets that of its payload when it is
+  that only its client learns, and that cannot be listed; it gets that of its payload when it is
   read-only.  What is left there: a hostile client can change its own payload after the commit, and
   a user of the group can read payloads whose names he knows, as he can by asking the shard.
 """
@@ -66,9 +66,9 @@ SHARES: Final = 4
 ROOM_S: Final = 1.0
 """How long a new draft waits for files that are on their way out."""
 SILENT_NS: Final = 60_000_000_000
-"""So long the log says nothing more of payloads that are no files; they are counted."""
+"""Time between two log lines about payloads outside the folder; all of them are counted."""
 ROOM_TRIES: Final = 8
-"""So often history lets go for a draft, each time of more, while others take the room before it."""
+"""How often history frees room for a draft, more each time, while others take that room."""
 
 _log = logging.getLogger("enact.shard")
 
@@ -166,7 +166,7 @@ class PayloadDesk:
             return Staged(file, 0, shared=False)
         with self._mutex:
             if file in self._over:
-                return Staged(file, total, False)  # a late copy: nobody waits for it
+                return Staged(file, total, False)  # a late copy: no client waits for it
         if not 0 < total <= BODY_BYTES_MAX:
             return Refused("protocol", f"a payload of {total} bytes; at most {BODY_BYTES_MAX}")
         draft: _Draft | Refused | None = self._drafts.get(file)
@@ -250,7 +250,7 @@ class PayloadDesk:
             if missing > 0:  # else something has gone by itself since
                 self._make_room(missing)
                 asked += 1
-            # What is let go of takes a moment to leave.
+            # Released data take a moment to leave.
             leftovers().wait(ROOM_S)
             if self._reserved(total):
                 return True
@@ -270,8 +270,8 @@ class PayloadDesk:
     def _displaced(self, owner: str, total: int, *, shared: bool) -> bool:
         """Give up drafts of those beyond their share for one who stays within; say whether any.
 
-        A client that stages on and on and commits nothing would else leave the others no room.
-        Whoever loses a draft that it wanted after all is told so at its commit, and stages again.
+        Otherwise a client that stages more and more and commits nothing would fill the folder.
+        A client that still wanted its draft learns of the loss at its commit, and stages again.
         """
         share = (self._bytes_max if shared else self._draft_bytes_max) // SHARES
         staged: Counter[str] = Counter()
@@ -343,7 +343,7 @@ class PayloadDesk:
         made = os.open(name, flags, 0o600, dir_fd=folder.descriptor)
         try:
             os.fchmod(made, folder.access.draft_mode)
-            # Never a hole: a page that cannot be had later kills whoever touches it.
+            # Never a hole: a page that is missing later kills the process that touches it.
             os.posix_fallocate(made, 0, total)
             return map_file(
                 made, total, writable=True, ended=partial(self._ended, file, folder, total)
@@ -418,7 +418,7 @@ class PayloadDesk:
         return draft.memory
 
     def _ended(self, file: str, folder: SharedFolder | None, counted: int) -> None:
-        """Nobody looks at a payload any more: remove it, then stop counting its bytes."""
+        """Remove a payload without readers, then stop counting its bytes."""
         if folder is not None and folder.descriptor >= 0:
             try:
                 os.unlink(self._names.pop(file, file), dir_fd=folder.descriptor)
@@ -438,7 +438,7 @@ class PayloadDesk:
     # ---------------------------------------------------------------- life
 
     def sweep(self, lives: Callable[[str], bool], works: Callable[[str], bool]) -> None:
-        """Give up the drafts that nobody will commit any more.
+        """Give up the drafts that no client will commit any more.
 
         Args:
             lives: Whether a session is known.

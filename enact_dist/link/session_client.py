@@ -63,7 +63,7 @@ FIRST_STAGED: Final = 1 << SERIES_BITS
 _GREETINGS: Final = (Welcome, Alive)
 
 CALLS_S_MAX: Final = 1e8
-"""Three years; whoever waits longer means for ever."""
+"""Three years; a longer time counts as for ever."""
 
 _log = logging.getLogger("enact.link")
 
@@ -82,7 +82,7 @@ class SessionClient:
     """Calls, catalogue and life of one session of this process with one cell.
 
     Attributes:
-        patience_s: How long a call is made again that nobody gave another time.
+        patience_s: How long a call is repeated, unless the caller gives another time.
     """
 
     def __init__(
@@ -403,7 +403,7 @@ class SessionClient:
             worlds: Names of world contexts, made where there is none.
             aspects: Entries of aspects.
             needed: Returns the shards that matter; None stands for all.  Only asked when some
-                shard lacks something, so that one that is away stops nobody who can do without.
+                shard lacks something, so a shard that is away stops only calls that need it.
             timeout_s: How long a shard may stay without an answer.
 
         Raises:
@@ -434,7 +434,7 @@ class SessionClient:
                 if isinstance(answer, Refused):
                     raise error_of(answer)
             restarted = [shard for shard in missing if self.core.epoch(shard) != epochs[shard]]
-            if restarted:  # the answer may be of before, and then was not looked at
+            if restarted:  # the answer may be from before the restart, and then was ignored
                 self.greet(restarted, timeout_s=timeout_s)
 
     def subscribe(self, interest: Survey | None = None) -> NoticeFeed:

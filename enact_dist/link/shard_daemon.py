@@ -1,8 +1,8 @@
 """A shard as a process of its own: folder, Zenoh session, signals, log.
 
 Exit status: 0 after SIGTERM or SIGINT, 1 where the shard cannot start or its store fails.  A
-daemon that ends on a signal drains: it grants nothing new, answers whoever is parked, lets commits
-in flight come to their end, and waits up to `drain_s` for holders to finish, which hands their
+daemon that ends on a signal drains: it grants nothing new, answers parked requests, lets commits
+in flight end, and waits up to `drain_s` for holders to finish, which hands their
 leases back.  A second signal cuts that wait short.  What is held then is named in the log and lost:
 its commit will be refused.  All else takes less than 1.2 s.
 """
@@ -65,11 +65,11 @@ _log = logging.getLogger("enact.shard")
 
 @dataclass(frozen=True, slots=True)
 class DaemonSettings:
-    """What a shard daemon is told.
+    """The settings of a shard daemon.
 
     Attributes:
         cell: Name of the cell.
-        shard: What the shard is told; its name and its own endpoints for clients stand in there.
+        shard: The settings of the shard, with its name and its endpoints for clients.
         listen: Endpoints to listen at ("tcp/0.0.0.0:7447").
         folder: Where its data live; None keeps them in memory only.
         log: "text" or "json" (one object per line, see `link.log`).
@@ -147,7 +147,7 @@ class RunningShard:
             undo.callback(self._comparing.close)
             self.host.call_with(self._calls.submit, self._comparing.submit)
             self._service = ZenohService(self.host, self._session, settings.cell)
-            for other in self._calls.others:  # what the first tick asked of them nobody carried
+            for other in self._calls.others:  # the first tick's requests to them were not sent
                 self.host.event(ShardReturned(other))
             undo.pop_all()
 
@@ -350,7 +350,7 @@ def _say_ready(shard: RunningShard, formatter: logging.Formatter) -> None:
 def _stay_responsive() -> None:
     """Set the interpreter up for short calls: beside threads that compute, and many slots.
 
-    A full collection over a million objects takes 0.1 s or more, in which nobody is answered.  The
+    A full collection over a million objects takes 0.1 s or more, without any answer.  The
     shard makes no cycles (measured: none in 5,000 updates), so only young objects are looked at.
     """
     sys.setswitchinterval(SWITCH_INTERVAL_S)

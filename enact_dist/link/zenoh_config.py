@@ -15,8 +15,8 @@ relay between peers).  Reasons for the settings, measured with 1.10 on a loopbac
   dropped after 50 ms; only senders of their own ever wait for it.
 - Reconnection after 50 ms, then more and more rarely up to once a second: a shard that restarts
   at once is back in use after 0.1 s, and one that stays away costs its clients nothing.
-- `zenoh_access`: who listens relays nothing, and silent connections keep nobody out.
-- `zenoh_links`: lost connections hold up nobody, and a cut one is back soon.
+- `zenoh_access`: a listener relays nothing, and silent connections keep no client out.
+- `zenoh_links`: lost connections hold up no client, and a cut one is back soon.
 
 Sessions must be closed before the interpreter ends (it hangs otherwise), and must never be closed
 or freed in a forked child (that hangs too): `close_session` and `keep_after_fork` see to both.
@@ -48,12 +48,12 @@ QUEUED_MAX: Final = 65_536
 MESSAGE_BYTES_MAX: Final = FRAME_BYTES_MAX + (64 << 10)
 """Longest message: a frame with its key.  Of a longer one Zenoh keeps nothing."""
 RETRY_MS, RETRY_MS_MAX, RETRY_FACTOR = 50, 1_000, 1.15
-"""Pauses between two attempts to connect to a place where nobody listens: they grow from the first
+"""Pauses between two attempts to connect to an endpoint without listener: they grow from the first
 to the second figure, or to a part of it that each session draws."""
 CONNECT_WAIT_MS: Final = 50
 """How long `open` may wait for a connection; where there is none it goes on trying behind."""
 OPEN_S: Final = 5.0
-"""How long whoever accepts a connection has to answer in Zenoh's language."""
+"""How long the accepting side of a connection has to answer in Zenoh's protocol."""
 CLIENT_BLOCK_S: Final = 3.0
 """How long a client waits for a shard that does not read before it gives up the connection; no
 shard waits longer for a client either."""
@@ -134,7 +134,7 @@ def open_session(
     open_s: float = OPEN_S,
     more: Mapping[str, object] = MappingProxyType({}),
 ) -> zenoh.Session:
-    """Open a session; whoever opens one closes it.
+    """Open a session; the caller closes it.
 
     Raises:
         ConfigError: An endpoint cannot be read.
@@ -207,7 +207,7 @@ def close_session(session: zenoh.Session) -> None:
     mine = (os.getpid(), session)
     if mine in _open_sessions:
         _open_sessions.remove(mine)
-        session.close()  # type: ignore[no-untyped-call]  # Zenoh's stub lacks it
+        session.close()  # type: ignore[no-untyped-call]  # untyped in its stub
         watch = _watches.pop(session, None)
         if watch is not None:  # else nothing could be declared any more when it was opened
             watch.join()

@@ -155,7 +155,7 @@ class ZenohService:
         finally:
             self._resting = True
             while turns:
-                turns.take()[1].query.drop()  # type: ignore[no-untyped-call]  # as Zenoh's stub has it
+                turns.take()[1].query.drop()  # type: ignore[no-untyped-call]  # untyped in its stub
 
     def _rest(self) -> None:
         """Wait for the next query: the channel was empty, so no tick waits for anything."""
@@ -194,7 +194,7 @@ class ZenohService:
         if not self._host.knows(client):
             client = NEWCOMERS
         if not self._turns.put(client, size, arrived):
-            query.drop()  # type: ignore[no-untyped-call]  # as Zenoh's stub has it
+            query.drop()  # type: ignore[no-untyped-call]  # untyped in its stub
             self._dropped(client)
 
     def _dropped(self, client: str) -> None:
@@ -242,7 +242,7 @@ class ZenohService:
                 raise ProtocolError(f"a {verb} came to several shards at once; only a ping may")
         except Exception as error:  # noqa: BLE001 - every query is answered
             if not isinstance(error, ProtocolError):
-                # A fault of the decoder: whoever found it must not make the shard deaf.
+                # A fault of the decoder: a client that triggers it must not make the shard deaf.
                 _log.exception("a frame of %d bytes broke the decoder", len(header or b""))
             self._host.count("frames_refused")
             call = _Call(self, query, key)
@@ -297,7 +297,7 @@ class ZenohService:
     # ---------------------------------------------------------------- notices and tokens
 
     def _publish(self, notice: Notice) -> None:
-        """Send a notice if anybody watches; Zenoh drops it for whoever does not read.
+        """Send a notice if there are watchers; Zenoh drops it for those that do not read.
 
         Zenoh may wait 1 ms before it drops one message, but 2 s for one in several fragments: such
         a long notice, and whatever comes after it, is left to a thread.
@@ -325,8 +325,8 @@ class ZenohService:
             return
         self._closed = True
         self._unwatch()
-        self._queryable.undeclare()  # type: ignore[no-untyped-call]  # as Zenoh's stub has it
-        self._tokens.undeclare()  # type: ignore[no-untyped-call]  # as Zenoh's stub has it
+        self._queryable.undeclare()  # type: ignore[no-untyped-call]  # untyped in its stub
+        self._tokens.undeclare()  # type: ignore[no-untyped-call]  # untyped in its stub
         self.senders.close()
         self._staged.put(None)
         for thread in self._threads:
@@ -394,7 +394,7 @@ class _Call:
 
     def drop(self) -> None:
         """Leave the client without an answer, which tells it to ask again."""
-        self._query.drop()  # type: ignore[no-untyped-call]  # as Zenoh's stub has it
+        self._query.drop()  # type: ignore[no-untyped-call]  # untyped in its stub
 
 
 def _answerable(key: str) -> bool:

@@ -29,9 +29,9 @@ _log = logging.getLogger("enact.link")
 
 
 def settle(patience_s: Mapping[tuple[int, int], float]) -> int:
-    """Let connections end when nobody acknowledges what they sent, and close at once.
+    """Let connections end if their peer acknowledges nothing, and close at once.
 
-    Zenoh 1.10 waits for the kernel in two places, each time with threads that serve everybody:
+    Zenoh 1.10 waits for the kernel in two places, each time with threads that serve all clients:
 
     - A link in mid-transfer is closed only once the kernel has taken what its sender has in hand,
       and whoever else has a message for it waits meanwhile (zenoh issues 1053 and 1876): among
@@ -88,7 +88,7 @@ def _written(address: str, port: int) -> str:
 
 
 def give_up(inodes: set[int]) -> None:
-    """End connections that nobody has answered, so that Zenoh tries anew."""
+    """End connections that got no answer, so that Zenoh tries again."""
     for connection in connections():
         with connection, contextlib.suppress(OSError):
             if os.fstat(connection.fileno()).st_ino in inodes and _state(connection) == _SYN_SENT:
