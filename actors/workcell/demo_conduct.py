@@ -6,6 +6,7 @@ data like all others.
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 import signal
@@ -13,8 +14,8 @@ import subprocess
 import sys
 import threading
 import time
-from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from actors.running_cell import DemoError
@@ -55,6 +56,8 @@ DEPTH: Final = 3
 """From the speed over the hull to the masks and the images."""
 KEPT_EVERY_S: Final = 1.0
 """At most so often the nearest approach is kept anew."""
+ASKED_S: Final = 10.0
+"""So long the end of a run waits for what is being kept."""
 NEARER_M: Final = 0.05
 """The nearest approach is kept anew only if it is so much nearer."""
 
@@ -101,6 +104,7 @@ class Conductor:
         self._online, self._truth = cell.world(ONLINE), cell.world(TRUTH)
         self.notes = Notes()
         self._kept_s = 0.0
+        self._asking: threading.Thread | None = None
 
     def prepare(self) -> None:
         """Wait for the actors, confirm that the cell is empty, wait for the backgrounds, start.
@@ -206,6 +210,8 @@ class Conductor:
             time.sleep(LOOK_S)
         for _, act in undo:
             act()
+        if self._asking is not None:
+            self._asking.join(timeout=ASKED_S)
 
     def _look(self, now_s: float, before: str) -> str:
         """Note the state of safety and the nearest approach; return the state."""
@@ -216,13 +222,28 @@ class Conductor:
         near = newest is not None and newest.nearest_m < self.notes.nearest_m - NEARER_M
         if newest is not None and near and now_s > self._kept_s + KEPT_EVERY_S:
             self._kept_s = now_s
-            self._keep("nearest", newest)
+            self._aside(partial(self._keep, "nearest", newest))
+        if found is not None and found.state == "stop" and not self.notes.stop and now_s > 0.0:
+            self._aside(self._keep_stop)
         if found is None or found.state == before:
             return before
         self._say(now_s, f"{found.state}: {found.reason}")
-        if found.state == "stop" and self.notes.stop is None and now_s > 0.0:
-            self.notes.stop = self._tree("first-stop")
         return found.state
+
+    def _aside(self, act: Callable[[], None]) -> None:
+        """Ask the shard at length in a thread, unless one does: the run must not wait for it."""
+        if self._asking is not None and self._asking.is_alive():
+            return
+
+        def ask() -> None:
+            with contextlib.suppress(EnactError):  # a shard that dies keeps nothing
+                act()
+
+        self._asking = threading.Thread(target=ask, name="keeper", daemon=True)
+        self._asking.start()
+
+    def _keep_stop(self) -> None:
+        self.notes.stop = self._tree("first-stop")
 
     def _keep(self, label: str, speed: words.Speed) -> None:
         tree = self._tree(label)
@@ -293,7 +314,7 @@ def masks_of(tree: CauseTree) -> list[CauseTree]:
     return sorted(masks, key=lambda cause: str(cause.entity))
 
 
-@contextmanager
+@contextlib.contextmanager
 def recording(cell: Cell, path: Path) -> Iterator[None]:
     """Record a cell exactly, without messages for viewers, while the block runs.
 

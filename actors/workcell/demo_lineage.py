@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from actors.workcell import vocabulary as words
 from actors.workcell.demo_conduct import DEPTH, WHAT_IF, WHAT_IF_S, masks_of
 from actors.workcell.trace import ONLINE
-from enact_dist import Aspect, View, ViewEach
+from enact_dist import Aspect, View
 from enact_dist.actor_process import ActorThread
 from enact_dist.cli.lineage import drawn
 from enact_dist.cli.output import print_tree
@@ -43,22 +43,24 @@ def show_lineage(tree: CauseTree, console: Console) -> None:
 
 
 def show_past(cell: Cell, notes: Notes, console: Console) -> None:
-    """Print the world context as it was at the nearest approach."""
+    """Print the world context as it was at the nearest approach, and the masks that were kept."""
     then = cell.world(ONLINE).at(stamp_ns=notes.nearest_ns)
-    masks = ViewEach(then, words.CAMERAS, words.SILHOUETTE)
     hull, speed = View(then, words.WORKSPACE, words.HULL), View(then, words.ROBOT, words.SPEED)
     second = (notes.nearest_ns - notes.start_ns) / 1e9
     console.print(f"\nonline at the nearest approach, second {second:.1f} (world.at)", style="bold")
-    seen = then.view(masks, hull, speed)
+    seen = then.view(hull, speed)
     found, command = seen.get(hull), seen.get(speed)
-    console.print(f"{len(seen[masks])} masks of that stamp", end="")
     if found is not None and command is not None:
         console.print(
-            f"; {len(found.voxels):,} voxels, the nearest {found.nearest_m:.2f} m from the arm;"
+            f"{len(found.voxels):,} voxels, the nearest {found.nearest_m:.2f} m from the arm;"
             f" speed {command.scale:.0%}: {command.reason}"
         )
-    else:
-        console.print()
+    masks = [
+        version
+        for version in cell.kept().get("nearest", ())
+        if version.aspect.name == words.SILHOUETTE.name and version.stamp_ns == notes.nearest_ns
+    ]
+    console.print(f"{len(masks)} masks of that stamp, kept under the label nearest")
 
 
 def show_what_if(
