@@ -135,7 +135,9 @@ class ListeningForWords:
                 lock[request] = words
             else:
                 del lock[request]
-        if word is None:
+        if not isinstance(word, dict):
+            if word is not None:
+                log.warning("%s: a command that is none was passed over", self._run.name)
             return
         token = str(word.get("token", ""))
         if word.get("restart"):

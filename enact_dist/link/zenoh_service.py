@@ -67,8 +67,8 @@ STAGED_BYTES_MAX: Final = 256 << 20
 """Bytes of slices that wait for their place: 32 transfers; a client asks again for a lost one."""
 PULLED_MAX: Final = 256
 """Queries that are taken from Zenoh's channel between two turns: 1 ms."""
-DRAIN_S_MAX: Final = 1.0
-"""How long a tick waits at most for what has arrived before it."""
+DRAIN_S_MAX: Final = 0.5
+"""How long a tick waits at most for what has arrived before it: no stall of the shard's timer."""
 DRAIN_STEP_S: Final = 0.001
 """How long a tick waits for a query that has just been taken from the channel, if one was."""
 OVERHEAD_BYTES: Final = 1024

@@ -8,6 +8,8 @@ import zenoh
 
 from enact_dist.core.messages import Hello, ListLocks, Ping
 from enact_dist.link import turns, zenoh_service
+from enact_dist.link.host import TICK_S_MAX
+from enact_dist.link.stalls import STALL_S
 from enact_dist.link.zenoh_config import close_session, open_session
 from enact_dist.wire.frames import encode_frame
 from enact_dist.wire.keys import request_key, verb_of
@@ -191,6 +193,11 @@ def test_tick_waits_for_what_has_arrived_before_it(stopped, sender, monkeypatch)
     timer.join(60)
 
     assert drained[0] >= 52
+
+
+def test_tick_that_waits_for_many_requests_is_no_stall_of_the_shard():
+    """Each one would be told as a pause of the process, for as long as too many requests come."""
+    assert zenoh_service.DRAIN_S_MAX + 2 * TICK_S_MAX < STALL_S
 
 
 def test_requests_without_room_are_dropped_counted_and_named(stopped, sender, monkeypatch, caplog):
