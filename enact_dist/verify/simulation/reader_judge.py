@@ -90,8 +90,10 @@ class ReaderJudge:
         moments = [picture.now(slot)]
         if isinstance(answer, Viewed):
             at_end = picture.at(slot, answer.until_ns)
+            at_begin = picture.at(slot, answer.from_ns)
             # Where the answer is of no one moment and says so, each datum is of some.
-            moments = [at_end] if answer.from_ns <= answer.until_ns else [*moments, at_end]
+            no_moment = answer.from_ns > answer.until_ns
+            moments = [*moments, at_begin, at_end] if no_moment else [at_end]
         right = [self._captured(picture, slot, newest, captured_ns) for newest in moments]
         right += [OUTSIDE] * self._model.clocks_were_set  # it may have grown old in one leap
         if not any(_is_shown(state, one) for one in right):
