@@ -181,7 +181,7 @@ class Camera(Actor):
         if calibration is None:
             raise CameraError(
                 f"{self.only_entity_name()}: asked for its calibration; found none in the context;"
-                " write it first (the actor Setup, or `enact workcell calibrate`)"
+                " write it first (the actor Setup does, or `lock.put` from a program of your own)"
             )
         if self._opened is None or not _same(self._opened, calibration):
             self._capture.open(calibration)

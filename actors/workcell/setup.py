@@ -2,7 +2,7 @@
 
 Cameras with their calibrations, the grid, the arm, its task, boxes that a plan of the room knows.
 Here it is that of the simulated room; a cell of one's own writes its own with an actor like this
-one, with `enact workcell calibrate`, or by hand with `enact world put`.
+one, from a program of your own or by hand with `enact world put`.
 """
 
 from __future__ import annotations
