@@ -218,12 +218,18 @@ Answer = (
     | Refused
 )
 Message = Request | Answer | Notice
+PAGED = (
+    *(Survey, ListLocks, ListSessions, ListAudit, ListHistory, Explain, FindEffects),
+    KeepVersions,
+)
+"""Requests with a cursor: their answers come in pages."""
 
 __all__ = [
     "OUTCOME_COMMITTED",
     "OUTCOME_EXPIRED",
     "OUTCOME_PENDING",
     "OUTCOME_UNSEEN",
+    "PAGED",
     "RESOLVED_ABORTED",
     "RESOLVED_COMMITTED",
     "RESOLVED_OPEN",

@@ -23,6 +23,7 @@ from enact_dist.core.history_desk import HistoryDesk
 from enact_dist.core.lineage_desk import LineageDesk
 from enact_dist.core.lock_desk import LockDesk
 from enact_dist.core.messages import (
+    PAGED,
     Acquire,
     AwaitStamp,
     Break,
@@ -90,8 +91,6 @@ if TYPE_CHECKING:
     from enact_dist.core.messages import Request
     from enact_dist.core.records import Event
 
-LISTINGS: Final = (Survey, ListLocks, ListSessions, ListAudit, ListHistory, Explain, FindEffects)
-"""What is answered in pages: requests with a cursor."""
 _DECIDE: Final = frozenset((Persisted, Called, Drain))
 """After these, what was undecided may be decided; after no other message."""
 
@@ -155,20 +154,20 @@ class Shard:
             MakeRoom: self._history.on_make_room,
         }
 
-        for kind in LISTINGS:
-            self._handlers[kind] = self._listing(self._handlers[kind])
+        for kind in PAGED:
+            self._handlers[kind] = self._paged(self._handlers[kind])
 
-    def _listing(self, handler: Callable[..., Iterator[Effect]]) -> Callable[..., Iterator[Effect]]:
-        """Return the handler of a listing that refuses a cursor of another epoch."""
+    def _paged(self, handler: Callable[..., Iterator[Effect]]) -> Callable[..., Iterator[Effect]]:
+        """Return the handler of a paged request, which refuses a cursor of another epoch."""
 
-        def listed(message: Request, reply_to: int) -> Iterator[Effect]:
-            if message.after.epoch in (0, self.epoch):  # type: ignore[union-attr]  # a listing
+        def paged(message: Request, reply_to: int) -> Iterator[Effect]:
+            if message.after.epoch in (0, self.epoch):  # type: ignore[union-attr]  # a paged one
                 yield from handler(message, reply_to)
             else:
                 self.state.count("epoch_refusals")
                 yield Reply(reply_to, EpochChanged(self.epoch))
 
-        return listed
+        return paged
 
     # ---------------------------------------------------------------- the one mutator
 

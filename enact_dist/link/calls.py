@@ -6,25 +6,18 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.messages import (
+    PAGED,
     START,
     Acquire,
     Audited,
     Commit,
     EpochChanged,
-    Explain,
-    FindEffects,
     Hello,
     KeepAlive,
-    KeepVersions,
     Kept,
-    ListAudit,
-    ListHistory,
-    ListLocks,
-    ListSessions,
     Locks,
     Prepare,
     Sessions,
-    Survey,
     Surveyed,
     Versions,
 )
@@ -40,9 +33,6 @@ BYTES_PER_S_MIN: Final = 10e6
 """A call that carries data gets this much more time per byte."""
 _WITH_DATA: Final = (Commit, Prepare)
 _SIGNS_OF_LIFE: Final = (Hello, KeepAlive)
-_LISTINGS: Final = (
-    Survey, ListLocks, ListSessions, ListAudit, ListHistory, Explain, FindEffects, KeepVersions,
-)  # fmt: skip
 _Page = Surveyed | Locks | Sessions | Audited | Versions | Kept
 _ANSWERS: Final = (Surveyed, Locks, Sessions, Audited, Versions, Kept)
 
@@ -69,7 +59,7 @@ class Calls:
     def take(self, number: int, answer: Answer) -> bool:
         """Take an answer; return whether a further page is to be asked for."""
         shard, asked = self.asked[number]
-        if not isinstance(asked, _LISTINGS):
+        if not isinstance(asked, PAGED):
             self.answers[number] = answer
         elif isinstance(answer, EpochChanged) and asked.after != START:
             # The shard has restarted between two pages, and its cursors mean nothing any more.

@@ -46,9 +46,9 @@ def test_compose_starts_the_shard_and_the_actors_of_the_cell():
         for command in commands
     ]
 
-    assert [(one.noun, one.target if one.noun == "actor" else one.name) for one in parsed] == [
-        *(("shard", shard.name) for shard in CELL.shards),
-        *(("actor", actor.name) for actor in CELL.actors),
+    assert [(one.noun, one.targets if one.noun == "actor" else [one.name]) for one in parsed] == [
+        *(("shard", [shard.name]) for shard in CELL.shards),
+        *(("actor", [actor.name]) for actor in CELL.actors),
     ]
 
 
