@@ -246,8 +246,8 @@ class Model:
                 self._judge_past(effect.answer, asked, picture)
             elif isinstance(effect.answer, Versions) and isinstance(asked, ListHistory):
                 self._pasts.check_list(asked, effect.answer, picture)
-            elif isinstance(effect.answer, Kept):
-                self._pasts.check_kept(host, effect.answer, picture)
+            elif isinstance(effect.answer, Kept) and isinstance(asked, KeepVersions):
+                self._pasts.check_kept(asked, effect.answer, picture)
             elif isinstance(effect.answer, Granted | Viewed):
                 self._readers.check(host, effect.answer, picture)
             elif isinstance(effect.answer, Surveyed) and isinstance(message, Survey):

@@ -8,7 +8,15 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from enact_dist.core.datum import Slot
-from enact_dist.core.messages import KeepVersions, Kept, ListHistory, SlotVersion, TakeView, Viewed
+from enact_dist.core.messages import (
+    START,
+    KeepVersions,
+    Kept,
+    ListHistory,
+    SlotVersion,
+    TakeView,
+    Viewed,
+)
 from enact_dist.patterns import pattern_matches
 from enact_dist.terms import Access, NullReason
 from enact_dist.verify.simulation.cells import CONTEXTS
@@ -175,11 +183,11 @@ class PastJudge:
         self._fail("only what was committed is kept", key)
         raise AssertionError(key)
 
-    def check_kept(self, host: ShardHost, answer: Kept, picture: Picture) -> None:
-        """A label that is told of survives."""
-        for label, kept in picture.labels.items():
-            if set(kept) == set(answer.versions):
-                picture.confirmed_labels[label] = None
+    def check_kept(self, asked: KeepVersions, answer: Kept, picture: Picture) -> None:
+        """What a shard has said to keep under a label survives; a further page promises nothing."""
+        kept = picture.labels.get(asked.label)
+        if asked.after == START and kept is not None and set(kept) == set(answer.versions):
+            picture.confirmed_labels[asked.label] = None
 
     def booted(self, host: ShardHost, recovered: Recovered, picture: Picture) -> None:
         """What a label keeps, and the disk has, is kept after a restart."""
