@@ -122,7 +122,7 @@ def test_report_names_what_was_missed():
     assert value_text("lost_share", 0.0001) == "0.0100%"
 
 
-@pytest.mark.slow
+@pytest.mark.timing
 def test_the_robot_rests_while_its_reconstruction_is_dead_and_goes_on(tmp_path, monkeypatch):
     """Real processes: no moment is too fast, commands stop with the hulls, and come back."""
     killed_s = 3.0
@@ -134,7 +134,7 @@ def test_the_robot_rests_while_its_reconstruction_is_dead_and_goes_on(tmp_path, 
         )
 
     monkeypatch.setattr(demo_conduct, "scenario_of", with_fault)
-    options = Options(tmp_path, scenario="S2", seconds=13.0, source="live", voxel_m=0.05)
+    options = Options(tmp_path, scenario="S2", seconds=20.0, source="live", voxel_m=0.05)
 
     outcome = run_quietly(options)
 
