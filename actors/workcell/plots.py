@@ -182,7 +182,7 @@ def timeline(
         for share in (0.0, 0.5, 1.0):
             y = round(down + (up - down) * share)
             cv2.line(sheet, (left, y), (right, y), (226, 230, 235), 1)
-            sheet = with_label(sheet, f"{top * share:g}", (8, y - 12), height_px=14, paper=None)
+            sheet = with_label(sheet, f"{top * share:.3g}", (8, y - 12), height_px=14, paper=None)
         for second in np.arange(0.0, end_s + 1e-9, _step(end_s)):
             x = round(left + (right - left) * second / end_s)
             cv2.line(sheet, (x, up), (x, down), (240, 242, 245), 1)
