@@ -6,9 +6,6 @@ one process, since a single recording needs no second host.
 
 from __future__ import annotations
 
-import logging
-import threading
-from contextlib import contextmanager
 from typing import TYPE_CHECKING, Final
 
 from actors.palletizing.reconstruction import Reconstruction
@@ -19,14 +16,14 @@ from actors.palletizing.recorded import (
     RecordedPerception,
 )
 from actors.palletizing.vocabulary import SURFACE, product_entity
-from enact_dist import View, local, run_actor
-from enact_dist.errors import EnactError
+from actors.threads import running
+from enact_dist import View, local
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable
 
     from actors.geometry.coloured_surface import ColouredSurface
-    from enact_dist import Actor, Cell, Entity
+    from enact_dist import Entity
 
 LOOK_S: Final = 0.2
 """How often the wait for the surface looks whether an actor has failed."""
@@ -54,7 +51,7 @@ def trained_surface(
         training = cell.world("training")
         with (
             training.watch("**", SURFACE, COLOURED_SURFACE) as watch,
-            _running([perception, Reconstruction(), RecordedFusion(voxel_m)], cell) as failures,
+            running([perception, Reconstruction(), RecordedFusion(voxel_m)], cell) as failures,
         ):
             views: set[Entity] = set()
             while True:
@@ -69,35 +66,3 @@ def trained_surface(
                 progress(len(views))
         request = View(training, product_entity(RECORDED), COLOURED_SURFACE)
         return training.view(request)[request]
-
-
-@contextmanager
-def _running(actors: list[Actor], cell: Cell) -> Iterator[list[Exception]]:
-    """Run actors in threads for the length of a block; yield what went wrong in them."""
-    stop, failures = threading.Event(), list[Exception]()
-
-    def failed(_: Entity | None, error: Exception) -> None:
-        if not isinstance(error, EnactError):  # those the framework tries again by itself
-            failures.append(error)
-
-    threads = [
-        threading.Thread(
-            target=run_actor,
-            args=(actor, cell),
-            kwargs={"stop": stop, "on_error": failed},
-            name=type(actor).__name__,
-        )
-        for actor in actors
-    ]
-    # A failure ends the run with one line of its own; its traceback in the log says no more.
-    log = logging.getLogger("enact.actor")
-    heard, log.disabled = log.disabled, True
-    for thread in threads:
-        thread.start()
-    try:
-        yield failures
-    finally:
-        stop.set()
-        for thread in threads:
-            thread.join()
-        log.disabled = heard

@@ -6,15 +6,13 @@ for noise is measured in litres, and a set of pictures may show a thing of a han
 
 from __future__ import annotations
 
-import logging
-import threading
 import time
-from contextlib import contextmanager
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from actors.geometry.silhouettes import packed
+from actors.threads import running
 from actors.workcell.background import BackgroundSubtraction
 from actors.workcell.reconstruction import Reconstruction
 from actors.workcell.vocabulary import (
@@ -31,18 +29,17 @@ from actors.workcell.vocabulary import (
     Silhouette,
     camera_entity,
 )
-from enact_dist import Actor, Lock, Together, View, Write, local, run_actor
-from enact_dist.errors import EnactError
+from enact_dist import Lock, Together, View, Write, local
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Sequence
 
     import numpy.typing as npt
 
     from actors.geometry.camera_sets import SetCamera
     from actors.geometry.voxels import VoxelBlocks
     from actors.workcell.folder_pictures import Shot
-    from enact_dist import Cell, Entity, WorldContext
+    from enact_dist import WorldContext
 
     Image = npt.NDArray[np.uint8]
 
@@ -78,7 +75,7 @@ def hull_by_actors(shots: Sequence[Shot], grid: VoxelBlocks) -> npt.NDArray[np.i
         actors = [BackgroundSubtraction(), _reconstruction(len(shots))]
         with (
             online.watch(str(WORKSPACE), HULL) as watch,
-            _running(actors, cell) as failures,
+            running(actors, cell) as failures,
         ):
             _write(online, shots)
             while (change := watch.next(LOOK_S)) is None or change.null:
@@ -125,31 +122,3 @@ def _write(online: WorldContext, shots: Sequence[Shot]) -> None:
             lock.put(request, image, stamp_ns=stamp_ns)
         for other, mask in masks:
             lock.put(other, mask, stamp_ns=stamp_ns)
-
-
-@contextmanager
-def _running(actors: Sequence[Actor], cell: Cell) -> Iterator[list[Exception]]:
-    """Run actors in threads for the length of a block; yield what went wrong in them."""
-    stop, failures = threading.Event(), list[Exception]()
-
-    def failed(_: Entity | None, error: Exception) -> None:
-        if not isinstance(error, EnactError):  # those the framework tries again by itself
-            failures.append(error)
-
-    threads = [
-        threading.Thread(
-            target=run_actor, args=(actor, cell), kwargs={"stop": stop, "on_error": failed}
-        )
-        for actor in actors
-    ]
-    log = logging.getLogger("enact.actor")
-    heard, log.disabled = log.disabled, True  # a failure is one line of its own
-    for thread in threads:
-        thread.start()
-    try:
-        yield failures
-    finally:
-        stop.set()
-        for thread in threads:
-            thread.join()
-        log.disabled = heard
