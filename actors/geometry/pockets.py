@@ -2,7 +2,8 @@
 
 Who goes into one vanishes.  A pocket is *held* from the set on in which whatever visible touched it
 is gone, until as much visible volume stands beside it again; one that reaches the side of the grid
-may be entered unseen and is always held.
+may be entered unseen and is always held.  One that comes into being because a camera ceases to look
+is held if something was in it.
 
 Rules a change must keep: a pocket smaller than a person is never held, because who reaches into it
 stays visible outside; when other cameras than before give silhouettes, what was held stays held.
@@ -108,6 +109,20 @@ class Pockets:
             rows = was[now == pocket]
             self._held[pocket] = True
             self._largest_m3[pocket] = before._largest_m3[before._of_row[rows]].max()
+
+    def hold(self, rows: Rows) -> None:
+        """Hold the pockets in which something was, before a camera that saw it ceased to look.
+
+        Args:
+            rows: (N,) voxels that were occupied.
+        """
+        if not self.count or not len(rows):
+            return
+        inside = self._of_row[rows]
+        volume = np.bincount(inside[inside >= 0], minlength=self.count) * self._grid.voxel_m**3
+        self._held |= volume > 0.0
+        self._largest_m3 = np.maximum(self._largest_m3, volume)
+        self._update_blocks()
 
     def _update_blocks(self) -> None:
         self.held_blocks[:] = False

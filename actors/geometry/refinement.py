@@ -15,7 +15,9 @@ R3    explained    a voxel within 10 cm of the robot goes if each     a hidden p
                                                                       which is thinner than the
                                                                       distance at which it rests
 R4    unreachable  a block goes that nobody reaches at 3 m/s from     people do not appear out of
-                   where something was, or from outside               nothing
+                   where something was in the last half second, or    nothing; if they seem to,
+                   from outside; not the third set in a row in which  they have been overlooked
+                   that takes the volume of a person away
 R5    forgiven     where something was, and 5 cameras or more have a  camouflage, or a camera that
       (kept)       say, one of them may say "free"                    is half blind
 ====  ===========  =================================================  ===========================
@@ -69,6 +71,14 @@ SPEED_MAX_M_S: Final = 3.0
 """R4: faster than anybody in a workcell."""
 GAP_MAX_S: Final = 1.0
 """R4: after a longer gap between sets anything may be anywhere."""
+RECENT_S: Final = 0.5
+"""R4: so long after something was in a block it may still be there, overlooked."""
+APPEARED_M3: Final = 0.020
+"""R4: so much visible volume is a person, wherever they came from."""
+APPEARED_SETS: Final = 3
+"""R4: in so many sets in a row."""
+SAMPLED: Final = 4
+"""R4: one of so many voxels is looked at to find that volume; so it takes 0.3 ms."""
 SAYS_MIN: Final = 5
 """R5: so many cameras must have a say for one to be outvoted."""
 BLIND_SHARE: Final = 0.15
@@ -138,6 +148,8 @@ class Refinement:
         self._static = static_voxels(self._grid, boxes)
         self._all_blocks = np.arange(self._grid.blocks)
         self._before: Flags | None = None
+        self._since_s = np.full(self._grid.block_shape, np.inf, np.float32)
+        self._appeared = 0
         self._live: tuple[int, ...] | None = None
         self._says = np.empty(0, np.uint8)
         self._pockets = Pockets(self._grid, np.zeros(self._grid.voxels, bool))
@@ -165,11 +177,10 @@ class Refinement:
         counts = {"raw": len(raw)}
         rows = raw[~self._static[raw]]
         counts["static"] = len(raw) - len(rows)
-        reachable = self._reachable(elapsed_s)
-        kept = rows if reachable is None else rows[reachable.ravel()[rows >> 6]]
+        outline = self._explaining(robot)
+        kept = self._possible(rows, elapsed_s, robot, outline)
         counts["unreachable"] = len(rows) - len(kept)
         counts["robot"] = counts["explained"] = 0
-        outline = self._explaining(robot)
         away = self._beside_robot(kept, robot, outline, counts)
         forgiven = self._forgiven(away.rows, len(kept))
         counts["forgiven"] = len(forgiven)
@@ -209,19 +220,47 @@ class Refinement:
         if live == self._live:
             return
         self._live = live
-        tables = self._hull.tables
+        tables, said = self._hull.tables, self._says
         self._says = (
             seen_by([tables[n] for n in live]) if live else np.zeros(self._grid.voxels, np.uint8)
         )
         self._pockets = Pockets(self._grid, (self._says == 0) & ~self._static, self._pockets)
+        if self._before is not None:
+            rows = self._grid.rows_in(np.flatnonzero(self._before.ravel()))
+            self._pockets.hold(rows[(said[rows] > 0) & (self._says[rows] == 0)])
+
+    def _possible(
+        self,
+        rows: Rows,
+        elapsed_s: float,
+        robot: Numbers | None,
+        outline: list[npt.NDArray[np.uint8]],
+    ) -> Rows:
+        """Return the voxels in which somebody can be (R4), or all if a person has appeared."""
+        reachable = self._reachable(elapsed_s)
+        if reachable is None:
+            self._appeared = 0
+            return rows
+        can_be = reachable.ravel()[rows >> 6]
+        others = rows[~can_be][::SAMPLED]
+        others = others[self._says[others] > 0]
+        solid = others[self._hull.tight(others)]
+        counts = {"robot": 0, "explained": 0}
+        beside = self._beside_robot(solid, robot, outline, counts)
+        volume_m3 = float((~beside.explained).sum()) * SAMPLED * self._grid.voxel_m**3
+        self._appeared = self._appeared + 1 if volume_m3 >= APPEARED_M3 else 0
+        return rows if self._appeared >= APPEARED_SETS else rows[can_be]
 
     def _reachable(self, elapsed_s: float) -> Flags | None:
         """Return which blocks (i, j, k) may be occupied now (R4); None if all."""
         if self._before is None or not 0.0 <= elapsed_s <= GAP_MAX_S:
+            self._since_s[:] = np.inf
             return None
         block_m = self._grid.voxel_m * 4
         reach = int(np.ceil(SPEED_MAX_M_S * elapsed_s / block_m - 1e-9))
-        result = grown(self._before | self._pockets.held_blocks, reach)
+        recent = self._since_s <= RECENT_S
+        self._since_s += np.float32(elapsed_s)
+        result = grown(recent | self._pockets.held_blocks, reach)
         result[:reach] = result[-reach:] = True
         result[:, :reach] = result[:, -reach:] = True
         return result
@@ -314,6 +353,7 @@ class Refinement:
         rows, label, visible = rows[kept], label[kept], visible[kept]
         self._before = np.zeros(shape, bool)
         self._before.ravel()[rows >> 6] = True
+        self._since_s[self._before] = 0.0
         self._pockets.note(rows, label, visible)
         return Refined(
             rows=rows,

@@ -230,6 +230,50 @@ def test_two_blind_cameras_are_believed_and_so_is_one_of_four():
     assert not set(few.rows_in(BODY).tolist()) & set(found.rows.tolist())
 
 
+def test_who_was_overlooked_in_one_set_is_there_again_in_the_next(cell):
+    """R4 looks back for longer than a set: one false word of two cameras makes nobody vanish."""
+    entered(cell)
+    lost = cell.step(BODY, bits=blind(bits_of(BODY, cell.cameras), [2, 3]))
+    found = cell.step(BODY)
+    assert len(lost.rows) == 0
+    assert set(cell.rows_in(BODY).tolist()) <= set(found.rows.tolist())
+
+
+def test_who_is_seen_in_the_middle_set_after_set_is_believed(cell):
+    """R4: what has the volume of a person in three sets in a row is no trick of the light."""
+    counts = [len(cell.step(BODY).rows) for _ in range(5)]
+    found = cell.step(BODY)
+    assert counts[:2] == [0, 0]
+    assert all(counts[2:])
+    assert set(cell.rows_in(BODY).tolist()) <= set(found.rows.tolist())
+
+
+def test_the_robot_alone_is_never_taken_for_somebody_who_appeared(cell):
+    """R4: the arm moves in the middle of the cell, set after set, and nothing is occupied."""
+    arm = np.array([[0.0, 0.0, 0.1, 0.0, 0.0, 0.9, 0.12], [0.0, 0.0, 0.9, 0.4, 0.0, 0.7, 0.09]])
+    for _ in range(6):
+        assert len(cell.step(arm, arm).rows) == 0
+
+
+def test_who_stands_where_only_a_dead_camera_saw_stays_there():
+    """A camera dies that alone saw a place: who was there stays there until a camera looks again."""
+    cell = Cell()
+    hull = hull_of(cell.grid, cell.cameras)
+    place = np.abs(cell.grid.centres(np.arange(cell.grid.voxels)) - (0.0, 0.1, 0.55))
+    inner = np.flatnonzero((place < (0.45, 0.35, 0.55)).all(1))
+    for table in hull.tables[1:]:
+        table.pixel[inner] = table.sentinel
+        table.cell[np.unique(inner >> 6)] = table.pool_sentinel
+    cell.refinement = Refinement(hull, cell.cameras, [])
+    body, bits = set(cell.rows_in(BODY).tolist()), bits_of(BODY, cell.cameras)
+    cell.step(BODY, elapsed_s=5.0)
+
+    for _ in range(5):
+        assert body <= set(cell.step(BODY, bits=[None, *bits[1:]]).rows.tolist())
+
+    assert len(cell.step(NOBODY).rows) == 0
+
+
 def test_who_walks_on_leaves_no_trail(cell):
     """R5: what was occupied and is free for one camera only does not stay behind a person."""
     for step in range(6):
