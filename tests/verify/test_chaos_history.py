@@ -214,6 +214,65 @@ def test_promise_may_be_applied_after_two_restarts(recorded):
     assert history.anomalies() == []
 
 
+def viewed_after_restart(recorded, writes, *, seen_before=False, followed=False):
+    """Tell of a commit, a restart of s0, and one expected view of the commit in the new epoch."""
+    recorded.lock("a.1", writes=writes)
+    if seen_before:
+        recorded.lock("b.1", views=[(FRAME, 1, "a.1")])
+    if followed:
+        recorded.lock("b.1", reads=[(FRAME, 1, UNSEEN)], writes=[(FRAME, 2, "b.1")])
+    recorded.restart("s0", 8, down_ns=recorded.now + 1)
+    view = {"views": [(FRAME, 1, "a.1")], "expected": [FRAME], "epochs": {"s1": 9}}
+    version = len(writes)
+    recorded.lock("b.2", writes=[(OTHER, version, "b.2")], **view)
+    recorded.lock("final.1", reads=[(OTHER, version, "b.2")], epochs={"s1": 9})
+    return recorded.rules()
+
+
+OVER_SHARDS = [(FRAME, 1, "a.1"), (OTHER, 1, "a.1")]
+
+
+def test_promise_over_a_restart_may_be_known_from_a_view_alone(recorded):
+    """Promised as version 1, applied as version 1 of the next epoch, and only a view shows it."""
+    assert viewed_after_restart(recorded, OVER_SHARDS) == []
+
+    history = chains.History(recorded.loaded())
+    writers = [state.writer for state in history.chains[FRAME]]
+    assert writers == ["restart 8 of s0 under a.1", "a.1"]
+
+
+def test_view_of_what_the_restart_emptied_is_named(recorded):
+    """A commit on one shard is not promised: after a restart of its shard nothing is left of it."""
+    assert viewed_after_restart(recorded, OVER_SHARDS[:1]) == ["stale read"]
+
+
+@pytest.mark.parametrize("witness", ["seen_before", "followed"])
+def test_view_of_what_was_applied_before_the_restart_is_named(recorded, witness):
+    """A commit over shards that somebody found before the restart was not applied after it."""
+    assert "stale read" in viewed_after_restart(recorded, OVER_SHARDS, **{witness: True})
+
+
+def test_view_while_its_shard_ends_is_of_the_epoch_that_ends(recorded):
+    """The shard answers on while it stops, and the next one has a version 1 of its own."""
+    recorded.lock("a.1", writes=OVER_SHARDS)
+    down_ns = recorded.now + 1
+    recorded.lock("b.1", views=[(FRAME, 1, "a.1")], epochs={}, at=(down_ns + 1, down_ns + 2))
+    recorded.restart("s0", 8, down_ns=down_ns)
+    recorded.lock("b.2", reads=[(FRAME, 0, "")], writes=[(FRAME, 1, "b.2")])
+    recorded.lock("final.1", reads=[(FRAME, 1, "b.2"), (OTHER, 1, "a.1")])
+
+    assert recorded.rules() == []
+
+
+def test_read_of_what_the_restart_emptied_is_named(recorded):
+    """Also where its writer was told nothing, and nobody else saw it."""
+    recorded.lock("a.1", writes=[(FRAME, 1, "a.1")], end="")
+    recorded.restart("s0", 8, down_ns=recorded.now + 1)
+    recorded.lock("b.1", reads=[(FRAME, 1, "a.1")])
+
+    assert "a volatile datum outlived its shard" in recorded.rules()
+
+
 def test_volatile_datum_that_outlives_its_shard_is_named(recorded):
     """Seen before the restart and after it: it was written once."""
     recorded.lock("a.1", writes=[(FRAME, 1, "a.1")]).lock("b.1", reads=[(FRAME, 1, "a.1")])

@@ -5,13 +5,15 @@ over everything among them, and from those who wrote: a version that nobody saw 
 that was told that it committed it, or else to the only one that may have.  A lock whose end is
 unknown counts as soon as one of its versions was seen.
 
-A volatile slot counts its versions anew after each restart, so it is told restart by restart; a
-commit over several shards may be applied after a restart as another version than it was promised.
+A volatile slot counts its versions anew after each restart, so it is told restart by restart.  A
+commit over several shards that was promised before a restart may be applied after it, always as
+version 1, which may be another one than was promised.  A commit on one shard never is.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
+from itertools import pairwise
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.patterns import pattern_matches
@@ -49,7 +51,7 @@ class History:
         self.guessed: dict[str, None] = {}
         self._seen: dict[str, dict[tuple[int, int], dict[str, None]]] = defaultdict(dict)
         self._untimed: dict[str, tuple[int, int]] = {}
-        self._viewed: list[tuple[str, int, str]] = []
+        self._viewed: dict[tuple[str, str], list[tuple[LockRecord, int]]] = defaultdict(list)
         self._claims: dict[str, dict[tuple[int, int], list[tuple[LockRecord, str]]]] = {}
         self._names: dict[str, dict[tuple[int, int], str]] = {}
         self._claimed: dict[tuple[str, str], tuple[int, int]] = {}
@@ -98,22 +100,63 @@ class History:
                     facts = (f"{slot}: {writer} wrote {claimed[1]}, {record.id} read {version}",)
                     self.oddities.append(Anomaly("a datum under another version", facts))
             elif not protected:
-                self._viewed.append((slot, version, writer))
+                self._viewed[slot, writer].append((record, version))
                 continue
+            elif claimed[0] < at[0] and not self._may_outlive(writer, version):
+                facts = (f"{slot}: {writer} wrote it in epoch {claimed[0]}, {record.id} read {at}",)
+                self.oddities.append(Anomaly("a volatile datum outlived its shard", facts))
             seen.setdefault(at, {})[writer] = None
 
     def _note_viewed(self) -> None:
         """Take the views of volatile slots, which know no epoch, where nobody else has looked."""
         known = {(slot, w) for slot, seen in self._seen.items() for ws in seen.values() for w in ws}
-        for slot, version, writer in self._viewed:
+        for (slot, writer), views in self._viewed.items():
             if (slot, writer) in known:
                 continue
-            epoch, promised = self._claimed.get((writer, slot), (_FIRST, version))
-            if promised != version:
-                # Applied after a restart: the next one, as nobody saw it in a later epoch.
-                later = (r.epoch for r in self._restarts[_shard_of(slot)] if r.epoch > epoch)
-                epoch = min(later, default=epoch)
-            self._seen[slot].setdefault((epoch, version), {})[writer] = None
+            written, promised = self._claimed.get((writer, slot), (_FIRST, views[0][1]))
+            shown = self._shown_later(slot, writer, [view for view, _ in views])
+            for _, version in views:
+                epoch = written
+                if version != promised:
+                    # Applied after a restart: the next one, as nobody saw it in a later epoch.
+                    later = (r.epoch for r in self._restarts[_shard_of(slot)] if r.epoch > written)
+                    epoch = min(later, default=written)
+                elif shown is not None and self._may_outlive(writer, version):
+                    epoch = shown
+                self._seen[slot].setdefault((epoch, version), {})[writer] = None
+
+    def _shown_later(self, slot: str, writer: str, views: list[LockRecord]) -> int | None:
+        """Return the epoch in which the first view showed a write, if its promise was older.
+
+        None where a view showed the write in the epoch of its promise, or somebody found there
+        what followed it: then it was applied there, and the restart has emptied the slot.
+        """
+        written, promised = self._claimed.get((writer, slot), (_FIRST, 0))
+        found = {*self._seen[slot], *self._claims.get(slot, ())}
+        if any(epoch == written and version > promised for epoch, version in found):
+            return None
+        epochs = (self._epoch_of_view(slot, view) for view in views)
+        shown = min((epoch for epoch in epochs if epoch is not None), default=written)
+        return shown if shown > written else None
+
+    def _epoch_of_view(self, slot: str, view: LockRecord) -> int | None:
+        """Return the epoch in which a lock was shown its view of a slot; None: one of several.
+
+        The views of a lock are taken between its begin and its grant.  A shard that ends by itself
+        answers some while after it was told to, and none answers before it was started.
+        """
+        restarts = self._restarts[_shard_of(slot)]
+        for one, then in pairwise(restarts):
+            if view.granted_ns is not None and view.granted_ns <= then.started_ns:
+                return one.epoch
+            if view.begun_ns < then.down_ns:
+                return None
+        return restarts[-1].epoch
+
+    def _may_outlive(self, writer: str, version: int) -> bool:
+        """Return whether a write may be applied as this version after a restart of its shard."""
+        record = self._locks.get(writer)
+        return version == 1 and record is not None and _is_over_shards(record)
 
     # ---------------------------------------------------------------- chains
 
@@ -225,7 +268,6 @@ class History:
             if reading is not None:
                 (reads if protected or slot in record.expected else views).append(reading)
         reads += self._absent(record)
-        shards = {_shard_of(slot) for slot, _, _ in record.writes}
         return LockStory(
             record.id,
             record.begun_ns,
@@ -234,7 +276,7 @@ class History:
             reads,
             views,
             writes=[slot for slot, _, _ in record.writes if not _is_volatile(slot)],
-            outlives_restarts=len(shards) > 1,
+            outlives_restarts=_is_over_shards(record),
         )
 
     def _reading(
@@ -285,6 +327,10 @@ def _shard_of(slot: str) -> str:
     """Return the shard that a thing is pinned to; of made things, some name of their own."""
     _, shard, _ = slot.partition(":")[2].split("/")[:3]
     return shard
+
+
+def _is_over_shards(record: LockRecord) -> bool:
+    return len({_shard_of(slot) for slot, _, _ in record.writes}) > 1
 
 
 def _epoch(record: LockRecord, slot: str) -> int:
