@@ -113,7 +113,7 @@ class BackgroundSubtraction(Actor):
 
     def update(self, lock: Lock) -> None:
         """Write the silhouette with the stamp of its image."""
-        if lock.is_null(self.background):
+        if lock.is_null(self.background) or lock.is_null(self.image):
             return
         wanted = (
             lock.entity.name,

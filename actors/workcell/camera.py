@@ -183,10 +183,10 @@ class Camera(Actor):
                 f"{self.only_entity_name()}: asked for its calibration; found none in the context;"
                 " write it first (the actor Setup does, or `lock.put` from a program of your own)"
             )
+        self.look(lock)
         if self._opened is None or not _same(self._opened, calibration):
             self._capture.open(calibration)
             self._opened = calibration
-        self.look(lock)
         try:
             image, exposed_ns = self._capture.frame(lock.tick_ns)
         except CameraEndedError:

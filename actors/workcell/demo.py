@@ -23,6 +23,7 @@ import math
 import sys
 import time
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 from actors.geometry.files import write_whole
@@ -165,7 +166,7 @@ def record_views(options: Options, folder: Path, renderer: str) -> int:
 
 def _conducted(cell: Cell, running: DemoCell, options: Options, console: Console) -> Notes:
     """Conduct and record the run; return what was noted."""
-    conductor = Conductor(cell, running, options, console.print)
+    conductor = Conductor(cell, running, options, partial(console.print, soft_wrap=True))
     conductor.prepare()
     with recording(cell, options.out / "run.mcap"):
         before, begun_s = running.processor_s(), time.monotonic()
@@ -197,7 +198,7 @@ def _reported(cell: Cell, options: Options, notes: Notes, console: Console) -> O
     if notes.cores:
         most = sorted(notes.cores.items(), key=lambda item: -item[1])
         told = ", ".join(f"{name} {cores:.2f}" for name, cores in most)
-        console.print(f"processors: {sum(notes.cores.values()):.2f} cores: {told}")
+        console.print(f"processors: {sum(notes.cores.values()):.2f} cores: {told}", soft_wrap=True)
     facts = {
         "scenario": options.scenario,
         "seed": options.seed,

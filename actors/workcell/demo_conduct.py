@@ -15,7 +15,6 @@ import sys
 import threading
 import time
 from dataclasses import dataclass, field
-from functools import partial
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from actors.running_cell import DemoError
@@ -222,12 +221,12 @@ class Conductor:
         near = newest is not None and newest.nearest_m < self.notes.nearest_m - NEARER_M
         if newest is not None and near and now_s > self._kept_s + KEPT_EVERY_S:
             self._kept_s = now_s
-            self._aside(partial(self._keep, "nearest", newest))
+            self._aside(self._keep)
         if found is not None and found.state == "stop" and not self.notes.stop and now_s > 0.0:
             self._aside(self._keep_stop)
         if found is None or found.state == before:
             return before
-        self._say(now_s, f"{found.state}: {found.reason}")
+        self._say(now_s, told(found))
         return found.state
 
     def _aside(self, act: Callable[[], None]) -> None:
@@ -243,23 +242,35 @@ class Conductor:
         self._asking.start()
 
     def _keep_stop(self) -> None:
-        self.notes.stop = self._tree("first-stop")
-
-    def _keep(self, label: str, speed: words.Speed) -> None:
-        tree = self._tree(label)
+        tree = self._tree()
         if tree is not None and len(masks_of(tree)) == words.CAMERA_COUNT:
-            self.notes.nearest_m, self.notes.nearest_ns = speed.nearest_m, speed.captured_ns
+            self._label("first-stop", tree)
+            self.notes.stop = tree
 
-    def _tree(self, label: str) -> CauseTree | None:
-        """Return where the newest speed comes from, and keep all versions of it under a label."""
+    def _keep(self) -> None:
+        """Keep the newest set and what was made of it, if it is the nearest one of all masks."""
+        tree = self._tree()
+        if tree is None or len(masks_of(tree)) < words.CAMERA_COUNT:
+            return
+        then = self._online.at(stamp_ns=tree.stamp_ns)
+        request = View(then, words.ROBOT, words.SPEED)
+        speed = then.view(request).get(request)
+        if speed is not None and speed.nearest_m < self.notes.nearest_m:
+            self._label("nearest", tree)
+            self.notes.nearest_m, self.notes.nearest_ns = speed.nearest_m, tree.stamp_ns
+
+    def _tree(self) -> CauseTree | None:
+        """Return where the newest speed comes from; None if part of it is forgotten already."""
         try:
-            tree = self._cell.why(ONLINE, words.ROBOT, words.SPEED, depth=DEPTH)
-            if label in self._cell.kept():
-                self._cell.let_go(label)
-            self._cell.keep(label, (cause for cause in tree.walk() if cause.known))
+            return self._cell.why(ONLINE, words.ROBOT, words.SPEED, depth=DEPTH)
         except ForgottenError:
             return None  # an image has left its retention meanwhile; the next set comes soon
-        return tree
+
+    def _label(self, label: str, tree: CauseTree) -> None:
+        """Keep all versions of a tree under a label, in place of what it kept before."""
+        if label in self._cell.kept():
+            self._cell.let_go(label)
+        self._cell.keep(label, (cause for cause in tree.walk() if cause.known))
 
     def _say(self, now_s: float, text: str) -> None:
         line = f"{now_s:6.1f} s  {text}"
@@ -300,6 +311,12 @@ class Conductor:
             if name in info.names():
                 return info.pid
         return self._running.shard_pid(name)
+
+
+def told(safety: words.Safety) -> str:
+    """Return the state of the cell in a line."""
+    reason = safety.reason.removeprefix("; ")
+    return f"{safety.state}: {reason}" if reason else safety.state
 
 
 def masks_of(tree: CauseTree) -> list[CauseTree]:

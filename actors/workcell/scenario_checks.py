@@ -10,11 +10,14 @@ import numpy as np
 
 from actors.geometry.capsules import distance_to_points
 from actors.workcell import vocabulary as words
+from actors.workcell.scenarios import scenario_of
+from actors.workcell.trace import TRUTH
 from actors.workcell.truth_of_run import PERIOD_NS, truth_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
+    from actors.workcell.scenarios import Scenario
     from actors.workcell.trace import Kept, Trace
     from actors.workcell.truth_of_run import Truth
 
@@ -32,9 +35,16 @@ def checks_of(trace: Trace, scores: Mapping[str, float]) -> dict[str, bool]:
         scores: Its scores.
     """
     truth = truth_of(trace)
-    name = trace.newest(words.SCENARIO.name, words.PLAYING, "truth").scenario
+    name = _playing(trace).name
     found = {"no moment faster than ISO/TS 15066 allows": scores.get("violations", 1.0) == 0.0}
-    return found | _CHECKS.get(name, _nothing)(trace, truth, scores)
+    found |= _CHECKS.get(name, _nothing)(trace, truth, scores)
+    return {text: bool(held) for text, held in found.items()}  # numpy's are no JSON
+
+
+def _playing(trace: Trace) -> Scenario:
+    """Return what was played."""
+    playing = trace.newest(words.SCENARIO.name, words.PLAYING, TRUTH)
+    return scenario_of(playing.scenario, playing.seed, playing.seconds)
 
 
 def _nothing(_: Trace, __: Truth, ___: Mapping[str, float]) -> dict[str, bool]:
@@ -155,15 +165,20 @@ def _left(trace: Trace, truth: Truth, _: Mapping[str, float]) -> dict[str, bool]
 def _cameras(trace: Trace, truth: Truth, _: Mapping[str, float]) -> dict[str, bool]:
     """S7: the cell goes on with fewer cameras, and takes each back."""
     hulls = _hulls(trace, truth)
-    total = len(trace.entities(words.CALIBRATION))
-    counts = [len(kept.datum.cameras) for kept in hulls]
+    replaced = taken_back = True
+    for fault in _playing(trace).faults:
+        name = fault.target.replace("-", "/")
+        after = [kept for kept in hulls if truth.at_s(kept.stamp_ns) > fault.at_s]
+        there = [name in kept.datum.cameras for kept in after]
+        replaced &= False in there
+        taken_back &= False in there and True in there[there.index(False) :]
     longest = max(
         ((other.stamp_ns - one.stamp_ns) / PERIOD_NS for one, other in itertools.pairwise(hulls)),
         default=math.inf,
     )
     return {
-        "sets with a stand-in": min(counts, default=total) < total,
-        "every camera is taken back": bool(counts) and counts[-1] == total,
+        "a stand-in replaces each camera that fails": replaced,
+        "every camera is taken back": taken_back,
         "the cell goes on within 2 s": longest <= 20.0,
     }
 

@@ -432,7 +432,7 @@ SAFETY: Final = Aspect("safety", Safety, Durability.OS)
 """State of the cell (system)."""
 CAMERA_STATES: Final = Aspect("cameras", dict[str, CameraState], _FLOW)
 """How the cameras do, by name of the entity (system)."""
-PLAYING: Final = Aspect("playing", Playing, _FLOW)
+PLAYING: Final = Aspect("playing", Playing, Durability.OS)
 """What is played (scenario, truth)."""
 BODY: Final = Aspect("body", Body, _FLOW, retention=Retention(versions=600))
 """The true body (human/*, truth)."""

@@ -90,7 +90,8 @@ class LiveSource:
                 f"camera/{self._number}: asked for a simulated camera; found that it cannot draw"
                 f" ({error}); install the extra workcell"
             ) from None
-        self._ahead = None
+        self._ahead = self._playing = self._stage = None
+        self._follow()  # draws the rooms of what plays: `frame` has less time
 
     def look(self, playing: Playing | None, joints: Joints | None, *, stuck: bool = False) -> None:
         """See what plays and where the arm is; `stuck` repeats the last image.

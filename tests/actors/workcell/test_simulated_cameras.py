@@ -12,6 +12,7 @@ import pytest
 from actors.geometry.kinematics import capsules_at
 from actors.workcell.scenarios import scenario_of
 from actors.workcell.simulation.arm import ARM, HOME_RAD, shown_at
+from actors.workcell.simulation.backdrop import backdrop_of
 from actors.workcell.simulation.camera import SimulatedCamera
 from actors.workcell.simulation.recording import kept_recording, read_info, record
 from actors.workcell.simulation.render import NOISE_LEVELS
@@ -253,3 +254,20 @@ def test_simulated_camera_and_truth_write_what_plays():
         wrong.only_entity = camera_entity(0)
         with pytest.raises(CameraError, match="asked for a simulated source"):
             testing.run_once(wrong, cell)
+
+
+def test_opening_draws_all_rooms_of_the_scenario(monkeypatch):
+    """A frame has one second; the rooms of a walk-in cabinet, and of a box that is left, take it."""
+    drawn = []
+    monkeypatch.setattr(
+        "actors.workcell.simulation.render.backdrop_of",
+        lambda *_: drawn.append(1) or backdrop_of(*_),
+    )
+    for name, rooms in (("S4", 2), ("S6", 2)):  # S4: without and with the cabinet
+        source = source_of("live", "0")
+        source.look(playing(name), None)
+        source.open(VIEWS[0])
+        assert len(drawn) == rooms
+        source.frame(BEGIN_NS + round((SECONDS - 1.0) * 1e9))
+        assert len(drawn) == rooms
+        drawn.clear()
