@@ -2,13 +2,16 @@
 
     DIR/recording.json           what it is of
     DIR/truth.npz                bodies (frames, people, 17, 7), NaN where nobody is; joints
-                                 (frames, 7) if the arm is shown, else (0, 7)
+                                 (frames, 7) if the arm is shown, else (0, 7); boxes (n, 9),
+                                 centre, half sizes and colour of what stands there, room by room
     DIR/camera_<i>/still.png     the empty room, exactly
     DIR/camera_<i>/windows.npy   (frames, 4), the part that differs from it: first column, first
                                  row, last column + 1, last row + 1; zeros: nothing differs
     DIR/camera_<i>/000042.jpg    that part of frame 42, without noise
 
-A recording appears under its name when it is whole.
+A recording appears under its name when it is whole.  One that shows people or things elsewhere than
+the scenario has them now was made by another version of it, and is never played: its images would
+disagree with the truth of the run.
 """
 
 from __future__ import annotations
@@ -49,7 +52,7 @@ if TYPE_CHECKING:
     Motion = Callable[[float], F64]
     Draw = Callable[[Scene], Image]
 
-FORMAT: Final = 1
+FORMAT: Final = 2
 """Number of the format; a recording of another one is made anew."""
 QUALITY: Final = 95
 RENDERERS: Final = ("composite", "mujoco")
@@ -120,9 +123,10 @@ def kept_recording(
     folder = root / name
     try:
         if read_info(folder) == wanted:
+            check_truth(folder, Stage(scenario))
             return folder
     except CameraError:
-        pass  # there is none, or it is of an older format: it is made anew
+        pass  # there is none, or an older version made it: it is made anew
     return record(folder, scenario, renderer=renderer, calibrations=chosen, progress=progress)
 
 
@@ -172,8 +176,13 @@ def record(
             ]
             for job in jobs:
                 job.result()
-        bodies, joints = _truth(stage, info, motion)
-        np.savez(begun / "truth.npz", bodies=bodies, joints=joints)
+        truth = _truth(stage, info, motion)
+        np.savez(
+            begun / "truth.npz",
+            bodies=truth["bodies"],
+            joints=truth["joints"],
+            boxes=truth["boxes"],
+        )
         text = json.dumps(dataclasses.asdict(info), indent=2)
         (begun / "recording.json").write_text(text + "\n", encoding="utf-8")
         if folder.exists():
@@ -204,6 +213,28 @@ def read_info(folder: Path) -> RecordingInfo:
             f"{path}: {asked} in format {FORMAT}; found format {info.format}; record it again"
         )
     return info
+
+
+def check_truth(folder: Path, stage: Stage) -> None:
+    """Refuse a recording that shows something else than its scenario does now.
+
+    Raises:
+        CameraError: People or things were elsewhere when it was made, or its truth is unreadable.
+    """
+    info = read_info(folder)
+    now = _truth(stage, info, None)
+    asked = f"asked for a recording of {info.scenario}, seed {info.seed}, as it is now"
+    try:
+        with np.load(folder / "truth.npz") as then:
+            same = {name: np.array_equal(then[name], now[name], equal_nan=True)
+                    for name in ("bodies", "boxes")}  # fmt: skip
+    except (OSError, ValueError, KeyError) as error:
+        raise CameraError(
+            f"{folder}: {asked}; found no readable truth.npz ({error}); record it again"
+        ) from None
+    for name, what in (("bodies", "people walk differently"), ("boxes", "other things stand")):
+        if not same[name]:
+            raise CameraError(f"{folder}: {asked}; found one in which {what}; record it again")
 
 
 class Tape:
@@ -345,11 +376,15 @@ def _record_camera(
     np.save(own / "windows.npy", windows)
 
 
-def _truth(stage: Stage, info: RecordingInfo, motion: Motion | None) -> tuple[F64, F64]:
-    """Return the bodies of each frame, and the arm's joints if it is shown."""
+def _truth(
+    stage: Stage, info: RecordingInfo, motion: Motion | None
+) -> dict[str, npt.NDArray[np.float64]]:
+    """Return what `truth.npz` holds."""
     times = [frame * PERIOD_NS / 1e9 for frame in range(info.frames)]
     bodies = np.full((info.frames, len(stage.people), CAPSULES, 7), np.nan)
     for frame, at_s in enumerate(times):
         for number, capsules in stage.bodies_at(at_s).items():
             bodies[frame, number] = capsules
-    return bodies, np.empty((0, 7)) if motion is None else np.array([motion(t) for t in times])
+    joints = np.empty((0, 7)) if motion is None else np.array([motion(t) for t in times])
+    boxes = [(*box.centre_m, *box.half_m, *box.colour) for room in stage.rooms for box in room]
+    return {"bodies": bodies, "joints": joints, "boxes": np.array(boxes, np.float64)}

@@ -17,7 +17,7 @@ import numpy as np
 from actors.geometry.kinematics import capsules_at
 from actors.workcell.scenarios import scenario_of
 from actors.workcell.simulation.arm import ARM, HOME_RAD, shown_at
-from actors.workcell.simulation.recording import Tape
+from actors.workcell.simulation.recording import Tape, check_truth
 from actors.workcell.simulation.render import View, robot_colours
 from actors.workcell.simulation.stage import Stage
 from actors.workcell.sources import PERIOD_NS, CameraError, check_options
@@ -215,7 +215,7 @@ class PlaybackSource(LiveSource):
         """Return what the recording shows.
 
         Raises:
-            CameraError: It is of another scenario.
+            CameraError: It is of another scenario, or of this one as it was before a change.
         """
         assert self._tape is not None, "open first"
         info, wanted = self._tape.info, (playing.scenario, playing.seed, playing.seconds)
@@ -225,7 +225,9 @@ class PlaybackSource(LiveSource):
                 f" {playing.seconds:g} s; found {info.scenario}, seed {info.seed},"
                 f" {info.seconds:g} s; record it, or play what was recorded"
             )
-        return super().stage_of(playing)
+        stage = super().stage_of(playing)
+        check_truth(self._folder, stage)
+        return stage
 
     def people(self, at_s: float) -> Rendered:
         """Return the recorded image; depth and shadows are drawn where the arm will need them."""

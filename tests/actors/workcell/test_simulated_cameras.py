@@ -155,6 +155,24 @@ def test_recording_knows_its_truth(recording):
     assert truth["joints"].shape == (0, 7)
 
 
+@pytest.mark.parametrize("changed", ["bodies", "boxes"])
+def test_recording_of_what_its_scenario_was_before_is_refused_and_made_anew(tmp_path, changed):
+    """The images of an older version disagree with the truth of the run."""
+    scenario = scenario_of("visit", 3, 3.0)
+    folder = kept_recording(tmp_path, scenario, calibrations=VIEWS[:1])
+    with np.load(folder / "truth.npz") as file:
+        truth = dict(file)
+    now = truth[changed].copy()
+    truth[changed] = now + 0.1
+    np.savez(folder / "truth.npz", **truth)
+
+    with pytest.raises(CameraError, match=r"as it is now; found one in which .*; record it again"):
+        opened(f"playback:{folder}", playing(seconds=3.0)).frame(BEGIN_NS)
+    assert kept_recording(tmp_path, scenario, calibrations=VIEWS[:1]) == folder
+    with np.load(folder / "truth.npz") as file:
+        np.testing.assert_array_equal(file[changed], now)
+
+
 def test_recording_with_the_arm_plays_as_it_was(tmp_path):
     scenario = scenario_of("S1", 1, 0.3)
 
