@@ -1,9 +1,9 @@
-"""What a backup has of each of its files, so that a restore can tell one byte that differs.
+"""Digests of all files of a backup, so that a restore can detect a single changed byte.
 
-``backup.json`` has the size and the SHA-256 of every other file, and ends with the SHA-256 of its
-own text before.  A store finds its own damage where it decides something; a backup has lain on
-other disks and gone over networks for a year, and is read once.  The text has also who may read the
-shard's files, since the copies are for nobody but their owner.
+``backup.json`` holds the size and SHA-256 of every other file and ends with the SHA-256 of its own
+preceding text.  A store checks its data where it decides something; a backup may lie on other disks
+and cross networks for a year before it is read once.  The text also records the permissions of the
+shard's files, since the copies are readable by their owner only.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ HERE: Final = "."
 MODE_MAX: Final = 0o7777
 _SEAL: Final = re.compile(rb'(?s)(.*), "sha256": "([0-9a-f]{64})"\}')
 _PLAIN: Final = frozenset((FORMAT_FILE, MARK_FILE, DATABASE_FILE, LOG_FILE))
-_COPY_AGAIN: Final = "copy the backup again from where it is whole, or take another one"
+_COPY_AGAIN: Final = "copy the backup again from an intact source, or use another one"
 
 
 class Digest(NamedTuple):
-    """How many bytes a file has, and which, as far as a SHA-256 tells."""
+    """Size and SHA-256 of a file."""
 
     size: int
     sha256: str
@@ -57,7 +57,7 @@ def digest_of(path: Path) -> Digest:
 
 
 def digests_of(folder: Path) -> dict[str, Digest]:
-    """Return the digests of the files of a backup, by their path in it.
+    """Return the digests of all files of a backup, by their path in it.
 
     Raises:
         OSError: As the system reports it.
@@ -66,7 +66,7 @@ def digests_of(folder: Path) -> dict[str, Digest]:
 
 
 def files_of(folder: Path) -> list[str]:
-    """Return the files of a backup, by their path in it, but for what it says of itself.
+    """Return the files of a backup except its description, by their path in it.
 
     Raises:
         OSError: As the system reports it.
@@ -76,14 +76,14 @@ def files_of(folder: Path) -> list[str]:
     return names
 
 
-# ---------------------------------------------------------------- who may read them
+# ---------------------------------------------------------------- permissions
 
 
 def modes_of(folder: Path, names: Iterable[str]) -> dict[str, str]:
-    """Return the permissions of a folder and of what is named in it, in octal digits.
+    """Return the permissions of a folder and of the files named in it, in octal digits.
 
     Raises:
-        OSError: As the system reports it; what is not there has none.
+        OSError: As the system reports it; a missing file is left out.
     """
     modes: dict[str, str] = {}
     for name in (HERE, *names):
@@ -102,7 +102,7 @@ def mode_of(path: Path) -> str:
 
 
 def set_modes(folder: Path, modes: dict[str, str]) -> None:
-    """Let who is named there, and nobody else, read and write; the owner may in any case.
+    """Set the permissions of the named files and folders; the owner always keeps access.
 
     Raises:
         OSError: As the system reports it.
@@ -115,17 +115,17 @@ def set_modes(folder: Path, modes: dict[str, str]) -> None:
 
 
 def check_modes(modes: dict[str, str], files: Iterable[str]) -> dict[str, str]:
-    """Return permissions of a backup.
+    """Return the permissions of a backup, checked.
 
     Raises:
-        ValueError: They are none, or of something that it does not have.
+        ValueError: They are invalid, or belong to a file that the backup lacks.
         AttributeError: As `ValueError`.
         TypeError: As `ValueError`.
     """
     if modes.keys() - {HERE, BLOB_FOLDER, *files}:
-        raise ValueError("it has permissions of what it does not have")
+        raise ValueError("it has permissions of files that it lacks")
     if any(not 0 <= int(mode, 8) <= MODE_MAX for mode in modes.values()):
-        raise ValueError("its permissions are none")
+        raise ValueError("its permissions are invalid")
     return modes
 
 
@@ -133,16 +133,16 @@ def check_modes(modes: dict[str, str], files: Iterable[str]) -> dict[str, str]:
 
 
 def sealed(told: dict[str, Any], files: dict[str, Digest]) -> bytes:
-    """Return the text of `BACKUP_FILE`: what a backup says of itself, its files, its digest."""
+    """Return the text of `BACKUP_FILE`: description, digests of the files, its own digest."""
     text = json.dumps({**told, FILES: files}).removesuffix("}").encode()
     return text + f', "sha256": "{hashlib.sha256(text).hexdigest()}"}}'.encode()
 
 
 def read_sealed(path: Path) -> tuple[dict[str, Any], dict[str, Digest] | None]:
-    """Return what a backup says of itself, and its files; None: it was made before it had digests.
+    """Return a backup's description and its digests; None: it is from before digests existed.
 
     Raises:
-        StoreError: There is no such text, or it is not what it was.
+        StoreError: The text is missing or has changed.
     """
     file = path / BACKUP_FILE
     try:
@@ -150,8 +150,8 @@ def read_sealed(path: Path) -> tuple[dict[str, Any], dict[str, Digest] | None]:
         seal = _SEAL.fullmatch(text)
         if seal is not None and (found := hashlib.sha256(seal[1]).hexdigest()) != seal[2].decode():
             raise StoreError(
-                f"{file} is not what it was when the backup was made: its text has SHA-256 {found},"
-                f" and says {seal[2].decode()} of itself; {_COPY_AGAIN}",
+                f"{file} has changed since the backup was made: its text has SHA-256 {found},"
+                f" but records {seal[2].decode()}; {_COPY_AGAIN}",
                 path=str(file),
             )
         told = json.loads(text)
@@ -177,7 +177,7 @@ def check_files(folder: Path, files: dict[str, Digest]) -> None:
     """Read all files of a backup.
 
     Raises:
-        StoreError: One is missing, or is not what it was.
+        StoreError: One is missing or has changed.
         OSError: One cannot be read.
     """
     wrong: list[str] = []
@@ -185,10 +185,10 @@ def check_files(folder: Path, files: dict[str, Digest]) -> None:
         try:
             found = digest_of(folder / name)
         except FileNotFoundError:
-            wrong.append(f"{folder / name} is missing, expected are {expected}")
+            wrong.append(f"{folder / name} is missing, expected {expected}")
         else:
             if found != expected:
-                wrong.append(f"{folder / name} has {found}, expected are {expected}")
+                wrong.append(f"{folder / name} has {found}, expected {expected}")
     if wrong:
         more = f" (and {len(wrong) - 1} more files)" if wrong[1:] else ""
         raise StoreError(f"{wrong[0]}{more}; {_COPY_AGAIN}", path=str(folder))

@@ -1,9 +1,8 @@
-"""Large bodies as files of their own, beside the database that names them.
+"""Large bodies as separate files beside the database that names them.
 
-Database rows name the file, its length and its checksum; a file that no row names is rubbish and
-is swept at the next start.  So the order is: write the file whole, then commit the row, then
-unlink the file that the row named before.  Names tell nothing about the content and are never
-used twice (epoch and counter).
+A database row holds the file's name, length and checksum; a file without a row is garbage, deleted
+at the next start.  So the order is: write the whole file, commit the row, then unlink the row's
+previous file.  Names are independent of the content and never reused (epoch and counter).
 """
 
 from __future__ import annotations
@@ -35,9 +34,9 @@ class Blob(NamedTuple):
 
 
 class Mapped(NamedTuple):
-    """A file as it is read: its bytes, and what is still to be asked about them.
+    """A mapped file: its bytes, and its pending check.
 
-    `fault` says what is wrong with the content, "" where nothing is; None: it was checked.
+    `fault` returns what is wrong with the content, "" if nothing; None: it was checked already.
     """
 
     body: memoryview
@@ -45,7 +44,7 @@ class Mapped(NamedTuple):
 
 
 class DamagedBlobError(Exception):
-    """A blob file is missing, or is not what its row says; the message says which."""
+    """A blob file is missing or does not match its row; the message says which."""
 
 
 class BlobFolder:
@@ -85,9 +84,9 @@ class BlobFolder:
         return Blob(name, len(flat), crc, durable)
 
     def force(self, blob: Blob) -> Blob:
-        """Force a file to the disk that was not when it was written; names need `sync_names` too.
+        """Force a file to the disk after it was written; its name needs `sync_names` too.
 
-        An error of its writing back is told to whoever forces it first.
+        The first caller that forces the file gets any error of its writeback.
 
         Raises:
             OSError: As the system reports it.
@@ -108,18 +107,18 @@ class BlobFolder:
         sync_folder(self.folder)
 
     def unlink(self, name: str) -> None:
-        """Remove a file that no row names any more; whoever has it mapped keeps its content.
+        """Unlink a file without a row; processes that have it mapped keep its content.
 
         Raises:
-            OSError: As the system reports it, unless the file is gone already.
+            OSError: As the system reports it; a missing file is no error.
         """
         (self.folder / name).unlink(missing_ok=True)
 
     def map(self, blob: Blob, *, whole: bool) -> Mapped:
-        """Map a file that is there and as long as its row says; pages are loaded when touched.
+        """Map an existing file of the length in its row; pages are loaded when touched.
 
-        The bytes stay, also when the file is unlinked.  With `whole` the content is checked too,
-        which reads all of it.
+        The bytes stay valid after the file is unlinked.  `whole` also checks the content, which
+        reads all of it.
 
         Raises:
             DamagedBlobError: It is missing, of another length, or (`whole`) its checksum differs.
@@ -133,7 +132,7 @@ class BlobFolder:
         try:
             found_bytes = os.fstat(descriptor).st_size
             if found_bytes != blob.size:
-                raise DamagedBlobError(f"{path} has {found_bytes} bytes, stored were {blob.size}")
+                raise DamagedBlobError(f"{path} has {found_bytes} bytes instead of {blob.size}")
             if whole and _crc_of(descriptor) != blob.crc:
                 raise DamagedBlobError(_damaged(path))
             body = body_of(map_file(descriptor, blob.size, writable=False)).toreadonly()
@@ -142,7 +141,7 @@ class BlobFolder:
         return Mapped(body, None if whole else _Check(path, body, blob.crc))
 
     def sweep(self, keep: Iterable[str]) -> int:
-        """Remove blob files and drafts that no row names; return how many there were.
+        """Delete blob files and drafts without a row; return how many there were.
 
         Raises:
             OSError: As the system reports it.
@@ -154,7 +153,7 @@ class BlobFolder:
         return len(orphans)
 
     def names(self) -> list[str]:
-        """Return the names of all blob files and drafts; other files are not ours.
+        """Return the names of all blob files and drafts; other files are left alone.
 
         Raises:
             OSError: As the system reports it.
@@ -186,7 +185,7 @@ def _crc_of(descriptor: int) -> int:
 
 
 class _Check:
-    """Compares mapped bytes with their checksum when it is first asked, and knows it from then."""
+    """Checks mapped bytes against their checksum on first use, and remembers the result."""
 
     __slots__ = ("_body", "_crc", "_fault", "_path")
 
@@ -204,7 +203,7 @@ class _Check:
 
     def _looked(self, body: memoryview) -> str:
         try:
-            # Not through the map: there a disk's error would end the process.
+            # Not through the map: there a disk error would kill the process.
             descriptor = os.open(self._path, os.O_RDONLY | os.O_CLOEXEC)
         except FileNotFoundError:
             return _damaged(self._path) if zlib.crc32(body) != self._crc else ""

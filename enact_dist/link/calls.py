@@ -1,4 +1,4 @@
-"""Calls of a client: how long each is waited for, and listings put together of their pages."""
+"""Calls of a client: their timeouts, and listings assembled from pages."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from enact_dist.core.messages import Answer, Request, WriteItem
 
 CALL_S: Final = 1.0
-"""How long one call may stay unanswered before it counts as unknown and is made again."""
+"""How long one call may stay unanswered before its outcome is unknown and it is repeated."""
 BYTES_PER_S_MIN: Final = 10e6
 """A call that carries data gets this much more time per byte."""
 _WITH_DATA: Final = (Commit, Prepare)
@@ -38,11 +38,11 @@ _ANSWERS: Final = (Surveyed, Locks, Sessions, Audited, Versions, Kept)
 
 
 class Calls:
-    """Calls of which some list things, and what came of them so far.
+    """A set of calls, some of them listings, and their answers so far.
 
     Attributes:
-        asked: Each shard and what it is to be asked now: of a listing the next page.
-        answers: The whole answers, None where there is none yet.
+        asked: The next request to each shard: for a listing, its next page.
+        answers: The complete answers; None while an answer is incomplete.
     """
 
     def __init__(self, calls: Sequence[tuple[str, Request]]) -> None:
@@ -53,16 +53,16 @@ class Calls:
 
     @property
     def left(self) -> list[int]:
-        """The numbers of the calls that are not answered as a whole."""
+        """The numbers of the calls without a complete answer."""
         return [number for number, answer in enumerate(self.answers) if answer is None]
 
     def take(self, number: int, answer: Answer) -> bool:
-        """Take an answer; return whether a further page is to be asked for."""
+        """Take an answer; return whether another page is needed."""
         shard, asked = self.asked[number]
         if not isinstance(asked, PAGED):
             self.answers[number] = answer
         elif isinstance(answer, EpochChanged) and asked.after != START:
-            # The shard has restarted between two pages, and its cursors mean nothing any more.
+            # The shard has restarted between two pages, so its cursors are invalid.
             self._pages.pop(number, None)
             self.asked[number] = self._first[number]
         elif isinstance(answer, _ANSWERS) and answer.more != START:
@@ -74,7 +74,7 @@ class Calls:
 
 
 def _joined(pages: list[_Page], last: Answer) -> Answer:
-    """Return one answer with the entries of all pages, and else what the first one says."""
+    """Return one answer with the entries of all pages and the other fields of the first."""
     if not pages or not isinstance(last, _ANSWERS):
         return last
     pages.append(last)
@@ -93,11 +93,11 @@ _ENTRIES: Final[dict[type, str]] = {
     Versions: "entries",
     Kept: "versions",
 }
-"""The field of each answer that grows."""
+"""The field that pages extend, by type of answer."""
 
 
 def bytes_with(writes: Iterable[Sequence[WriteItem]]) -> int:
-    """Return how many bytes of data travel with the messages that write these."""
+    """Return how many bytes of data the messages for these writes carry."""
     size = 0
     for each in writes:
         for _, datum in each:

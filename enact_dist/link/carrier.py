@@ -1,11 +1,11 @@
-"""The seam between a client and its shards: move one request and its answer.
+"""The interface between a client and its shards: carry one request and its answer.
 
-A carrier decides nothing.  Rules that each one keeps:
+A carrier decides nothing.  Every carrier keeps these rules:
 
-- No answer (None) means *unknown*, never *not executed*: requests are idempotent, ask again.
-- Many threads may use one carrier at once; a slow answer to one never delays another.
+- No answer (None) means *unknown*, never *not executed*: requests are idempotent, so repeat them.
+- Many threads may use one carrier at once; a slow answer never delays another thread.
 - It belongs to the process that opened it; after a fork it raises `MisuseError` in the child.
-- It never blocks the interpreter's exit, even if it was not closed.
+- It never blocks the interpreter's exit, even without `close`.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ FORKED_REMEDY: Final = (
     "connect for the first time after the fork, or start the child with the 'spawn' method"
     " (multiprocessing.get_context('spawn'))"
 )
-"""What somebody does who wants to use a cell in a child process."""
+"""What to do to use a cell in a child process."""
 
 
 def check_usable(pid: int, *, closed: bool) -> None:
@@ -54,9 +54,9 @@ def check_usable(pid: int, *, closed: bool) -> None:
 
 
 def failure_of(failures: Mapping[str, Exception]) -> Exception:
-    """Return the error of shards that could not be connected, which names all of them.
+    """Return the error for shards that could not be connected; it names all of them.
 
-    It is a `ConfigError` only where each is one: of any other kind may pass.
+    It is a `ConfigError` only if every one is: any other kind may be temporary.
     """
     if len(failures) == 1:
         return next(iter(failures.values()))
@@ -69,7 +69,7 @@ def read_answer(shard: str, header: bytes, payload: bytes | memoryview) -> Answe
     """Return the answer that a shard's frame carries.
 
     Raises:
-        ProtocolError: It cannot be read, or is no answer.
+        ProtocolError: It cannot be read or is no answer.
     """
     answer = decode_frame(header, payload)
     if type(answer) not in _ANSWERS:
@@ -78,42 +78,42 @@ def read_answer(shard: str, header: bytes, payload: bytes | memoryview) -> Answe
 
 
 class NoticeFeed(Protocol):
-    """Notices of all shards of a cell as they come; best effort, their numbers show gaps."""
+    """Notices of all shards of a cell; best effort, with numbers that show gaps."""
 
     @property
     def dropped(self) -> int:
-        """How many notices were dropped because the watcher did not take them in time."""
+        """How many notices were dropped because the watcher was too slow."""
 
     @property
     def late_s(self) -> float:
-        """How long the number of a notice of no interest may stay out."""
+        """How late the numbers of notices without interest may be, in seconds."""
 
     def get(self, timeout_s: float | None) -> Notice | Skipped | None:
-        """Return the next notice of interest, or which numbers were of none.
+        """Return the next notice of interest, or the numbers of skipped ones.
 
-        `timeout_s` None waits until a notice comes or `close` is called; else None is returned
-        after so long without one, or once closed.
+        With `timeout_s` None, waits for a notice or `close`.  Returns None after the timeout or
+        once closed.
         """
 
     def get_here(self) -> Notice | Skipped | None:
-        """Return the next of those that are here already, None if there is none; never waits."""
+        """Return the next notice that has arrived already, or None; never waits."""
 
     def not_beyond(self, shard: str, epoch: int, number: int) -> None:
-        """Let notices after this number come: the shard says that it has sent no later one."""
+        """Accept notices after this number: the shard reports it as the last one sent."""
 
     def close(self) -> None:
-        """End the feed and wake a thread that waits in `get`; twice is harmless."""
+        """End the feed and wake a thread that waits in `get`; idempotent."""
 
 
 class Begun(Protocol):
-    """A request that was sent; exactly one of the methods is called, once."""
+    """A request that was sent; call exactly one of the methods, once."""
 
     def wait(self, into: memoryview | None = None) -> Answer | None:
-        """Return the answer, or None if there was none in time.
+        """Return the answer, or None if none came in time.
 
         Args:
-            into: Where the answer's data may be put, if they are exactly as long; then they are
-                a view on it, and on a copy otherwise.
+            into: Buffer for the answer's data.  If their length matches, they become a view of it,
+                otherwise a copy.
 
         Raises:
             ProtocolError: As `Carrier.request`.
@@ -128,26 +128,27 @@ class Carrier(Protocol):
 
     @property
     def inside(self) -> bool:
-        """Whether the only shard is in this process, where data need not travel."""
+        """Whether the only shard runs in this process, so that data are not copied."""
 
     @property
     def fetch_bytes(self) -> int:
-        """How large a slice of a datum is asked for in one call, at most."""
+        """The largest slice of a datum that one call requests, in bytes."""
 
     def request(self, shard: str, message: Request, *, timeout_s: float) -> Answer | None:
-        """Send one request and return its answer, or None if there was none in time.
+        """Send one request and return its answer, or None if none came in time.
 
-        None may come at once if the shard is known to be away; a caller pauses before it retries.
+        None may come at once if the shard is known to be away; pause before a retry.
 
         Raises:
-            ProtocolError: The peer sent what this version cannot read, or two daemons answered.
+            ProtocolError: The peer sent a message that this version cannot read, or two daemons
+                answered.
             MisuseError: The carrier is closed or was opened before a fork.
         """
 
     def request_all(
         self, requests: Sequence[tuple[str, Request]], *, timeout_s: float
     ) -> list[Answer | None]:
-        """Send all requests before waiting for the first answer; answers in the same order.
+        """Send all requests before waiting for the first answer; return them in order.
 
         Raises:
             ProtocolError: As `request`.
@@ -155,29 +156,29 @@ class Carrier(Protocol):
         """
 
     def begin(self, shard: str, message: Request, *, timeout_s: float) -> Begun:
-        """Send one request that moves a slice of a large datum; its answer is waited for later.
+        """Send one request for a slice of a large datum; the caller awaits the answer later.
 
-        These travel so that nothing else waits behind them.  Many may be under way; those of one
-        thread to one shard are best waited for in the order in which they were begun.
+        No other message waits behind slices.  Many may be in flight; those of one thread to one
+        shard are best awaited in the order in which they were sent.
 
         Raises:
-            ProtocolError: The request cannot travel.
+            ProtocolError: The request cannot be sent.
             MisuseError: As `request`.
         """
 
     def subscribe(self, interest: Survey | None = None) -> NoticeFeed:
-        """Open a feed of the notices of all shards, those of shards added later included.
+        """Open a feed of the notices of all shards, including shards added later.
 
         Args:
             interest: What is watched; None for everything.
         """
 
     def add_endpoints(self, entries: Sequence[ShardEntry]) -> None:
-        """Connect to further shards, to all that can be; those already in reach stay as they are.
+        """Connect to all further shards that can be reached; existing connections stay.
 
         Raises:
             ConfigError: An endpoint cannot be read.
-            LinkError: Several cannot be connected, for the reasons that it names.
+            LinkError: Some cannot be connected; the message gives the reasons.
             MisuseError: As `request`.
         """
 
@@ -187,17 +188,17 @@ class Carrier(Protocol):
     def away(self, shard: str) -> bool:
         """Whether a shard is known to be out of reach; contacts no shard.
 
-        Once it no longer is, what `tell_returns` was given is called.
+        When it comes back, the callback given to `tell_returns` is called.
         """
 
     def tell_returns(self, returned: Callable[[str], None]) -> None:
-        """Call `returned` with the name of each shard that comes (back) into reach.
+        """Call `returned` with the name of each shard that comes (back) within reach.
 
-        From any thread; it must not wait.  A hint only: a carrier that cannot tell never calls it.
+        The call comes from any thread and must not block.  It is a hint: some carriers never call.
         """
 
     def endpoint_of(self, shard: str) -> str:
-        """Return where the shard is expected, for messages to people."""
+        """Return the shard's expected endpoint, for messages to people."""
 
     def close(self) -> None:
-        """End all connections and pending calls (they return None); twice is harmless."""
+        """End all connections and pending calls (they return None); idempotent."""

@@ -1,9 +1,9 @@
-"""What a client knows of the shards' catalogues: world contexts and aspects, shard by shard.
+"""What a client knows of the shards' catalogues: world contexts and aspects, by shard.
 
-A shard that keeps nothing on disk forgets its catalogue when it restarts; `forget` then makes the
-client register anew what it needs there.  One with a folder may have forgotten an aspect as well,
-or know it with another type since (`enact shard forget`), and any may have let a newer type succeed
-the one that it had: `lapses` tells that this has happened.
+A shard without a folder loses its catalogue when it restarts; `forget` then makes the client
+register its needs there again.  A shard with a folder may also have purged an aspect, or registered
+it with another type since (`enact shard forget`), and on any shard a newer type may have succeeded
+the known one; `lapses` counts these events.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ CATALOGUES: Final = (Welcome, Registered)
 class KnownCatalogue:
     """The newest catalogue of each shard that was greeted.
 
-    One thread at a time changes it, any may look: whatever it is shown was made whole before.
+    One thread at a time changes it, any thread may read: published objects are complete.
 
     Attributes:
-        lapses: How often a shard knew an aspect no more, or with another type than before.
+        lapses: How often a shard had lost an aspect or had it with another type.
     """
 
     def __init__(self) -> None:
@@ -42,18 +42,19 @@ class KnownCatalogue:
         self._settled: tuple[PlacementMap | None, set[AspectEntry]] = (None, set())
 
     def learn(self, shard: str, answer: Welcome | Registered, *, sent_in: int = 0) -> None:
-        """Take the catalogue that an answer carries; not that of an epoch which is over.
+        """Take the catalogue that an answer carries; ignore that of a past epoch.
 
         Args:
-            shard: Who has answered.
-            answer: What it said.
-            sent_in: The epoch that it was asked in; whose the answer is only a welcome says.
+            shard: The answering shard.
+            answer: Its answer.
+            sent_in: The epoch in which the request was sent; only a welcome names the answer's
+                epoch.
         """
         epoch = answer.epoch if isinstance(answer, Welcome) else sent_in
         known = self._epochs.get(shard, 0)
         changes = successions(answer.aspects)
         if epoch < known or (epoch == known and changes < self._successions.get(shard, 0)):
-            return  # it was sent before what is known
+            return  # older than the known state
         self._successions[shard] = changes
         if isinstance(answer, Welcome):
             self._epochs[shard] = epoch
@@ -61,7 +62,7 @@ class KnownCatalogue:
         self._worlds[shard] = worlds | {entry.name: entry for entry in answer.forks}
         before = self._aspects.get(shard, {})
         now = self._aspects[shard] = {entry.name: entry for entry in answer.aspects}
-        self._settled = (None, set())  # after it: nobody settles by what was known before
+        self._settled = (None, set())  # afterwards, so that no thread uses the old state
         if not all(
             name in now and same_type(now[name].fingerprint, entry.fingerprint)
             for name, entry in before.items()
@@ -69,14 +70,14 @@ class KnownCatalogue:
             self.lapses += 1
 
     def wants(self, aspects: Iterable[AspectEntry]) -> None:
-        """Note the aspects that this client registers: as it writes them, if it does."""
+        """Note the aspects that this client registers, for writing or only for reading."""
         for entry in aspects:
             if not entry.reads or entry.name not in self._wanted:
                 self._wanted[entry.name] = entry
 
     def wanted(self, names: Container[str]) -> list[AspectEntry]:
-        """Return what this client has registered, to be registered anew where it is forgotten."""
-        wanted = list(self._wanted.values())  # other threads add to them
+        """Return what this client has registered, for registering it again where it was lost."""
+        wanted = list(self._wanted.values())  # other threads add entries
         return [entry for entry in wanted if entry.name in names]
 
     def successions(self, shard: str) -> int:
@@ -84,15 +85,15 @@ class KnownCatalogue:
         return self._successions.get(shard, 0)
 
     def forget(self, shard: str) -> None:
-        """Forget the aspects of a shard, which does not know what it was said to know."""
+        """Drop the aspects known of a shard, because its catalogue proved wrong."""
         self._aspects.pop(shard, None)
         self._settled = (None, set())
         self.lapses += 1
 
     def settled(self, aspects: Iterable[AspectEntry], placement: PlacementMap) -> bool:
-        """Whether no shard of a placement must be asked before these aspects can be used.
+        """Whether these aspects can be used without asking any shard of a placement.
 
-        Found out once for each, until some catalogue changes: every lock asks.
+        The result is cached until a catalogue changes, because every lock asks.
         """
         settled_for, settled = self._settled
         if placement is not settled_for:
@@ -106,13 +107,13 @@ class KnownCatalogue:
         return True
 
     def worlds(self) -> dict[str, WorldEntry]:
-        """Return the world contexts that every greeted shard knows, and knows as the same fork."""
+        """Return the world contexts that every greeted shard knows as the same fork."""
         known = [set(worlds.values()) for worlds in list(self._worlds.values())]
         common = set.intersection(*known) if known else set()
         return {entry.name: entry for entry in sorted(common)}
 
     def worlds_at(self, name: str) -> dict[str, WorldEntry]:
-        """Return the shards that know a world context, and as what."""
+        """Return the shards that know a world context, each with its entry."""
         known = list(self._worlds.items())
         return {shard: worlds[name] for shard, worlds in known if name in worlds}
 
@@ -125,7 +126,7 @@ class KnownCatalogue:
         return merged
 
     def lacks(self, shard: str, worlds: Iterable[str], aspects: Iterable[AspectEntry]) -> bool:
-        """Whether the shard must be asked before these can be used there."""
+        """Whether the shard must be asked before these can be used on it."""
         known = self._aspects.get(shard, {})
         return not all(_agrees(known.get(entry.name), entry) for entry in aspects) or not set(
             worlds

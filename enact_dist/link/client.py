@@ -1,11 +1,11 @@
-"""The client's working half for locks: drives `core.MultiLock` over a carrier until it rests.
+"""Locks on the client's side: drives `core.MultiLock` over a carrier until it rests.
 
-The caller's own thread makes its lock's calls.  Rules a change must keep:
+A lock's calls run in the caller's own thread.  Rules a change must keep:
 
   * The mutex of the session guards the pure core and is never held during a call.
-  * Whatever ends a thread's way through here, an interrupt too, leaves nothing held at a shard
-    for good, and gives the lane back exactly once.
-  * A commit that was sent ends in an answer or in `CommitUnknownError`.
+  * However a thread leaves this module, even by an interrupt, no shard keeps its lock forever, and
+    its lane is returned exactly once.
+  * A commit that was sent ends with an answer or a `CommitUnknownError`.
 """
 
 from __future__ import annotations
@@ -54,12 +54,12 @@ if TYPE_CHECKING:
 
 _WITH_DATA: Final = (Commit, Prepare)
 INTERRUPTIBLE_SLICE_NS: Final = 120_000_000
-"""How long one call of a lock that may be told to stop waiting is parked."""
+"""How long one call of an interruptible lock is parked."""
 RESTARTS_AT_ONCE: Final = 1
-"""How often a lock that was lost before it was held is asked for anew without a pause."""
+"""Retries without a pause for a lock that was lost before it was held."""
 RESTART_S_MAX: Final = 0.3
 REGISTRATIONS_MAX: Final = 3
-"""How often one lock registers its aspects again at a shard that says not to know them."""
+"""How often one lock registers its aspects again with a shard that does not know them."""
 
 _log = logging.getLogger("enact.link")
 
@@ -81,17 +81,17 @@ class CellClient(SessionClient):
 
         Args:
             items: What to lock and view.
-            wait_s: How long to wait for the grant; with 0 each shard is asked once.
+            wait_s: How long to wait for the grant; 0 asks each shard once.
             hold_s: Hold limit after the last grant.
             interrupt: Ends the waiting within 0.2 s once it is set.
-            begun: Gets the lock before anything is asked, so that its caller can release it when
+            begun: Receives the lock before the first request, so that its caller can release it if
                 an exception comes between the return and the assignment.
-            past_ns: The items are views alone, as of this stamp.
+            past_ns: All items are views, as of this timestamp.
 
         Raises:
             LockTimeoutError: Not granted in time; nothing is held.
-            ForgottenError: A state as of `past_ns` has left its retention.
-            ShardUnreachableError: A shard stayed without an answer.
+            ForgottenError: A state as of `past_ns` is beyond retention.
+            ShardUnreachableError: A shard did not answer.
             MisuseError: Too many threads hold or await locks.
             EnactError: The shard refused the request.
         """
@@ -109,7 +109,7 @@ class CellClient(SessionClient):
                 lock = self.core.begin(lane, plan, now_ns=now_ns, wait_ns=wait_ns, hold_ns=hold_ns)
                 begun.append(lock)
                 for before in begun[-2:-1]:
-                    before.lane_free = True  # the lane goes on with the next one
+                    before.lane_free = True  # the next lock takes over the lane
             if interrupt is not None:
                 lock.slice_ns = INTERRUPTIBLE_SLICE_NS
 
@@ -139,9 +139,9 @@ class CellClient(SessionClient):
             raise
 
     def _release_of(self, lane: int) -> None:
-        """Release what lives in a lane, a lock that an interrupt has kept from being noted too.
+        """Release the lock of a lane, even one that an interrupt kept from being recorded.
 
-        Keep-alives would name it for ever, and no lost release of the lane would be repaired.
+        Otherwise keep-alives would name it forever, and a lost release would never be repaired.
         """
         with self._mutex:
             for lock in self.core.live_locks():
@@ -149,7 +149,7 @@ class CellClient(SessionClient):
                     lock.release()
 
     def _begins_anew(self, lock: MultiLock, attempt: int) -> bool:
-        """Whether a lock that came to rest should be asked for once more; pauses before that."""
+        """Whether to request a resting lock once more; pauses first."""
         if lock.phase in (Phase.LOST, Phase.MISPLACED):
             if attempt >= RESTARTS_AT_ONCE:
                 self._pause(min(0.02 * 2 ** min(attempt, 8), RESTART_S_MAX))
@@ -159,9 +159,9 @@ class CellClient(SessionClient):
             return False
         shards = {shard for shard, _ in (*lock.plan.locks, *lock.plan.views)}
         if code == NEWER_TYPE:
-            self.greet(shards)  # who asked sees the lapse, and compares the types once more
+            self.greet(shards)  # the caller sees the lapse and compares the types again
             return True
-        # A shard that keeps nothing restarted since: its catalogue is empty again.
+        # A shard without a folder has restarted: its catalogue is empty again.
         named = {i.aspect for _, its in (*lock.plan.locks, *lock.plan.views) for i in its}
         for shard in shards:
             self._catalogue.forget(shard)
@@ -170,7 +170,7 @@ class CellClient(SessionClient):
         return bool(aspects)
 
     def _pause(self, pause_s: float) -> None:
-        """Wait before asking again; raises if the cell is closed meanwhile."""
+        """Wait before a retry; raise if the cell is closed meanwhile."""
         if self.pauses.rest(pause_s):
             self.check_usable()
 
@@ -212,7 +212,7 @@ class CellClient(SessionClient):
     def _wait_until(
         self, lock: MultiLock, until_ns: int, returns: int, interrupt: threading.Event | None
     ) -> None:
-        """Wait before a lock asks again, unless a shard has come back since or it is given up."""
+        """Wait before a lock asks again, until a shard returns or the lock is given up."""
         while True:
             left_ns = max(1_000_000, until_ns - self._now_ns())
             if interrupt is not None:
@@ -224,7 +224,7 @@ class CellClient(SessionClient):
                 return
 
     def _sendable(self, shard: str, request: Request) -> Request:
-        """Return a request as it can travel: data that a shard has lost are brought once more."""
+        """Return a request ready to send, staging again any data that a shard has lost."""
         if not isinstance(request, _WITH_DATA) or self.carrier.inside:
             return request
         if bytes_with([request.writes]) <= COMMIT_BYTES_MAX:
@@ -233,7 +233,7 @@ class CellClient(SessionClient):
         return replace(request, writes=tuple(named[shard]))
 
     def _say_farewell(self, lock: MultiLock) -> None:
-        """Send the releases of a lock that rests; the keep-alives repair what gets lost."""
+        """Send the releases of a lock that rests; keep-alives repair lost ones."""
         with self._mutex:
             farewells = lock.take_farewells()
         try:
@@ -250,19 +250,19 @@ class CellClient(SessionClient):
         reads: tuple[DatumRead, ...] = (),
         reads_left_out: int = 0,
     ) -> None:
-        """Publish `writes` and give the lock back.
+        """Publish `writes` and release the lock.
 
         Args:
-            lock: What is held.
-            writes: What each shard has to set.
-            expects: What was viewed and must still be the newest.
-            reads: What went into the writes, for their lineage.
-            reads_left_out: How many further data did.
+            lock: The held lock.
+            writes: What to set, by shard.
+            expects: Viewed versions that must still be the newest.
+            reads: Inputs of the writes, for their lineage.
+            reads_left_out: How many further inputs there were.
 
         Raises:
-            ChangedError: An expected slot has moved on; nothing was written.
+            ChangedError: An expected slot has changed; nothing was written.
             LeaseLostError: The lock was lost; nothing was written.
-            CommitUnknownError: The commit was sent and never answered.
+            CommitUnknownError: The commit was sent but never answered.
             ShardUnreachableError: A shard does not answer; nothing was written.
         """
         started_ns = self._now_ns()
@@ -300,7 +300,7 @@ class CellClient(SessionClient):
             self.release(lock)  # only the lane, unless something broke in between
 
     def _check_held(self, lock: MultiLock) -> None:
-        """Raise if a lock was lost while its data were on their way."""
+        """Raise if a lock was lost while its data were being sent."""
         self.check_usable()
         if lock.phase is not Phase.HELD:
             self._ask_cause(lock)
@@ -323,12 +323,12 @@ class CellClient(SessionClient):
         return not_committed(lock, waited_s, self.carrier.endpoint_of, name=name)
 
     def outcome(self, name: str, *, timeout_s: float) -> Position | None:
-        """Ask what became of a commit; see `Cell.outcome`."""
+        """Ask for the outcome of a commit; see `Cell.outcome`."""
         lock, shard = read_name(name)
         if shard not in self.shards():
             raise MisuseError(f"{name!r} names shard {shard}; there are {', '.join(self.shards())}")
         deadline_ns = self._now_ns() + int(timeout_s * 1e9)
-        # A copy of the commit that is still under way finds nothing to commit after this.
+        # After this, a copy of the commit still in flight finds nothing to commit.
         released = self.call(shard, Release(lock), timeout_s=timeout_s)
         while True:
             left_s = max(0.0, (deadline_ns - self._now_ns()) / 1e9)
@@ -341,15 +341,16 @@ class CellClient(SessionClient):
                     raise error_of(released)
                 return None
             if kind != OUTCOME_PENDING or self._now_ns() >= deadline_ns:
-                why = "still works on it" if kind == OUTCOME_PENDING else "knows it no more"
+                why = "still works on it" if kind == OUTCOME_PENDING else "no longer knows it"
                 raise CommitUnknownError(
-                    f"shard {shard} {why}: commit {name} may stand or not; read its data",
+                    f"shard {shard} {why}: whether commit {name} took effect is unknown; read"
+                    " its data",
                     lock_id=name,
                 )
             self._pause(0.02)
 
     def release(self, lock: MultiLock) -> None:
-        """Give the lock back without writing, and its lane; nothing where that is done already.
+        """Release the lock without writing, and free its lane; idempotent.
 
         Never raises for a lock or cell already lost.
         """
@@ -368,7 +369,7 @@ class CellClient(SessionClient):
                 self._lanes.give_back(lock.lock.lane)
 
     def valid(self, lock: MultiLock) -> bool:
-        """Whether the client may still believe in the lock, without asking over a network."""
+        """Whether the lock's lease still holds by the local clock, without a network call."""
         if self.forked or self.closed:
             return False
         with self._mutex:
@@ -380,7 +381,7 @@ class CellClient(SessionClient):
         return valid
 
     def check(self, lock: MultiLock) -> None:
-        """Make sure that the lock is held, asking its shards where belief has run out.
+        """Make sure that the lock is held, asking its shards if its lease may have ended.
 
         Raises:
             LeaseLostError: It is lost.
@@ -400,23 +401,23 @@ class CellClient(SessionClient):
             raise not_committed(lock, FINISH_S, self.carrier.endpoint_of)
 
     def _ask_cause(self, lock: MultiLock) -> None:
-        """Let the shard say why it took a lock away whose absence a keep-alive has shown."""
+        """Ask the shard why a lock ended whose loss a keep-alive has revealed."""
         call = lock.ask_cause()
         if call is not None:
             try:
                 lock.told_cause(self.call_once([call])[0])
             except EnactError as error:
-                _log.info("why lock %s was lost cannot be asked: %s", lock.lock, error)
+                _log.info("cannot ask why lock %s was lost: %s", lock.lock, error)
 
     def _ask_who(self, lock: MultiLock) -> None:
-        """Let the shard say who committed what a lock did not expect."""
+        """Ask the shard who committed an unexpected change."""
         moved = lock.moved
         if moved is None:
             return
         try:
             answer = self.call_once([(self.shard_of(moved.slot.entity), Explain((moved,)))])[0]
         except EnactError as error:
-            _log.info("who changed %s cannot be asked: %s", moved.slot, error)
+            _log.info("cannot ask who changed %s: %s", moved.slot, error)
             return
         for entry in answer.entries if isinstance(answer, Versions) else ():
             if entry.cause is not None:

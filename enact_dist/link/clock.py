@@ -1,14 +1,14 @@
-"""This host's clocks, in integer nanoseconds; the one place where they are read.
+"""This host's clocks, in integer nanoseconds; the only module that reads them.
 
 ==============  ==========================================  ====================================
-clock           runs while the host is suspended            for
+clock           runs while the host is suspended            used for
 ==============  ==========================================  ====================================
 `monotonic_ns`  no: leases end later, which is safe         the shard's deadlines
-`boottime_ns`   yes: a client believes less, which is safe  a client's belief in its locks
-`wall_ns`       yes, and is set by people                   stamps only, never a decision on leases
+`boottime_ns`   yes: a client believes less, which is safe  a client's own view of its leases
+`wall_ns`       yes, and is set by people                   timestamps only, never leases
 ==============  ==========================================  ====================================
 
-Times of two hosts are never compared; only durations travel.
+Times of two hosts are never compared; messages carry only durations.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Protocol
 
 
 def monotonic_ns() -> int:
-    """Return the time since an arbitrary start that stands still in suspend."""
+    """Return the time since an arbitrary start that stops during suspend."""
     return time.monotonic_ns()
 
 
@@ -31,18 +31,18 @@ else:
 
 
 def wall_ns() -> int:
-    """Return the time since 1970-01-01 UTC as this host has it."""
+    """Return the time since 1970-01-01 UTC by this host's clock."""
     return time.time_ns()
 
 
 class Clock(Protocol):
-    """The two clocks of a shard; a test may put its own in their place."""
+    """The two clocks of a shard; a test may replace them."""
 
     def monotonic_ns(self) -> int:
-        """Return a time that never goes back."""
+        """Return a time that never decreases."""
 
     def wall_ns(self) -> int:
-        """Return the time since 1970, for stamps."""
+        """Return the time since 1970, for timestamps."""
 
 
 class SystemClock:

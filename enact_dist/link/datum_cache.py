@@ -1,8 +1,8 @@
-"""The data that this process has seen, by version: what it holds is never sent to it twice.
+"""Data that this process has seen, by version, so that a shard does not send them again.
 
-A datum is known by (shard, epoch, slot, version): versions of volatile slots start again with a
-new epoch of their shard, so a version alone could name two data.  The bytes held are capped, and
-the least recently used go first.
+The key of a datum is (shard, epoch, slot, version): versions of volatile slots start again with
+each epoch, so a version alone would be ambiguous.  The cache has a byte limit and evicts the least
+recently used data first.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 CACHE_BYTES_MAX: Final = 256 << 20
 CACHED_BYTES_MIN: Final = 1024
-"""Smaller data cost less to send again than to look up."""
+"""Smaller data cost less to send again than to look up, bytes."""
 
 
 class _Known(NamedTuple):
@@ -27,7 +27,7 @@ class _Known(NamedTuple):
 
 
 class DatumCache:
-    """The newest datum of each slot that this process has seen, up to a number of bytes."""
+    """The newest datum of each slot that this process has seen, up to a byte limit."""
 
     def __init__(self, bytes_max: int = CACHE_BYTES_MAX) -> None:
         self._bytes_max = bytes_max
@@ -39,13 +39,13 @@ class DatumCache:
         return slot in self._known
 
     def version(self, slot: Slot, shard: str, epoch: int) -> int:
-        """Return the version that is known of a slot in this epoch (0: none)."""
+        """Return the known version of a slot in this epoch (0: none)."""
         with self._mutex:
             known = self._known.get(slot)
         return known.version if known and (known.shard, known.epoch) == (shard, epoch) else 0
 
     def get(self, slot: Slot, shard: str, epoch: int, version: int) -> Datum | None:
-        """Return the datum of exactly this version, if it is known."""
+        """Return the datum of exactly this version, if it is cached."""
         with self._mutex:
             known = self._known.get(slot)
             if known is None or (known.shard, known.epoch, known.version) != (
@@ -58,9 +58,9 @@ class DatumCache:
             return known.datum
 
     def put(self, slot: Slot, shard: str, epoch: int, version: int, datum: Datum) -> None:
-        """Remember a datum; forget older ones beyond the cap.
+        """Store a datum; evict older ones beyond the limit.
 
-        What was seen of the past stands in for nothing newer.
+        A datum of the past never replaces a newer one.
         """
         if not CACHED_BYTES_MIN <= datum.size <= self._bytes_max:
             return

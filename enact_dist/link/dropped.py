@@ -1,7 +1,7 @@
-"""Sessions that nobody can use any more and nobody has closed: they are ended, with a warning.
+"""Ends sessions that were dropped without being closed, and logs a warning.
 
-The threads of a session keep its carrier and not the session itself, which therefore goes with the
-last cell, world context, lock or watch that uses it.
+The threads of a session hold its carrier, not the session itself.  The session is therefore
+collected together with the last cell, world context, lock or watch that uses it.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ if TYPE_CHECKING:
     from enact_dist.link.client import CellClient
 
 GOODBYE_S: Final = 0.5
-"""How long the shards of a dropped session may take to answer its goodbye."""
+"""How long the shards of a dropped session may take to answer the goodbye."""
 _PACKAGE: Final = "enact_dist."
 
 
 def weakly(method: Callable[..., Any]) -> Callable[..., Any]:
-    """Return what calls a bound method while its object lives, and returns None afterwards."""
+    """Return a function that calls a bound method while its object lives, else returns None."""
     found = weakref.WeakMethod(method)
 
     def call(*arguments: Any) -> Any:
@@ -40,24 +40,24 @@ def weakly(method: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def when_dropped(client: CellClient, name: str, host: Any) -> weakref.finalize[Any, Any]:
-    """End a session, and the shard inside this process, when nobody refers to it any more.
+    """End a session, and the shard inside this process, once nothing refers to it any more.
 
     Args:
         client: The session.
         name: The cell's name.
-        host: The shard inside this process; None where there is none.
+        host: The shard inside this process; None: there is none.
 
     Returns:
-        What `detach` of calls it off.
+        A finalizer whose `detach` cancels this.
     """
     left = client.carrier, client.core, client.pauses, host
     found = weakref.finalize(client, _dropped, os.getpid(), name, _made_at(), *left)
-    found.atexit = False  # what is open then is closed in order
+    found.atexit = False  # at exit, open cells are closed in order
     return found
 
 
 def _made_at() -> str:
-    """Return the place outside of this package where a cell is being opened."""
+    """Return the line outside this package that is opening a cell."""
     frame: FrameType | None = sys._getframe(1)  # noqa: SLF001 - a traceback would cost a file read
     while frame is not None and str(frame.f_globals.get("__name__")).startswith(_PACKAGE):
         frame = frame.f_back
@@ -65,17 +65,17 @@ def _made_at() -> str:
 
 
 def _dropped(pid: int, name: str, made_at: str, carrier: Any, core: Any, *left: Any) -> None:
-    if pid != os.getpid():  # a forked child: all of it is the parent's
+    if pid != os.getpid():  # in a forked child everything belongs to the parent
         return
     ending = threading.Thread(
         target=_end, args=(carrier, core, *left), name="enact-dropped", daemon=True
     )
-    # Not here: whoever happens to drop the last reference may hold locks that the end takes.
-    with contextlib.suppress(RuntimeError):  # the interpreter ends
+    # Not here: the thread that drops the last reference may hold locks needed below.
+    with contextlib.suppress(RuntimeError):  # the interpreter is exiting
         ending.start()
     warnings.warn(
-        f"cell {name!r} was dropped without close(), and is closed now; it was opened at {made_at};"
-        " write `with connect(…) as cell:`, or close it",
+        f"cell {name!r} was dropped without close() and is closed now; it was opened at {made_at};"
+        " use `with connect(…) as cell:`, or close it",
         ResourceWarning,
         stacklevel=2,
     )

@@ -1,7 +1,7 @@
-"""The carrier of `local()`: the shard lives in this process, a call is a function call.
+"""The carrier of `local()`: the shard runs in this process, a call is a function call.
 
-Nothing is encoded and nothing copied; data are immutable, so both sides may hold them.  The
-session's token is present as long as the process is, exactly as over a network.
+Nothing is encoded or copied: data are immutable, so both sides share them.  The session's token
+exists as long as the process, as it does over a network.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ if TYPE_CHECKING:
 
 
 FETCH_BYTES: Final = 1 << 40
-"""More than any datum has."""
+"""Larger than any datum."""
 
 
 class _Call:
-    """One answer on its way; most are there before anybody waits."""
+    """One pending answer; most have arrived before a thread waits."""
 
     __slots__ = ("answer", "done", "timeout_s")
 
     def __init__(self) -> None:
         self.answer: Answer | None = None
         self.timeout_s = 0.0
-        self.done = threading.Lock()  # a bare lock wakes in half the time of an Event
+        self.done = threading.Lock()  # a bare lock wakes twice as fast as an Event
         self.done.acquire()
 
     def __call__(self, answer: Answer) -> None:
@@ -42,24 +42,25 @@ class _Call:
         self.done.release()
 
     def wait(self, into: memoryview | None = None) -> Answer | None:
-        """Return the answer; its data are those that the shard has."""
+        """Return the answer; its data are the shard's own objects."""
         self.done.acquire(timeout=max(0.0, self.timeout_s))
         return self.answer
 
     def abandon(self) -> None:
-        """Do nothing: nothing is left to do."""
+        """Do nothing: an abandoned call needs no cleanup."""
 
 
 class EmbeddedCarrier:
     """Calls the one shard of this process.  See `Carrier` for the methods.
 
     Args:
-        host: The shard; it is not closed with the carrier.
-        session: The session whose token is shown as present until `close`.
+        host: The shard; the carrier does not close it.
+        session: The session whose token counts as present until `close`.
 
     Attributes:
-        inside: The only shard is in this process.
-        fetch_bytes: How large a slice of a datum is asked for in one call: all, nothing is copied.
+        inside: True: the only shard runs in this process.
+        fetch_bytes: The largest slice that one call requests: a whole datum, since nothing is
+            copied.
     """
 
     def __init__(self, host: ShardHost, session: str) -> None:
@@ -73,7 +74,7 @@ class EmbeddedCarrier:
         host.event(SessionSeen(session, present=True))
 
     def request(self, shard: str, message: Request, *, timeout_s: float) -> Answer | None:
-        """Call the shard; None if it is parked for longer than `timeout_s` or fails meanwhile.
+        """Call the shard; return None if it parks the call beyond `timeout_s`, or fails.
 
         Raises:
             ShardUnreachableError: `shard` is not the shard of this process.
@@ -87,7 +88,7 @@ class EmbeddedCarrier:
     def request_all(
         self, requests: Sequence[tuple[str, Request]], *, timeout_s: float
     ) -> list[Answer | None]:
-        """Make all calls, then wait for those that are parked.
+        """Make all calls, then wait for the parked ones.
 
         Raises:
             ShardUnreachableError: As `request`.
@@ -100,7 +101,7 @@ class EmbeddedCarrier:
         return [call.answer for call in calls]
 
     def begin(self, shard: str, message: Request, *, timeout_s: float) -> _Call:
-        """Make a call whose answer is waited for later.
+        """Make a call whose answer the caller awaits later.
 
         Raises:
             ShardUnreachableError: As `request`.
@@ -132,7 +133,7 @@ class EmbeddedCarrier:
                 f" {os.getpid()}, which was forked from it; open one there, or use a shard daemon"
             )
         if self._closed:
-            raise MisuseError("the connection to this cell is closed; open it again")
+            raise MisuseError("the connection to this cell is closed; open a new one")
 
     def subscribe(self, interest: Survey | None = None) -> NoticeQueue:
         """Open a feed of the shard's notices."""
@@ -152,27 +153,27 @@ class EmbeddedCarrier:
         """Do nothing: there is no other shard."""
 
     def way_to(self, shard: str) -> str:
-        """Return how calls travel: not at all."""
+        """Return the transport, for people: calls stay inside this process."""
         return "call"
 
     def away(self, shard: str) -> bool:
-        """Say no: the shard is in this process."""
+        """Return False: the shard is in this process."""
         return False
 
     def tell_returns(self, returned: Callable[[str], None]) -> None:
-        """Do nothing: the shard is in reach as long as this process lives."""
+        """Do nothing: the shard is within reach while this process lives."""
 
     def endpoint_of(self, shard: str) -> str:
-        """Return where the shard is, and why it answers no more."""
+        """Return where the shard is and, once it has failed, why."""
         failure = self._host.failure
         if failure is not None:
             return (
-                f"this process, where it has stopped ({failure}; close the cell and open it anew)"
+                f"this process, where it has stopped ({failure}; close the cell and open a new one)"
             )
         return "this process"
 
     def close(self) -> None:
-        """End the session's token and all feeds; twice is harmless."""
+        """End the session's token and all feeds; idempotent."""
         if self._closed or self._pid != os.getpid():
             return
         self._closed = True

@@ -1,6 +1,6 @@
-"""Zenoh's names of places, as ``tcp/host:7447?option#setting``, and what is known of them soon.
+"""Zenoh endpoints such as ``tcp/host:7447?option#setting``, and quick checks of them.
 
-Nothing of Zenoh is loaded here.
+This module does not load Zenoh.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 PROTOCOLS: Final = frozenset(("tcp", "udp", "tls", "quic", "ws", "unixsock-stream"))
-"""How the names of places begin."""
+"""Prefixes of endpoints."""
 LISTENS_S: Final = 0.3
-"""How long a place may take to say that somebody listens."""
+"""How long a host may take to accept or refuse a probing connection."""
 LOOK_UP_S: Final = 1.0
-"""How long host names may take to be looked up where that only explains an error."""
+"""How long host names may take to be looked up where the result only explains an error."""
 
 
 def split_endpoint(endpoint: str) -> tuple[str, str, str]:
-    """Return protocol, host and port of an endpoint; host and port are empty where it lacks them.
+    """Return protocol, host and port of an endpoint; host and port are empty if missing.
 
-    Options and settings are left out; an IPv6 address keeps its brackets.
+    Drops options and settings; an IPv6 address keeps its brackets.
     """
     protocol, _, address = endpoint.partition("/")
     host, _, port = address.partition("?")[0].partition("#")[0].rpartition(":")
@@ -34,7 +34,7 @@ def split_endpoint(endpoint: str) -> tuple[str, str, str]:
 
 
 def somebody_listens(endpoint: str) -> bool:
-    """Say whether it is worth asking there; a refused connection saves the time of asking."""
+    """Return whether asking there is worthwhile; a refused connection saves the wait."""
     protocol, host, port = split_endpoint(endpoint)
     if protocol != "tcp" or not port.isdecimal():
         return True
@@ -46,7 +46,7 @@ def somebody_listens(endpoint: str) -> bool:
 
 
 def is_of_this_host(endpoint: str) -> bool:
-    """Say whether this host may listen at an endpoint; so it is where nobody can tell."""
+    """Return whether this host may listen at an endpoint; True if that cannot be determined."""
     protocol, host, port = split_endpoint(endpoint)
     if protocol != "tcp" or not port.isdecimal():
         return True
@@ -67,7 +67,7 @@ def is_of_this_host(endpoint: str) -> bool:
 
 
 def unknown_hosts(endpoints: Sequence[str]) -> list[str]:
-    """Return the hosts of endpoints whose names cannot be resolved, as far as is known soon."""
+    """Return the hosts of endpoints whose names do not resolve, as far as a short look tells."""
     hosts = list(dict.fromkeys(split_endpoint(endpoint)[1].strip("[]") for endpoint in endpoints))
     found: queue.SimpleQueue[str | None] = queue.SimpleQueue()
 
@@ -79,7 +79,7 @@ def unknown_hosts(endpoints: Sequence[str]) -> list[str]:
         else:
             found.put(None)
 
-    for host in hosts:  # in threads of their own: a silent name server is waited for much longer
+    for host in hosts:  # in separate threads: a silent name server blocks for much longer
         threading.Thread(target=look_up, args=(host,), name="look-up", daemon=True).start()
     unknown: set[str | None] = set()
     end_s = time.monotonic() + LOOK_UP_S

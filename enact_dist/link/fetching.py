@@ -1,7 +1,7 @@
-"""Data on the way to the client: from the cache, or in slices straight to where they will stay.
+"""Fetches data for a client: from its cache, or in slices directly into their final memory.
 
-Several data are fetched together, over all shards, through one window (`Transfer`): the slices
-of a pattern's many images follow each other as those of one large cloud do.
+Data of all shards are fetched together through one window (`Transfer`): the slices of many matching
+images follow each other like those of one large cloud.
 """
 
 from __future__ import annotations
@@ -38,17 +38,17 @@ def fetch_all(
     readings: Iterable[Reading],
     alive: Callable[[], None] = lambda: None,
 ) -> dict[Slot, Datum]:
-    """Return the data that `readings` name, from the grant, the cache, or in slices.
+    """Return the data of `readings`, from the grant, the cache, or in slices.
 
     Args:
         client: The session that took the grant or view.
-        cache: Where to look first and to remember them.
+        cache: Where to look first; receives the fetched data.
         lock: The lock that pins the data.
-        readings: States with a datum (not null), each with its shard and that shard's epoch.
-        alive: Raises when the data are wanted no more; asked whenever an answer was lost.
+        readings: States with a datum (not null), each with its shard and epoch.
+        alive: Raises if the data are no longer wanted; called after each lost answer.
 
     Raises:
-        LeaseLostError: A shard keeps one of these versions for the lock no more.
+        LeaseLostError: A shard no longer keeps one of these versions for the lock.
         ShardUnreachableError: A shard does not answer.
         ProtocolError: The answers do not fit together.
     """
@@ -87,19 +87,19 @@ def _at_hand(client: CellClient, cache: DatumCache, reading: Reading) -> Datum |
 
 
 class _Incoming:
-    """One datum that comes in slices, and where they go.
+    """One datum that arrives in slices, and their destinations.
 
     Attributes:
-        reading: What names it.
+        reading: Identifies it.
         state: Its state.
-        count: How many slices it has.
+        count: Number of slices.
     """
 
     def __init__(self, lock: LockId, reading: Reading, slice_bytes: int) -> None:
         self.reading = reading
         self.state = reading.state
         if self.state.size > BODY_BYTES_MAX:
-            raise ProtocolError(f"{self.state.slot} is said to have {self.state.size} bytes")
+            raise ProtocolError(f"a shard announced {self.state.size} bytes for {self.state.slot}")
         self._lock = lock
         self._slice_bytes = slice_bytes
         self._offsets = range(0, max(1, self.state.size), slice_bytes)
@@ -108,7 +108,7 @@ class _Incoming:
         self._encoding, self._stamp_ns = b"", 0
 
     def pieces(self) -> Iterator[Piece]:
-        """Yield its slices; memory for all of them is taken with the first."""
+        """Yield its slices; the first one allocates memory for all."""
         shard, epoch, state = self.reading
         if self.count > 1:
             self._body = _room(state.size)
@@ -128,16 +128,16 @@ class _Incoming:
             into[:] = came
 
     def datum(self) -> Datum:
-        """Return the datum, all of whose slices have come."""
+        """Return the complete datum."""
         body = self._body if self._body is not None else memoryview(b"")
         return Datum(self._encoding, body.toreadonly(), self.state.size, self._stamp_ns)
 
 
 def _room(size: int) -> memoryview:
-    """Return memory for a datum that comes in slices, not set to zero first.
+    """Return memory for a datum that comes in slices, not zeroed.
 
-    Ordinary memory may be recycled, and touches no page for the first time then.  What is too long
-    for that is given back by a thread of its own.  Pages of 2 MB were slower than either.
+    Ordinary memory may be recycled, which avoids page faults.  A separate thread frees blocks too
+    long for that.  Huge pages (2 MB) were slower than either.
     """
     if size > RECYCLED_BYTES_MAX:
         return body_of(plain_memory(size))
@@ -145,7 +145,7 @@ def _room(size: int) -> memoryview:
 
 
 def _checked(answer: Answer, call: Fetch, state: SlotState, lock: LockId) -> Slice:
-    """Return the answer if it is the asked slice, else raise what it stands for."""
+    """Return the answer if it is the requested slice, else raise its error."""
     if isinstance(answer, Slice):
         wanted = min(call.length, state.size - call.offset)
         fits = (answer.slot, answer.version, answer.offset) == (
@@ -155,15 +155,15 @@ def _checked(answer: Answer, call: Fetch, state: SlotState, lock: LockId) -> Sli
         )
         if not fits or answer.total != state.size or answer.body.size != wanted:
             raise ProtocolError(
-                f"{state.slot}: a slice of {answer.body.size} bytes at"
-                f" {answer.offset} came, {wanted} at {call.offset} was asked"
+                f"{state.slot}: got a slice of {answer.body.size} bytes at"
+                f" {answer.offset} instead of {wanted} at {call.offset}"
             )
         return answer
     if isinstance(answer, Gone | EpochChanged):
         raise LeaseLostError(
-            f"version {state.version} of {state.slot} is kept for lock {lock} no more: the lock was"
-            " lost or its shard restarted; take it again",
-            cause="the datum is gone",
+            f"version {state.version} of {state.slot} is no longer kept for lock {lock}: the lock"
+            " was lost or its shard restarted; take it again",
+            cause="the datum was removed",
         )
     if isinstance(answer, Refused):
         raise error_of(answer)

@@ -1,8 +1,8 @@
 """One process per data folder: the exclusive lock, and the folder's format version.
 
-The lock is the kernel's (`flock`), so it ends with its process, `kill -9` included; what the file
-says about its holder is for people.  The format is checked under the lock and before anything
-else in the folder is opened: a folder of a newer version is left exactly as it is.
+The lock is the kernel's (`flock`), so it ends with its process, even after `kill -9`; the text in
+the lock file, which names the holder, is for people.  The format is checked under the lock, before
+anything else in the folder is opened: a folder of a newer format is not touched.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ FORMAT_FILE: Final = "format"
 FORMAT_READ_MIN: Final = 3
 """The oldest format that this program reads."""
 FORMAT: Final = 4
-"""Version of everything below a data folder; goes up when an older program could misread it.
+"""Format of the whole data folder; raised when an older program could misread a folder.
 
-2: commits over shards are stored (prepared locks, decisions), and the mark is there first.
-3: slots have a row per stored state, with its cause.  A folder of 2 is refused as well: to take a
-row in either form would weaken the check that it is exactly what was written.
-4: a session's row and an operator's act end with whose they are; a folder of 3 is read and marked
-as one of 4, which an older program leaves alone.
+2: commits over several shards are stored (prepared locks, decisions), and the mark comes first.
+3: slots have one row per stored state, with its cause.  A folder of format 2 is refused: accepting
+both row forms would weaken the check that rows are exactly as written.
+4: rows of sessions and operator actions end with an identity; a folder of format 3 is read and
+marked as 4, which older programs refuse.
 """
 
 _FORMAT_WORDS: Final = "enact-dist store"
@@ -38,7 +38,7 @@ _LOCK_BYTES_MAX: Final = 512
 
 
 def file_mode(folder: Path) -> int:
-    """Return the mode of new files in a folder: nobody's but ours, or as wide as the folder is.
+    """Return the mode of new files in a folder: private, or as open as the folder.
 
     Raises:
         OSError: As the system reports it.
@@ -53,7 +53,7 @@ class FolderLock:
         folder: An existing folder.
 
     Raises:
-        StoreError: Somebody else holds it, or the lock file cannot be made.
+        StoreError: Another process holds it, or the lock file cannot be made.
     """
 
     __slots__ = ("_descriptor",)
@@ -101,14 +101,14 @@ class FolderLock:
         return f"process {pid} on host {host}" + (" (this one)" if mine else "")
 
     def close(self) -> None:
-        """Let the folder go; twice is harmless."""
+        """Release the folder; idempotent."""
         if self._descriptor >= 0:
             os.close(self._descriptor)
             self._descriptor = -1
 
 
 def sync_folder(folder: Path) -> None:
-    """Make the entries of `folder` durable: names made, renamed and unlinked so far.
+    """Make the entries of `folder` durable: all names created, renamed and unlinked so far.
 
     Raises:
         OSError: As the system reports it.
@@ -121,22 +121,22 @@ def sync_folder(folder: Path) -> None:
 
 
 def replace_file(path: Path, content: bytes, *, mode: int | None = None) -> None:
-    """Put `content` in place of the file at `path`, durably, whole or not at all.
+    """Put `content` in place of the file at `path`, durably and atomically.
 
     Args:
-        path: Whether it is there or not.
-        content: All of it.
-        mode: Who may read and write it, as far as the umask lets them; None: as `file_mode` says.
+        path: May exist already.
+        content: The whole new content.
+        mode: Permissions, before the umask; None: as `file_mode` says.
 
     Raises:
-        OSError: As the system reports it; the file before stands then.
+        OSError: As the system reports it; the previous file then remains.
     """
     draft = path.with_name(path.name + ".tmp")
     mode = file_mode(path.parent) if mode is None else mode
     descriptor = os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, mode)
     left = memoryview(content)
     try:
-        while left:  # a disk that is nearly full takes a part
+        while left:  # a nearly full disk accepts a part
             left = left[os.write(descriptor, left) :]
         os.fsync(descriptor)
     except BaseException:
@@ -149,11 +149,11 @@ def replace_file(path: Path, content: bytes, *, mode: int | None = None) -> None
 
 
 def check_format(folder: Path, *, is_new: bool) -> None:
-    """Refuse a folder of another format; mark with ours a new one, and one that ours contains.
+    """Refuse a folder of another format; mark a new or compatible one with ours.
 
     Args:
         folder: The data folder, locked.
-        is_new: Whether nothing was ever stored in it.
+        is_new: Whether nothing has been stored in it yet.
 
     Raises:
         StoreError: The format is newer or older, unreadable, or missing in a folder with data.
@@ -169,7 +169,7 @@ def check_format(folder: Path, *, is_new: bool) -> None:
     words, _, version = (text or "").rpartition(" ")
     if words != _FORMAT_WORDS or not version.isdecimal():
         raise StoreError(
-            f"{path} says {text!r} where '{_FORMAT_WORDS} {FORMAT}' was expected: {folder} is no"
+            f"{path} contains {text!r} instead of '{_FORMAT_WORDS} {FORMAT}': {folder} is no"
             " data folder of a shard, or the file is damaged; restore the folder from a backup, or"
             " give the shard an empty folder",
             path=str(path),
@@ -183,7 +183,7 @@ def check_format(folder: Path, *, is_new: bool) -> None:
     if int(version) < FORMAT:
         raise StoreError(
             f"{folder} has store format {version}, this program reads {FORMAT}: it was written by"
-            " an older enact-dist; read its data out with that one, or give the shard an empty"
+            " an older enact-dist; export its data with that one, or give the shard an empty"
             " folder; nothing was changed",
             path=str(path),
         )

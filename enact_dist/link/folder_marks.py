@@ -1,8 +1,8 @@
-"""Marks on folders of a stopped cell that are changed together: no shard starts from one meanwhile.
+"""Marks on folders of a stopped cell that are changed together; no shard starts meanwhile.
 
-The marks are there before the first folder is changed and go after the last one, so a run that is
-cut off anywhere is taken up by the next one.  They come and go in the order of the shards' names.
-What is done is not known by them: a folder that was restored meanwhile has none.
+The marks are set before the first folder changes and removed after the last one, so the next run
+completes an interrupted one.  They are set and removed in the order of the shards' names.  They do
+not record progress: a folder restored meanwhile has no mark.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ def mark(
     act: Callable[[str], None],
     aspects: Mapping[str, int] | None = None,
 ) -> None:
-    """Mark all folders as of one change, new or taken up.
+    """Mark all folders for one change, new or resumed.
 
     Args:
         folders: The folder of each shard.
-        act: Told before each one is marked.
-        aspects: Those that are forgotten, and from which stamp on; none where entities move.
+        act: Called before each mark is set.
+        aspects: Aspects being purged, each with the timestamp from which on; empty for a rebalance.
     """
     found = [mark for folder in folders.values() if (mark := moving_mark(folder)) is not None]
     number = found[0].number if found else uuid.uuid4().hex
@@ -46,7 +46,7 @@ def mark(
 
 
 def unmark(folders: Mapping[str, Path], act: Callable[[str], None]) -> None:
-    """Take all marks away: everything is done, durably."""
+    """Remove all marks: everything is done, durably."""
     for name, folder in sorted(folders.items()):
         act(f"unmark {name}")
         (folder / MOVING_FILE).unlink(missing_ok=True)
@@ -54,14 +54,15 @@ def unmark(folders: Mapping[str, Path], act: Callable[[str], None]) -> None:
 
 
 def under_way(folders: Mapping[str, Path], *, forgets: bool = False) -> dict[str, MovingMark]:
-    """Return the marks of an earlier run that was cut off; all of its folders must be there.
+    """Return the marks of an interrupted run; all of its folders must be present.
 
     Args:
         folders: The folder of each shard.
-        forgets: Whether aspects are to be forgotten, not entities to be moved.
+        forgets: Whether the present run purges aspects; otherwise it moves entities.
 
     Raises:
-        StoreError: They are not, or they are of several runs, or of one that does the other.
+        StoreError: Folders are missing, or the marks belong to several runs or to the other
+            command.
     """
     marks = {name: mark for name, folder in folders.items() if (mark := moving_mark(folder))}
     for name, mark in marks.items():
@@ -71,7 +72,7 @@ def under_way(folders: Mapping[str, Path], *, forgets: bool = False) -> dict[str
         which = "times that aspects were forgotten" if forgets else "rebalances"
         raise StoreError(
             f"the folders of {', '.join(sorted(marks))} are in the midst of different {which};"
-            " give each one those that were its own"
+            " use the folders that belong to one run"
         )
     for name, mark in marks.items():
         lacking = [shard for shard in mark.shards if shard not in folders]
@@ -79,17 +80,17 @@ def under_way(folders: Mapping[str, Path], *, forgets: bool = False) -> dict[str
             others = ", ".join(lacking)
             if forgets:
                 raise StoreError(
-                    f"the run that was cut off on {name} also forgets aspects of {others}; leave"
-                    f" --shard out, or {way_out(mark)}, with --store NAME=PATH for a folder that is"
-                    " not where the cell.toml says"
+                    f"the interrupted run on {name} also forgets aspects of {others}; leave"
+                    f" --shard out, or {way_out(mark)}, with --store NAME=PATH for a folder that"
+                    " is not where cell.toml says"
                 )
             raise StoreError(
-                f"the run that was cut off on {name} also moves entities of {others}; name their"
+                f"the interrupted run on {name} also moves entities of {others}; name their"
                 " folders too, with --store NAME=PATH"
             )
-        if forgets and folders.keys() - set(mark.shards):  # they keep what they have
+        if forgets and folders.keys() - set(mark.shards):  # these keep their data
             raise StoreError(
-                f"the run that was cut off on {name} was of {', '.join(mark.shards)} alone;"
+                f"the interrupted run on {name} covers only {', '.join(mark.shards)};"
                 f" {way_out(mark)} first"
             )
     return marks

@@ -1,14 +1,15 @@
-"""Forgets aspects in the folders of a stopped cell: their types, and all their data.
+"""Purges aspects from the folders of a stopped cell: their types and all their data.
 
 ::
 
     all folders locked, opened, checked ─> marked ─> shard by shard: one batch ─> marks removed
 
-Each arrow is durable before the next act, so a run that is killed anywhere is taken up by the next
-one; while a folder is marked no shard starts from it.  Cut off among the first or the last marks,
-some shards do start: with all that they had, or with none of it.  What a shard has of an aspect
-goes in one batch, so it never has a part of it.  Nobody need wait for leases of before the stop: a
-lock that somebody believes in is refused at its commit, and a shard that starts grants none before.
+Each arrow is durable before the next step, so a later run completes one that was killed anywhere.
+While a folder is marked, no shard starts from it.  If the run is cut off while marks are being set
+or removed, some shards start: with all of their data, or with none of the aspect's.  Each shard's
+data of an aspect go in one batch, so a shard never has a part of them.  Old leases need no waiting:
+a commit under a lock from before the stop is refused, and a shard that starts first waits until
+such leases have ended.
 """
 
 from __future__ import annotations
@@ -33,17 +34,17 @@ if TYPE_CHECKING:
 
 
 class Progress(Protocol):
-    """Is told what goes, and how far it is."""
+    """Reports what is purged, and the progress."""
 
     def found(self, forgotten: Forgotten) -> None:
-        """Hear what will go; nothing has been changed, and an exception leaves it so."""
+        """Take what will be purged; nothing has changed yet, and an exception keeps it so."""
 
     def act(self, name: str) -> None:
-        """Hear what is done next; it is durable before the next one."""
+        """Take the next step; it is durable before the one after."""
 
 
 class _Nobody:
-    """Is told, and tells nobody."""
+    """Ignores all reports."""
 
     def found(self, forgotten: Forgotten) -> None:
         """Do nothing."""
@@ -53,16 +54,16 @@ class _Nobody:
 
 
 class Forgotten(NamedTuple):
-    """What was let go, or would be.
+    """What was purged, or would be.
 
     Attributes:
-        aspects: The aspects, those of an earlier run that was cut off among them.
-        known: All aspects that these shards have, or have had.
-        going: What each shard has, or had, of each one.
-        resumed: Whether an earlier run was cut off; a shard that had let an aspect go has it no
-            more, and what is there of it has come since.
-        done: The aspects of one that every shard has let go already.
-        worlds: The world contexts without data that were let go, or would be.
+        aspects: The aspects, including those of an interrupted earlier run.
+        known: All aspects that these shards have or had.
+        going: Each shard's data of each aspect.
+        resumed: Whether an earlier run was interrupted.  A shard that had already purged an aspect
+            no longer has it; any data there are newer.
+        done: The aspects of the earlier run that every shard had already purged.
+        worlds: The world contexts without data that were dropped, or would be.
     """
 
     aspects: tuple[str, ...]
@@ -80,13 +81,13 @@ def look(
     unused: Collection[str] | None = None,
     progress: Progress | None = None,
 ) -> Forgotten:
-    """Return what `forget` would let go, and change nothing.
+    """Return what `forget` would purge; change nothing.
 
     Args:
         folders: The folder of each shard.
         aspects: Names of the aspects.
         unused: As for `forget`.
-        progress: Told what would go.
+        progress: Receives what would be purged.
 
     Raises:
         StoreError: As `forget`.
@@ -111,20 +112,20 @@ def forget(
     unused: Collection[str] | None = None,
     progress: Progress | None = None,
 ) -> Forgotten:
-    """Let aspects go, with everything that these shards have of them.
+    """Purge aspects, with all data that these shards have of them.
 
     Args:
         folders: The folder of each shard.
         aspects: Names of the aspects.
         now_ns: The wall clock, nanoseconds since 1970.
-        unused: If given, all aspects and world contexts without data go as well, but for these
-            contexts, and forks.
-        progress: Told what goes and how far it is.
+        unused: If given, also purge all aspects and world contexts without data, except these
+            contexts and forks.
+        progress: Receives what is purged, and each step.
 
     Raises:
-        StoreError: A folder is in use, damaged or cannot be written, folders of an earlier run are
-            missing, or a commit that names an aspect is not settled; the message says what to do.
-        MisuseError: No shard here has ever known one of the aspects.
+        StoreError: A folder is in use, damaged or not writable, folders of an earlier run are
+            missing, or a commit that names an aspect is undecided; the message says what to do.
+        MisuseError: None of these shards ever knew one of the aspects.
     """
     progress = progress or _Nobody()
     with ExitStack() as undo:
@@ -163,10 +164,10 @@ def _plan(
     now_ns: int,
     unused: Collection[str] | None,
 ) -> tuple[Forgotten, Plan]:
-    """Return what goes and how; aspects of a run that was cut off go as well.
+    """Return the plan; aspects of an interrupted run are purged as well.
 
     Raises:
-        StoreError: Something is in the way.
+        StoreError: There is an obstacle.
     """
     begun = _begun(folders)
     worlds: tuple[str, ...] = ()
@@ -177,12 +178,12 @@ def _plan(
     if plan.obstacles:
         more = f"; and {len(plan.obstacles) - 3} more" if len(plan.obstacles) > 3 else ""
         raise StoreError(f"nothing was forgotten: {'; '.join(plan.obstacles[:3])}{more}")
-    known = plan.known | begun.keys()  # a restore may have left nothing of what was begun
+    known = plan.known | begun.keys()  # a restore may have removed all traces of the run
     return Forgotten(plan.names, known, plan.going, bool(begun), plan.done, worlds), plan
 
 
 def _begun(folders: Mapping[str, Path]) -> dict[str, int]:
-    """Return the aspects of a run that was cut off, and from which stamp on it let each one go.
+    """Return the aspects of an interrupted run, each with the timestamp from which on to purge.
 
     Raises:
         StoreError: As `under_way`.
@@ -202,7 +203,7 @@ def _refuse_unknown(found: Forgotten) -> None:
 
 @contextmanager
 def _of_shard(name: str) -> Iterator[None]:
-    """Name the shard whose folder cannot be used."""
+    """Add the shard's name to errors about its folder."""
     try:
         yield
     except StoreError as error:

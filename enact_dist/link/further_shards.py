@@ -1,4 +1,4 @@
-"""Connects a session to the shards of a placement that it learns of on the way."""
+"""Connects a session to shards of a placement that it learns about later."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from enact_dist.link.namesakes import Doubts
 
 PAUSE_NS: Final = 1_000_000_000
-"""How long after a failure nothing is tried: each try may open a session."""
+"""Pause after a failure: each attempt may open a session."""
 
 _log = logging.getLogger("enact.link")
 
@@ -24,15 +24,15 @@ _log = logging.getLogger("enact.link")
 class FurtherShards:
     """Follows the placement of one session.  Thread-safe.
 
-    It is called with the answer to whatever was asked, which stands, so it raises nothing: who
-    got an error for a commit would write twice.
+    It runs after each answer, which stays valid, so it raises nothing: a caller that got an error
+    for its commit would write twice.
 
     Args:
-        carrier: Connects to them.
-        linked: The placement whose shards need no connecting.
+        carrier: Connects to the shards.
+        linked: The placement whose shards are connected already.
         now_ns: The session's clock.
-        count: Called with the name of what is to be counted.
-        doubts: Told where the shards of a placement are; None where there can be no doubt.
+        count: Called with the name of a counter.
+        doubts: Receives the endpoints in a placement; None: there can be no doubt.
     """
 
     def __init__(
@@ -50,10 +50,10 @@ class FurtherShards:
         self._not_before_ns: int | None = None
 
     def follow(self, placement: PlacementMap) -> None:
-        """Connect to the shards of a placement, if that was just learned.
+        """Connect to the shards of a placement that was just received.
 
-        Where that fails it is tried again after a pause, and where another thread is at it,
-        whoever gets the next answer looks again.
+        After a failure it tries again after a pause; if another thread is connecting, the next
+        answer triggers another look.
         """
         if placement is self._linked or not self._mutex.acquire(blocking=False):
             return
@@ -64,7 +64,7 @@ class FurtherShards:
                 self._hear(placement)
                 self._carrier.add_endpoints(placement.shards)
             self._linked, self._not_before_ns = placement, None
-        except ConfigError as error:  # an endpoint that never can be reached is told once
+        except ConfigError as error:  # an endpoint that can never be reached is logged once
             self._linked, self._not_before_ns = placement, None
             self._count("connects_failed")
             _log.error("not every shard of the cell can be reached: %s", error)
@@ -81,10 +81,10 @@ class FurtherShards:
             _log.error("%s", text)
 
     def check(self, shard: str) -> None:
-        """Raise if a shard is not to be trusted.
+        """Raise if a shard is served by several daemons.
 
         Raises:
-            LinkError: More than one daemon serves it; the message names them.
+            LinkError: More than one daemon serves the shard; the message names them.
         """
         text = self._doubts.about(shard) if self._doubts is not None else ""
         if text:

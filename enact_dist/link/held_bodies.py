@@ -1,9 +1,9 @@
-"""Links that keep the large bodies of a shard's folder for as long as a backup of it is made.
+"""Links that preserve the large bodies of a shard's folder while it is backed up.
 
-The shard unlinks what it replaces, whoever copies meanwhile; a second name keeps the file.  One
-backup at a time holds such links, by a lock that ends with its process: what a killed one leaves is
-let go by the next one, or when the shard starts.  Who holds it and where the copy goes is written
-beside the links, for people.
+The shard unlinks bodies that it replaces, even during a backup; a second name keeps the file.  One
+backup at a time holds such links, under a lock that ends with its process; the next backup or the
+shard's start deletes the links of a killed one.  A file beside the links names the holder and the
+destination, for people.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _log = logging.getLogger("enact.store")
 
 
 class HeldBodies:
-    """The links of the one backup of a folder that is under way.
+    """The links of the one backup in progress of a folder.
 
     Args:
         held: The folder of the links.
@@ -41,30 +41,30 @@ class HeldBodies:
         self._held = held
 
     def hold(self, blobs: Path) -> None:
-        """Link all files of `blobs` that are not linked yet, so that they stay."""
+        """Link all files of `blobs` that are not linked yet, to preserve them."""
         for path in blobs.iterdir():
             with suppress(FileNotFoundError, FileExistsError):
                 os.link(path, self._held / path.name)
 
     def has(self, name: str) -> bool:
-        """Return whether a body of this name is held."""
+        """Return whether a body of this name is linked."""
         return (self._held / name).exists()
 
     def path(self, name: str) -> Path:
-        """Return where a body that is held can be read."""
+        """Return the path of a linked body."""
         return self._held / name
 
 
 @contextmanager
 def held_bodies(folder: Path, into: Path) -> Iterator[HeldBodies]:
-    """Hold bodies of a shard's folder; they are let go at the end.
+    """Preserve the bodies of a shard's folder; remove the links at the end.
 
     Args:
-        folder: The shard's.
-        into: Where its copy goes.
+        folder: The shard's folder.
+        into: Destination of the backup.
 
     Raises:
-        StoreError: Another backup of this folder is under way.
+        StoreError: Another backup of this folder is in progress.
         OSError: As the system reports it.
     """
     with _locked(folder) as held:
@@ -80,7 +80,7 @@ def held_bodies(folder: Path, into: Path) -> Iterator[HeldBodies]:
 
 @contextmanager
 def _locked(folder: Path) -> Iterator[Path]:
-    """Be the one that backs a folder up; what a killed one has left is gone."""
+    """Lock the folder against other backups; delete the links of a killed one."""
     held = folder / HELD_FOLDER
     with (folder / FORMAT_FILE).open("rb") as locked:
         try:
@@ -89,8 +89,8 @@ def _locked(folder: Path) -> Iterator[Path]:
             if failure.errno != errno.EWOULDBLOCK:
                 raise
             raise StoreError(
-                f"a backup of {folder} is under way, by {_holder(held)}; one is made at a time:"
-                " wait for its end",
+                f"a backup of {folder} is in progress, by {_holder(held)}; make one at a time:"
+                " wait until it ends",
                 path=str(folder),
             ) from failure
         if held.exists():
@@ -98,8 +98,8 @@ def _locked(folder: Path) -> Iterator[Path]:
             (held / _HOLDER_FILE).unlink(missing_ok=True)
             shutil.rmtree(held)
             _log.warning(
-                "a backup was killed, by %s: what it held is let go; what it has copied lies beside"
-                " its place, until the next backup goes there",
+                "a backup was killed, by %s: its links are removed; its copy stays beside"
+                " the destination until the next backup to that place",
                 killed,
             )
         yield held
@@ -113,9 +113,9 @@ def _holder(held: Path) -> str:
 
 
 def let_go_of_killed(folder: Path) -> None:
-    """Remove the links of a backup of this folder that was killed, if nobody makes one now.
+    """Remove the links of a killed backup of this folder, unless a backup is in progress.
 
-    They cost room on the disk and nothing else: what cannot be removed is logged.
+    They only cost disk space; a failure to remove them is logged.
     """
     if not (folder / HELD_FOLDER).exists():
         return
@@ -123,4 +123,4 @@ def let_go_of_killed(folder: Path) -> None:
         with suppress(StoreError), _locked(folder):
             pass
     except OSError as failure:
-        _log.warning("what a killed backup has left in %s stays: %s", folder, failure)
+        _log.warning("cannot remove the remains of a killed backup in %s: %s", folder, failure)

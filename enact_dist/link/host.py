@@ -8,15 +8,15 @@
               reply(answer)  ◄── Reply │ StoreThread ◄── Persist │ watchers ◄── Publish
                                        │ other shards ◄── Call, Compare
 
-A transport needs `submit` and nothing else; the shard cannot tell which one a message came by.
+A transport needs `submit` and nothing else; the shard cannot tell the transports apart.
 Rules that a change must keep:
 
-- The thread that brings an event handles it, under the mutex, and performs its effects before it
-  lets go: no further thread stands between a request and its answer, and notices leave in order.
+- The thread that brings an event handles it under the mutex and performs its effects before it
+  releases the mutex: no further thread delays the answer, and notices leave in order.
 - A reply callback must not block and must not call back into the host.
-- Before a `Tick` the inboxes are drained: a renewal that has arrived counts before its expiry.
-- If the store or the core fails, nothing is answered any more: whatever was not acknowledged may
-  be lost, whatever was is on disk.
+- Before a `Tick` the inboxes are drained: a renewal that has arrived counts before the expiry.
+- If the store or the core fails, the host answers nothing more: unacknowledged changes may be lost,
+  acknowledged ones are on disk.
 """
 
 from __future__ import annotations
@@ -75,15 +75,15 @@ if TYPE_CHECKING:
     from enact_dist.link.store_thread import StoreThread
 
 TICK_S_MAX: Final = 0.1
-"""The timer wakes at least so often: bounds by how much an expiry may be late."""
+"""Longest pause between two timer wake-ups: bounds how late an expiry may be."""
 TICK_S_MIN: Final = 0.001
-"""The timer rests at least so long; deadlines of many locks then share one tick."""
+"""Shortest pause of the timer; deadlines of many locks then share one tick."""
 _SOON_NS: Final = TICK_S_MAX * 1e9
-# Tuples: a union would be made anew for each message.
+# Tuples: a union would be rebuilt for each message.
 _TOLD_LATER: Final = (Publish, Story)
 _THAT_MAY_WAIT: Final = (Acquire, AwaitStamp)
 PARKED_MAX: Final = 100_000
-"""Requests that may wait for their answers at one time."""
+"""Requests that may be parked at one time."""
 JOIN_S: Final = 0.5
 """How long a closing host waits for its timer; a drain has to be over within 2 s."""
 
@@ -99,10 +99,10 @@ def open_host(
     shared: SharedFolder | None = None,
     payload_bytes_max: int | None = None,
 ) -> ShardHost:
-    """Open a shard's folder and run the shard; without a folder nothing outlives the process.
+    """Open a shard's folder and run the shard; without a folder no data outlive the process.
 
     Raises:
-        StoreError: The folder is in use, unreadable or corrupt, or has entities of other shards.
+        StoreError: The folder is in use, unreadable or corrupt, or holds entities of other shards.
     """
     clock = clock or SystemClock()
     wall_ns = clock.wall_ns()
@@ -120,7 +120,7 @@ def open_host(
             undo.pop_all()
     shard = Shard(settings, recovered, now_ns=clock.monotonic_ns(), wall_ns=wall_ns)
     if left_out := shard.state.catalogue.shown().left_out:
-        what = "world contexts and aspects are more than clients can be shown"
+        what = "world contexts and aspects do not fit into the catalogue sent to clients"
         _log.warning("shard %s: %d %s; %s", settings.name, left_out, what, REMEDY)
     return ShardHost(
         shard,
@@ -137,13 +137,13 @@ class ShardHost:
 
     Args:
         shard: The shard; only the host calls it from now on.
-        store: Where its records go; None keeps nothing beyond this process.
+        store: Where its records go; None: they last only as long as this process.
         clock: Read under the mutex, so the shard's time never goes back.
-        on_failure: Called once, from whichever thread, when the store or the core has failed;
-            the host is dead then and answers no request.
-        shared: Where large data lie that clients of this host map; None keeps them in memory.
-        payload_bytes_max: How many bytes may lie there; None: half of what the file system has,
-            and what is beyond in plain memory.
+        on_failure: Called once, from any thread, when the store or the core has failed; the host is
+            dead then and answers no request.
+        shared: Folder of large data that clients of this host map; None: they stay in memory.
+        payload_bytes_max: Byte limit of that folder; None: half of the file system, and plain
+            memory beyond.
     """
 
     def __init__(
@@ -204,17 +204,17 @@ class ShardHost:
 
     @property
     def epoch(self) -> int:
-        """The shard's epoch, new with every start."""
+        """The shard's epoch, which changes with every start."""
         return self._shard.epoch
 
     @property
     def state(self) -> str:
-        """Whether locks are granted, and if not, why; read without the mutex."""
+        """Whether locks are granted, and the reason if not; read without the mutex."""
         state = self._shard.state
         return state_of(grants=state.grants, draining=state.draining)
 
     def figures(self) -> dict[str, float]:
-        """Return the counters and what there is now, by name; see `link.host_figures`."""
+        """Return counters and current values, by name; see `link.host_figures`."""
         return figures_of(
             self._shard.state,
             self._payloads,
@@ -223,7 +223,7 @@ class ShardHost:
         )
 
     def latencies(self) -> dict[str, Latencies]:
-        """Return how long things took, by name; see `link.host_figures`."""
+        """Return latencies, by name; see `link.host_figures`."""
         return latencies_of(self._shard.state, self._store_thread)
 
     @property
@@ -233,20 +233,20 @@ class ShardHost:
 
     @property
     def failure(self) -> Exception | None:
-        """What killed the host, or None while it lives."""
+        """Why the host failed, or None while it lives."""
         return self._failure
 
     def submit(self, message: Request, reply: Callable[[Answer], None], identity: str = "") -> None:
-        """Hand a request to the shard; `reply` is called once, now or later, from any thread.
+        """Pass a request to the shard; `reply` is called once, now or later, from any thread.
 
-        It is never called when the host ends or fails first: no answer means *unknown*.
-        `identity` is who asks, as the transport knows it ("": this process).
+        If the host ends or fails first, `reply` is never called: no answer means *unknown*.
+        `identity` is the sender as the transport knows it ("": this process).
         """
         kind = type(message)
         if kind is Commit or kind is Prepare:
             commit = cast("Commit", message)
             if names_payloads(commit) and self._refusal(commit, identity) is None:
-                message = self._payloads.with_bodies(commit)  # else nothing staged is used up
+                message = self._payloads.with_bodies(commit)  # otherwise staged data stay
         elif kind is Stage:
             self._stage(cast("Stage", message), reply, identity)
             return
@@ -257,7 +257,7 @@ class ShardHost:
                 return
             if len(self._replies) >= PARKED_MAX:
                 self.count("overloads")
-                reply(Refused("overload", f"{PARKED_MAX} requests wait for shard {self.name}"))
+                reply(Refused("overload", f"{PARKED_MAX} requests are parked at shard {self.name}"))
                 return
             self._handles += 1
             self._replies[self._handles] = reply
@@ -276,31 +276,31 @@ class ShardHost:
             reply(self._payloads.stage(message, identity))
 
     def _refusal(self, message: Request, identity: str) -> Refused | EpochChanged | None:
-        """Return why the shard will refuse a message because of who asks, else None."""
+        """Return why the shard will refuse a message because of its sender, else None."""
         state = self._shard.state
         return owners.refusal(message, identity, state.sessions, self.epoch) if identity else None
 
     def owner_of(self, session: str) -> str:
-        """Return the identity of a session; "" where that is not known.  Without the mutex."""
+        """Return the identity of a session; "" if unknown.  Takes no mutex."""
         return self._shard.state.sessions.owner(session) or ""
 
     def knows(self, identity: str) -> bool:
-        """Whether an identity has a session here.  Without the mutex."""
+        """Whether an identity has a session here.  Takes no mutex."""
         return bool(self._shard.state.sessions.of(identity))
 
     def event(self, event: Event) -> None:
-        """Hand an event to the shard (a session's token appeared, for example)."""
+        """Pass an event to the shard (for example: a session's token appeared)."""
         with self._mutex:
             if not self._ended:
                 self._handle(event, 0)
 
     def count(self, name: str, amount: int = 1) -> None:
-        """Add to a counter of the shard that `ListSessions` shows; reply callbacks may, too."""
+        """Add to a counter of the shard; also allowed in reply callbacks."""
         with self._mutex:
             self._shard.state.count(name, amount)
 
     def _biggest(self) -> str:
-        """Name the slots with the largest data, for people."""
+        """Return the slots with the largest data, for people."""
         with self._mutex:
             names = ", ".join(f"{name} {size}" for name, size in self._shard.biggest(3))
         return f"; the largest: {names}" if names else ""
@@ -308,11 +308,11 @@ class ShardHost:
     def call_with(
         self, call: Callable[[str, Request], None], compare: Callable[[Compare], None] | None = None
     ) -> None:
-        """Let `call(shard, request)` and `compare(effect)` ask other shards; they must not wait."""
+        """Set the functions that ask other shards; they must not block."""
         self._call, self._compare = call, compare
 
     def watch(self, watcher: Callable[[Notice], None]) -> Callable[[], None]:
-        """Call `watcher` with each notice, in order; return the function that ends it."""
+        """Call `watcher` with each notice, in order; return a function that ends this."""
         with self._mutex:
             self._watchers = (*self._watchers, watcher)
         return lambda: self._unwatch(watcher)
@@ -322,21 +322,21 @@ class ShardHost:
             self._watchers = tuple(other for other in self._watchers if other is not watcher)
 
     def add_inbox(self, drain: Callable[[], None]) -> None:
-        """Call `drain` before each tick; it submits what its transport has received already."""
+        """Call `drain` before each tick; it submits requests that have already arrived."""
         self._inboxes = (*self._inboxes, drain)
 
     def each_tick(self, act: Callable[[], None]) -> None:
-        """Call `act` after each tick, so at least every `TICK_S_MAX` while the shard decides.
+        """Call `act` after each tick, so at least every `TICK_S_MAX` while the shard works.
 
-        It is called by the timer's thread once the mutex was had and the shard has returned: a
-        shard that hangs does not call it.  It must not block.
+        The timer's thread calls it after the shard has returned, so a hung shard stops the calls.
+        `act` must not block.
         """
         self._each_tick = (*self._each_tick, act)
 
     # ---------------------------------------------------------------- messages in, effects out
 
     def _handle(self, message: Request | Event, handle: int, identity: str = "") -> None:
-        """Let the shard decide and do what it says.  The mutex is held."""
+        """Let the shard decide, and perform its effects.  The mutex is held."""
         with self._uninterrupted:
             try:
                 self._perform(self._decide(message, handle, identity))
@@ -345,7 +345,7 @@ class ShardHost:
                 if self._draining and self._shard.idle:
                     self._rests.set()
             except BaseException as failure:
-                # Half a decision must not be served.
+                # A half-made decision must not be used.
                 _log.exception("the shard failed on %s", type(message).__name__)
                 self._end_failed(failure)
                 if not isinstance(failure, Exception):
@@ -362,7 +362,7 @@ class ShardHost:
         )
 
     def _perform(self, effects: list[Effect]) -> None:
-        """Do what the shard says: answers first, since somebody waits for them."""
+        """Perform the shard's effects: answers first, since clients wait for them."""
         later: list[Publish | Story] = []
         for effect in effects:
             if isinstance(effect, Reply):
@@ -393,7 +393,7 @@ class ShardHost:
             self._kept_at_once.append(effect.ticket)
 
     def _persisted(self, tickets: list[int]) -> None:
-        """Take the store thread's word that these are kept."""
+        """Report to the shard that these tickets are stored."""
         with self._mutex:
             for ticket in tickets:
                 if ticket and not self._failure:
@@ -418,7 +418,7 @@ class ShardHost:
     # ---------------------------------------------------------------- time
 
     def tick(self) -> int:
-        """Take what has arrived, then let time pass; return when the next tick is due, in ns."""
+        """Submit arrived requests, then advance time; return when the next tick is due, in ns."""
         for drain in self._inboxes:
             drain()
         sessions, tenures = self._shard.state.sessions, self._shard.state.tenures
@@ -449,7 +449,7 @@ class ShardHost:
                 self._look_again = False
 
     def _look_at_clock_for(self, message: Request) -> None:
-        """Wake the timer if this request, not answered yet, ends before the timer looks again."""
+        """Wake the timer if this parked request times out before the next tick."""
         if isinstance(message, _THAT_MAY_WAIT):
             begins_soon = self._handles in self._replies and message.wait_ns < _SOON_NS
         else:
@@ -465,15 +465,15 @@ class ShardHost:
     # ---------------------------------------------------------------- end
 
     def drain(self) -> None:
-        """Grant nothing new and answer all parked requests; may be called again."""
+        """Grant nothing new and answer all parked requests; may be called repeatedly."""
         self._draining = True
         self.event(Drain())
 
     def wait_idle(self, timeout_s: float) -> bool:
-        """Wait until a drained shard may stop without anybody losing a lock or a commit.
+        """Wait until a drained shard may stop without costing a client its lock or commit.
 
         Returns:
-            Whether it may, or has failed; False after `timeout_s`, and after `hurry`.
+            True once it may stop or has failed; False after `timeout_s` and after `hurry`.
         """
         return self._rests.wait(timeout_s) and not self._hurried
 
@@ -483,7 +483,7 @@ class ShardHost:
         self._rests.set()
 
     def close(self) -> None:
-        """Keep what is on its way to the store, then end; twice is harmless."""
+        """Store all pending records, then end; idempotent."""
         if self._store_thread is not None:
             self._store_thread.close()
         with self._mutex:

@@ -1,7 +1,7 @@
-"""What a running shard shows of itself in figures; see `link.metrics`.
+"""The figures of a running shard: counters, current values and latencies; see `link.metrics`.
 
-Taken without the host's mutex, so that who looks never delays the shard: one figure may be a
-moment older than the next.
+They are read without the host's mutex, so that reading never delays the shard; one figure may be
+slightly older than the next.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ if TYPE_CHECKING:
 def figures_of(
     state: ShardState, payloads: PayloadDesk, *, parked: int, now_ns: int
 ) -> dict[str, float]:
-    """Return the counters and what there is now, by name.
+    """Return counters and current values, by name.
 
     Args:
-        state: The shard's.
-        payloads: Where its large data lie.
-        parked: How many requests wait for their answers.
+        state: State of the shard.
+        payloads: The shard's large data.
+        parked: Number of parked requests.
         now_ns: This host's monotonic clock.
     """
     tenures = list(state.tenures.by_lock.values())
@@ -46,7 +46,7 @@ def figures_of(
 
 
 def latencies_of(state: ShardState, store: StoreThread | None) -> dict[str, Latencies]:
-    """Return how long things took, by name."""
+    """Return latencies, by name."""
     return {
         "store_write_seconds": store.latencies if store is not None else Latencies(),
         "lock_wait_seconds": state.tenures.waited,

@@ -1,4 +1,4 @@
-"""Threads that are inside Zenoh: an end has to wait for them, or the interpreter aborts."""
+"""Counts threads inside Zenoh: shutdown must wait for them, or the interpreter aborts."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import threading
 
 
 class Inside:
-    """Counts the threads that are inside Zenoh, so that an end can wait for them."""
+    """Counts the threads inside Zenoh, so that shutdown can wait for them."""
 
     __slots__ = ("_changed", "_count")
 
@@ -25,6 +25,6 @@ class Inside:
                 self._changed.notify_all()
 
     def wait_empty(self, timeout_s: float) -> bool:
-        """Wait until no thread is inside; say whether that came true in time."""
+        """Wait until no thread is inside; return whether that happened in time."""
         with self._changed:
             return self._changed.wait_for(lambda: not self._count, timeout_s)

@@ -1,4 +1,4 @@
-"""The first contact with a cell: find a shard, then open the session's carrier to all of them."""
+"""First contact with a cell: finds a shard, then opens the session's carrier to all of them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from enact_dist.link.carrier import Carrier
 
 HELLO_S: Final = 1.0
-"""How long a further shard has to welcome us, where the socket of the first one cannot be used."""
+"""How long another shard may take to welcome us if the first one's socket is unusable."""
 
 
 def join(
@@ -36,20 +36,20 @@ def join(
     carrier: str = "auto",
     expected: Sequence[ShardEntry] = (),
 ) -> tuple[str, CellClient, Welcome]:
-    """Return the cell's name, a client with its carrier open, and a shard's welcome.
+    """Return the cell's name, a client with an open carrier, and a shard's welcome.
 
     Args:
-        name: The cell's name; empty where only an endpoint is known.
-        endpoints: Where shards listen; one that answers is enough.
-        client: The session to bring in.
+        name: The cell's name; empty if only an endpoint is known.
+        endpoints: Endpoints of shards; one that answers is enough.
+        client: The session that joins.
         timeout_s: How long to wait for a first answer.
         open_s: How long a shard has to answer a connection.
         carrier: How messages travel, one of `CARRIERS`.
-        expected: The shards of the `cell.toml`, and where it says that they are.
+        expected: The shards and endpoints of `cell.toml`.
 
     Raises:
-        LinkError: Another cell answers, or the socket is asked for and no shard has one to use;
-            where the first one has none and another does not answer, only after `timeout_s`.
+        LinkError: Another cell answers, or a socket is required and no shard has a usable one
+            (raised only after `timeout_s` if the first shard has none and another does not answer).
         ShardUnreachableError: None answered; the message names the endpoints.
     """
     found, welcome = discover(endpoints, client.hello(""), timeout_s=timeout_s)
@@ -58,7 +58,7 @@ def join(
             f"a shard of cell {found!r} answers at {', '.join(endpoints)}, not one of {name!r};"
             " two cells use one endpoint, or cell.toml was renamed while shards run"
         )
-    # The link's lease follows the session's, which the shard may have shortened.
+    # The link's lease follows the session's, and the shard may have shortened that.
     client.ttl_ns = min(client.ttl_ns, welcome.ttl_ns)
     reachable = [e for entry in welcome.placement.shards for e in entry.endpoints]
     identity = identity_of(client.actor, client.host, client.pid)
@@ -87,10 +87,10 @@ def join(
 def _first_usable(
     sockets: SocketCarrier, client: Client, welcome: Welcome, timeout_s: float
 ) -> Welcome:
-    """Return the welcome of a shard to which calls may travel: this one, unless that is refused.
+    """Return the welcome of a shard with a usable transport: this one's unless refused.
 
     Raises:
-        LinkError: The socket is asked for, and no shard with one answers within `timeout_s`.
+        LinkError: A socket is required, and no shard with one answers within `timeout_s`.
     """
     try:
         sockets.learn(welcome)
@@ -109,6 +109,6 @@ def _first_usable(
                     continue
                 if isinstance(answer, Welcome):
                     return answer
-            time.sleep(POLL_S)  # its connection may be on its way
+            time.sleep(POLL_S)  # it may be connecting
         raise
     return welcome

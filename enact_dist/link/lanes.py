@@ -1,7 +1,7 @@
 """Lanes: small numbers for the threads of a session that hold or await a lock at the same time.
 
-A shard keeps a few facts per lane (the exactly-once table), so their number is bounded.  A lane is
-used again after its lock has ended, by any thread.
+A shard keeps a few facts per lane (the exactly-once table), so their number is bounded.  Any thread
+may reuse a lane after its lock has ended.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from enact_dist.core.sessions import LANES_MAX
 from enact_dist.errors import MisuseError
 
 KEPT_MAX: Final = 64
-"""Lanes that rest after a commit without an answer: a new lock would overwrite its outcome."""
+"""Lanes kept unused after an unanswered commit, since a new lock would erase its outcome."""
 
 
 class Lanes:
@@ -27,10 +27,10 @@ class Lanes:
         self._made = 0
 
     def take(self) -> int:
-        """Return a lane that no live lock has.
+        """Return a lane that no live lock uses.
 
         Raises:
-            MisuseError: As many locks as a session may have are held or awaited.
+            MisuseError: The session already holds or awaits its maximum of locks.
         """
         try:
             return self._free.pop()
@@ -48,11 +48,11 @@ class Lanes:
             return self._made - 1
 
     def give_back(self, lane: int) -> None:
-        """Let the lane be used again; to be called once per `take`, or two locks would share it."""
+        """Free the lane; call once per `take`, or two locks would share it."""
         self._free.append(lane)
 
     def keep(self, lane: int) -> None:
-        """Give back a lane whose outcome may still be asked for; the oldest such one is freed."""
+        """Keep the outcome of a lane for a while; frees the oldest such lane."""
         with self._mutex:
             self._kept.append(lane)
             if len(self._kept) > KEPT_MAX:

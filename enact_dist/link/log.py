@@ -1,23 +1,23 @@
-"""The log of a process: lines for people, or one JSON object per line with fields that stay.
+"""The log of a process: lines for people, or one JSON object per line with stable fields.
 
 =======  ==========================================================================================
 field    of a line of `--log json`
 =======  ==========================================================================================
 time     seconds since 1970, a number
 level    "DEBUG", "INFO", "WARNING", "ERROR" or "CRITICAL"
-logger   which part speaks: "enact.shard", "enact.store", "enact.link", "enact.actor", …
-event    what happened, in words that programs may rely on ("lock.taken", "shard.stop"); empty
-         where a line is for people only
+logger   the part that logs: "enact.shard", "enact.store", "enact.link", "enact.actor", …
+event    what happened, in names that programs may rely on ("lock.taken", "shard.stop"); empty
+         if the line is only for people
 text     the line for people
-cell     name of the cell; empty where it is not known yet
-process  "shard NAME" or "actor NAME"; "process NAME" where several actors share a process and it
-         is not known which of them speaks
+cell     name of the cell; empty if not known yet
+process  "shard NAME" or "actor NAME"; "process NAME" if several actors share a process and the
+         line belongs to none of them
 error    a traceback; only where there is one
 =======  ==========================================================================================
 
-`shard.ready` has further fields, `endpoints`, `epoch` and `folder` (null: data in memory only), and
-so has `actor.end`: `state`, `updates`, `failures` and `refused`.  These two and `actor.ready` go to
-standard output, all else to standard error.
+`shard.ready` has further fields: `endpoints`, `epoch` and `folder` (null: data in memory only).
+`actor.end` has `state`, `updates`, `failures` and `refused`.  These two and `actor.ready` go to
+standard output, everything else to standard error.
 """
 
 from __future__ import annotations
@@ -41,25 +41,26 @@ if TYPE_CHECKING:
 FORMATS: Final = ("text", "json")
 TEXT: Final = "%(asctime)s %(levelname)s %(name)s %(message)s"
 READY: Final = "ready:"
-"""First word of the line by which a shard or an actor says that it serves."""
+"""First word of the line by which a shard or an actor reports that it is ready."""
 STDERR: Final = 2
 _FIELDS: Final = "enact_fields"
-"""Attribute of a record with further fields of its object; what else a program adds is its own."""
+"""Attribute of a record that holds further fields; all other extra attributes are ignored."""
 LAST_S: Final = 0.3
-"""How long an ending process waits until its last lines are written."""
+"""How long an ending process waits for its last lines to be written."""
 LINES_MAX: Final = 10_000
-"""Log lines that wait for whoever reads the log; beyond, lines are lost, never time."""
+"""Log lines queued for a slow reader; more lines are dropped so that nothing blocks."""
 
 _log = logging.getLogger("enact.shard")
 
 
 class TextLines(logging.Formatter):
-    """Makes lines for people; what a message holds of control characters is shown escaped.
+    """Formats lines for people, with control characters escaped.
 
-    So a line of the log is one event, whatever clients are called; a traceback has its lines.
+    One line is one event, whatever names clients choose; tracebacks keep their line breaks.
 
     Args:
-        actors: Names of the actors that share this process; a line begins with that of its thread.
+        actors: Names of the actors that share this process; a line begins with the name of its
+            thread's actor.
     """
 
     def __init__(self, actors: Collection[str] = ()) -> None:
@@ -67,7 +68,7 @@ class TextLines(logging.Formatter):
         self._actors = actors
 
     def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802 - of `logging`
-        """Return the line without a traceback."""
+        """Return the line without its traceback."""
         actor = actor_of(record, self._actors)
         return shown(f"[{actor}] " * bool(actor) + super().formatMessage(record))
 
@@ -81,9 +82,9 @@ class JsonLines(logging.Formatter):
 
     Attributes:
         cell: Name of the cell.
-        process: What the lines are said to come from.
-        actors: Names of the actors that share this process: a line of the thread of one is said to
-            come from that actor.
+        process: Default source of the lines.
+        actors: Names of the actors that share this process; lines of an actor's thread name it as
+            the source.
     """
 
     def __init__(self, *, cell: str = "", process: str = "", actors: Collection[str] = ()) -> None:
@@ -91,7 +92,7 @@ class JsonLines(logging.Formatter):
         self.cell, self.process, self.actors = cell, process, actors
 
     def format(self, record: logging.LogRecord) -> str:
-        """Return the line without its end."""
+        """Return the line without its line break."""
         actor = actor_of(record, self.actors)
         line = {
             "time": round(record.created, 6),
@@ -108,25 +109,25 @@ class JsonLines(logging.Formatter):
         return shown_json(text)
 
     def line(self, event: str, text: str, *, level: int = logging.INFO, **fields: object) -> str:
-        """Return the line of an event that no logger tells of."""
+        """Return the line of an event that no logger emits."""
         named = {"name": f"enact.{event.partition('.')[0]}", "msg": text, "event": event}
         levels = {"levelno": level, "levelname": logging.getLevelName(level)}
         return self.format(logging.makeLogRecord({**named, **levels, _FIELDS: fields}))
 
 
 def actor_of(record: logging.LogRecord, actors: Collection[str]) -> str:
-    """Return which of these actors a record comes from, by its thread; empty: of none.
+    """Return the actor whose thread made a record; empty: none.
 
-    The thread of an actor is named as the actor, a thread that serves it "NAME lookout".
+    An actor's thread has the actor's name; its helper thread is called "NAME lookout".
     """
     name = (record.threadName or "").partition(" ")[0]
     return name if name in actors else ""
 
 
 def say(formatter: logging.Formatter, event: str, text: str, **fields: object) -> None:
-    """Print what others wait for to standard output: the text, or an object with it and `fields`.
+    """Print a line that other programs wait for: text, or an object with it and `fields`.
 
-    In one write: others may share the pipe.
+    One write prints it all, since other processes may share the pipe.
     """
     if isinstance(formatter, JsonLines):
         text = formatter.line(event, text, level=logging.INFO, **fields)
@@ -135,14 +136,14 @@ def say(formatter: logging.Formatter, event: str, text: str, **fields: object) -
 
 
 def says_ready(line: str) -> bool:
-    """Whether a shard or an actor says by this line, text or object, that it serves."""
+    """Whether this line, text or object, reports that a shard or an actor is ready."""
     return in_words(line).startswith(READY)
 
 
 def in_words(line: str) -> str:
-    """Return the text of an object by which a shard or an actor says that it serves.
+    """Return the text of an object that reports that a shard or an actor is ready.
 
-    Any other line comes back as it is.
+    Any other line is returned unchanged.
     """
     if not line.startswith("{") or '.ready"' not in line:
         return line
@@ -155,11 +156,11 @@ def in_words(line: str) -> str:
 
 
 class Log:
-    """Sends the log of a daemon to stderr from a thread of its own while its block runs.
+    """Sends the log of a daemon to stderr from a separate thread while its block runs.
 
-    A reader of the log that stops reading must not stop the shard, nor keep it from ending: lines
-    beyond `LINES_MAX` are lost and counted, and the last ones are waited for `LAST_S` only.  A line
-    that cannot be made is counted, too, and told in its place.
+    A reader that stops reading must neither block the shard nor keep it from ending.  Lines beyond
+    `LINES_MAX` are dropped and counted, and the last ones get at most `LAST_S`.  A line that cannot
+    be formatted is counted too, and replaced by a note.
     """
 
     def __init__(self, formatter: logging.Formatter) -> None:
@@ -176,14 +177,14 @@ class Log:
         self._thread.start()
 
     def _write(self) -> None:
-        # To the descriptor itself: the locks of Python's streams and handlers, held while a full
-        # pipe blocks a line, would keep the interpreter from ending.
+        # Straight to the descriptor: a full pipe would block a line while Python's streams and
+        # handlers hold their locks, and the interpreter could not exit.
         while (record := self._lines.get()) is not None:
             left = f"{self._formatted(record)}\n".encode("utf-8", "backslashreplace")
             try:
                 while left:
                     left = left[os.write(STDERR, left) :]
-            except OSError:  # its reader is gone for good, or its disk is full
+            except OSError:  # its reader is gone, or its disk is full
                 self._handler.lost += 1
 
     def _formatted(self, record: logging.LogRecord) -> str:
@@ -206,12 +207,12 @@ class Log:
 
 
 class _BoundedHandler(QueueHandler):
-    """Queues log records; counts those for which there is no room."""
+    """Queues log records; counts those that do not fit."""
 
     lost = 0
 
     def prepare(self, record: logging.LogRecord) -> logging.LogRecord:
-        """Make the text here, where what it tells of cannot change meanwhile; keep the rest."""
+        """Format the text here, before its arguments can change; keep the other fields."""
         record = copy(record)
         try:
             record.msg = record.getMessage()
@@ -230,4 +231,4 @@ class _BoundedHandler(QueueHandler):
 
 def _unmade(record: logging.LogRecord, error: Exception) -> str:
     where = f"{record.module}:{record.lineno}"
-    return f"a line of {where} is lost, it cannot be made: {type(error).__name__}"
+    return f"a line of {where} is lost because it cannot be formatted: {type(error).__name__}"

@@ -1,8 +1,8 @@
-"""Files mapped into memory, each for as long as somebody looks at its bytes.
+"""Maps files into memory; each map lasts as long as any view of its bytes.
 
-A body over a map is a plain memoryview; when the last view, slice or array over it is gone, the
-pages are given back.  That costs the kernel up to 0.2 ms per MB, so a thread of its own does it
-for large ones.  Python's own `mmap` would keep a descriptor for each map (before 3.13).
+A body over a map is a plain memoryview; when the last view, slice or array over it is gone, its
+pages are returned to the system.  That costs the kernel up to 0.2 ms per MB, so a separate thread
+does it for large maps.  Python's own `mmap` would keep a descriptor per map (before 3.13).
 """
 
 from __future__ import annotations
@@ -23,22 +23,22 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 AT_ONCE_BYTES: Final = 256 << 10
-"""Up to this size a map is given back by whoever drops it: waking a thread costs more."""
+"""Maps up to this size are freed by the thread that drops them: waking another costs more."""
 STEP_BYTES: Final = 4 << 20
-"""So much is given back at a time: until it is, no other thread of the process gets memory."""
+"""Bytes freed in one step; during a step no other thread of the process gets memory."""
 GATHER_S: Final = 0.02
-"""How long leftovers are gathered: a thread that wakes for each would be in everybody's way."""
+"""How long freed maps are collected: a thread that wakes for each would disturb all others."""
 _log = logging.getLogger("enact.link")
 _to_fill: Final[weakref.WeakValueDictionary[int, Pages]] = weakref.WeakValueDictionary()
-"""Maps that their files still get what is written to, by the descriptors of the files."""
+"""Maps whose writes still reach their files, by file descriptor."""
 _FAILED: Final = ctypes.c_void_p(-1).value
 _MAP_FIXED: Final = 0x10
 
 
 class _Mapped(ctypes.Union):
-    """Mapped memory, which a memoryview of this shows; `_mapped` makes it and `body_of` cuts it.
+    """Mapped memory as a memoryview shows it; `_mapped` makes it and `body_of` slices it.
 
-    The declared length is the longest possible.
+    The declared length is the largest possible.
     """
 
     _fields_ = (("bytes", ctypes.c_ubyte * BODY_BYTES_MAX),)
@@ -59,9 +59,9 @@ class Pages(_Mapped):
 
 
 class Plain(_Mapped):
-    """Memory of this process alone, with the same end as `Pages`.
+    """Memory of this process alone, freed in the same way as `Pages`.
 
-    A `bytearray` would be set to zero while all other threads wait: 50 ms for 100 MB.
+    A `bytearray` would be zeroed while all other threads wait: 50 ms for 100 MB.
     """
 
 
@@ -69,11 +69,11 @@ Kind = TypeVar("Kind", bound=_Mapped)
 
 
 def plain_memory(size: int, *, ended: Callable[[], None] | None = None) -> Plain:
-    """Return `size` bytes of this process, at least 1, which come page by page as they are filled.
+    """Return `size` bytes (at least 1) of private memory, whose pages appear as they are filled.
 
     Args:
         size: How many bytes.
-        ended: Called when nobody looks at them any more, as that of `map_file`.
+        ended: Called when the last view is gone, as in `map_file`.
 
     Raises:
         OSError: As the system reports it.
@@ -86,13 +86,13 @@ def plain_memory(size: int, *, ended: Callable[[], None] | None = None) -> Plain
 def map_file(
     descriptor: int, size: int, *, writable: bool, ended: Callable[[], None] | None = None
 ) -> Pages:
-    """Map a file of at least `size` bytes, shared with whoever else maps it.
+    """Map a file of at least `size` bytes, shared with all other processes that map it.
 
     Args:
         descriptor: Of the file; may be closed afterwards.
         size: How many bytes, at least 1.
-        writable: Whether the memory may be changed; that needs a descriptor for writing, too.
-        ended: Called when the pages were given back, from any thread; must not raise.
+        writable: Whether the memory may be changed; this needs a descriptor open for writing.
+        ended: Called from any thread once the pages are freed; must not raise.
 
     Raises:
         OSError: As the system reports it.
@@ -103,7 +103,7 @@ def map_file(
 
 
 def map_to_fill(descriptor: int, size: int) -> Pages:
-    """Map a file for writing until `cut_off`; a forked child is cut off it at once.
+    """Map a file for writing until `cut_off`; in a forked child the map becomes private at once.
 
     Raises:
         OSError: As the system reports it.
@@ -113,7 +113,7 @@ def map_to_fill(descriptor: int, size: int) -> Pages:
 
 
 def cut_off(pages: Pages, descriptor: int) -> None:
-    """Withdraw a map that was filled, and close its file.
+    """Make a filled map private, and close its file.
 
     Raises:
         OSError: As the system reports it.
@@ -126,19 +126,19 @@ def cut_off(pages: Pages, descriptor: int) -> None:
 
 
 def _cut_child_off() -> None:
-    """Let a forked child change what it has of its parent's maps for itself alone."""
+    """Make a forked child's copies of its parent's writable maps private."""
     for descriptor, pages in list(_to_fill.items()):
         try:
             withdraw(pages, descriptor)
         except OSError as error:
-            _log.warning("what the parent fills could not be cut off: %s", error)
+            _log.warning("the parent's writable maps could not be made private: %s", error)
     _to_fill.clear()
 
 
 def anonymous_file(size: int) -> int:
-    """Return the descriptor of a file that has no name, all of whose pages are there.
+    """Return the descriptor of a file without a name, with all of its pages allocated.
 
-    It goes with its descriptor and its maps.
+    The file disappears with its descriptor and maps.
 
     Raises:
         OSError: As the system reports it.
@@ -161,14 +161,14 @@ def _mapped(kind: type[Kind], address: int, size: int, ended: Callable[[], None]
 
 
 def body_of(pages: Pages | Plain) -> memoryview:
-    """Return the bytes; they last as long as this or any view made of it."""
+    """Return the bytes; the map lasts as long as these or any view of them."""
     return memoryview(pages).cast("B")[: pages.size]
 
 
 def withdraw(pages: Pages, descriptor: int) -> None:
-    """Cut a writable map off its file: what is written to it from now on stays in this process.
+    """Detach a writable map from its file: later writes to it stay in this process.
 
-    Arrays over it keep their content; a stray write to one neither changes the file nor crashes.
+    Arrays over it keep their content; a stray write neither changes the file nor crashes.
 
     Raises:
         OSError: As the system reports it.
@@ -176,7 +176,7 @@ def withdraw(pages: Pages, descriptor: int) -> None:
     for offset in range(0, pages.size, STEP_BYTES):
         length = min(STEP_BYTES, pages.size - offset)
         _system().madvise(pages.address + offset, length, mmap.MADV_DONTNEED)
-    # Nothing is left to be torn down while all other threads of the process stand still.
+    # Leave nothing to unmap while all other threads of the process are stopped.
     protection = mmap.PROT_READ | mmap.PROT_WRITE
     flags = mmap.MAP_PRIVATE | _MAP_FIXED
     _map(pages.address, pages.size, protection, flags, descriptor)
@@ -215,7 +215,7 @@ def _unmap(address: int, size: int, ended: Callable[[], None] | None) -> None:
 
 
 class Leftovers:
-    """Does in a thread of its own what nobody should wait for."""
+    """Runs tasks that no caller should wait for, in a thread of its own."""
 
     def __init__(self) -> None:
         self._tasks: queue.SimpleQueue[tuple[Callable[..., None], tuple[Any, ...]]] = (
@@ -226,7 +226,7 @@ class Leftovers:
         self._thread: threading.Thread | None = None
 
     def start(self) -> None:
-        """Make sure that the thread runs."""
+        """Start the thread unless it runs."""
         if self._thread is None:
             with self._mutex:
                 if self._thread is None:
@@ -236,11 +236,11 @@ class Leftovers:
                     self._thread.start()
 
     def later(self, task: Callable[..., None], *arguments: object) -> None:
-        """Leave a task to the thread; may be called from a destructor."""
+        """Queue a task for the thread; may be called from a destructor."""
         self._tasks.put((task, arguments))
 
     def wait(self, timeout_s: float) -> bool:
-        """Wait until all that was left so far is done; False after `timeout_s`."""
+        """Wait until all tasks queued so far are done; return False after `timeout_s`."""
         self.start()
         done = threading.Event()
         self.later(done.set)
@@ -248,7 +248,7 @@ class Leftovers:
         return done.wait(timeout_s)
 
     def forget(self) -> None:
-        """Begin anew in a forked child: the thread and its tasks are the parent's."""
+        """Start afresh in a forked child: the thread and its tasks belong to the parent."""
         self.__init__()  # type: ignore[misc]  # the same object stays in everybody's hands
 
     def _run(self) -> None:
@@ -260,7 +260,7 @@ class Leftovers:
                 try:
                     task(*arguments)
                 except Exception:  # noqa: BLE001 - memory of all others would never be given back
-                    _log.exception("what was left to be done has failed")
+                    _log.exception("a task that frees memory has failed")
                 del task, arguments
                 try:
                     task, arguments = self._tasks.get_nowait()
@@ -274,5 +274,5 @@ os.register_at_fork(after_in_child=_leftovers.forget)
 
 
 def leftovers() -> Leftovers:
-    """Return what does the leftovers of this process."""
+    """Return the task queue of this process."""
     return _leftovers

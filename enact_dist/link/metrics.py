@@ -28,9 +28,9 @@ class Metric(NamedTuple):
     Attributes:
         name: Its name in Prometheus.
         kind: "counter", "gauge" or "histogram".
-        meaning: What it is.
+        meaning: What it measures.
         remedy: What to do if it grows; empty if growth is normal.
-        figure: Its name among the figures, or latencies, of a `ShardHost`.
+        figure: Its name in the figures or latencies of a `ShardHost`.
     """
 
     name: str

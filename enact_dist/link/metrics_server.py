@@ -1,8 +1,8 @@
-"""Serves one page over HTTP, from threads that wait for nobody the shard waits for.
+"""Serves one page over HTTP, from threads that never block the shard.
 
-Whoever reads slowly holds one of `READERS_MAX` threads, for `READ_S` per step at most; more readers
-are turned away.  While the process has no descriptor free nobody can be taken, and whoever waits at
-the door stays there: it is looked for again after a pause, not at once.
+A slow reader occupies one of `READERS_MAX` threads, for at most `READ_S` per step; further readers
+are refused.  While the process has no free descriptor, new connections stay in the queue and are
+tried again after a pause.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ POLL_S: Final = 0.1
 """How long `close` may wait for the thread that accepts."""
 PAUSE_S_MIN: Final = 0.05
 PAUSE_S_MAX: Final = 1.0
-"""Pause after a reader that could not be taken; doubles up to the second figure."""
+"""Pause after a connection that could not be accepted; doubles up to the second figure."""
 
 _log = logging.getLogger("enact.link")
 
@@ -38,14 +38,14 @@ class MetricsServer:
 
     Args:
         address: Host and port; port 0 takes any that is free.
-        page: Makes the page; called from the server's threads.
-        count: Called with "metrics_readers_refused" for each reader that is not taken.
+        page: Returns the page; called from the server's threads.
+        count: Called with "metrics_readers_refused" for each refused reader.
 
     Attributes:
-        port: At which it listens.
+        port: The port on which it listens.
 
     Raises:
-        LinkError: The address is in use, or not of this host.
+        LinkError: The address is in use, or not an address of this host.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class MetricsServer:
         self._thread.start()
 
     def close(self) -> None:
-        """Stop listening; twice is harmless."""
+        """Stop listening; idempotent."""
         self._server.ending.set()
         self._server.shutdown()
         self._server.server_close()
@@ -90,12 +90,12 @@ class _Server(ThreadingMixIn, TCPServer):
         super().__init__(address, _Handler)
 
     def get_request(self) -> tuple[Any, Any]:
-        """Take who waits; where the system refuses, its caller comes again at once."""
+        """Accept the waiting connection; if the system refuses, the caller retries at once."""
         try:
             taken = super().get_request()
         except OSError as error:
             if not self._pause_s:
-                _log.warning("a reader of the metrics cannot be taken for now: %s", error)
+                _log.warning("cannot accept a reader of the metrics now: %s", error)
             self._count("metrics_readers_refused")
             self._pause_s = min(max(2 * self._pause_s, PAUSE_S_MIN), PAUSE_S_MAX)
             self.ending.wait(self._pause_s)
@@ -122,7 +122,7 @@ class _Server(ThreadingMixIn, TCPServer):
             self._room.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        _log.info("a reader of the metrics at %s went: lost in mid-answer", client_address)
+        _log.info("a reader of the metrics at %s left in mid-answer", client_address)
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -131,7 +131,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         if self.path.partition("?")[0] != PATH:
-            self.send_error(HTTPStatus.NOT_FOUND, f"there is {PATH} here, and nothing else")
+            self.send_error(HTTPStatus.NOT_FOUND, f"this server has only {PATH}")
             return
         body = cast("_Server", self.server).page().encode()
         self.send_response(HTTPStatus.OK)
@@ -141,4 +141,4 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(body)
 
     def log_message(self, format: str, *arguments: object) -> None:  # noqa: A002 - its base's word
-        """Say nothing: it is asked every few seconds."""
+        """Log nothing: requests come every few seconds."""

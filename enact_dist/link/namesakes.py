@@ -1,9 +1,9 @@
-"""Two daemons under one name: who serves a shard at each of the places where it is said to be.
+"""Detects two daemons with the same shard name, by asking at each known endpoint.
 
-A shard that runs twice, from two folders at two places, is two shards: what one client reads
-another never wrote.  Nobody sees that from one place alone, so whoever hears of a second place
-asks at both.  A daemon is told from another by the random number of its start, not by its epoch:
-two folders may be in the same one, and a restart at the same place is one daemon after another.
+A shard that runs twice, from two folders at two endpoints, is two shards: clients of one never see
+writes to the other.  No single place can see this, so a process that learns of a second endpoint
+asks at both.  The random number of a start tells daemons apart, not the epoch: two folders may have
+the same epoch, and a restart at the same endpoint is one daemon after another.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ _log = logging.getLogger("enact.link")
 
 @dataclass(frozen=True, slots=True)
 class Serving:
-    """A daemon that serves a shard.
+    """A daemon that serves a shard, as it answered.
 
     Attributes:
         endpoint: Where it answers.
         start: The random number of its start.
-        epoch: The epoch that it is in.
-        uptime_s: For how long it has run.
+        epoch: Its current epoch.
+        uptime_s: Time since its start.
     """
 
     endpoint: str
@@ -53,14 +53,14 @@ class Serving:
 def serving(
     cell: str, shard: str, endpoints: Iterable[str], *, timeout_s: float
 ) -> tuple[Serving, ...]:
-    """Ask place by place who serves a shard there; return each daemon once.
+    """Ask endpoint by endpoint who serves a shard there; return each daemon once.
 
-    A place that cannot be one, whoever has named it, is passed over: the others are asked.
+    An invalid endpoint, whatever its origin, is skipped.
 
     Args:
         cell: Name of the cell.
         shard: Name of the shard.
-        endpoints: The places.
+        endpoints: The endpoints.
         timeout_s: How long each may take to answer.
 
     Raises:
@@ -74,7 +74,7 @@ def serving(
         try:
             answer = ask_shards([endpoint], [wanted], Ping(), timeout_s=timeout_s).get(wanted)
         except ConfigError as error:
-            _log.warning("shard %s is said to be where nobody can be: %s", shard, error)
+            _log.warning("shard %s is announced at an invalid endpoint: %s", shard, error)
             continue
         if isinstance(answer, Pong):
             one = Serving(endpoint, answer.start, answer.epoch, answer.uptime_ns / 1e9)
@@ -85,12 +85,12 @@ def serving(
 def told_places(
     cell: str, shards: Sequence[ShardEntry], *, timeout_s: float
 ) -> list[tuple[ShardEntry, ...]]:
-    """Ask shards of a cell where they expect each shard; return what each of them says.
+    """Ask shards of a cell where they expect each shard; return their answers.
 
     Args:
         cell: Name of the cell.
-        shards: Whom to ask, and where.
-        timeout_s: How long they may take together; those that take longer are left out.
+        shards: The shards to ask, with their endpoints.
+        timeout_s: Time limit for all together; slower shards are left out.
 
     Raises:
         ConfigError: An endpoint cannot be read.
@@ -106,9 +106,9 @@ def told_places(
 def moved_places(
     known: Mapping[str, Iterable[str]], told: Iterable[ShardEntry]
 ) -> dict[str, list[str]]:
-    """Return the shards that somebody expects elsewhere than is known, with all their places.
+    """Return the shards with an unknown endpoint in some answer, with all their endpoints.
 
-    One that has a place in common is the same shard with another address beside.
+    Two answers that share an endpoint mean the same shard with an additional address.
     """
     moved: dict[str, dict[str, None]] = {}
     for shard, places in told:
@@ -119,7 +119,7 @@ def moved_places(
 
 
 def two_daemons(cell: str, shard: str, found: Sequence[Serving]) -> str:
-    """Return what is said of a shard that several daemons serve."""
+    """Return the message about a shard that several daemons serve."""
     return (
         f"{len(found)} daemons serve shard {shard} of cell {cell}, each with its own data:"
         f" {' and '.join(map(str, found))}; stop all but the one whose data you want to keep, and"
@@ -128,22 +128,22 @@ def two_daemons(cell: str, shard: str, found: Sequence[Serving]) -> str:
 
 
 class Comparing:
-    """Asks which daemons serve a shard, for a shard that runs: on a thread of its own, in turn.
+    """Finds out which daemons serve a shard, for a running shard: in a thread, one by one.
 
-    A shard that several daemons serve is asked about again until one of them is gone, and from time
-    to time after that: one that was stopped, slow or cut off comes back without a word.
+    A shard with several daemons is checked again until only one answers, and occasionally after
+    that: a stopped, slow or disconnected daemon may come back.
 
     Args:
         cell: Name of the cell.
-        tell: Takes what was found.
+        tell: Receives the result.
     """
 
     ASK_S: Final = 0.5
-    """How long each place may take to answer."""
+    """How long each endpoint may take to answer."""
     AGAIN_S: Final = 5.0
-    """After so long a shard that several daemons serve is asked about again."""
+    """Pause before a shard with several daemons is checked again."""
     LATER_S: Final = 30.0
-    """And so long after that, once only one of them answers."""
+    """Pause before the next check, once only one of them answers."""
 
     def __init__(self, cell: str, tell: Callable[[Served], None]) -> None:
         self._cell, self._tell = cell, tell
@@ -155,7 +155,7 @@ class Comparing:
         self._closed = False
 
     def submit(self, compare: Compare) -> None:
-        """Ask soon; the newest question about a shard replaces one that waits."""
+        """Check soon; a newer question about a shard replaces a waiting one."""
         with self._wake:
             if self._closed:
                 return
@@ -164,8 +164,8 @@ class Comparing:
                 thread = threading.Thread(target=self._run, name="enact-compare", daemon=True)
                 try:
                     thread.start()
-                except RuntimeError as error:  # no thread is left: the next question tries again
-                    _log.warning("the places of shard %s not compared: %s", compare.shard, error)
+                except RuntimeError as error:  # no thread available: the next question tries again
+                    _log.warning("endpoints of shard %s not compared: %s", compare.shard, error)
                     return
                 self._thread = thread
             self._wake.notify()
@@ -176,7 +176,7 @@ class Comparing:
                 found = serving(self._cell, compare.shard, compare.places, timeout_s=self.ASK_S)
             except Exception as error:  # noqa: BLE001 - a place that somebody named may be anything
                 if not self._closed:
-                    _log.warning("the places of shard %s not compared: %s", compare.shard, error)
+                    _log.warning("endpoints of shard %s not compared: %s", compare.shard, error)
                 continue
             with self._wake:
                 self._doubled.pop(compare.shard, None)
@@ -200,7 +200,7 @@ class Comparing:
             return None if self._closed else self._asked.pop(next(iter(self._asked)))
 
     def close(self, join_s: float = 0.5) -> None:
-        """Ask no more; wait so long for a question under way.  Twice is harmless."""
+        """Ask no more; wait up to `timeout_s` for a check in progress.  Idempotent."""
         with self._wake:
             self._closed = True
             thread = self._thread
@@ -210,17 +210,17 @@ class Comparing:
 
 
 class Doubts:
-    """The shards of one session that more than one daemon serves; neither is trusted.
+    """The shards of one session that several daemons serve; none of these is trusted.
 
     Args:
         cell: Name of the cell.
-        expected: The shards as the session's user knows them, with their places.
+        expected: The shards and endpoints that the session's user configured.
     """
 
     ASK_S: Final = 0.5
-    """How long each place may take to answer."""
+    """How long each endpoint may take to answer."""
     AGAIN_S: Final = 2.0
-    """After so long it is asked again whether the doubt is over."""
+    """Pause before checking whether the doubt is over."""
 
     def __init__(self, cell: str, expected: Iterable[ShardEntry] = ()) -> None:
         self._cell = cell
@@ -228,10 +228,10 @@ class Doubts:
         self._doubted: dict[str, tuple[list[str], str, float]] = {}
 
     def hear(self, shards: Iterable[ShardEntry]) -> list[str]:
-        """Take where a shard says that all are; return what is wrong with those found twice.
+        """Take a shard's list of all endpoints; return messages about shards found twice.
 
         Raises:
-            EnactError: A place cannot be asked.
+            EnactError: An endpoint cannot be asked.
         """
         shards = tuple(shards)
         moved = moved_places(self._known, shards)
@@ -251,7 +251,7 @@ class Doubts:
         return text
 
     def about(self, shard: str) -> str:
-        """Return why a shard is not to be trusted now; empty where it is."""
+        """Return why a shard cannot be trusted now; empty if it can."""
         doubt = self._doubted.get(shard)
         if doubt is None:
             return ""

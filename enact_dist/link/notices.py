@@ -1,11 +1,10 @@
 """A bounded queue of notices between their receiver and a watcher.
 
-The newest notices win: if the watcher does not take them, the oldest are dropped and counted.  The
-watcher sees the gap in their numbers and asks for the present state, so it never misses a change
-without knowing.
+The newest notices win: if the watcher is slow, the oldest are dropped and counted.  The watcher
+sees the gap in their numbers and asks for the present state, so it never silently misses a change.
 
-A watcher names its `Interest`.  Other notices do not wake it: of a run of them only the numbers are
-passed on (`Skipped`), so that a gap remains a gap.
+A watcher names its `Interest`.  Other notices do not wake it; it gets only their numbers
+(`Skipped`), so that real gaps remain visible.
 """
 
 from __future__ import annotations
@@ -28,15 +27,15 @@ if TYPE_CHECKING:
     from enact_dist.core.messages import Survey
 
 NOTICES_MAX: Final = 65_536
-"""Notices kept for a watcher that does not take them: 11 minutes at 100 per second."""
+"""Notices queued for a slow watcher: 11 minutes at 100 per second."""
 
 
 KNOWN_MAX: Final = 4096
-"""Slots of which it is remembered whether they are of interest."""
+"""Slots whose relevance is cached."""
 
 
 class Skipped(NamedTuple):
-    """The notices of an epoch after one number, up to another one, were of no interest."""
+    """A run of notices without interest: their epoch, the number before the first, the last."""
 
     shard: str
     epoch: int
@@ -45,10 +44,10 @@ class Skipped(NamedTuple):
 
 
 class Interest:
-    """Which slots somebody watches.  Used by one thread at a time.
+    """The slots that a watcher wants.  Used by one thread at a time.
 
     Args:
-        wanted: The listing that shows them all.
+        wanted: The listing of all these slots.
     """
 
     __slots__ = ("_aspects", "_contexts", "_entities", "_known", "wanted")
@@ -60,7 +59,7 @@ class Interest:
         self._known: dict[Slot, bool] = {}
 
     def covers(self, notice: Notice) -> bool:
-        """Whether a notice tells of one of them."""
+        """Whether a notice is about one of them."""
         return any(self.wants(change[0]) for change in notice.changes)
 
     def wants(self, slot: Slot) -> bool:
@@ -79,23 +78,23 @@ class Interest:
 
 
 class Source(Protocol):
-    """Where a waiting thread can read notices."""
+    """A source from which a waiting thread can read notices."""
 
     def fileno(self) -> int:
-        """Return the descriptor that becomes readable when something has come."""
+        """Return the descriptor that becomes readable when data have arrived."""
 
     def take_notices(self) -> list[Notice | Skipped]:
-        """Return what has come, if anything has come whole; waits for nothing.
+        """Return the complete notices that have arrived; never waits.
 
         Raises:
-            EnactError: It made no sense.
-            EOFError: It has ended.
-            OSError: It is broken.
+            EnactError: The data are invalid.
+            EOFError: The source has ended.
+            OSError: The source is broken.
         """
 
 
 class _Ear:
-    """Waits for a source, or for a bell that other threads ring; it rings on until it is heard."""
+    """Waits for a source, or for a bell that other threads ring; the bell rings until heard."""
 
     __slots__ = ("_bell", "_poll", "on_end", "source")
 
@@ -107,14 +106,14 @@ class _Ear:
         self._poll.register(source, select.POLLIN)
 
     def wait(self, wait_s: float | None) -> list[int]:
-        """Return what can be heard: descriptors, that of the bell among others."""
+        """Return the readable descriptors, that of the bell included."""
         return [one for one, _ in self._poll.poll(None if wait_s is None else wait_s * 1e3)]
 
     def ring(self) -> None:
         os.eventfd_write(self._bell, 1)
 
     def heard_bell(self, ready: list[int]) -> bool:
-        """Whether the bell is in `ready`, which it is no more; the mutex of who rings is held."""
+        """Whether the bell is in `ready`; silences it.  The ringing thread's mutex is held."""
         rang = self._bell in ready
         if rang:
             ready.remove(self._bell)
@@ -128,15 +127,15 @@ class _Ear:
 class NoticeQueue:
     """A feed filled from another thread.  `put` never blocks, `get` wakes at once.
 
-    It may have one source that `get` itself reads, so that no thread has to be woken by another.
+    `get` itself may read one source, so that no thread has to wake another.
 
     Args:
-        interest: What is watched; None for everything.
-        notices_max: How many notices it keeps.
+        interest: The slots to watch; None: all.
+        notices_max: Capacity of the queue.
 
     Attributes:
-        late_s: How long the number of a notice of no interest may stay out.
-        on_close: Called once by the first `close`; ends what fills the feed.
+        late_s: How late the numbers of notices without interest may be, in seconds.
+        on_close: Called once by the first `close`; stops the sources of the feed.
     """
 
     def __init__(self, interest: Survey | None = None, *, notices_max: int = NOTICES_MAX) -> None:
@@ -157,11 +156,11 @@ class NoticeQueue:
 
     @property
     def dropped(self) -> int:
-        """How many notices were dropped because the watcher did not take them in time."""
+        """How many notices were dropped because the watcher was too slow."""
         return self._dropped
 
     def put(self, notice: Notice) -> None:
-        """Add a notice; one that came already (over a second connection) is ignored."""
+        """Add a notice; a duplicate (from a second connection) is ignored."""
         with self._mutex:
             wanted = self._interest is None or self._interest.covers(notice)
             self._put(notice, wanted=wanted)
@@ -182,9 +181,9 @@ class NoticeQueue:
         self._wake()
 
     def not_beyond(self, shard: str, epoch: int, number: int) -> None:
-        """Let notices after this number come: the shard itself says that it has sent no later one.
+        """Accept notices after this number: the shard itself reports it as the last one sent.
 
-        One with a later number was no notice of the shard's, and must not hide those that follow.
+        A notice with a later number was not the shard's and must not hide the ones that follow.
         """
         with self._mutex:
             if self._newest.get(shard, (0, 0)) > (epoch, number):
@@ -197,9 +196,9 @@ class NoticeQueue:
             self._ear.ring()
 
     def wait_for_earlier(self, first: Notice | Skipped, wait_s: float) -> None:
-        """Wait until what a shard has sent before `first` has come by another way.
+        """Wait until a shard's notices before `first` have arrived by another route.
 
-        Not longer than `wait_s`: it may have been lost, or have come before this feed was opened.
+        Waits at most `wait_s`: a notice may be lost, or older than this feed.
         """
         after = first.after if isinstance(first, Skipped) else first.number - 1
         with self._mutex:
@@ -213,10 +212,10 @@ class NoticeQueue:
             )
 
     def read_from(self, source: Source, on_end: Callable[[Exception], None]) -> bool:
-        """Let `get` read this source, too; say no if there is one, or the feed is closed.
+        """Let `get` read this source too; False if it already has one, or the feed is closed.
 
         Args:
-            source: What is read while somebody waits; what comes at other times waits there.
+            source: Read while a thread waits in `get`; at other times its data wait there.
             on_end: Called once by `get`, with the reason, when the source has ended.
         """
         with self._mutex:
@@ -227,7 +226,7 @@ class NoticeQueue:
             return True
 
     def take(self, found: Iterable[Notice | Skipped]) -> None:
-        """Add what came from a shard that passes over what is of no interest by itself."""
+        """Add notices from a shard that already skips those without interest."""
         with self._mutex:
             for one in found:
                 if not isinstance(one, Skipped):
@@ -236,7 +235,7 @@ class NoticeQueue:
                     self._skip(one)
 
     def _skip(self, skipped: Skipped) -> None:
-        """Add the numbers of notices that were of no interest; wakes no thread."""
+        """Add the numbers of notices without interest; wakes no thread."""
         last = self._notices[-1] if self._notices else None
         if isinstance(last, Skipped) and (last.shard, last.epoch, last.number) == skipped[:3]:
             self._notices[-1] = Skipped(last.shard, last.epoch, last.after, skipped.number)
@@ -244,9 +243,9 @@ class NoticeQueue:
             self._notices.append(skipped)
 
     def get(self, timeout_s: float | None) -> Notice | Skipped | None:
-        """Return the next notice or what was skipped before it.
+        """Return the next notice, or the skipped run before it.
 
-        None after `timeout_s` without one, once closed, and in a forked child.
+        Returns None after `timeout_s`, once closed, and in a forked child.
         """
         if self._is_inherited():
             return None
@@ -266,25 +265,25 @@ class NoticeQueue:
                 self._polling = True
             if not self._read(ear, _left_s(deadline_s)):
                 return None
-            # What came may be a part of a notice, or the end of the source.
+            # The data may be a part of a notice, or the end of the source.
             late = deadline_s is not None and time.monotonic() >= deadline_s
 
     def get_here(self) -> Notice | Skipped | None:
-        """Return the next of those that are here already, None if there is none."""
+        """Return the next notice that has arrived already, or None."""
         if self._is_inherited():
             return None
         with self._mutex:
             return self._notices.popleft() if self._notices and not self._closed else None
 
     def _is_inherited(self) -> bool:
-        """Whether this is a forked child: its parent's thread may have held the mutex for good."""
+        """Whether this is a forked child: a thread of the parent may have held the mutex."""
         return self._pid != os.getpid()
 
     def _has_news(self) -> bool:
         return bool(self._notices) or self._closed or self._ear is not None
 
     def _read(self, ear: _Ear, wait_s: float | None) -> bool:
-        """Wait for the source or the bell, and take what has come; False: nothing did."""
+        """Wait for the source or the bell, and take what has arrived; False if nothing has."""
         try:
             ready = ear.wait(wait_s)
             with self._mutex:
@@ -307,7 +306,7 @@ class NoticeQueue:
         ear.on_end(error)
 
     def close(self) -> None:
-        """End the feed and wake a thread that waits in `get`; twice is harmless."""
+        """End the feed and wake a thread that waits in `get`; idempotent."""
         if self._is_inherited():
             return
         with self._mutex:

@@ -1,7 +1,7 @@
-"""Pauses of a session: they end early once it is closed, or a shard has come back.
+"""Pauses of a session, which end early once it is closed or a shard has come back.
 
-A session that is used gives signs of life more often than one that only exists; the first lock
-after a while wakes the thread that gives them.
+A session in use sends keep-alives more often than an idle one; the first lock after a while wakes
+the keep-alive thread.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class Pauses:
-    """Where the threads of one session wait before they ask again.  Thread-safe.
+    """Where the threads of one session pause before a retry.  Thread-safe.
 
     Attributes:
         returns: How often a shard has come back.
@@ -34,9 +34,9 @@ class Pauses:
         self._changed = threading.Condition(threading.Lock())
 
     def rest(self, pause_s: float, returns: int | None = None) -> bool:
-        """Wait, but not once more shards than `returns` have come back; say whether it is over.
+        """Pause, but only until shards have come back more than `returns` times; return `over`.
 
-        `returns` None stands for those that have come back so far.
+        `returns` None: the present count.
         """
         with self._changed:
             before = self.returns if returns is None else returns
@@ -44,13 +44,13 @@ class Pauses:
             return self._over
 
     def shard_returned(self) -> None:
-        """Let everybody who waits ask again at once."""
+        """Let all pausing threads retry at once."""
         with self._changed:
             self.returns += 1
             self._changed.notify_all()
 
     def rest_of_renewal(self, pause_s: float, returns: int) -> bool:
-        """Wait as in `rest`, and not once the session is used; say whether that came first."""
+        """Pause as `rest`, but only until the session is used; return whether it was."""
         with self._changed:
             over = self._changed.wait_for(
                 lambda: self._over or self.returns != returns or self._hurried, max(0.0, pause_s)
@@ -59,39 +59,39 @@ class Pauses:
             return over and hurried and not self._over and self.returns == returns
 
     def hurry(self) -> None:
-        """Let a renewal that rests for long look again: the session is used."""
+        """End a long pause of the keep-alive thread, because the session is used."""
         with self._changed:
             self._hurried = True
             self._changed.notify_all()
 
     @property
     def over(self) -> bool:
-        """Whether nobody waits any more."""
+        """Whether all pauses have ended."""
         return self._over
 
     def end(self) -> None:
-        """Let nobody wait any more."""
+        """End all pauses, for ever."""
         with self._changed:
             self._over = True
             self._changed.notify_all()
 
 
 class Renewed(Protocol):
-    """What has to give signs of life."""
+    """An object that sends keep-alives."""
 
     def next_renewal_s(self) -> float:
-        """Return how long no sign of life is due."""
+        """Return how long until the next keep-alive is due."""
 
     def renew(self) -> None:
-        """Send those that are due; raises nothing."""
+        """Send the keep-alives that are due; raises nothing."""
 
 
 def keep_renewing(found: weakref.ref[Renewed], pauses: Pauses) -> None:
-    """Renew a session until it is closed, or nobody uses it any more."""
+    """Renew a session until it is closed, or nothing refers to it any more."""
     returns = 0
     while (session := found()) is not None:
         pause_s = session.next_renewal_s()
-        del session  # its last user may go while this waits
+        del session  # its last user may drop it during this wait
         hurried = pauses.rest_of_renewal(pause_s, returns)
         if pauses.over:
             return
@@ -103,14 +103,14 @@ def keep_renewing(found: weakref.ref[Renewed], pauses: Pauses) -> None:
 
 
 class Renewal:
-    """When one session gives signs of life, and to which shards.  Thread-safe.
+    """When one session sends keep-alives, and to which shards.  Thread-safe.
 
     Args:
         core: The session.
-        carrier: Knows which shards are away.
+        carrier: Tells which shards are away.
         mutex: Guards the session.
-        pauses: Where its renewal rests.
-        now_ns: Its clock.
+        pauses: Where the keep-alive thread pauses.
+        now_ns: The session's clock.
     """
 
     def __init__(
@@ -127,7 +127,7 @@ class Renewal:
         self._rests_long = False
 
     def pause_s(self) -> float:
-        """Return how long no sign of life is due."""
+        """Return how long until the next keep-alive is due."""
         core, away = self._core, self._carrier.away
         with self._mutex:
             now_ns = self._now_ns()
@@ -137,14 +137,14 @@ class Renewal:
             return self._signs.pause_ns(core.shards_in_use(), away, core.ttl_ns, now_ns) / 1e9
 
     def due(self) -> list[tuple[str, bool]]:
-        """Return the shards that are to be asked now, and whether each of them was away."""
+        """Return the shards to renew with now, each with whether it was away."""
         shards, away = self._core.shards_in_use(), self._carrier.away
         with self._mutex:
             due = self._signs.due(shards, away, self._now_ns())
             return [(shard, shard in self._signs.gone) for shard in due]
 
     def used(self) -> None:
-        """Note that a lock begins, or that somebody follows what the answers tell."""
+        """Note that a lock begins, or that a thread waits for news from the shards."""
         with self._mutex:
             self._signs.used(self._now_ns(), self._core.ttl_ns)
             hurry, self._rests_long = self._rests_long, False

@@ -1,11 +1,11 @@
-"""Large data on the client's side: written into the shard's folder, read by mapping its files.
+"""Large data on the client's side: writes them to the shard's folder, reads by mapping files.
 
-Both need that client and shard share memory, which the nonce of the shard's WELCOME proves for one
-start of it (see `shared_folder`).  Where they do not, or whatever fails here, the same bytes travel
-with the messages: every failure is counted, none is the caller's.
+Both need shared memory between client and shard, which the nonce in the shard's WELCOME proves for
+one start of it (see `shared_folder`).  Otherwise, and after any failure here, the same bytes go
+into messages; failures are counted and never reach the caller.
 
-A shard in this very process takes the bytes as they are.  What is filled in place for it lies in a
-file without a name, so that its writer can be cut off just the same.
+A shard in this process takes the bytes without a copy.  Data filled in place for it go to a file
+without a name, so that the writer can be detached from it in the same way.
 """
 
 from __future__ import annotations
@@ -53,8 +53,8 @@ class Draft:
     """A payload that this process fills; to be committed by its name, or dropped.
 
     Attributes:
-        shard: Where it lies.
-        file: Its name there; "" where it has none, and is committed by its bytes.
+        shard: The shard that stores it.
+        file: Its name there; "" if it has none and is committed by its bytes.
         size: Its length in bytes.
     """
 
@@ -66,10 +66,9 @@ class Draft:
         self._pages: Pages | None = None
 
     def fill(self, parts: Sequence[Any]) -> memoryview:
-        """Write the parts one after another, which fill it whole; return the bytes, read-only.
+        """Write the parts in order, filling all of it; return the bytes, read-only.
 
-        A write costs half of what filling a fresh map does: no page is touched for the first time
-        by this process.
+        Writing costs half as much as filling a fresh map: this process touches no new page.
 
         Raises:
             OSError: As the system reports it.
@@ -86,7 +85,7 @@ class Draft:
         return self.shown()
 
     def shown(self) -> memoryview:
-        """Return the bytes, read-only, in a map that no `close` cuts off.
+        """Return the bytes, read-only, in a map that `close` does not detach.
 
         Raises:
             OSError: As the system reports it.
@@ -94,7 +93,7 @@ class Draft:
         return body_of(map_file(self._descriptor, self.size, writable=False)).toreadonly()
 
     def memory(self) -> memoryview:
-        """Return the bytes to be filled in place.
+        """Return the bytes, writable in place.
 
         Raises:
             OSError: As the system reports it.
@@ -103,10 +102,10 @@ class Draft:
         return body_of(self._pages)
 
     def close(self) -> None:
-        """Let nothing that this process does reach the file any more; twice is harmless.
+        """Ensure that no later write of this process reaches the file; idempotent.
 
-        Memory that was filled in place stays readable, and is cut off the file in a moment: its
-        pages are too many to be waited for.
+        Memory that was filled in place stays readable.  It is detached from the file a moment
+        later, in another thread, because that takes long.
         """
         descriptor, self._descriptor = self._descriptor, -1
         if descriptor < 0:
@@ -123,11 +122,11 @@ def _cut_off(pages: Pages, descriptor: int) -> None:
     try:
         cut_off(pages, descriptor)
     except OSError as error:
-        _log.warning("a committed array could not be cut off its file: %s", error)
+        _log.warning("a committed array could not be detached from its file: %s", error)
 
 
 class _Shared:
-    """What one start of a shard shares with this process, if anything."""
+    """The shared folder of one start of a shard, if this process sees it."""
 
     __slots__ = ("epoch", "folder", "name", "nonce")
 
@@ -144,10 +143,10 @@ class SharedPayloads:
     """The payloads of all shards as one process sees them.  Thread-safe.
 
     Args:
-        session: The session of this process; its payloads bear its name.
-        call: Makes one call to a shard; None stands for no answer.
+        session: The session of this process; its payloads carry its name.
+        call: Makes one call to a shard; None: no answer.
         count: Adds to a counter of the session.
-        inside: Whether the only shard is in this process, and takes data as they lie here.
+        inside: Whether the only shard runs in this process and takes data without a copy.
 
     Attributes:
         inside: As above.
@@ -168,7 +167,7 @@ class SharedPayloads:
         )
 
     def learn(self, welcome: Welcome) -> None:
-        """Take from a WELCOME what the shard shares; looked at when it is first needed."""
+        """Take from a WELCOME what the shard shares; opened on first use."""
         with self._mutex:
             known = self._shards.get(welcome.shard)
             if known is not None and (known.epoch, known.name) == (welcome.epoch, welcome.shared):
@@ -188,10 +187,10 @@ class SharedPayloads:
     # ---------------------------------------------------------------- writing
 
     def draft(self, shard: str, size: int) -> Draft | None:
-        """Make a payload to be filled; None where the bytes have to travel.
+        """Make a payload to be filled; None if the bytes have to go into messages.
 
         Raises:
-            NoRoomError: The shard's cap is reached, and no history is left to go.
+            NoRoomError: The shard's limit is reached, and it has no history left to remove.
         """
         shared = self._folder(shard)
         if shared is None or size <= PAYLOAD_BYTES_MIN:
@@ -213,18 +212,18 @@ class SharedPayloads:
             name = answer.draft or file
             return Draft(shard, file, size, self._opened(shared, name, size, os.O_RDWR))
         except OSError as error:
-            # A folder that can be read only, most likely.
+            # Most likely the folder is read-only here.
             self._count("payload_fallbacks")
             _log.info("payload %s of shard %s: %s", file, shard, error)
             self.drop(shard, file)
             return None
 
     def nameless(self, shard: str, size: int) -> tuple[Draft, memoryview, memoryview] | None:
-        """Make memory that is filled in place and handed to a shard in this process as it lies.
+        """Make memory to be filled in place and passed to a shard in this process without a copy.
 
         Returns:
-            The draft, its bytes to be filled, and the same bytes as the shard gets them; None
-            where they are few, are copied on their way, or no such memory can be had.
+            The draft, its writable bytes, and the same bytes for the shard; None if they are few,
+            are copied anyway, or no such memory is available.
         """
         if not self.inside or size <= PAYLOAD_BYTES_MIN:
             return None
@@ -241,7 +240,7 @@ class SharedPayloads:
             return None
 
     def filled(self, draft: Draft, parts: Sequence[Any]) -> memoryview | None:
-        """Fill a payload; return its bytes, or None where that fails and they have to travel."""
+        """Fill a payload; return its bytes, or None if that fails and messages must carry them."""
         try:
             return draft.fill(parts)
         except OSError as error:
@@ -251,7 +250,7 @@ class SharedPayloads:
             draft.close()
 
     def memory(self, draft: Draft) -> memoryview | None:
-        """Return the memory of a payload to be filled in place; None where there is none."""
+        """Return the memory of a payload to be filled in place; None if that fails."""
         try:
             return draft.memory()
         except OSError as error:
@@ -265,19 +264,19 @@ class SharedPayloads:
         self.drop(draft.shard, draft.file)
 
     def drop(self, shard: str, file: str) -> None:
-        """Tell a shard that a payload will not be committed; it finds out by itself, too."""
+        """Tell a shard that a payload will not be committed; without this it notices later."""
         try:
             self._call(shard, Stage(self._session, file, 0, 0, NOTHING))
         except EnactError as error:
-            _log.info("payload %s of shard %s is not given up: %s", file, shard, error)
+            _log.info("cannot give up payload %s of shard %s: %s", file, shard, error)
 
     # ---------------------------------------------------------------- reading
 
     def mapped(self, shard: str, epoch: int, file: str, size: int) -> memoryview | None:
-        """Return the bytes of a payload without a copy; None where they have to be fetched.
+        """Return the bytes of a payload without a copy; None if they have to be fetched.
 
-        A map lasts as long as somebody looks at it: what is replaced leaves the memory with its
-        last reader, so none is kept here for the next one.
+        A map lasts while its bytes are in use.  No map is cached for later readers, so replaced
+        data leave memory with their last reader.
         """
         shared = self._folder(shard)
         if shared is None or shared.epoch != epoch:
@@ -300,16 +299,16 @@ class SharedPayloads:
 
     @staticmethod
     def _opened(shared: _Shared, file: str, size: int, access: int) -> int:
-        """Open a payload, sure to be what the shard has made.
+        """Open a payload, verified to be a file of the shard.
 
         Raises:
-            OSError: It is not.
+            OSError: It is not one.
         """
         assert shared.folder is not None
         flags = access | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
         descriptor = os.open(file, flags, dir_fd=shared.folder.descriptor)
         found = os.fstat(descriptor)
-        # Shorter than it is said to be, it would kill whoever touches what is missing.
+        # If it were shorter than announced, touching the missing part would kill the process.
         fits = stat.S_ISREG(found.st_mode) and found.st_size == size
         if not fits or found.st_uid != shared.folder.owner:
             os.close(descriptor)
@@ -317,6 +316,6 @@ class SharedPayloads:
         return descriptor
 
     def close(self) -> None:
-        """Let go of all folders; what is mapped stays."""
+        """Close all folders; mapped payloads stay."""
         with self._mutex:
             self._shards.clear()

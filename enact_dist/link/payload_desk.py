@@ -1,4 +1,4 @@
-"""Payloads at a shard: large data that came, or were made, apart from the commit that names them.
+"""Payloads at a shard: large data that arrived, or were written, ahead of their commit.
 
 ::
 
@@ -7,21 +7,22 @@
     Commit, Prepare ───┴──> adopted: read-only, its bytes become the body of the datum
     last datum gone ──────> the file is removed; processes that have mapped it keep its content
 
-The desk stands in front of the shard: the core sees bodies and never learns where they lie.  A
-payload lasts as long as somebody looks at its bytes, and a draft as long as its client.
+The desk works in front of the shard: the core sees bodies and never learns where they are stored.
+A payload lasts as long as its bytes are in use, a draft as long as its client.
 
 Rules that a change must keep:
 
-- A name is used once.  No reader learns of a payload before its commit stands, so none is ever read
-  half-filled.
-- What is counted against the cap is counted until the file is gone, and before it is made.
-- A client that still has a draft mapped for writing could change it after the commit.  Ours hands
-  out read-only arrays then and cuts itself off some milliseconds later; a hostile one of the same
-  user could do worse.
-- In a folder of a group, whose users may write what the shard makes for them, a draft has a name
-  that only its client learns, and that cannot be listed; it gets that of its payload when it is
-  read-only.  What is left there: a hostile client can change its own payload after the commit, and
-  a user of the group can read payloads whose names he knows, as he can by asking the shard.
+- A name is used once.  Readers learn of a payload only after its commit, so nobody reads a
+  half-filled one.
+- Bytes count against the limit from before the file is made until it is gone.
+- A client that still has a draft mapped for writing could change it after the commit.  Our client
+  hands out read-only arrays from then on and detaches itself some milliseconds later; a hostile one
+  of the same user could do worse.
+- In a folder of a group, whose users may write files that the shard makes for them, only the client
+  learns the name of its draft, and names cannot be listed; the draft gets its payload's name when
+  it becomes read-only.  Two gaps remain: a hostile client can change its own payload after the
+  commit, and a user of the group can read payloads whose names he knows, as he can by asking the
+  shard.
 """
 
 from __future__ import annotations
@@ -52,23 +53,23 @@ if TYPE_CHECKING:
     _Written = TypeVar("_Written", Commit, Prepare)
 
 GAPS_MAX: Final = 1024
-"""Slices of one draft that may be here while one before them is not."""
+"""Slices of one draft that may arrive before a preceding one."""
 NO_ROOM: Final = "no_room"
-"""The code of a refusal because of the cap."""
+"""The code of a refusal for lack of room."""
 DRAFT_NS: Final = 30_000_000_000
-"""A draft of a session that holds no lock is given up after so long without a slice."""
+"""A draft of a session without a lock is dropped after this time without a slice."""
 FULL_NS: Final = 100_000_000
-"""So long after a payload did not fit, none that is as large is made room for."""
+"""After a payload did not fit, the desk frees no room for one as large during this time."""
 DRAFT_BYTES_MAX: Final = 2 << 30
-"""Bytes of drafts that wait in plain memory for their commits."""
+"""Bytes of drafts in plain memory that may wait for their commits."""
 SHARES: Final = 4
-"""Of the room for drafts one client has a quarter in any case; more only while others want none."""
+"""Each client always has a quarter of the room for drafts; more only while others need none."""
 ROOM_S: Final = 1.0
-"""How long a new draft waits for files that are on their way out."""
+"""How long a new draft waits for files that are being removed."""
 SILENT_NS: Final = 60_000_000_000
-"""Time between two log lines about payloads outside the folder; all of them are counted."""
+"""Shortest time between two log lines about payloads outside the folder; all are counted."""
 ROOM_TRIES: Final = 8
-"""How often history frees room for a draft, more each time, while others take that room."""
+"""How often history is removed for a draft, more each time, while others take that room."""
 
 _log = logging.getLogger("enact.shard")
 
@@ -88,7 +89,7 @@ class _Draft:
     beyond: list[tuple[int, int]] = field(default_factory=list)
 
     def add(self, begin: int, end: int) -> None:
-        """Note that a slice is here, perhaps again, or before one that belongs in front of it."""
+        """Note the arrival of a slice, perhaps repeated or ahead of an earlier one."""
         self.beyond.append((begin, end))
         self.beyond.sort()
         while self.beyond and self.beyond[0][0] <= self.have:
@@ -96,9 +97,9 @@ class _Draft:
 
     @property
     def whole(self) -> bool:
-        """Whether all of it is here: from slices, or (none came) from its client in the folder.
+        """Whether all of it is here: from slices or, without any, from its client in the folder.
 
-        Not while a slice is being written: nothing may change once a commit has it.
+        False while a slice is being written: nothing may change once a commit has it.
         """
         if self.writing:
             return False
@@ -109,15 +110,15 @@ class PayloadDesk:
     """The payloads of one shard.  Thread-safe; never waits for the shard.
 
     Args:
-        folder: Where clients of this host find them; None keeps them in this process.
-        bytes_max: So many bytes of files at most, drafts included; without a folder, of drafts.
-        firm: Whether a payload beyond that is refused; else it lies in plain memory.
-        make_room: Called to let history go, until so many bytes are free.
-        biggest: Names the slots that hold the most, for the text of a refusal.
-        clock: Tells how long a draft has had no slice.
+        folder: Where clients of this host find them; None: they stay in this process.
+        bytes_max: Byte limit of the files, drafts included; without a folder, of the drafts.
+        firm: Whether a payload beyond the limit is refused; otherwise it goes to plain memory.
+        make_room: Called to remove history until so many bytes are free.
+        biggest: Names the largest slots, for the text of a refusal.
+        clock: Measures how long a draft has had no slice.
 
     Attributes:
-        counters: What happened, by name, for `ListSessions`.
+        counters: Counters by name, for `ListSessions`.
     """
 
     def __init__(
@@ -152,11 +153,11 @@ class PayloadDesk:
     # ---------------------------------------------------------------- drafts
 
     def stage(self, message: Stage, owner: str = "") -> Staged | Refused:
-        """Open a draft, take a slice of one, or give one up.
+        """Open a draft, take a slice of one, or drop one.
 
         Args:
-            message: A slice, or the question for room.
-            owner: Whose share of the room it takes; the session's own unless it is said.
+            message: A slice, or a request for room.
+            owner: The identity whose share of the room it takes; default: the session's.
         """
         file, total = message.file, message.total
         if not PAYLOAD_NAME.match(file) or not file.startswith(f"{message.session}-"):
@@ -166,12 +167,12 @@ class PayloadDesk:
             return Staged(file, 0, shared=False)
         with self._mutex:
             if file in self._over:
-                return Staged(file, total, False)  # a late copy: no client waits for it
+                return Staged(file, total, False)  # a late copy that no client waits for
         if not 0 < total <= BODY_BYTES_MAX:
             return Refused("protocol", f"a payload of {total} bytes; at most {BODY_BYTES_MAX}")
         draft: _Draft | Refused | None = self._drafts.get(file)
         if draft is None:
-            # Slices of one draft may come by several threads.
+            # Slices of one draft may come from several threads.
             with self._opening[hash(file) % len(self._opening)]:
                 draft = self._drafts.get(file) or self._opened(
                     message.session, owner or message.session, file, total
@@ -187,13 +188,15 @@ class PayloadDesk:
     def _take(self, file: str, draft: _Draft, offset: int, slice_: Datum) -> Staged | Refused:
         end = offset + slice_.size
         if not 0 <= offset <= end <= draft.size:
-            return Refused("protocol", f"a slice to {end} of payload {file}, of {draft.size} bytes")
+            return Refused(
+                "protocol", f"a slice up to {end} of payload {file} of {draft.size} bytes"
+            )
         if len(draft.beyond) >= GAPS_MAX:
-            return Refused("protocol", f"{GAPS_MAX} slices of payload {file} came before others")
+            return Refused("protocol", f"{GAPS_MAX} slices of payload {file} came ahead of others")
         with self._mutex:
             draft.touched_ns = self._clock.monotonic_ns()
             if self._drafts.get(file) is not draft:
-                return Staged(file, draft.size, False)  # meanwhile: a late copy, as in `stage`
+                return Staged(file, draft.size, False)  # a late copy, as in `stage`
             if not slice_.size or end <= draft.have:
                 return Staged(file, draft.have, draft.shared, self._names.get(file, ""))
             draft.writing += 1
@@ -209,15 +212,15 @@ class PayloadDesk:
             return Staged(file, draft.have, draft.shared, self._names.get(file, ""))
 
     def _opened(self, session: str, owner: str, file: str, total: int) -> _Draft | Refused | None:
-        """Return a new draft; None where its name was used up meanwhile."""
-        small = total <= PAYLOAD_BYTES_MIN  # many of these together, each read with its grant
+        """Return a new draft; None if its name has been used meanwhile."""
+        small = total <= PAYLOAD_BYTES_MIN  # often many together, and read with the grant
         shared = self._folder is not None and not small and self._has_room(total)
         if not shared and self._folder is not None and not small and self._firm:
             shared = self._displaced(owner, total, shared=True) and self._reserved(total)
             if not shared:
                 return self._refused(session, total, self._bytes, self._bytes_max)
         if self._folder is not None and not shared and not small:
-            self._travels(f"its cap of {self._bytes_max} bytes is reached")
+            self._travels(f"its limit of {self._bytes_max} bytes is reached")
         memory = self._in_folder(self._folder, file, total) if shared else None
         if memory is None:
             drafted = self._drafted()
@@ -228,7 +231,7 @@ class PayloadDesk:
             found = memory or plain_memory(total, ended=partial(self._ended, file, None, 0))
         except OSError as error:
             self._count("payloads_refused")
-            return Refused(NO_ROOM, f"{total} bytes for a payload cannot be had: {error.strerror}")
+            return Refused(NO_ROOM, f"no memory for a payload of {total} bytes: {error.strerror}")
         draft = _Draft(session, owner, total, found, memory is not None, self._clock.monotonic_ns())
         with self._mutex:
             if file in self._over:
@@ -237,25 +240,25 @@ class PayloadDesk:
         return draft
 
     def _has_room(self, total: int) -> bool:
-        """Count the bytes of a new file if they fit under the cap, history gone if need be."""
+        """Count the bytes of a new file if they fit under the limit, removing history if needed."""
         if self._reserved(total):
             return True
         until_ns, least = self._full
         if self._clock.monotonic_ns() < until_ns and total >= least:
-            return False  # looking through all history again would only delay the others
+            return False  # searching all history again would only delay others
         asked = 0
         for _ in range(ROOM_TRIES):
             gone = self._gone
             missing = self._bytes + (asked + 1) * total - self._bytes_max
-            if missing > 0:  # else something has gone by itself since
+            if missing > 0:  # otherwise room has been freed meanwhile
                 self._make_room(missing)
                 asked += 1
-            # Released data take a moment to leave.
+            # Released data take a moment to disappear.
             leftovers().wait(ROOM_S)
             if self._reserved(total):
                 return True
             if missing > 0 and self._gone == gone:
-                break  # history has no more to give; else another payload has taken the room
+                break  # no more history to remove; otherwise another payload took the room
         self._full = self._clock.monotonic_ns() + FULL_NS, total
         return False
 
@@ -268,10 +271,10 @@ class PayloadDesk:
             return True
 
     def _displaced(self, owner: str, total: int, *, shared: bool) -> bool:
-        """Give up drafts of those beyond their share for one who stays within; say whether any.
+        """Drop drafts of clients beyond their share for one within its share; return if any.
 
-        Otherwise a client that stages more and more and commits nothing would fill the folder.
-        A client that still wanted its draft learns of the loss at its commit, and stages again.
+        Otherwise a client that only stages and never commits would fill the folder.  A client that
+        still wanted its draft learns of the loss at its commit and stages it again.
         """
         share = (self._bytes_max if shared else self._draft_bytes_max) // SHARES
         staged: Counter[str] = Counter()
@@ -300,7 +303,7 @@ class PayloadDesk:
         return freed >= total
 
     def _drafted(self) -> int:
-        """Return the bytes of drafts in plain memory; a small one costs more than it has."""
+        """Return the bytes of drafts in plain memory, counting an overhead for small ones."""
         with self._mutex:
             plain = [draft.size for draft in self._drafts.values() if not draft.shared]
         return sum(max(size, PAYLOAD_BYTES_MIN) for size in plain)
@@ -310,12 +313,12 @@ class PayloadDesk:
         return Refused(
             NO_ROOM,
             f"session {session[:8]} asked for a payload of {total} bytes; {used} of at most {most}"
-            f" are in use{self._biggest()}; raise shared_bytes_max, keep fewer versions, or let go"
-            " of arrays, and end locks, that hold old ones",
+            f" are in use{self._biggest()}; raise shared_bytes_max, keep fewer versions, or release"
+            " arrays and locks that still reference old ones",
         )
 
     def _in_folder(self, folder: SharedFolder | None, file: str, total: int) -> Pages | None:
-        """Return the memory of a new file whose bytes are counted; None where it cannot be."""
+        """Return the memory of a new file whose bytes are counted; None if that fails."""
         assert folder is not None
         try:
             return self._file_memory(folder, file, total)
@@ -327,12 +330,12 @@ class PayloadDesk:
             return None
 
     def _travels(self, why: str) -> None:
-        """Count a payload that is no file; say so, but of a full folder not for each."""
+        """Count a payload outside the folder, and log it; a full folder is logged less often."""
         self._count("payload_fallbacks")
         now_ns = self._clock.monotonic_ns()
         if self._folder is not None and now_ns >= self._silent_until_ns:
             self._silent_until_ns = now_ns + SILENT_NS
-            text = "large data travel over the network, for the shared folder %s takes none: %s"
+            text = "large data go over the network because the shared folder %s takes none: %s"
             _log.warning(text, self._folder.path, why)
 
     def _file_memory(self, folder: SharedFolder, file: str, total: int) -> Pages:
@@ -343,7 +346,7 @@ class PayloadDesk:
         made = os.open(name, flags, 0o600, dir_fd=folder.descriptor)
         try:
             os.fchmod(made, folder.access.draft_mode)
-            # Never a hole: a page that is missing later kills the process that touches it.
+            # No holes: a page that is missing later kills the process that touches it.
             os.posix_fallocate(made, 0, total)
             return map_file(
                 made, total, writable=True, ended=partial(self._ended, file, folder, total)
@@ -356,7 +359,7 @@ class PayloadDesk:
             os.close(made)
 
     def drop(self, file: str) -> None:
-        """Give a draft up; nothing where there is none."""
+        """Drop a draft, if it exists."""
         with self._mutex:
             self._drafts.pop(file, None)
             self._over.add(file)
@@ -364,9 +367,9 @@ class PayloadDesk:
     # ---------------------------------------------------------------- adoption
 
     def with_bodies(self, message: _Written) -> _Written:
-        """Return a commit or prepare whose named payloads have become bodies.
+        """Return a commit or prepare with its named payloads replaced by bodies.
 
-        What is not here stays without: the shard then says what that means for this lock.
+        Missing payloads stay without a body; the shard decides what that means for the lock.
         """
         if not names_payloads(message):
             return message
@@ -387,12 +390,12 @@ class PayloadDesk:
             return write
         shared = isinstance(memory, Pages)
         body = body_of(memory).toreadonly()
-        # Plain memory has a name for its writer alone.
+        # Plain memory has a name only for its writer.
         file = datum.file if shared else ""
         return WriteItem(write.slot, replace(datum, body=body, file=file))
 
     def _adopt(self, file: str, size: int) -> Pages | Plain | None:
-        """Return the bytes of a whole payload, for good; None where there is none."""
+        """Return the bytes of a complete payload and adopt it; None if there is none."""
         with self._mutex:
             known = self._adopted.get(file)
             if known is not None:
@@ -411,18 +414,18 @@ class PayloadDesk:
                 if name != file:
                     os.rename(name, file, src_dir_fd=descriptor, dst_dir_fd=descriptor)
                     del self._names[file]
-            except OSError as error:  # somebody has cleared the folder
+            except OSError as error:  # another program has cleared the folder
                 _log.warning("payload %s is lost: %s", file, error.strerror)
                 return None
         self._count("payloads_adopted")
         return draft.memory
 
     def _ended(self, file: str, folder: SharedFolder | None, counted: int) -> None:
-        """Remove a payload without readers, then stop counting its bytes."""
+        """Delete a payload without readers, then stop counting its bytes."""
         if folder is not None and folder.descriptor >= 0:
             try:
                 os.unlink(self._names.pop(file, file), dir_fd=folder.descriptor)
-            except OSError as error:  # the folder went first
+            except OSError as error:  # the folder was deleted first
                 _log.info("payload %s: %s", file, error)
         with self._mutex:
             self._bytes -= counted
@@ -430,7 +433,7 @@ class PayloadDesk:
             self._gone += 1
 
     def _unadopted(self, file: str, gone: weakref.ref[Pages | Plain]) -> None:
-        """Forget an adopted payload; others of its name, too late to be a draft, end unnoticed."""
+        """Forget an adopted payload; a late draft of the same name then ends silently."""
         with self._mutex:
             if self._adopted.get(file) is gone:
                 del self._adopted[file]
@@ -438,7 +441,7 @@ class PayloadDesk:
     # ---------------------------------------------------------------- life
 
     def sweep(self, lives: Callable[[str], bool], works: Callable[[str], bool]) -> None:
-        """Give up the drafts that no client will commit any more.
+        """Drop the drafts that no client will commit any more.
 
         Args:
             lives: Whether a session is known.
@@ -464,7 +467,7 @@ class PayloadDesk:
             return {file: draft.session for file, draft in self._drafts.items()}
 
     def figures(self) -> dict[str, int]:
-        """Return counters, and what there is now: files, bytes, drafts."""
+        """Return counters and current values: files, bytes, drafts."""
         with self._mutex:
             return {
                 **self.counters,
@@ -480,12 +483,12 @@ class PayloadDesk:
 
 
 def names_payloads(message: Commit | Prepare) -> bool:
-    """Whether a commit or prepare names data that were sent ahead of it."""
+    """Whether a commit or prepare names data that were staged before it."""
     return any(write.datum is not None and write.datum.file for write in message.writes)
 
 
 def half_of(folder: SharedFolder | None) -> int:
-    """Return half of the bytes that the file system of a folder has; without one, of drafts."""
+    """Return half of the folder's file system in bytes; without a folder, the limit of drafts."""
     if folder is None:
         return DRAFT_BYTES_MAX
     system = os.fstatvfs(folder.descriptor)

@@ -1,8 +1,8 @@
-"""Copies that nobody else may read, from their first byte on, and whatever the umask says.
+"""Copies that only their owner can read, from the first byte on, whatever the umask.
 
-A folder is put together beside its place and gets its name when it is whole.  One process at a
-time does so, by a lock on the folder that ends with it: what a killed one leaves is removed by the
-next one.  Some file systems (NFS) lock no folders; there a backup is made all the same.
+A folder is built beside its destination and renamed when it is complete.  One process at a time
+builds it, under a lock that ends with the process; the next one deletes the remains of a killed
+one.  Some file systems (NFS) cannot lock folders; backups work there without the lock.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _log = logging.getLogger("enact.store")
 
 
 def copy_private(source: Path, target: Path) -> None:
-    """Copy the bytes of a file to a new one that its owner alone may read.
+    """Copy the bytes of a file to a new one that only its owner may read.
 
     Raises:
         OSError: As the system reports it.
@@ -39,12 +39,12 @@ def copy_private(source: Path, target: Path) -> None:
 
 @contextmanager
 def partial_folder(path: Path, suffix: str) -> Iterator[Path]:
-    """Make an empty folder beside `path`, with its name and `suffix`, that nobody else reads.
+    """Make a private empty folder beside `path`, with its name and `suffix`.
 
-    Whoever has put all into it renames it; else it is removed.
+    The caller renames it when it is complete; otherwise it is deleted.
 
     Raises:
-        StoreError: Somebody else works in it.
+        StoreError: Another process works in it.
         OSError: As the system reports it.
     """
     partial = path.with_name(path.name + suffix)
@@ -60,7 +60,7 @@ def partial_folder(path: Path, suffix: str) -> Iterator[Path]:
 
 
 def _made(partial: Path) -> int:
-    """Make the folder anew; return its lock."""
+    """Make the folder from scratch; return its lock."""
     left = _lock_of_left(partial)
     try:
         if left is not None:
@@ -76,14 +76,14 @@ def _made(partial: Path) -> int:
 
 
 def _lock_of_left(partial: Path) -> int | None:
-    """Return the lock of a folder that a killed process has left; None: there is none."""
+    """Return the lock of a folder that a killed process has left; None: it does not exist."""
     with suppress(FileNotFoundError):
         while True:
             descriptor = _locked(partial)
             with suppress(FileNotFoundError):
                 if os.path.samestat(os.fstat(descriptor), partial.stat()):
                     return descriptor
-            os.close(descriptor)  # another one has removed it meanwhile, or given it its name
+            os.close(descriptor)  # another process has removed or renamed it meanwhile
     return None
 
 
@@ -95,13 +95,12 @@ def _locked(partial: Path) -> int:
         if failure.errno == errno.EWOULDBLOCK:
             os.close(descriptor)
             raise _in_use(partial) from failure
-        _log.info("%s cannot be locked, so two at once are not told: %s", partial, failure)
+        _log.info("cannot lock %s, so concurrent backups stay undetected: %s", partial, failure)
     return descriptor
 
 
 def _in_use(partial: Path) -> StoreError:
     return StoreError(
-        f"another backup or restore works in {partial} just now: wait for its end, or name another"
-        " folder",
+        f"another backup or restore works in {partial}: wait until it ends, or name another folder",
         path=str(partial),
     )

@@ -1,17 +1,17 @@
-"""Moves entities between the folders of a stopped cell, to where its placement says.
+"""Moves entities between the folders of a stopped cell according to its placement.
 
 ::
 
-    all folders locked, opened, checked ─> marked ─> epochs raised ─> what all must know
+    all folders locked, opened, checked ─> marked ─> epochs raised ─> shared records copied
       ─> batch by batch: the new shard has it durably ─> the old one forgets it ─> marks removed
 
-Each arrow is durable before the next act, so a run that is killed anywhere is taken up by the next
-one.  While a folder is marked no shard starts from it.  Rules that a change must keep:
+Each arrow is durable before the next step, so a later run completes one that was killed anywhere.
+While a folder is marked, no shard starts from it.  Rules that a change must keep:
 
-- Epochs rise on all shards above that of every one before anything moves: an entity's fencing
-  numbers grow on its new shard too, and no client takes a version of then for one of now.
-- A client that was cut off in a lock may believe in it for a TTL.  So the marks stay until all
-  folders have been locked for the longest TTL of the sessions that had not ended.
+- Before anything moves, all epochs rise above the highest one: an entity's fencing numbers then
+  grow on its new shard too, and no client confuses old and new versions.
+- A client that was disconnected while holding a lock may believe in it for a TTL.  So the marks
+  stay until all folders have been locked for the longest TTL of the sessions that had not ended.
 """
 
 from __future__ import annotations
@@ -37,25 +37,25 @@ if TYPE_CHECKING:
     from enact_dist.link.store import Store
 
 BATCH_BYTES: Final = 32 << 20
-"""About so many bytes move at once; an entity that has more moves alone."""
+"""About so many bytes move at once; a larger entity moves alone."""
 BATCH_STATES: Final = 2_000
 
 
 class Progress(Protocol):
-    """Is told how far a rebalance is."""
+    """Reports the progress of a rebalance."""
 
     def act(self, name: str) -> None:
-        """Hear what is done next; it is durable before the next one."""
+        """Take the next step; it is durable before the one after."""
 
     def moved(self, entities: int, size: int) -> None:
-        """Hear how many entities and bytes of data are where they belong."""
+        """Take the number of entities and bytes that are in their final place."""
 
     def waits(self, wait_s: float) -> None:
-        """Hear how long leases of before the stop are still waited for."""
+        """Take the remaining wait for leases from before the stop."""
 
 
 class _Nobody:
-    """Is told, and tells nobody."""
+    """Ignores all reports."""
 
     def act(self, name: str) -> None:
         """Do nothing."""
@@ -72,8 +72,8 @@ class Rebalance(NamedTuple):
 
     Attributes:
         moves: The entities that move, in order.
-        resumed: Whether an earlier run was cut off.
-        waited_s: How long leases of before the stop were waited for.
+        resumed: Whether an earlier run was interrupted.
+        waited_s: Time spent waiting for leases from before the stop.
     """
 
     moves: list[Move]
@@ -82,7 +82,7 @@ class Rebalance(NamedTuple):
 
 
 def look(folders: Mapping[str, Path], placement: PlacementMap) -> Rebalance:
-    """Return what `rebalance` would do, and change nothing.
+    """Return what `rebalance` would do, without changing anything.
 
     Raises:
         StoreError: As `rebalance`.
@@ -104,13 +104,13 @@ def rebalance(
     unix_s: int,
     progress: Progress | None = None,
 ) -> Rebalance:
-    """Move every entity to the shard that `placement` gives it to.
+    """Move every entity to its shard under `placement`.
 
     Args:
         folders: The folder of each shard: all of the placement, and those that leave the cell.
-        placement: Where entities are to live.
+        placement: The new placement of entities.
         unix_s: The wall clock, seconds since 1970.
-        progress: Told how far it is.
+        progress: Receives the progress.
 
     Raises:
         StoreError: A folder is in use, damaged or cannot be written, folders of an earlier run are
@@ -172,7 +172,7 @@ def _move(
 
 
 def _batches(moves: Iterable[Move]) -> Iterator[list[Move]]:
-    """Yield moves that go together, those of entities that are copied already last."""
+    """Yield batches of moves, with entities that are already copied last."""
     ordered = sorted(moves, key=lambda move: (move.copied, move.source, move.target))
     for _, group in groupby(ordered, key=lambda move: (move.copied, move.source, move.target)):
         batch: list[Move] = []

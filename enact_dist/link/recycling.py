@@ -1,8 +1,8 @@
-"""Lets the C library keep blocks of memory as long as a slice for the next one.
+"""Makes the C library recycle memory blocks as large as a slice.
 
-By itself it asks the system for each block over 128 KiB and gives it back at once, and the next
-one touches all its pages anew: half the work of a shard that sends 10 MB.  glibc learns from the
-first long block that is given back; for another C library this does nothing.
+By default it requests each block over 128 KiB from the system and returns it at once, so the next
+block touches all its pages for the first time: half the work of a shard that sends 10 MB.  glibc
+adapts after the first long block is freed; with other C libraries this has no effect.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ from functools import cache
 from typing import Final
 
 RECYCLED_BYTES_MAX: Final = 16 << 20
-"""Blocks up to this length are recycled; up to twice as much stays with an idle process."""
+"""Blocks up to this length are recycled; an idle process keeps up to twice as much."""
 
 
 @cache
 def recycle_blocks() -> None:
-    """Make it so for the rest of this process; no page of the block is touched."""
+    """Enable recycling for the rest of this process; touches no page of the block."""
     bytes(RECYCLED_BYTES_MAX)

@@ -1,6 +1,6 @@
-"""What a call or lock that did not succeed means to its user: the errors and their texts.
+"""The errors that a user gets for calls and locks that did not succeed, and their texts.
 
-Each text says what was asked, what was found, who holds it and what to do.
+Each text states what was requested, what was found, who holds it and what to do.
 """
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ if TYPE_CHECKING:
 def unreachable(
     shard: str, waited_s: float, endpoint_of: Callable[[str], str], *, runs: bool = False
 ) -> ShardUnreachableError:
-    """Return the error for a shard that does not answer, though it `runs` perhaps."""
+    """Return the error for a shard that does not answer, though it may run (`runs`)."""
     endpoint = endpoint_of(shard)
     advice = (
         f"is it running? (enact shard ls; enact shard run {shard})"
         if not runs
-        else "it runs, so perhaps its disk stands still: see its log"
+        else "it runs, so its disk may be stalled: see its log"
     )
     return ShardUnreachableError(
         f"shard {shard} at {endpoint} did not answer for {waited_s:.1f} s; {advice}",
@@ -63,7 +63,7 @@ def not_granted(
     endpoint_of: Callable[[str], str],
     asked: tuple[Item, ...],
 ) -> EnactError:
-    """Return the error for a lock, or a view, that came to rest before it was held."""
+    """Return the error for a lock, or a view, that ended before it was granted."""
     if lock.phase is Phase.REFUSED and lock.refusal is not None:
         return error_of(lock.refusal)
     if lock.phase is Phase.UNREACHABLE:
@@ -72,7 +72,7 @@ def not_granted(
     if lock.plan.past_ns:
         return LockTimeoutError(
             f"waited {waited_s:.1f} s to see {wanted} as of {moment_name(lock.plan.past_ns)}: a"
-            " commit stamped before is not decided yet, or a shard restarts again and again; the"
+            " commit with an earlier timestamp is still undecided, or a shard keeps restarting; the"
             " shard that decides it may be away (enact shard ls; enact lock ls)",
             waited_s=waited_s,
         )
@@ -84,19 +84,19 @@ def not_granted(
         )
     if lock.phase is Phase.RELEASED:
         return LockTimeoutError(
-            f"told to stop after waiting {waited_s:.1f} s for {wanted}; nothing is held",
+            f"interrupted after waiting {waited_s:.1f} s for {wanted}; nothing is held",
             holders=holders,
             waited_s=waited_s,
         )
     if lock.phase is Phase.LOST:
-        why = f"granted and lost again each time: {lock.cause}"
+        why = f"each grant was lost again: {lock.cause}"
     elif holders:
         why = "; ".join(holders)
     else:
         why = "the shard grants nothing yet: it restarted and waits for older leases to end"
-    remedy = "raise wait_s, or shorten what holds it"
+    remedy = "raise wait_s, or hold the lock for less time"
     if not any(ACCESSES[item.access].locks for item in asked):  # a view: it has no wait_s
-        remedy = "look again, or raise patience_s of connect(…)"
+        remedy = "try again, or raise patience_s of connect(…)"
     return LockTimeoutError(
         f"waited {waited_s:.1f} s for {wanted}; {why}; {remedy}",
         holders=holders,
@@ -107,17 +107,17 @@ def not_granted(
 def not_committed(
     lock: MultiLock, finish_s: float, endpoint_of: Callable[[str], str], *, name: str = ""
 ) -> EnactError:
-    """Return the error for a lock that ended otherwise than by its commit.
+    """Return the error for a lock that ended without committing.
 
-    `name` is under what its outcome can be asked for.
+    `name` identifies the commit for `Cell.outcome`.
     """
     if lock.phase is Phase.REFUSED and lock.refusal is not None:
         return error_of(lock.refusal)
     if lock.phase is Phase.UNKNOWN:
         why = lock.cause or f"no answer came for {finish_s:.1f} s"
         return CommitUnknownError(
-            f"the commit of lock {lock.lock} ({_wanted(lock)}) was sent, and {why}; it may stand or"
-            " not; read the data before writing them again, or ask for it when the shard is back:"
+            f"the commit of lock {lock.lock} ({_wanted(lock)}) was sent, and {why}; whether it took"
+            " effect is unknown; read the data before writing them again, or ask later:"
             f" cell.outcome({name!r})",
             lock_id=name,
         )
@@ -125,12 +125,12 @@ def not_committed(
         return unreachable(lock.silent_shard, finish_s, endpoint_of)
     if lock.phase is Phase.CHANGED:
         return ChangedError(
-            f"{lock.cause}; nothing was written: take the lock again and redo the work with what is"
-            " there then, or ask with Read, so that nobody changes it"
+            f"{lock.cause}; nothing was written: take the lock again and redo the work with the"
+            " current data, or use Read, so that no other client can change it",
         )
     remedy = "take the lock again and redo the work"
     if lock.cause.startswith(HELD_TOO_LONG):
-        remedy = "raise hold_s, or shorten the block: look by a View and compute before it"
+        remedy = "raise hold_s, or shorten the block: read with a View and compute first"
     return LeaseLostError(
         f"lock {lock.lock} on {_wanted(lock)} was lost: {lock.cause}; nothing was written;"
         f" {remedy}",
@@ -149,7 +149,7 @@ def _wanted(lock: MultiLock) -> str:
 
 
 def holder_line(holder: Holder) -> str:
-    """Return one line about who holds or awaits a lock, for an error message."""
+    """Return one line about a holder or waiter of a lock, for an error message."""
     state = "held" if holder.granted else "awaited"
     return (
         f"{', '.join(holder.slots)} {state} by {holder.actor or 'client'}@{holder.host}"
@@ -158,7 +158,7 @@ def holder_line(holder: Holder) -> str:
 
 
 def moment_name(stamp_ns: int) -> str:
-    """Return a stamp as people and `fromisoformat` read it: this host's zone, and which it is."""
+    """Return a timestamp as people and `fromisoformat` read it, in this host's time zone."""
     seconds, rest_ns = divmod(stamp_ns, 1_000_000_000)
     try:
         local = time.localtime(seconds)
@@ -169,27 +169,27 @@ def moment_name(stamp_ns: int) -> str:
 
 
 def forgotten(answer: Forgotten) -> ForgottenError:
-    """Return the error for a past state that its shard does not keep any more.
+    """Return the error for a past state that its shard no longer keeps.
 
-    Which of the two reasons it has does not travel.
+    The answer does not say which of the two reasons applies.
     """
-    # Rounded up: what is copied from here must not lie before it.
+    # Rounded up: a time copied from this text must not be earlier.
     known = (
-        f"all that was asked is known from {moment_name(answer.oldest_ns + 999_999)} on (stamp"
+        f"everything requested is known from {moment_name(answer.oldest_ns + 999_999)} on (stamp"
         f" {answer.oldest_ns})"
         if answer.oldest_ns
-        else "nothing of it is known"
+        else "none of it is known"
     )
     return ForgottenError(
-        f"the asked state of {answer.slot} is older than its retention, or than the last `enact"
-        f" shard forget {answer.slot.aspect or '…'}`; {known}; ask for a later time; more is kept"
-        " from now on with a larger Aspect(…, retention=…), or in cell.toml",
+        f"the requested state of {answer.slot} is older than its retention, or than the last `enact"
+        f" shard forget {answer.slot.aspect or '…'}`; {known}; ask for a later time, or keep more"
+        " from now on with a larger Aspect(…, retention=…) or in cell.toml",
         oldest_ns=answer.oldest_ns,
     )
 
 
 def error_of(refused: Refused | Forgotten) -> EnactError:
-    """Return the exception that a refusal stands for."""
+    """Return the exception for a refusal."""
     if isinstance(refused, Forgotten):
         return forgotten(refused)
     if refused.code == "unknown_world":

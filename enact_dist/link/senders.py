@@ -1,18 +1,18 @@
-"""Who sends an answer: the thread that made it, or the client's own sender.
+"""Decides which thread sends an answer: the one that made it, or the client's own sender.
 
-Sending to a client that does not read can block until its connection is given up.  So that this
-delays nobody else, the dispatcher sends by itself only while a client has less than
-`OUTSTANDING_BYTES_MAX` outstanding: that much fits into the connection's buffers, the call returns
-at once, and no other thread has to be woken (30 us of a 200 us round trip).  Everything beyond
-goes, in order, to a thread of that client alone.
+Sending to a client that does not read can block until its connection is closed.  To delay no other
+client, the dispatcher sends an answer itself only while the client has less than
+`OUTSTANDING_BYTES_MAX` outstanding: that fits into the connection's buffers, so the call returns at
+once and no other thread has to be woken (30 us of a 200 us round trip).  Everything beyond goes, in
+order, to a thread of that client.
 
-Nobody tells a shard that an answer was read.  But a request that arrives *after* the answer was
-sent proves that its client lives and reads.  Requests that waited in the inbox prove nothing, so a
-new burst starts only when the inbox was seen empty (`new_burst`), and a client's outstanding bytes
-count anew with its first request in a new burst (`heard`).
+A shard cannot see whether an answer was read.  But a request that arrives *after* the answer was
+sent proves that its client lives and reads.  Requests that waited in the inbox prove nothing.  So a
+new burst starts only when the inbox was found empty (`new_burst`), and a client's outstanding bytes
+are reset by its first request in a new burst (`heard`).
 
-Every queue is bounded; what does not fit is dropped and counted.  A dropped answer is *unknown* to
-the client, which asks again.
+Every queue is bounded; excess answers are dropped and counted.  A dropped answer is *unknown* to
+the client, which repeats its request.
 """
 
 from __future__ import annotations
@@ -55,19 +55,19 @@ QUEUED_ANSWERS_MAX: Final = 1024
 QUEUED_BYTES_MAX: Final = 256 << 20
 """Bytes of data that wait for one client."""
 CLIENTS_MAX: Final = 16_384
-"""Clients whose outstanding bytes are remembered; more than sessions of a shard."""
+"""Clients whose outstanding bytes are remembered; more than a shard has sessions."""
 SENDERS_MAX: Final = 256
-"""Sender threads of one shard; each client that fetches large data at the moment needs one."""
+"""Sender threads of one shard; each client that is fetching large data needs one."""
 IDLE_S: Final = 2.0
-"""A sender without work ends after so long; the next large answer starts one anew."""
+"""A sender without work ends after this time; the next large answer starts a new one."""
 ANSWER_OVERHEAD_BYTES: Final = 256
-"""What an answer is counted with beside its data."""
+"""Overhead that each answer adds to the size of its data."""
 
 _log = logging.getLogger("enact.link")
 
 
 class Parcel(Protocol):
-    """An answer on its way to one client."""
+    """An answer to one client."""
 
     @property
     def size(self) -> int:
@@ -77,12 +77,12 @@ class Parcel(Protocol):
         """Send it; may block while the client does not read.  Never raises."""
 
     def drop(self) -> None:
-        """Give it up: the client is left without an answer.  Never raises."""
+        """Drop it: the client gets no answer.  Never raises."""
 
 
 @dataclass(slots=True)
 class _Account:
-    """What one client has outstanding, and its sender while there is one."""
+    """A client's outstanding bytes, and its sender while it has one."""
 
     burst: int
     bytes: int = 0
@@ -108,13 +108,13 @@ class Senders:
         self._closed = False
 
     def new_burst(self) -> None:
-        """Note that the inbox was empty: what comes now was sent after all earlier answers."""
+        """Note that the inbox was empty: later requests were sent after all earlier answers."""
         self.burst += 1
 
     def heard(self, client: str, burst: int | None = None) -> None:
-        """Note a request of `client`: it lives, what it was sent in earlier bursts was read.
+        """Note a request of `client`: it has read what was sent to it in earlier bursts.
 
-        `burst` is in which one it came, where it has waited since; None stands for this one.
+        `burst` is the burst in which the request arrived; None: the present one.
         """
         account = self._accounts.get(client)
         if account is not None and account.burst < (self.burst if burst is None else burst):
@@ -122,7 +122,7 @@ class Senders:
             account.bytes = 0
 
     def send(self, client: str, parcel: Parcel) -> None:
-        """Send `parcel` here and now, or leave it to the client's own sender."""
+        """Send `parcel` in this thread, or queue it for the client's own sender."""
         with self._mutex:
             account = self._account_of(client)
             account.bytes += parcel.size + ANSWER_OVERHEAD_BYTES
@@ -160,7 +160,7 @@ class Senders:
         return account.sender.put(parcel)
 
     def _idle(self, account: _Account, sender: _Sender) -> bool:
-        """Let a sender go that has nothing to do; say no if a parcel came meanwhile."""
+        """Remove an idle sender; return False if it got a parcel meanwhile."""
         with self._mutex:
             if not sender.idle:
                 return False
@@ -169,7 +169,7 @@ class Senders:
             return True
 
     def close(self) -> None:
-        """Send nothing more by threads; what waits is dropped, a blocked call ends by itself."""
+        """Stop all sender threads; queued answers are dropped, a blocked call ends by itself."""
         with self._mutex:
             self._closed = True
             senders = [account.sender for account in self._accounts.values() if account.sender]
@@ -178,7 +178,7 @@ class Senders:
 
 
 class _Sender:
-    """One client's own thread, alive while there is something to send."""
+    """One client's own thread, alive while it has something to send."""
 
     def __init__(self, may_end: Callable[[_Sender], bool]) -> None:
         self._may_end = may_end
@@ -195,7 +195,7 @@ class _Sender:
         return not self._parcels and not self._in_hand
 
     def put(self, parcel: Parcel) -> bool:
-        """Queue a parcel; False if there are too many."""
+        """Queue a parcel; False if the queue is full."""
         with self._changed:
             full = len(self._parcels) >= QUEUED_ANSWERS_MAX or self._bytes >= QUEUED_BYTES_MAX
             if full or self._closed:
@@ -206,7 +206,7 @@ class _Sender:
         return True
 
     def close(self) -> None:
-        """Drop what waits and end once the parcel in hand is sent or given up."""
+        """Drop the queue, and end once the present parcel is sent or dropped."""
         with self._changed:
             self._closed = True
             parcels = list(self._parcels)
@@ -239,7 +239,7 @@ class _Sender:
 def encoded(
     answer: Answer, count: Callable[[str, int], None]
 ) -> tuple[bytes, list[bytes | memoryview]]:
-    """Return header and bodies of an answer, of a refusal in place of one that cannot be sent."""
+    """Return header and bodies of an answer, or of a refusal if it cannot be encoded."""
     header, bodies, problem = encode_answer(answer)
     if problem:
         count("answers_refused", 1)

@@ -1,17 +1,17 @@
-"""Tells a service manager such as systemd how this process is: `sd_notify` as plain datagrams.
+"""Reports this process's state to a service manager such as systemd: `sd_notify` datagrams.
 
 =============  ==================================================================================
 message        sent
 =============  ==================================================================================
-READY=1        once, when the process serves
-STATUS=…       whenever what it says has changed
-WATCHDOG=1     from the thread whose life it proves, three times per WatchdogSec: a dispatcher that
-               hangs says nothing, and is killed and started anew
-STOPPING=1     when the process was told to end
+READY=1        once, when the process is ready
+STATUS=…       whenever its text has changed
+WATCHDOG=1     from the thread that it vouches for, three times per WatchdogSec: a hung dispatcher
+               sends none, so the manager kills and restarts it
+STOPPING=1     when the process was asked to end
 =============  ==================================================================================
 
-Where NOTIFY_SOCKET is not set nothing happens.  The variables are taken out of the environment, so
-that no child speaks in this process's name.  A manager that is away never fails or delays anybody.
+Without NOTIFY_SOCKET nothing happens.  The variables are removed from the environment, so that no
+child sends in this process's name.  An absent manager causes neither errors nor delays.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ class ServiceManager:
     """The service manager of this process.  `alive` is for one thread, the rest for any.
 
     Args:
-        environment: Where NOTIFY_SOCKET, WATCHDOG_USEC and WATCHDOG_PID stand; they are taken out.
+        environment: Contains NOTIFY_SOCKET, WATCHDOG_USEC and WATCHDOG_PID, which are removed.
 
     Attributes:
-        ping_s: How often `alive` pings, seconds; 0 where nobody asked for it.
+        ping_s: How often `alive` pings, seconds; 0 without a watchdog.
     """
 
     def __init__(self, environment: MutableMapping[str, str] | None = None) -> None:
@@ -55,20 +55,20 @@ class ServiceManager:
         self._failed = False
 
     def ready(self, status: str = "") -> None:
-        """Say that this process serves."""
+        """Report that this process is ready."""
         if self._tell(f"READY=1\n{_status_line(status)}MAINPID={os.getpid()}"):
             self._status = status
 
     def stopping(self, status: str = "") -> None:
-        """Say that this process was told to end."""
+        """Report that this process was asked to end."""
         if self._tell(f"STOPPING=1\n{_status_line(status)}"):
             self._status = status
 
     def alive(self, status: str = "") -> None:
-        """Show a sign of life of the calling thread, and a status that has changed.
+        """Ping for the calling thread, and send a changed status.
 
-        May be called as often as one likes: pings are as rare as they may be.  Never blocks; what
-        the manager had no room for is sent with the next call.
+        May be called at any rate: pings are sent only as often as needed.  Never blocks; what the
+        manager cannot take now is sent with the next call.
         """
         if not self._address:
             return
@@ -83,18 +83,18 @@ class ServiceManager:
                 self._ping_at_s = now_s + self.ping_s
 
     def _tell(self, text: str, *, wait_s: float = TELL_S) -> bool:
-        """Send a message; return whether the manager has it."""
+        """Send a message; return whether the manager got it."""
         if not self._address:
             return False
         try:
             with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as line:
                 line.settimeout(wait_s)
                 line.sendto(text.encode(), self._address)
-        except OSError as error:  # too long a path, nobody there, a full queue
+        except OSError as error:  # too long a path, no receiver, a full queue
             if not self._failed:
                 self._failed = True
                 where = self._address.replace("\0", "@", 1)
-                _log.warning("the service manager at %s does not listen: %s", where, error)
+                _log.warning("the service manager at %s does not answer: %s", where, error)
             return False
         self._failed = False
         return True

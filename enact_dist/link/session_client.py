@@ -1,11 +1,11 @@
-"""One session of this process with a cell: calls, what the shards know, the sign of life.
+"""One session of this process with a cell: its calls, the shards' catalogues, keep-alives.
 
 Threads: any thread may call; one keep-alive thread per cell renews the session and reconciles.
-`_mutex` guards the pure core and is never held during a call.  Where the shard lives in this
-process there is no such thread: it is asked when its word is needed.
+`_mutex` guards the pure core and is never held during a call.  With the shard in this process there
+is no such thread: the shard is asked when its answer is needed.
 
-The lease itself also rides on the transport's liveliness token, which native threads renew: a
-Python thread alone would starve for as long as a library holds the interpreter lock.
+The transport's liveliness token, which native threads renew, also extends the lease: a Python
+thread alone would starve while a library holds the interpreter lock.
 """
 
 from __future__ import annotations
@@ -55,15 +55,15 @@ if TYPE_CHECKING:
     from enact_dist.link.namesakes import Doubts
 
 FINISH_S: Final = 10.0
-"""How long calls are made again before their shard counts as unreachable, unless said otherwise."""
+"""Default time for repeating a call before its shard counts as unreachable."""
 
 FIRST_STAGED: Final = 1 << SERIES_BITS
-"""Numbers of payloads that travel in slices; files that a client fills itself begin at 1."""
-# Tuples: a union would be made anew for each call.
+"""Numbers of payloads sent in slices; files that a client fills itself begin at 1."""
+# Tuples: a union would be rebuilt for each call.
 _GREETINGS: Final = (Welcome, Alive)
 
 CALLS_S_MAX: Final = 1e8
-"""Three years; a longer time counts as for ever."""
+"""Three years; longer times count as infinite."""
 
 _log = logging.getLogger("enact.link")
 
@@ -82,7 +82,7 @@ class SessionClient:
     """Calls, catalogue and life of one session of this process with one cell.
 
     Attributes:
-        patience_s: How long a call is repeated, unless the caller gives another time.
+        patience_s: How long a call is repeated by default.
     """
 
     def __init__(
@@ -128,14 +128,14 @@ class SessionClient:
     # ---------------------------------------------------------------- start and end
 
     def start(self, welcome: Welcome) -> None:
-        """Take the first welcome and begin to keep the session alive."""
+        """Take the first welcome and start the keep-alive thread."""
         self._take(welcome.shard, self.core.hello(welcome.shard), welcome)
         if self._renewer is not None:
             self._renewer.start()
             self.carrier.tell_returns(weakly(self._shard_returned))
 
     def close(self) -> None:
-        """Say goodbye to every shard and end; twice is harmless."""
+        """Say goodbye to every shard and end; idempotent."""
         if self.closed or self.forked:
             return
         self.closed = True
@@ -165,7 +165,7 @@ class SessionClient:
     # ---------------------------------------------------------------- calls
 
     def call(self, shard: str, request: Request, *, timeout_s: float | None = None) -> Answer:
-        """Make one idempotent call, again until it is answered.
+        """Make one idempotent call, repeating it until it is answered.
 
         Raises:
             ShardUnreachableError: No answer within `timeout_s` (None: `patience_s`).
@@ -175,10 +175,10 @@ class SessionClient:
     def call_all(
         self, calls: Sequence[tuple[str, Request]], *, timeout_s: float | None = None
     ) -> list[Answer]:
-        """Make idempotent calls at once, each again until it is answered.
+        """Make idempotent calls at once, repeating each until it is answered.
 
         Raises:
-            ShardUnreachableError: One stays without an answer for `timeout_s`.
+            ShardUnreachableError: One got no answer within `timeout_s`.
         """
         answers = self.call_each(calls, timeout_s=timeout_s)
         for (shard, _), answer in zip(calls, answers, strict=True):
@@ -190,9 +190,9 @@ class SessionClient:
     def call_each(
         self, calls: Sequence[tuple[str, Request]], *, timeout_s: float | None = None
     ) -> list[Answer | None]:
-        """Make idempotent calls at once, each again until it is answered or the time is over.
+        """Make idempotent calls at once, repeating each until it is answered or time is up.
 
-        Listings come whole; the time begins anew with each of their pages.
+        Listings are complete; each of their pages gets the full time.
         """
         self.check_usable()
         made = Calls(calls)
@@ -219,7 +219,7 @@ class SessionClient:
         return made.answers
 
     def _deadline_ns(self, timeout_s: float | None) -> int:
-        """Return when calls are over that may take so long (None: `patience_s`)."""
+        """Return the deadline of calls with this time limit (None: `patience_s`)."""
         wait_s = self.patience_s if timeout_s is None else timeout_s
         return self._now_ns() + int(min(wait_s, CALLS_S_MAX) * 1e9)
 
@@ -230,14 +230,14 @@ class SessionClient:
         *,
         timeout_s: float | None = None,
     ) -> dict[str, Answer | None]:
-        """Make one call to each shard that only a known session may make; greet where needed.
+        """Make one call to each shard that needs a known session; greet where needed.
 
         Args:
-            shards: Whom to ask.
-            request_of: Makes the call to a shard of its name, its epoch and the message counter;
-                anew when the shard has restarted.
-            timeout_s: How long they may take; None stands for no answer then.  A greeting that is
-                refused is the shard's answer.
+            shards: The shards to call.
+            request_of: Makes the call for a shard's name, epoch and message counter; called again
+                if the shard has restarted.
+            timeout_s: Time limit; afterwards a missing answer is None.  A refused greeting counts
+                as the shard's answer.
         """
         answers: dict[str, Answer | None] = dict.fromkeys(shards)
         deadline_ns = self._deadline_ns(timeout_s)
@@ -262,16 +262,16 @@ class SessionClient:
                 return answers
 
     def unreachable(self, shard: str, waited_s: float) -> ShardUnreachableError:
-        """Return the error for a shard without an answer, after a question that needs no disk."""
+        """Return the error for a shard without an answer to a question that needs no disk."""
         runs = self.carrier.request(shard, Ping(), timeout_s=CALL_S / 4) is not None
         return unreachable(shard, waited_s, self.carrier.endpoint_of, runs=runs)
 
     def call_once(
         self, calls: Sequence[tuple[str, Request]], *, timeout_s: float = CALL_S
     ) -> list[Answer | None]:
-        """Make calls at once, none of them twice; None stands for no answer.
+        """Make calls at once, each only once; None: no answer.
 
-        Listings come whole, and `timeout_s` holds for each of their pages.
+        Listings are complete; `timeout_s` holds for each of their pages.
         """
         self.check_usable()
         made = Calls(calls)
@@ -290,7 +290,7 @@ class SessionClient:
         return made.answers
 
     def begin(self, shard: str, request: Request, *, timeout_s: float) -> Begun:
-        """Send one request of a transfer, whose answer the caller waits for later.
+        """Send one request of a transfer; the caller awaits its answer later.
 
         Raises:
             MisuseError: This client is closed.
@@ -299,7 +299,7 @@ class SessionClient:
         return self.carrier.begin(shard, request, timeout_s=timeout_s)
 
     def rest(self, pause_s: float) -> None:
-        """Wait a little before something is asked again, but not once a shard has come back."""
+        """Wait a little before a retry; end early when a shard comes back."""
         self.pauses.rest(pause_s)
 
     def _staged(self, shard: str, request: Request) -> Answer | None:
@@ -315,7 +315,7 @@ class SessionClient:
         return self.carrier.request_all(calls, timeout_s=longest_s)
 
     def _take(self, shard: str, request: Request, answer: Answer, sent_in: int = 0) -> None:
-        """Let the session learn from an answer, asked in that epoch of the shard."""
+        """Update the session from an answer to a request sent in that epoch of the shard."""
         with self._mutex:
             self._learn(shard, answer, sent_in)
             self.core.answered(shard, request, answer, self._now_ns())
@@ -331,12 +331,12 @@ class SessionClient:
             self.notice_numbers[shard] = (answer.epoch, answer.notice_number)
 
     def unsettled_ns(self, shard: str) -> int:
-        """Return the stamp of a commit of ours that a shard may not show yet (0: none)."""
+        """Return the timestamp of our latest commit that a shard may not show yet (0: none)."""
         with self._mutex:
             return self.core.unsettled_ns(shard)
 
     def reached(self, shard: str, stamp_ns: int) -> None:
-        """Note that a shard shows everything up to a stamp."""
+        """Note that a shard shows everything up to a timestamp."""
         with self._mutex:
             self.core.reached(shard, stamp_ns)
 
@@ -347,7 +347,7 @@ class SessionClient:
         return tuple(shard.name for shard in self.core.placement.shards)
 
     def shard_of(self, entity: str) -> str:
-        """Return the shard on which an entity of that name lies."""
+        """Return the shard that stores an entity of that name."""
         return shard_of(entity, self.core.placement)
 
     def greet(self, shards: Iterable[str] | None = None, *, timeout_s: float | None = None) -> None:
@@ -363,7 +363,7 @@ class SessionClient:
         return self._catalogue.worlds()
 
     def worlds_at(self, name: str) -> dict[str, WorldEntry]:
-        """Return the greeted shards that know a world context, and as what."""
+        """Return the greeted shards that know a world context, each with its entry."""
         return self._catalogue.worlds_at(name)
 
     def aspect_entries(self) -> dict[str, AspectEntry]:
@@ -372,17 +372,17 @@ class SessionClient:
 
     @property
     def lapses(self) -> int:
-        """How often a shard knew an aspect no more, or with another type than before."""
+        """How often a shard had lost an aspect or had it with another type."""
         return self._catalogue.lapses
 
     def knows(self, aspects: Sequence[AspectEntry]) -> bool:
-        """Whether every shard of the cell is known to know these aspects: the usual case."""
+        """Whether every shard of the cell is known to have these aspects: the usual case."""
         return self._catalogue.settled(aspects, self.core.placement)
 
     def lacking(
         self, aspects: Sequence[AspectEntry], needed: Callable[[], Iterable[str]]
     ) -> list[str]:
-        """Return those of the needed shards that are not known to know all these aspects."""
+        """Return those of the needed shards that may lack some of these aspects."""
         missing = [shard for shard in self.shards() if self._catalogue.lacks(shard, (), aspects)]
         if not missing:
             return []
@@ -397,14 +397,14 @@ class SessionClient:
         needed: Callable[[], Iterable[str]] | None = None,
         timeout_s: float | None = None,
     ) -> None:
-        """Make sure that shards know these world contexts and aspects.
+        """Ensure that shards know these world contexts and aspects.
 
         Args:
-            worlds: Names of world contexts, made where there is none.
+            worlds: Names of world contexts, created if missing.
             aspects: Entries of aspects.
-            needed: Returns the shards that matter; None stands for all.  Only asked when some
-                shard lacks something, so a shard that is away stops only calls that need it.
-            timeout_s: How long a shard may stay without an answer.
+            needed: Returns the shards that matter; None: all.  Called only if some shard lacks
+                something, so an absent shard stops only calls that need it.
+            timeout_s: How long a shard may take to answer.
 
         Raises:
             DatumTypeError: An aspect is registered with another type or durability.
@@ -414,7 +414,7 @@ class SessionClient:
         worlds, aspects = tuple(worlds), tuple(aspects)
         if self.core.observer and (worlds or aspects):
             raise MisuseError(
-                "this session only observes: it cannot lock, and makes no world contexts and"
+                "this session only observes: it cannot lock or create world contexts and"
                 " aspects; connect without observer=True"
             )
         self._catalogue.wants(aspects)
@@ -434,7 +434,7 @@ class SessionClient:
                 if isinstance(answer, Refused):
                     raise error_of(answer)
             restarted = [shard for shard in missing if self.core.epoch(shard) != epochs[shard]]
-            if restarted:  # the answer may be from before the restart, and then was ignored
+            if restarted:  # the answer may be from before the restart and is then ignored
                 self.greet(restarted, timeout_s=timeout_s)
 
     def subscribe(self, interest: Survey | None = None) -> NoticeFeed:
@@ -445,30 +445,30 @@ class SessionClient:
     # ---------------------------------------------------------------- keep-alive
 
     def next_renewal_s(self) -> float:
-        """Return how long no sign of life is due."""
+        """Return how long until the next keep-alive is due."""
         return self.renewal.pause_s()
 
     def renew(self) -> None:
-        """Send the signs of life that are due; whatever comes of it is for the log."""
+        """Send the keep-alives that are due; failures are only logged."""
         try:
             self.renew_once()
             if any(self.core.needs_hello(shard) for shard in self.core.shards_in_use()):
-                # A shard restarted: the sooner it knows that we know, the sooner it grants.
+                # A shard restarted: the sooner it hears that we noticed, the sooner it grants.
                 self.renew_once()
         except Exception as error:  # noqa: BLE001 - a bad answer must not end the renewal
             self.count("keep_alives_failed")
             _log.warning("keep-alive of session %s: %s", self.core.session[:8], error)
 
     def _shard_returned(self, _: str) -> None:
-        """Let everybody who waits ask again at once."""
+        """Let all waiting threads retry at once."""
         with self._mutex:
             self.core.ask_again()
         self.pauses.shard_returned()
 
     def renew_once(self) -> None:
-        """Send one keep-alive to every shard in use that is in reach, and take the answers.
+        """Send one keep-alive to every shard in use that is within reach; process the answers.
 
-        One that is known to be away is asked more and more rarely.
+        A shard that is known to be away is asked less and less often.
         """
         due = self.renewal.due()
         with self._mutex:
@@ -484,7 +484,7 @@ class SessionClient:
                 self.count("keep_alives_unanswered")
 
     def set_report(self, report: bytes) -> None:
-        """Let the next keep-alives carry this actor's statistics (msgpack)."""
+        """Set what the next keep-alives carry: this actor's statistics (msgpack)."""
         if self.forked or self.closed:
             return
         with self._mutex:
@@ -493,6 +493,6 @@ class SessionClient:
             self.renew_once()
 
     def count(self, name: str, amount: int = 1) -> None:
-        """Add to one of the counters that `Cell.counters` shows."""
+        """Add to one of the counters in `Cell.counters`."""
         with self._mutex:
             self.counters[name] = self.counters.get(name, 0) + amount

@@ -1,8 +1,8 @@
-"""Calls from shard to shard: what became of a prepared lock, and that one has committed.
+"""Calls between shards: the outcome of a prepared lock, and the decision to commit.
 
-Each other shard has a Zenoh session and a thread of its own, both made at the first call, so that
-one that is down delays nobody.  A call is made once; whether it is made again the core decides,
-which is told when a shard comes back into reach.  Whoever submits never waits.
+Each other shard gets its own Zenoh session and thread at the first call, so that an absent shard
+delays no other.  A call is made once; the core decides on repeating it, and learns when a shard
+comes back.  Callers of `submit` never wait.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ if TYPE_CHECKING:
     from enact_dist.core.messages import ShardEntry
 
 CALL_S: Final = 1.0
-"""How long a call may stay without an answer; the core makes it again anyway."""
+"""How long a call may stay without an answer; the core repeats it anyway."""
 QUEUED_MAX: Final = 10_000
-"""Calls that wait for one shard; what is beyond is dropped, and made again later."""
+"""Calls that wait for one shard; further ones are dropped, and repeated later."""
 JOIN_S: Final = 0.5
 """How long closing waits for all threads."""
 SILENT_S: Final = 5.0
-"""A shard that answers nothing for so long is told to the log, once."""
+"""A shard that is silent for this time is logged, once."""
 
 _ANSWERS: Final = frozenset(get_args(Answer))
 _log = logging.getLogger("enact.link")
@@ -45,12 +45,12 @@ class ShardCalls:
 
     Args:
         cell: The cell's name.
-        name: The calling shard; its identity stands in the keys.
+        name: The calling shard; its identity is part of the keys.
         shards: All shards of the cell with their endpoints.
-        lease_s: A connection counts as lost after so long without a sign of life.
+        lease_s: A connection counts as lost after this time without a sign of life.
         answered: Called with shard, request and answer, from the thread of that shard.
-        returned: Called with the name of each shard that was called once and comes (back) into
-            reach, from any thread.
+        returned: Called from any thread with the name of each previously called shard that comes
+            (back) within reach.
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class ShardCalls:
         return tuple(self._endpoints)
 
     def submit(self, shard: str, request: Request) -> None:
-        """Queue a call; the same call that is queued already is not queued twice."""
+        """Queue a call; a call that is already queued is not queued twice."""
         with self._mutex:
             if self._closed:
                 return
@@ -89,7 +89,7 @@ class ShardCalls:
             line.submit(request)
 
     def _opened(self, shard: str) -> _Line | None:
-        """Return a new line to a shard; None where the system has no more threads."""
+        """Return a new line to a shard; None if the system has no more threads."""
         try:
             line = _Line(
                 shard,
@@ -108,18 +108,18 @@ class ShardCalls:
         return line
 
     def _tell_unknown(self, shard: str) -> None:
-        """Tell the log once of a shard that a lock was prepared with and the cell has no more."""
+        """Log once that a lock was prepared with a shard that the cell no longer has."""
         if shard not in self._unknown:
             self._unknown[shard] = None
             _log.error(
                 "a lock waits for shard %s, which is not among the shards of this cell (%s): start"
-                " it again, or give the lock up (enact lock resolve --force-abort)",
+                " it again, or abort the lock (enact lock resolve --force-abort)",
                 shard,
                 ", ".join(self._endpoints) or "none",
             )
 
     def close(self) -> None:
-        """Drop what is queued and end; twice is harmless."""
+        """Drop what is queued and end; idempotent."""
         with self._mutex:
             self._closed = True
             lines = list(self._lines.values())
@@ -131,7 +131,7 @@ class ShardCalls:
 
 
 class _Line:
-    """The way to one other shard.  Whatever goes wrong on it, the next calls are tried again."""
+    """The connection to one other shard.  After any failure the next calls try again."""
 
     def __init__(
         self,
@@ -169,7 +169,7 @@ class _Line:
                     answers = self._answers(calls)
                 except Exception as error:  # noqa: BLE001 - a lock may wait for the next call
                     answers = []
-                    _log.error("calls to shard %s: %s", self._shard, error)
+                    _log.error("cannot call shard %s: %s", self._shard, error)
                 self._note_silence(answered=bool(answers))
                 for request, answer in answers:
                     if not self._ending:
@@ -181,7 +181,7 @@ class _Line:
         """Make calls at once; return those that were answered.
 
         Raises:
-            EnactError: None can be made.
+            EnactError: No call can be made.
         """
         session = self._session
         if session is None:
@@ -194,10 +194,10 @@ class _Line:
         return [(request, answer) for request, answer in received if answer is not None]
 
     def _watch(self, session: zenoh.Session, key: str) -> None:
-        """Watch the shard, or leave that to the next calls; these are made all the same."""
+        """Watch the shard; on failure the next calls try again, and these are made anyway."""
         try:
             self._presence = ShardPresence(session, key, self._tell_returned)
-        except (zenoh.ZError, RuntimeError) as error:  # closed meanwhile, or no thread is left
+        except (zenoh.ZError, RuntimeError) as error:  # closed meanwhile, or no thread available
             if not self._ending:
                 _log.warning("shard %s is not watched at the moment: %s", self._shard, error)
 
@@ -206,7 +206,7 @@ class _Line:
             self._returned()
 
     def _note_silence(self, *, answered: bool) -> None:
-        """Tell the log once that the shard is away, and once that it is back."""
+        """Log once that the shard is away, and once that it is back."""
         now_s = time.monotonic()
         if answered:
             if self._silence_told:
@@ -248,7 +248,7 @@ class _Line:
             return None
 
     def end(self) -> None:
-        """Take no more calls and let those under way end without an answer."""
+        """Take no more calls and let pending ones end without an answer."""
         with self._wake:
             self._ending = True
             self._wake.notify()
@@ -285,6 +285,6 @@ def _receive(replies: zenoh.Handler[zenoh.Reply] | None, end_s: float) -> Answer
             bytes(payload) if payload is not None else b"",
         )
     except ProtocolError as error:
-        _log.warning("another shard's answer cannot be read: %s", error)
+        _log.warning("cannot read another shard's answer: %s", error)
         return None
     return cast("Answer", answer) if type(answer) in _ANSWERS else None

@@ -1,10 +1,10 @@
-"""A shard as a process of its own: folder, Zenoh session, signals, log.
+"""A shard as a process: folder, Zenoh session, signals, log.
 
-Exit status: 0 after SIGTERM or SIGINT, 1 where the shard cannot start or its store fails.  A
-daemon that ends on a signal drains: it grants nothing new, answers parked requests, lets commits
-in flight end, and waits up to `drain_s` for holders to finish, which hands their
-leases back.  A second signal cuts that wait short.  What is held then is named in the log and lost:
-its commit will be refused.  All else takes less than 1.2 s.
+Exit status: 0 after SIGTERM or SIGINT; 1 if the shard cannot start or its store fails.  On a signal
+the daemon drains: it grants nothing new, answers parked requests, lets commits in progress end, and
+waits up to `drain_s` for holders to finish, which ends their leases.  A second signal cuts that
+wait short.  Locks still held then are logged and lost: their commits will be refused.  Everything
+else takes less than 1.2 s.
 """
 
 from __future__ import annotations
@@ -52,13 +52,13 @@ if TYPE_CHECKING:
     from enact_dist.link.metrics_server import MetricsServer
 
 PROBE_S: Final = 0.3
-"""How long another daemon under our name has to answer before we start."""
+"""How long another daemon with our name may take to answer before we start."""
 DRAIN_S: Final = 0.8
-"""How long holders may still finish unless told; with the rest it stays below 2 s."""
+"""Default time for holders to finish; together with the rest it stays below 2 s."""
 SWITCH_INTERVAL_S: Final = 0.0002
 """With Python's 5 ms a busy store thread would add 7 to 11 ms to a call (p90), measured."""
 GC_THRESHOLDS: Final = (5_000, 20, 1_000_000)
-"""Objects made between two looks at the youngest, and how rarely the older ones are looked at."""
+"""Allocations between two collections of young objects, and how rarely older ones are examined."""
 
 _log = logging.getLogger("enact.shard")
 
@@ -69,19 +69,19 @@ class DaemonSettings:
 
     Attributes:
         cell: Name of the cell.
-        shard: The settings of the shard, with its name and its endpoints for clients.
+        shard: The settings of the shard, with its name and the endpoints for clients.
         listen: Endpoints to listen at ("tcp/0.0.0.0:7447").
-        folder: Where its data live; None keeps them in memory only.
+        folder: Its data folder; None keeps data in memory only.
         log: "text" or "json" (one object per line, see `link.log`).
-        link_lease_s: A connection counts as lost after so long without a sign of life.
-        carrier: How clients of this host may reach it: "auto" by a socket too, if there can be
-            one; "socket" makes it an error if there cannot; "zenoh" makes none.
-        shared_bytes_max: So many bytes of large data lie in memory that is shared on this host;
-            beyond, history goes, then writes are refused.  None stands for half of what the file
-            system there has, and plain memory beyond; 0 shares none.
-        drain_s: How long holders may still finish after a signal.
-        metrics: Host and port at which Prometheus may ask, see `link.metrics`; None: nowhere.
-        written: Where `cell.toml` says that the shard is, whatever replaces that for this start.
+        link_lease_s: A connection counts as lost after this time without a sign of life.
+        carrier: How clients of this host may reach it.  "auto": also over a socket, if one can be
+            made; "socket": it is an error if none can be made; "zenoh": no socket.
+        shared_bytes_max: Byte limit of large data in memory shared on this host.  Beyond it,
+            history is removed, then writes are refused.  None: half of the file system there, and
+            plain memory beyond; 0: nothing is shared.
+        drain_s: How long holders may still take to finish after a signal.
+        metrics: Host and port for Prometheus, see `link.metrics`; None: no server.
+        written: The shard's endpoints in `cell.toml`, even if this start overrides them.
     """
 
     cell: str
@@ -98,7 +98,7 @@ class DaemonSettings:
 
 
 class RunningShard:
-    """A shard that serves.  Made by `start_shard`; `stop` it before the interpreter ends."""
+    """A running shard.  Made by `start_shard`; `stop` it before the interpreter exits."""
 
     def __init__(self, settings: DaemonSettings) -> None:
         self.settings = settings
@@ -157,7 +157,7 @@ class RunningShard:
         return self.host.failure
 
     def wait(self, timeout_s: float | None = None) -> bool:
-        """Wait until the shard has failed or was told to end; False after `timeout_s`."""
+        """Wait until the shard has failed or was asked to end; False after `timeout_s`."""
         return self._ended.wait(timeout_s)
 
     def end(self) -> None:
@@ -165,7 +165,7 @@ class RunningShard:
         self._ended.set()
 
     def stop(self, *, drain_s: float = DRAIN_S) -> None:
-        """Drain, answer who is parked, close connections and store; twice is harmless."""
+        """Drain, answer parked requests, close connections and store; idempotent."""
         with self._stopping:
             if self._stopped:
                 return
@@ -173,7 +173,7 @@ class RunningShard:
             self.host.drain()
             if not self.host.wait_idle(drain_s):
                 self._name_holders(drain_s)
-            self.host.drain()  # who asked meanwhile is parked: answer them, too
+            self.host.drain()  # requests parked meanwhile are answered, too
             self.host.close()
             self._calls.close()
             self._comparing.close()
@@ -188,7 +188,7 @@ class RunningShard:
             self._ended.set()
 
     def hurry(self) -> None:
-        """Let a drain wait no longer."""
+        """End the wait of a drain."""
         self.host.hurry()
 
     def _name_holders(self, drain_s: float) -> None:
@@ -208,9 +208,9 @@ class RunningShard:
             ]
         if held:
             _log.warning(
-                "%d locks are lost, still held when the drain of %g s was over: %s; give them"
-                " longer: --drain, or ENACT_SHARD_<NAME>_DRAIN_S, or drain_s in [shards.%s] of"
-                " cell.toml; the first of them that is there counts",
+                "%d locks are lost, still held when the drain of %g s was over: %s; to give them"
+                " more time: --drain, or ENACT_SHARD_<NAME>_DRAIN_S, or drain_s in [shards.%s] of"
+                " cell.toml; the first of these that is set counts",
                 len(held),
                 drain_s,
                 "; ".join(held),
@@ -228,10 +228,10 @@ def _metrics_server(settings: DaemonSettings, host: ShardHost) -> MetricsServer:
 
 
 def _shared_folder(settings: DaemonSettings) -> SharedFolder | None:
-    """Make the folder that the shard shares with processes of its host.
+    """Make the folder that the shard shares with processes of this host.
 
     Raises:
-        LinkError: It is asked for and cannot be made.
+        LinkError: It is required and cannot be made.
     """
     if settings.carrier == "zenoh" and settings.shared_bytes_max == 0:
         return None
@@ -245,12 +245,12 @@ def _shared_folder(settings: DaemonSettings) -> SharedFolder | None:
 
 
 def start_shard(settings: DaemonSettings) -> RunningShard:
-    """Start a shard in this process and return once it serves.
+    """Start a shard in this process; return when it is ready.
 
     Raises:
         StoreError: The folder is in use, unreadable or corrupt.
-        LinkError: An endpoint is in use, or another daemon serves this shard already.
-        ConfigError: An endpoint cannot be read, or there is none.
+        LinkError: An endpoint is in use, or another daemon already serves this shard.
+        ConfigError: An endpoint cannot be read, or is missing.
     """
     if not settings.listen:
         raise ConfigError(f"shard {settings.shard.name} has no endpoint to listen at")
@@ -259,16 +259,16 @@ def start_shard(settings: DaemonSettings) -> RunningShard:
 
 
 def refuse_second_daemon(settings: DaemonSettings, *, probe_s: float = PROBE_S) -> None:
-    """Raise if a daemon already serves this shard where its clients look for it.
+    """Raise if a daemon already serves this shard at one of its endpoints for clients.
 
-    The other shards of the cell that run are asked where they expect it.
+    Other running shards of the cell are asked where they expect it.
 
     Args:
-        settings: Of the shard.
-        probe_s: How long who listens there may take to say what it is.
+        settings: Settings of the shard.
+        probe_s: How long a listener there may take to identify itself.
 
     Raises:
-        LinkError: One does, or another shard of the cell runs twice.
+        LinkError: A daemon does, or another shard of the cell runs twice.
         ConfigError: An endpoint cannot be read.
     """
     name, cell = settings.shard.name, settings.cell
@@ -289,7 +289,7 @@ def refuse_second_daemon(settings: DaemonSettings, *, probe_s: float = PROBE_S) 
         if shard == name and daemons:
             raise LinkError(
                 f"shard {name} of cell {cell} already runs at {daemons[0]}, where other shards of"
-                f" the cell expect it, and this start would listen at {', '.join(settings.listen)};"
+                f" the cell expect it; this start would listen at {', '.join(settings.listen)};"
                 " two daemons must not serve one shard: stop the other first, and let the cell.toml"
                 " of every shard name the same endpoint"
             )
@@ -348,10 +348,10 @@ def _say_ready(shard: RunningShard, formatter: logging.Formatter) -> None:
 
 
 def _stay_responsive() -> None:
-    """Set the interpreter up for short calls: beside threads that compute, and many slots.
+    """Configure the interpreter for short calls beside computing threads and many slots.
 
-    A full collection over a million objects takes 0.1 s or more, without any answer.  The
-    shard makes no cycles (measured: none in 5,000 updates), so only young objects are looked at.
+    A full collection over a million objects blocks all answers for 0.1 s or more.  The shard makes
+    no cycles (measured: none in 5,000 updates), so only young objects are collected.
     """
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     gc.collect()

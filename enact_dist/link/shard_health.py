@@ -1,7 +1,7 @@
-"""Whether shards are alive and ready: one real query to each, without joining the cell.
+"""Checks whether shards are alive and ready, with one query to each, without joining the cell.
 
-No session is opened at a shard, so a check leaves nothing behind; it loads Zenoh and the wire, and
-nothing of the rest.
+It opens no session at a shard, so a check leaves nothing behind.  It imports only Zenoh and the
+wire.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class ShardHealth:
-    """How one shard is.
+    """The health of one shard.
 
     Attributes:
         name: Its name.
         alive: It answers.
         ready: It answers and grants locks.
         state: "open", "waits for older leases", "drains" or "unreachable".
-        endpoint: Where it was asked, comma separated.
-        epoch: New with every start; 0 if it does not answer.
-        uptime_s: Since that start.
-        took_s: Of the whole check, connections included.
+        endpoint: Where the query was sent, comma separated.
+        epoch: Changes with every start; 0 if it does not answer.
+        uptime_s: Time since that start.
+        took_s: Duration of the whole check, connections included.
     """
 
     name: str
@@ -54,7 +54,7 @@ class ShardHealth:
 def of_shards(
     cell: str, endpoints: Mapping[str, Sequence[str]], *, timeout_s: float
 ) -> list[ShardHealth]:
-    """Ask shards of a cell, each named with the endpoints at which it may be reached.
+    """Ask shards of a cell, given by name, each with its endpoints.
 
     Raises:
         ConfigError: An endpoint cannot be read.
@@ -73,11 +73,11 @@ def of_shards(
 
 
 def of_endpoint(endpoint: str, name: str | None, *, timeout_s: float) -> list[ShardHealth]:
-    """Ask the shards that are found at one endpoint, or of them the one called `name`.
+    """Ask the shards at one endpoint, or only the one called `name`.
 
     Raises:
         ConfigError: The endpoint cannot be read.
-        ShardUnreachableError: Nobody answers there, or not the one that is named.
+        ShardUnreachableError: No shard answers there, or not the one named.
         ProtocolError: An answer cannot be read.
     """
     started_s = time.monotonic()

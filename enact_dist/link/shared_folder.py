@@ -4,18 +4,18 @@
 
     /dev/shm/enact-1000/             the root: ENACT_SHARED_FOLDER, or this one of the user
         cell.shard.5f0c…/            one start of a shard: its socket, and what else it shares
-            nonce                    128 random bits, told in the shard's WELCOME
+            nonce                    128 random bits, sent in the shard's WELCOME
 
-Whether two processes share memory is not asked of host names or boot numbers, which containers
-have in common: a client opens *its own* path of that name and compares the nonce.
+Host names and boot ids cannot tell whether two processes share memory, since containers have them
+in common.  So a client opens *its own* path of that name and compares the nonce.
 
 Rules that a change must keep:
 
-- A folder belongs to one start of one shard, which holds an exclusive `flock` on it for as long
-  as it lives; whoever gets that lock may sweep the folder away.
-- The nonce is written after the lock was taken and before anybody is told the name.
-- Nobody but its owner, root and the group of a root that was given on purpose gets in.
-- The group may not list the folder, so that nobody finds a draft whose name he was not told.
+- A folder belongs to one start of one shard, which holds an exclusive `flock` on it for its
+  lifetime; a process that gets the lock may delete the folder.
+- The shard writes the nonce after taking the lock and before sending the folder's name.
+- Only the owner, root, and the group of a deliberately configured root may enter.
+- The group may not list the folder, so that only a draft's client knows the draft's name.
 """
 
 from __future__ import annotations
@@ -36,18 +36,18 @@ from typing import Final
 from enact_dist.errors import LinkError
 
 SHARED_FOLDER_VARIABLE: Final = "ENACT_SHARED_FOLDER"
-"""Names the root where the default does not fit: a tmpfs that containers have in common."""
+"""Names the root if the default does not fit, for example a tmpfs shared by containers."""
 MEMORY: Final = Path("/dev/shm")  # noqa: S108 - the kernel's folder, not a temporary file
 NONCE: Final = "nonce"
 NONCE_BYTES: Final = 16
 NAME_BYTES_MAX: Final = 200
-"""Longest name of a folder; what a shard says is checked against it."""
+"""Longest name of a folder; names that a shard sends are checked against it."""
 PART_CHARACTERS_MAX: Final = 60
-"""So much of the cell's and the shard's names stands in a folder's name, for people."""
+"""Characters of the cell's and the shard's names in a folder's name, for people."""
 UNFINISHED_S: Final = 60.0
-"""A folder without a nonce is being made; one that stays so for longer was left behind."""
+"""A folder without a nonce is being made; after this time it counts as abandoned."""
 _MADE_HERE: Final = re.compile(r".+\..+\.[0-9a-f]{16}\Z", re.DOTALL)
-"""Names of folders that `SharedFolder` makes; a root may hold anything else beside them."""
+"""Names of folders that `SharedFolder` makes; other files in a root are left alone."""
 ADDRESS_BYTES_MAX: Final = 107
 """Longest path of a Unix socket; a longer one is reached through an open descriptor."""
 
@@ -60,22 +60,22 @@ def shared_root() -> Path:
 
 @dataclass(frozen=True, slots=True)
 class Access:
-    """Who may enter what is made below a root.
+    """Permissions of everything made below a root.
 
     Attributes:
-        group: The group that may, beside owner and root; None where none may.
+        group: The group that may enter, besides owner and root; None: no group.
     """
 
     group: int | None
 
     @property
     def folder_mode(self) -> int:
-        """Mode of a folder: files in it take over its group, which may not list them."""
+        """Mode of a folder: its files inherit the group, which may not list them."""
         return 0o700 if self.group is None else 0o2710
 
     @property
     def socket_mode(self) -> int:
-        """Mode of a socket: to connect is to write."""
+        """Mode of a socket: connecting needs write permission."""
         return 0o600 if self.group is None else 0o660
 
     @property
@@ -90,16 +90,16 @@ class Access:
 
 
 def _open_root(root: Path, *, make: bool) -> tuple[int, Access]:
-    """Open the root and say who may use what lies in it.
+    """Open the root and find out who may use its contents.
 
     Raises:
-        LinkError: It is missing, or others could put their own in the place of ours.
+        LinkError: It is missing, or other users could replace our folders.
     """
     chosen = bool(os.environ.get(SHARED_FOLDER_VARIABLE))
     try:
         if make:
             root.mkdir(mode=0o700, parents=True, exist_ok=True)
-        # A link is followed only where somebody has chosen the path.
+        # A link is followed only if the user has chosen the path.
         flags = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC | (0 if chosen else os.O_NOFOLLOW)
         opened = os.open(root, flags)
     except OSError as error:
@@ -108,7 +108,7 @@ def _open_root(root: Path, *, make: bool) -> tuple[int, Access]:
     mode = found.st_mode
     problem = ""
     if mode & stat.S_IWOTH and not mode & stat.S_ISVTX:
-        problem = "everybody may replace what lies in it (mode lacks the sticky bit)"
+        problem = "every user may replace its contents (its mode lacks the sticky bit)"
     elif not chosen and found.st_uid != os.geteuid():
         problem = f"it belongs to user {found.st_uid}"
     if problem:
@@ -124,18 +124,18 @@ def _open_root(root: Path, *, make: bool) -> tuple[int, Access]:
 class SharedFolder:
     """The folder of this start of a shard; made empty, gone with `close`.  Shard side.
 
-    What earlier starts have left behind is swept away first.  Its descriptor holds the lock that
-    says that the shard lives; a process that is killed lets go of it.
+    Folders left behind by earlier starts are deleted first.  The descriptor holds the lock that
+    shows that the shard lives; the kernel releases it when the process is killed.
 
     Attributes:
         name: Its name below the root, for the WELCOME.
-        nonce: What stands in its nonce file.
-        path: Where it is, as this process sees it.
+        nonce: Content of its nonce file.
+        path: Its path in this process.
         descriptor: Of the folder, open until `close`.
-        access: Who may enter.
+        access: Its permissions.
 
     Raises:
-        LinkError: There is no place for it, or the place is not safe.
+        LinkError: No folder can be made, or the root is not safe.
     """
 
     def __init__(self, cell: str, shard: str, *, root: Path | None = None) -> None:
@@ -168,24 +168,25 @@ class SharedFolder:
             os.close(written)
 
     def address(self, name: str) -> str:
-        """Return a path by which a socket called `name` in here can be bound or reached."""
+        """Return a path at which a socket called `name` in this folder can be bound or reached."""
         return address_in(self.descriptor, self.path, name)
 
     def close(self) -> None:
-        """Remove the folder with all that is in it; twice is harmless."""
+        """Delete the folder with its contents; calling it twice is harmless."""
         if self.descriptor >= 0:
             shutil.rmtree(self.path, ignore_errors=True)
-            # Nobody may name a file by its number any more when another thread gets that.
+            # Another thread may get this descriptor's number, so no file may be named by it any
+            # more.
             descriptor, self.descriptor = self.descriptor, -1
             os.close(descriptor)
 
 
 def _make(root: int, name: str, access: Access) -> tuple[Access, int]:
-    """Make a folder and lock it; say who may enter in the end."""
+    """Make a folder and lock it; set its permissions last."""
     os.mkdir(name, 0o700, dir_fd=root)
     made = os.open(name, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC, dir_fd=root)
     try:
-        # A sweeper that looks at it right now lets go at once: it finds no nonce.
+        # A sweeper that holds it right now releases it at once: it finds no nonce.
         fcntl.flock(made, fcntl.LOCK_EX)
         if access.group is not None:
             try:
@@ -200,7 +201,7 @@ def _make(root: int, name: str, access: Access) -> tuple[Access, int]:
 
 
 def _sweep(root: int, path: Path) -> None:
-    """Remove the folders of this user's shards that live no more."""
+    """Delete the folders of this user's shards that no longer run."""
     for entry in filter(_MADE_HERE.match, os.listdir(root)):
         try:
             found = os.stat(entry, dir_fd=root, follow_symlinks=False)
@@ -218,7 +219,7 @@ def _sweep(root: int, path: Path) -> None:
 
 
 def _is_left_behind(folder: int, found: os.stat_result) -> bool:
-    """Say whether a folder is one of ours that nobody holds; nobody can take it until closed."""
+    """Return whether a folder is abandoned; while it is open here, no process can take it."""
     try:
         fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
@@ -228,19 +229,19 @@ def _is_left_behind(folder: int, found: os.stat_result) -> bool:
     try:
         size = os.stat(NONCE, dir_fd=folder, follow_symlinks=False).st_size
     except FileNotFoundError:
-        # Being made right now, left behind while it was, or not ours at all.
+        # Being made right now, abandoned while being made, or not one of ours.
         return not os.listdir(folder) and time.time() - found.st_mtime > UNFINISHED_S
     return size == NONCE_BYTES
 
 
 @dataclass(frozen=True, slots=True)
 class OpenedFolder:
-    """A shard's folder as a client has found it; to be closed.
+    """A shard's folder, opened by a client; to be closed.
 
     Attributes:
         descriptor: Of the folder.
-        path: Where it is, as this process sees it.
-        owner: The user that the shard runs as.
+        path: Its path in this process.
+        owner: The user that runs the shard.
     """
 
     descriptor: int
@@ -248,32 +249,32 @@ class OpenedFolder:
     owner: int
 
     def address(self, name: str) -> str:
-        """Return a path by which a socket called `name` in here can be reached."""
+        """Return a path at which a socket called `name` in this folder can be reached."""
         return address_in(self.descriptor, self.path, name)
 
     def close(self) -> None:
-        """Let go of it; what was opened or connected through it stays."""
+        """Close the descriptor; files opened and sockets connected through it stay open."""
         os.close(self.descriptor)
 
 
 def open_shared(name: str, nonce: bytes, *, root: Path | None = None) -> OpenedFolder:
-    """Open the folder that a shard has named, if it is the same one here.  Client side.
+    """Open the folder that a shard has named, if this process sees the same one.  Client side.
 
     Raises:
-        LinkError: There is none, it is another one, or it is not safe; the message says which.
+        LinkError: It does not exist, is a different one, or is not safe; the message says which.
     """
     if not _is_plain(name) or len(nonce) != NONCE_BYTES:
-        raise LinkError(f"a shard names {name[:80]!r} as its shared folder, which cannot be one")
+        raise LinkError(f"a shard sent {name[:80]!r} as its shared folder, which is no valid name")
     root = root or shared_root()
     path = root / name
     above, access = _open_root(root, make=False)
     try:
-        # It need not be readable: what is in there is known by name.
+        # It need not be readable: files in it are opened by name.
         flags = os.O_PATH | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
         opened = os.open(name, flags, dir_fd=above)
     except FileNotFoundError:
         raise LinkError(
-            f"{path} is not shared with this process, or its shard is gone: there is none"
+            f"{path} is not shared with this process, or its shard is gone: it does not exist"
         ) from None
     except OSError as error:
         raise LinkError(f"{path} is not shared with this process: {error.strerror}") from None
@@ -289,7 +290,7 @@ def open_shared(name: str, nonce: bytes, *, root: Path | None = None) -> OpenedF
             )
         if not hmac.compare_digest(_read_nonce(opened, path), nonce):
             raise LinkError(
-                f"{path} is another one than the shard's: the nonces differ, so these processes"
+                f"{path} is not the shard's folder: the nonces differ, so these processes"
                 " have different shared memory"
             )
     except BaseException:
@@ -319,7 +320,7 @@ def _read_nonce(folder: int, path: Path) -> bytes:
 
 
 def address_in(folder: int, path: Path, name: str) -> str:
-    """Return a path of a socket that is short enough for its address."""
+    """Return a path of a socket that fits into a socket address."""
     direct = str(path / name)
     if len(os.fsencode(direct)) <= ADDRESS_BYTES_MAX:
         return direct

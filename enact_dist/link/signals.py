@@ -1,15 +1,15 @@
 """SIGTERM and SIGINT as an ordinary event: no lock is ever taken inside a signal handler.
 
-A Python handler runs in the main thread between any two of its instructions, and nowhere else.
+A Python handler runs in the main thread, between any two of its instructions.
 
-  * If that thread is just inside `Event.wait`, an `Event.set` (or a log line) in the handler waits
-    for a lock that its own thread holds, for ever: a daemon that was told to stop the moment it was
-    ready hung so, once in some hundred starts.
-  * The kernel may give the signal to any other thread, and does after a SIGCONT; then nothing wakes
-    the main thread, and a daemon that waits there never hears of it.
+  * If that thread is inside `Event.wait`, an `Event.set` (or a log line) in the handler waits
+    forever for a lock that its own thread holds.  A daemon that was stopped the moment it was ready
+    hung this way in about one start of a hundred.
+  * The kernel may deliver the signal to any other thread, and does so after a SIGCONT; nothing then
+    wakes the main thread, so a daemon that waits there misses the signal.
 
-So nothing is done in the handler.  The interpreter's own C code writes the number of each signal to
-a socket, in whichever thread it arrives, and a thread of ours reads it there and does the rest.
+So the handler does nothing.  The interpreter's C code writes the number of each signal to a socket,
+in whatever thread it arrives; a thread of ours reads it and does the rest.
 """
 
 from __future__ import annotations
@@ -27,8 +27,9 @@ if TYPE_CHECKING:
     from types import FrameType
 
 SAME_S: Final = 1.0
-"""A signal this soon after the first belongs to the same request: `timeout` sends one to its
-command and one to the group, systemd one to each process of a unit and `enact up` one more."""
+"""A signal this soon after the first is the same request: `timeout` signals its command and its
+group, systemd each process of a unit, and `enact up` sends one more.
+"""
 STOPPING: Final = (signal.SIGTERM, signal.SIGINT)
 _END: Final = 0
 
@@ -37,7 +38,7 @@ _running: list[StopSignals] = []
 
 
 def _leave_to_parent() -> None:
-    """Let a forked child die of its signals; its parent's socket is none of its business."""
+    """Restore default handlers in a forked child, which must not use its parent's socket."""
     if _running:
         signal.set_wakeup_fd(-1)
         for number, handler in _running[0].before.items():
@@ -53,8 +54,8 @@ class StopSignals:
 
     Attributes:
         event: Set by the first signal.
-        count: How many requests to end came; signals within `SAME_S` of the first are one.
-        before: The handlers outside of the block.
+        count: Number of requests to end; signals within `SAME_S` of the first count as one.
+        before: The handlers outside the block.
     """
 
     def __init__(self) -> None:
@@ -69,7 +70,7 @@ class StopSignals:
 
     def __enter__(self) -> Self:
         self._numbers, self._arrivals = socket.socketpair()
-        self._arrivals.setblocking(False)  # as the interpreter demands
+        self._arrivals.setblocking(False)  # required by the interpreter
         self._thread.start()
         self._fd_before = signal.set_wakeup_fd(self._arrivals.fileno(), warn_on_full_buffer=False)
         self.before = {number: signal.signal(number, _do_nothing) for number in STOPPING}
@@ -88,7 +89,7 @@ class StopSignals:
         self._numbers.close()
 
     def call(self, act: Callable[[str], None]) -> None:
-        """Call `act` with the signal's name at the first signal, at once if there was one."""
+        """Call `act` with the signal's name at the first signal, or at once after it."""
         with self._mutex:
             self._acts.append(act)
             name = self._name
@@ -104,7 +105,7 @@ class StopSignals:
         first_s = 0.0
         while (number := self._numbers.recv(1)[0]) != _END:
             if number not in STOPPING:
-                continue  # of a handler that somebody else has set
+                continue  # for another handler
             now_s = time.monotonic()
             if self.count and now_s - first_s < SAME_S:
                 continue
@@ -117,9 +118,9 @@ class StopSignals:
                 try:
                     act(self._name)
                 except Exception:  # noqa: BLE001 - the process has to end all the same
-                    _log.exception("what %s was to bring about has failed", self._name)
+                    _log.exception("an action on %s has failed", self._name)
             self.event.set()
 
 
 def _do_nothing(_: int, __: FrameType | None) -> None:
-    """Be a handler, so that the signal neither ends the process nor is ignored."""
+    """Do nothing; as a handler it keeps the signal from ending the process or being ignored."""

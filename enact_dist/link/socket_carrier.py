@@ -1,14 +1,13 @@
 """The carrier of a client whose shards may run on its own host: a socket there, Zenoh elsewhere.
 
-It stands in front of a `ZenohCarrier`, whose sessions and tokens exist in any case.  A shard's
-WELCOME names a shared folder; where this process sees the same folder, its calls go over the
-socket in there.  Whenever the socket is not to be had, a call goes over Zenoh instead and nobody
-notices.  A call that was sent over a socket that then breaks is *unknown*; it is not sent again
-here.
+It works in front of a `ZenohCarrier`, whose sessions and tokens exist in any case.  A shard's
+WELCOME names a shared folder; if this process sees that folder, calls to the shard use the socket
+in it.  If the socket is unavailable, a call silently uses Zenoh instead.  A call whose socket
+breaks after sending is *unknown*; this carrier does not send it again.
 
-With the socket forced, a WELCOME whose socket cannot be used is an error, if whoever sent it is
-still there; before the first one, and after a shard went away, calls still take Zenoh, since the
-WELCOME itself has to come from somewhere.
+With the socket forced, a WELCOME whose socket cannot be used is an error, provided its shard still
+runs.  Before the first WELCOME, and after a shard went away, calls still use Zenoh: the WELCOME
+itself has to arrive somehow.
 """
 
 from __future__ import annotations
@@ -36,29 +35,29 @@ if TYPE_CHECKING:
     from enact_dist.link.zenoh_carrier import ZenohCarrier
 
 FETCH_BYTES: Final = 4 << 20
-"""A slice over a socket delays nobody else; more than this no shard sends at once."""
+"""A slice over a socket delays no other client; a shard sends no larger slice at once."""
 LATE_S: Final = 1.0
-"""How long the numbers of notices of no interest may stay out: four times as a shard says."""
+"""How late the numbers of skipped notices may be: four times a shard's own limit."""
 FORCED_TRIES: Final = 20
-"""So often a forced socket is tried: a busy shard may not answer one within half a second."""
+"""Attempts for a forced socket: a busy shard may not answer one within half a second."""
 THERE_S: Final = 1.0
-"""How long a shard whose forced socket cannot be used has to say that it is still there."""
+"""How long a shard with an unusable forced socket may take to show that it still runs."""
 
 _log = logging.getLogger("enact.link")
 _open: weakref.WeakSet[SocketCarrier] = weakref.WeakSet()
 
 
 class SocketCarrier:
-    """Reaches shards over sockets where it can.  See `Carrier` for the methods; thread-safe.
+    """Reaches shards over sockets where possible.  See `Carrier` for the methods; thread-safe.
 
     Args:
-        behind: Reaches every shard; closed with this carrier.
-        session: For which session the connections speak.
-        identity: Whose it is.
-        forced: Whether a socket that cannot be used is an error.
+        behind: Reaches every shard; closed together with this carrier.
+        session: The session that the connections speak for.
+        identity: Owner of the session.
+        forced: Whether an unusable socket is an error.
 
     Attributes:
-        inside: No shard is in this process.
+        inside: False: no shard runs in this process.
         calls: How many calls went over sockets, and how many over Zenoh.
     """
 
@@ -81,7 +80,7 @@ class SocketCarrier:
 
     @property
     def fetch_bytes(self) -> int:
-        """How large a slice of a datum is asked for in one call, at most."""
+        """The largest slice of a datum that one call requests, in bytes."""
         lines = list(self._lines.values())
         all_here = len(lines) == len(self._shards) and not any(line.problem for line in lines)
         return FETCH_BYTES if lines and all_here else self._behind.fetch_bytes
@@ -89,12 +88,12 @@ class SocketCarrier:
     # ---------------------------------------------------------------- requests
 
     def request(self, shard: str, message: Request, *, timeout_s: float) -> Answer | None:
-        """Send one request and return its answer, or None if there was none in time.
+        """Send one request and return its answer, or None if none came in time.
 
         Raises:
             ProtocolError: An answer cannot be read, or two daemons answer for one shard.
             MisuseError: The carrier is closed or was opened before a fork.
-            LinkError: The socket is forced, and the shard's cannot be used.
+            LinkError: The socket is forced and cannot be used.
         """
         self._check_usable()
         line = self._lines.get(shard)
@@ -141,7 +140,7 @@ class SocketCarrier:
                 if type(answers[index]) is Alive:
                     self._is_near(requests[index][0])
         finally:
-            for line, connection in sent.values():  # something was raised before its turn
+            for line, connection in sent.values():  # an exception came before its turn
                 line.drop(connection)
         for answer in answers:
             if type(answer) is Welcome:
@@ -149,14 +148,14 @@ class SocketCarrier:
         return answers
 
     def _is_near(self, shard: str) -> None:
-        """Let feeds that have lost the socket to a shard try it again: its session lives there."""
+        """Let feeds that lost the socket to a shard try it again: its session lives there."""
         line = self._lines.get(shard)
         for feed in list(self._feeds.values()):
             if line is not None:
                 feed.come_back(shard, line)
 
     def begin(self, shard: str, message: Request, *, timeout_s: float) -> Begun:
-        """Send one request whose answer is waited for later; each has a connection of its own.
+        """Send one request whose answer the caller awaits later; each uses its own connection.
 
         Raises:
             ProtocolError: As `request`.
@@ -173,17 +172,17 @@ class SocketCarrier:
 
     @staticmethod
     def _sent(line: SocketLine, message: Request, timeout_s: float) -> Connection | None:
-        """Send a request over a socket; None where nothing of it can have arrived."""
+        """Send a request over a socket; None if none of it can have arrived."""
         connection = line.take()
         if connection is None:
             return None
         try:
             connection.send(message, timeout_s)
         except BlockingIOError:
-            line.drop(connection)  # it does not read: what it has got of this is no frame
+            line.drop(connection)  # it does not read, and has only a part of the frame
             return None
         except OSError:
-            line.lost(connection)  # either end was closed before: nobody reads this whole
+            line.lost(connection)  # either end was closed before, so the frame is incomplete
             return None
         except BaseException:
             line.drop(connection)
@@ -196,10 +195,10 @@ class SocketCarrier:
     # ---------------------------------------------------------------- lines
 
     def learn(self, welcome: Welcome) -> None:
-        """Take from a shard's WELCOME whether it shares memory with this process.
+        """Find out from a shard's WELCOME whether it shares memory with this process.
 
         Raises:
-            LinkError: The socket is forced, and this one cannot be used.
+            LinkError: The socket is forced and this one cannot be used.
         """
         shard, old, connection = welcome.shard, None, None
         with self._mutex:
@@ -222,7 +221,8 @@ class SocketCarrier:
         if old is not None:
             old.close()
         if line is not None:
-            # A connection is there before anybody asks, and with it the kernel's word on our end.
+            # The connection is open before the first call, so the kernel can report the end of our
+            # process.
             connection = self.tried(line, line.take)
             if connection is not None:
                 line.give_back(connection)
@@ -234,7 +234,7 @@ class SocketCarrier:
     def tried(
         self, line: SocketLine, open_one: Callable[[], Connection | None]
     ) -> Connection | None:
-        """Return what `open_one` opens on a line; where the socket is forced, it is asked again."""
+        """Return what `open_one` opens on a line; retried if the socket is forced."""
         for _ in range(FORCED_TRIES if self._forced else 1):
             line.try_again()
             connection = open_one()
@@ -243,14 +243,14 @@ class SocketCarrier:
         return None
 
     def _refuse_if_there(self, welcome: Welcome, line: SocketLine | None) -> None:
-        """Raise if the shard that sent a WELCOME runs still; else its socket has gone with it."""
+        """Raise if the shard that sent a WELCOME still runs; otherwise its socket ended with it."""
         shard, problem = welcome.shard, line.problem if line is not None else "it offers none"
         if not problem:
             return
         answer = self._behind.request(shard, Ping(), timeout_s=THERE_S)
         if isinstance(answer, Pong) and answer.epoch == welcome.epoch:
             raise LinkError(
-                f"the socket is asked for (ENACT_CARRIER=socket), and that of shard {shard} cannot"
+                f"a socket is required (ENACT_CARRIER=socket), but that of shard {shard} cannot"
                 f" be used: {problem}"
             )
 
@@ -263,11 +263,11 @@ class SocketCarrier:
         return f"zenoh ({line.problem})" if line.problem else "socket"
 
     def add_endpoints(self, entries: Sequence[ShardEntry]) -> None:
-        """Connect to further shards, to all that can be; those already in reach stay as they are.
+        """Connect to all further shards that can be reached; existing connections stay.
 
         Raises:
             ConfigError: An endpoint cannot be read.
-            LinkError: Several cannot be connected, for the reasons that it names.
+            LinkError: Some cannot be connected; the message gives the reasons.
             MisuseError: The carrier is closed or was opened before a fork.
         """
         self._check_usable()
@@ -279,12 +279,12 @@ class SocketCarrier:
                 feed.settle()
 
     def away(self, shard: str) -> bool:
-        """Whether a shard is out of reach: of Zenoh, and of a socket as far as was tried."""
+        """Whether a shard is out of reach over Zenoh and over any socket tried so far."""
         line = self._lines.get(shard)
         return (line is None or bool(line.problem)) and self._behind.away(shard)
 
     def tell_returns(self, returned: Callable[[str], None]) -> None:
-        """Call `returned` with the name of each shard that comes (back) into reach."""
+        """Call `returned` with the name of each shard that comes (back) within reach."""
         lines = self._lines
 
         def told(shard: str) -> None:
@@ -296,13 +296,13 @@ class SocketCarrier:
         self._behind.tell_returns(told)
 
     def endpoint_of(self, shard: str) -> str:
-        """Return where the shard is expected, for messages to people."""
+        """Return the shard's expected endpoint, for messages to people."""
         return self._behind.endpoint_of(shard)
 
     # ---------------------------------------------------------------- notices
 
     def subscribe(self, interest: Survey | None = None) -> NoticeQueue:
-        """Open a feed of the notices of all shards, those of shards added later included."""
+        """Open a feed of the notices of all shards, including shards added later."""
         self._check_usable()
         queue = NoticeQueue(interest)
         if interest is not None:
@@ -319,7 +319,7 @@ class SocketCarrier:
             feed.close()
 
     def lines(self) -> tuple[set[str], dict[str, SocketLine]]:
-        """Return the known shards, and the lines to those that have one."""
+        """Return the known shards, and the lines of those that have one."""
         return set(self._shards), dict(self._lines)
 
     @property
@@ -330,7 +330,7 @@ class SocketCarrier:
     # ---------------------------------------------------------------- end
 
     def close(self) -> None:
-        """End all connections and pending calls (they return None); twice is harmless."""
+        """End all connections and pending calls (they return None); idempotent."""
         if self._closed or self._pid != os.getpid():
             return
         with self._mutex:
@@ -342,7 +342,7 @@ class SocketCarrier:
         self._behind.close()
 
     def abandon(self) -> None:
-        """Let a forked child forget the parent's connections."""
+        """Make a forked child forget the parent's connections."""
         for line in self._lines.values():
             line.abandon()
 
@@ -357,18 +357,18 @@ class _Begun:
         self._connection = connection
 
     def wait(self, into: memoryview | None = None) -> Answer | None:
-        """Return the answer, or None where none will come."""
+        """Return the answer, or None if none will come."""
         return _received(self._line, self._connection, into)
 
     def abandon(self) -> None:
-        """Throw the connection away, and the answer with it."""
+        """Discard the connection and the answer with it."""
         self._line.drop(self._connection)
 
 
 def _received(
     line: SocketLine, connection: Connection, into: memoryview | None = None
 ) -> Answer | None:
-    """Return the answer on a connection, or None where none will come."""
+    """Return the answer on a connection, or None if none will come."""
     try:
         answer = connection.receive(into)
     except BlockingIOError:  # the time is over

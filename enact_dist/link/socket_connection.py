@@ -1,8 +1,8 @@
 """One connection of a client to a shard of its host: a request, its answer, the next request.
 
-Its thread reads a request, lets the host decide, and sends the answer when the host has let go of
-it.  An answer that comes later (a grant after a wait) is sent by whoever brings it, as far as that
-goes without waiting; what does not fit is left to the connection's thread.
+Its thread reads a request, lets the host decide, and sends the answer once the host has released
+its mutex.  A later answer (a grant after a wait) is sent by the thread that produces it, as far as
+that works without blocking; the connection's thread sends the rest.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ if TYPE_CHECKING:
     from enact_dist.link.socket_service import SocketService
 
 OPEN_S: Final = 1.0
-"""How long a new connection has to say for whom it speaks."""
+"""How long a new connection may take to name its session."""
 SEND_S: Final = 5.0
-"""How long a client may read nothing of an answer before its connection is given up."""
+"""How long a client may leave an answer unread before its connection is closed."""
 
 _log = logging.getLogger("enact.link")
 
 
 def end_socket(connected: socket.socket) -> None:
-    """Wake whoever waits on a socket; its own thread closes it."""
+    """Wake the thread that waits on a socket; that thread closes it."""
     try:
         connected.shutdown(socket.SHUT_RDWR)
     except OSError:  # ended already
@@ -54,12 +54,12 @@ class SocketConnection:
     """One connection and its thread: a request, its answer, the next request.
 
     Attributes:
-        session: For which session it speaks; empty until the service has admitted it.
-        identity: Whose that is.
-        peer: Which process is at the other end, as the kernel says.
-        step: 3n while it waits for its n-th request, 3n + 1 once it has read that, 3n + 2 once the
-            host has it, too.
-        ended: Set once the thread is through.
+        session: The session it speaks for; empty until the service has admitted it.
+        identity: Owner of that session.
+        peer: The process at the other end, according to the kernel.
+        step: 3n while it waits for its n-th request, 3n + 1 once it has read it, 3n + 2 once the
+            host has it.
+        ended: Set when the thread has ended.
     """
 
     __slots__ = (
@@ -104,13 +104,13 @@ class SocketConnection:
             self.ended.set()
 
     def _open(self) -> bool:
-        """Learn for whom the connection speaks; say whether it may."""
+        """Read which session the connection speaks for; return whether it may."""
         try:
             kind, header, payload = self._stream.receive()
         except BlockingIOError:
             return False
         if kind != Kind.OPEN or payload:
-            raise ProtocolError(f"a frame of kind {kind} came in place of a greeting")
+            raise ProtocolError(f"a frame of kind {kind} came instead of a greeting")
         session, self.identity = read_greeting(header)
         try:
             self._service.admit(self, session)
@@ -142,7 +142,7 @@ class SocketConnection:
                     self.step = step + 1
                     SocketWatcher(self._service, self.connected, _interest(header)).run()
                     return
-                raise ProtocolError(f"a frame of kind {kind} came in place of a request")
+                raise ProtocolError(f"a frame of kind {kind} came instead of a request")
             try:
                 message = decode_request(header, payload)
             except ProtocolError as error:
@@ -160,20 +160,20 @@ class SocketConnection:
             self._send_answer()
 
     def _may_name(self, session: str, message: Request) -> bool:
-        """Whether a message may name another session: who asks for a commit's outcome sends these.
+        """Whether a message may name another session, as a question for a commit's outcome does.
 
-        Of two sessions of one process each may release the locks of the other.  What else is
-        refused the core decides, by the identity.
+        Of two sessions of one process, each may release the other's locks.  The core refuses
+        everything else by identity.
         """
         if type(message) is Release:
             return not self._service.is_of_another_process(session, self.peer)
         return type(message) is Outcome
 
     def _take(self, answer: Answer) -> None:
-        """Take the answer from the host, whose mutex is held: nothing here may wait.
+        """Take the answer from the host, whose mutex is held: this must not block.
 
-        Another thread leaves `_answer` alone: this connection's own may look at it at any moment,
-        and one of the two has to send.
+        This connection's thread may look at `_answer` at any moment, and exactly one of the two
+        threads must send, so no third thread may touch it.
         """
         if threading.get_ident() == self._thread:
             self._answer = answer
@@ -185,7 +185,7 @@ class SocketConnection:
         self._wake()
 
     def _send_answer(self) -> None:
-        """Send the answer, or wait for whoever brings it and send what is left of it."""
+        """Send the answer, or wait for the thread that produces it and send the rest."""
         answer, self._answer = self._answer, None
         if answer is None:
             self._answered.acquire()
@@ -200,7 +200,7 @@ class SocketConnection:
         send_frame(self.connected, *encoded(answer, self._service.host.count))
 
     def _send_what_fits(self, answer: Answer) -> memoryview | None:
-        """Send without waiting; return what is left for the connection's thread."""
+        """Send without blocking; return the rest, which the connection's thread sends."""
         header, bodies = encoded(answer, self._service.host.count)
         payload = b"".join(bodies)
         frame = prefixed(header, len(payload)) + payload
@@ -215,7 +215,7 @@ class SocketConnection:
         return memoryview(frame)[sent:] if sent < len(frame) else None
 
     def end(self) -> None:
-        """Let the thread end soon, wherever it waits."""
+        """Make the thread end soon, wherever it waits."""
         end_socket(self.connected)
         self._wake()
 
@@ -227,16 +227,16 @@ class SocketConnection:
 
 
 def _interest(header: bytes) -> Interest | None:
-    """Return what a watcher watches; None for everything.
+    """Return what a watcher watches; None: everything.
 
     Raises:
-        ProtocolError: The header is something else, or names patterns that nobody may.
+        ProtocolError: The header is something else, or its patterns are invalid.
     """
     if not header:
         return None
     wanted = decode_frame(header, b"")
     if not isinstance(wanted, Survey):
-        raise ProtocolError(f"{type(wanted).__name__} came to say what is watched")
+        raise ProtocolError(f"{type(wanted).__name__} came instead of what to watch")
     try:
         checked_patterns(wanted.patterns)
     except ValueError as error:

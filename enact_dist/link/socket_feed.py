@@ -1,14 +1,13 @@
-"""One feed of notices of a client whose shards may run on its own host.
+"""A client's feed of notices, over sockets for shards on its host.
 
-It has a connection to each shard with a socket, and Zenoh where one has none.  Both may bring the
-same notice for a while; the queue takes each number once, and a number that is missing is noticed
-by whoever watches.  Whoever waits reads the first of the connections itself, and each further one
-has a thread.
+It has a connection to each shard with a socket and uses Zenoh for the others.  Both may bring the
+same notice for a while: the queue takes each number once, and the watcher notices missing numbers.
+A waiting thread reads the first connection itself; each further one has a thread.
 
-A connection that ends is opened again at once.  Where that fails, its shard's notices come over
-Zenoh, and the socket is tried again when a sign of life of this session was answered over one, as
-it is some times per TTL.  Zenoh stays until the first notice has come over the socket and all
-before it over Zenoh, so that none is missed.
+A connection that ends is reopened at once.  If that fails, its shard's notices come over Zenoh.
+The socket is tried again when a keep-alive of this session was answered over one, which happens
+several times per TTL.  Zenoh stays until the first notice has come over the socket and all earlier
+ones over Zenoh, so that none is missed.
 """
 
 from __future__ import annotations
@@ -30,18 +29,18 @@ if TYPE_CHECKING:
 
 JOIN_S: Final = 1.0
 EARLIER_S: Final = 1.0
-"""How long what came over Zenoh before the first notice of a socket may be on its way."""
+"""How long notices from before a socket's first one may still be in transit over Zenoh."""
 
 _log = logging.getLogger("enact.link")
 
 
 class SocketFeed:
-    """A connection to each shard with a socket, Zenoh where one has none.
+    """Connects to each shard with a socket; uses Zenoh for the others.
 
     Args:
-        carrier: Of the client.
-        queue: Where notices go.
-        interest: What is watched; None for everything.
+        carrier: The client's carrier.
+        queue: Receives the notices.
+        interest: The slots to watch; None: all.
     """
 
     def __init__(self, carrier: SocketCarrier, queue: NoticeQueue, interest: Survey | None) -> None:
@@ -55,7 +54,7 @@ class SocketFeed:
         self._closed = False
 
     def settle(self) -> None:
-        """Open and close what has to be, after something changed."""
+        """Open and close connections as needed after a change."""
         with self._mutex:
             if self._closed:
                 return
@@ -76,7 +75,7 @@ class SocketFeed:
             self._read_from(shard, line, connection)
 
     def _read_from(self, shard: str, line: SocketLine, connection: Connection) -> None:
-        """Let whoever waits read a connection, or a thread; the mutex is held."""
+        """Assign a connection to the waiting thread or to a new one; the mutex is held."""
         if self._queue.read_from(
             connection, lambda error: self._ended(shard, line, connection, error)
         ):
@@ -89,7 +88,7 @@ class SocketFeed:
         self._pumps[shard] = line, connection, thread
 
     def come_back(self, shard: str, line: SocketLine) -> None:
-        """Try the socket to a shard again, if its notices come over Zenoh; does not wait for it."""
+        """Try the socket to a shard again if its notices come over Zenoh; does not block."""
         if shard in self._pumps or shard in self._coming:
             return
         thread = threading.Thread(
@@ -101,11 +100,11 @@ class SocketFeed:
             self._coming[shard] = None, thread
             try:
                 thread.start()
-            except RuntimeError:  # no more threads: at the next time
+            except RuntimeError:  # no thread available: try next time
                 del self._coming[shard]
 
     def _come_back(self, shard: str, line: SocketLine) -> None:
-        """Watch over a socket beside Zenoh until it brings what Zenoh need not bring."""
+        """Watch over the socket in parallel, until Zenoh is no longer needed for this shard."""
         connection = self._watching(line)
         came = False
         try:
@@ -123,7 +122,7 @@ class SocketFeed:
                     self._read_from(shard, line, connection)
                     came = True
         except Exception as error:  # noqa: BLE001 - Zenoh goes on, and the socket is tried again
-            _log.debug("notices of shard %s stay with Zenoh: %s", shard, error)
+            _log.debug("notices of shard %s stay on Zenoh: %s", shard, error)
         finally:
             with self._mutex:
                 self._coming.pop(shard, None)
@@ -133,7 +132,7 @@ class SocketFeed:
             self.settle()
 
     def _watching(self, line: SocketLine) -> Connection | None:
-        """Return a new connection that gets notices, None where there is none to be had."""
+        """Return a new connection for notices, or None if that fails."""
         connection = line.connect()
         if connection is None:
             return None
@@ -166,7 +165,7 @@ class SocketFeed:
             self.settle()
 
     def close(self) -> None:
-        """End it; waits for its threads."""
+        """End the feed; waits for its threads."""
         with self._mutex:
             self._closed = True
             pumps = list(self._pumps.values())

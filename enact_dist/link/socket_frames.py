@@ -1,17 +1,16 @@
-"""How frames travel on a stream between two processes of one host.
+"""Frames on a stream between two processes of one host.
 
 Each frame is a prefix of 16 bytes, the header and the payload::
 
     "ED" | version of the stream | kind | length of the header | length of the payload
       2              1               1             4                        8
 
-`Stream` reads one frame at a time into a buffer that it keeps; what is longer gets memory of its
-own, after its length was found to be within the limits.  The peer must not send a second frame
-before the first was answered (a feed of notices excepted), so a call costs one system call per
-direction.
+`Stream` reads one frame at a time into a buffer that it keeps; a longer frame gets its own memory,
+once its length is known to be within the limits.  The peer must not send a second frame before the
+first was answered (except on a feed of notices), so a call costs one system call per direction.
 
-Rule to keep: a stream on which anything was unexpected is closed; a part of a frame would be taken
-for the beginning of the next.
+Rule to keep: close a stream after anything unexpected; otherwise a part of a frame would be taken
+for the start of the next one.
 """
 
 from __future__ import annotations
@@ -33,11 +32,11 @@ Buffer = bytes | memoryview
 STREAM_VERSION: Final = 2
 MAGIC: Final = b"ED"
 BUFFER_BYTES: Final = 32 << 10
-"""Kept per connection; frames up to this length are read without taking memory."""
+"""Kept per connection; frames up to this length are read without allocating memory."""
 PARTS_MAX: Final = 512
 """Pieces of memory that one system call may send together (the kernel allows 1024)."""
 ROUND_S: Final = 0.1
-"""Long waits are rounded up to this, so that the kernel is seldom told a new one."""
+"""Long waits are rounded up to this, so that the kernel's timeout rarely has to be changed."""
 
 _PREFIX: Final = struct.Struct("<2sBBIQ")
 PREFIX_BYTES: Final = _PREFIX.size
@@ -45,21 +44,23 @@ _TIMEVAL: Final = struct.Struct("ll")
 
 
 class Kind(enum.IntEnum):
-    """What a frame is."""
+    """The kind of a frame."""
 
     OPEN = 1
-    """Client: I speak for this session (the header is `greeting_of` it)."""
+    """Client: the connection's session (the header is its `greeting_of`)."""
     OPENED = 2
-    """Shard: go on (the header is the shard's name)."""
+    """Shard: accepted (the header is the shard's name)."""
     REFUSED = 3
-    """Shard: no, for this reason (the header is text); nothing follows."""
+    """Shard: refused (the header is the reason); nothing follows."""
     MESSAGE = 4
     """A request, its answer, or a notice: the frame of `wire.frames`."""
     WATCH = 5
-    """Client: from now on send notices, I say nothing more (the header is the `Survey` that lists
-    what I watch, or empty for all)."""
+    """Client: send notices from now on; the client sends nothing more.  The header is the `Survey`
+    that
+    lists the watched slots; empty: all.
+    """
     SKIPPED = 6
-    """Shard: these notices were of no interest to you (the header is epoch, first and last)."""
+    """Shard: these notices were skipped (the header is epoch, first and last)."""
 
 
 _MESSAGE: Final = int(Kind.MESSAGE)
@@ -70,42 +71,42 @@ _SKIPPED: Final = struct.Struct("<QQQ")
 
 
 def greeting_of(session: str, identity: str) -> bytes:
-    """Return how a connection says for which session it speaks, and whose that is."""
+    """Return the header that names a connection's session and identity."""
     return f"{session} {quoted_identity(identity)}".encode()
 
 
 def read_greeting(header: bytes) -> tuple[str, str]:
-    """Return the session and the identity for which a connection speaks.
+    """Return the session and the identity of a connection.
 
     Raises:
-        ProtocolError: The header says neither.
+        ProtocolError: The header is invalid.
     """
     session, _, identity = header.decode("ascii", "replace").partition(" ")
     fits = 0 < len(session) <= NAME_CHARACTERS_MAX and identity
     if not fits or quoted_identity(identity) != identity:
-        raise ProtocolError("a connection did not say for whom it speaks")
+        raise ProtocolError("a connection did not name its session")
     return session, identity
 
 
 def skipped_frame(epoch: int, after: int, number: int) -> bytes:
-    """Return the frame that says which notices of an epoch were of no interest."""
+    """Return the frame that tells which notices of an epoch were skipped."""
     return prefixed(_SKIPPED.pack(epoch, after, number), 0, Kind.SKIPPED)
 
 
 def read_skipped(header: bytes) -> tuple[int, int, int]:
-    """Return the epoch, the number before the first and the last of what was skipped.
+    """Return the epoch, the number before the first and the last number of a skipped run.
 
     Raises:
-        ProtocolError: The header says something else.
+        ProtocolError: The header is invalid.
     """
     if len(header) != _SKIPPED.size:
-        raise ProtocolError(f"{len(header)} bytes say which notices were skipped")
+        raise ProtocolError(f"{len(header)} bytes are no run of skipped notices")
     epoch, after, number = _SKIPPED.unpack(header)
     return epoch, after, number
 
 
 def prefixed(header: bytes, payload_bytes: int, kind: int = _MESSAGE) -> bytes:
-    """Return the beginning of a frame: the prefix and the header."""
+    """Return the start of a frame: prefix and header."""
     return _PREFIX.pack(MAGIC, STREAM_VERSION, kind, len(header), payload_bytes) + header
 
 
@@ -115,7 +116,7 @@ def send_frame(
     """Send a frame whole; blocks while the peer does not read.
 
     Raises:
-        OSError: The peer is gone, or did not read for as long as the socket waits.
+        OSError: The peer is gone, or did not read within the socket's time limit.
     """
     if not bodies:
         start = prefixed(header, 0, kind)
@@ -128,7 +129,7 @@ def send_frame(
 
 
 def _send_parts(connected: socket.socket, parts: Sequence[Buffer]) -> None:
-    """Send pieces one after another, many of them in one call, none of them copied."""
+    """Send pieces in order, many per call, without copying them."""
     for first in range(0, len(parts), PARTS_MAX):
         group = parts[first : first + PARTS_MAX]
         sent = connected.sendmsg(group)
@@ -141,10 +142,10 @@ def _send_parts(connected: socket.socket, parts: Sequence[Buffer]) -> None:
 
 
 def wait_at_most(connected: socket.socket, option: int, wait_s: float) -> None:
-    """Let the kernel end a blocked `SO_RCVTIMEO` or `SO_SNDTIMEO` call after a while.
+    """Set the kernel's time limit (`SO_RCVTIMEO` or `SO_SNDTIMEO`) of blocked calls.
 
-    Python's own timeouts would cost a further system call for each one that sends or receives.
-    0 stands for no limit.
+    Python's own timeouts would cost one more system call per send and receive.
+    0: no limit.
     """
     seconds, fraction = divmod(wait_s, 1.0)
     value = _TIMEVAL.pack(int(seconds), int(fraction * 1e6))
@@ -152,7 +153,7 @@ def wait_at_most(connected: socket.socket, option: int, wait_s: float) -> None:
 
 
 def rounded_s(wait_s: float) -> float:
-    """Return a time to wait, rounded up so that few different ones occur."""
+    """Return a waiting time, rounded up so that few different ones occur."""
     step_s = ROUND_S if wait_s >= 1.0 else ROUND_S / 10
     return math.ceil(max(wait_s, 0.001) / step_s - 1e-9) * step_s
 
@@ -171,18 +172,18 @@ class Stream:
 
     @property
     def begun(self) -> bool:
-        """Whether something of the next frame is here already."""
+        """Whether a part of the next frame has arrived."""
         return bool(self._filled)
 
     def receive(self, into: memoryview | None = None) -> tuple[int, bytes, Buffer]:
-        """Return kind, header and payload of the next frame; blocks until it is there.
+        """Return kind, header and payload of the next frame; blocks until it has arrived.
 
-        A payload longer than the buffer, and exactly as long as `into`, is put there.
+        A payload longer than the buffer and exactly as long as `into` is put there.
 
         Raises:
             EOFError: The peer has closed the connection.
-            OSError: The connection is broken, or nothing came for as long as the socket waits.
-            ProtocolError: What came is no frame, or one over a limit.
+            OSError: The connection is broken, or nothing came within the socket's time limit.
+            ProtocolError: The data are no frame, or exceed a limit.
         """
         filled, view = self._filled, self._view
         while filled < PREFIX_BYTES:
@@ -197,12 +198,12 @@ class Stream:
         return self._taken(kind, header_bytes, length, filled)
 
     def receive_here(self, *, wait: bool = False) -> tuple[int, bytes, Buffer] | None:
-        """Return kind, header and payload of the next frame if all of it has come, else None.
+        """Return kind, header and payload of the next frame once it is complete, else None.
 
-        What has come of it stays for the next time.
+        Incomplete data stay for the next call.
 
         Args:
-            wait: Whether to wait until something has come; never for the rest of it.
+            wait: Whether to wait for some data; never waits for the rest of a frame.
 
         Raises:
             EOFError: As `receive`.
@@ -220,14 +221,14 @@ class Stream:
         return frame
 
     def _whole(self) -> tuple[int, bytes, Buffer] | None:
-        """Take the next frame, if all of it is in memory."""
+        """Return the next frame if all of it is in memory, else None."""
         filled, memory = self._filled, self._long
         if filled < PREFIX_BYTES:
             return None
         kind, header_bytes, payload_bytes = _read_prefix(memory or self._buffer)
         length = PREFIX_BYTES + header_bytes + payload_bytes
         if memory is None and length > BUFFER_BYTES:
-            # As in `_receive_long`: a length that is only claimed costs nothing.
+            # As in `_receive_long`: a claimed length alone costs nothing.
             memory = self._long = memoryview(mmap.mmap(-1, length))
             memory[:filled] = self._view[:filled]
         if filled < length:
@@ -241,7 +242,7 @@ class Stream:
     def _taken(
         self, kind: int, header_bytes: int, length: int, filled: int
     ) -> tuple[int, bytes, Buffer]:
-        """Take a frame that is whole in the buffer out of it."""
+        """Remove a complete frame from the buffer and return it."""
         view, end = self._view, PREFIX_BYTES + header_bytes
         header = bytes(view[PREFIX_BYTES:end])
         payload = bytes(view[end:length]) if end < length else b""
@@ -264,16 +265,16 @@ class Stream:
         filled: int,
         into: memoryview | None,
     ) -> tuple[int, bytes, Buffer]:
-        """Read a frame that is longer than the buffer into memory of its own.
+        """Read a frame longer than the buffer into its own memory.
 
-        The memory is the kernel's and comes page by page as it is filled, so a length that is only
-        claimed costs nothing.
+        The kernel provides the memory page by page as it is filled, so a claimed length alone costs
+        nothing.
         """
         header, payload = memoryview(bytearray(header_bytes)), memoryview(bytearray())
         if into is not None and len(into) == payload_bytes:
             payload = into
         elif payload_bytes:
-            payload = memoryview(mmap.mmap(-1, payload_bytes))  # begins at a page
+            payload = memoryview(mmap.mmap(-1, payload_bytes))  # starts at a page
         at = PREFIX_BYTES
         for part in (header, payload):
             taken = min(filled - at, len(part))
@@ -288,17 +289,17 @@ def _read_prefix(buffer: bytearray | memoryview) -> tuple[int, int, int]:
     """Return kind, length of the header and of the payload.
 
     Raises:
-        ProtocolError: It is none of ours, or claims more than a frame may have.
+        ProtocolError: It is invalid, or claims more than a frame's limit.
     """
     magic, version, kind, header_bytes, payload_bytes = _PREFIX.unpack_from(buffer)
     if magic != MAGIC or version != STREAM_VERSION or kind not in _KINDS:
         raise ProtocolError(
-            f"{bytes(buffer[:4])!r} begins no frame of a stream of version {STREAM_VERSION}; run"
+            f"{bytes(buffer[:4])!r} starts no frame of a stream of version {STREAM_VERSION}; run"
             " the same release of enact-dist in all processes of this host"
         )
     if header_bytes > HEADER_BYTES_MAX or payload_bytes > PAYLOAD_BYTES_MAX:
         raise ProtocolError(
-            f"a frame of {header_bytes} + {payload_bytes} bytes is announced; at most"
+            f"a frame of {header_bytes} + {payload_bytes} bytes was announced; at most"
             f" {HEADER_BYTES_MAX} + {PAYLOAD_BYTES_MAX}"
         )
     return kind, header_bytes, payload_bytes

@@ -1,8 +1,8 @@
-"""The way of one client to one shard of the same host: a few connections, one call on each.
+"""Connections of one client to one shard of the same host; each carries one call at a time.
 
-The calling thread sends and receives by itself, so that no other thread has to be woken: a round
-trip costs two system calls on either side.  A connection whose answer did not come in time is
-thrown away; a late answer never meets the next call.
+The calling thread sends and receives, so no other thread has to be woken: a round trip costs two
+system calls on either side.  A connection whose answer was late is closed, so a late answer never
+meets the next call.
 """
 
 from __future__ import annotations
@@ -43,25 +43,27 @@ SOCKET_NAME: Final = "socket"
 CONNECTIONS_MAX: Final = 100
 """Connections of one client to one shard; further calls take the other carrier."""
 IDLE_MAX: Final = 16
-"""Connections that are kept open for the next call."""
+"""Idle connections kept open for the next call."""
 CONNECT_S: Final = 0.5
-"""How long a shard has to take a connection: it is on this host."""
+"""How long a shard may take to accept a connection: it is on this host."""
 SEND_S: Final = 3.0
-"""How long a shard may read nothing of a request before its connection is given up."""
+"""How long a shard may leave a request unread before its connection is closed."""
 SLACK_S: Final = 1.0
-"""So much longer than asked, and at most twice as long, a call may be left without an answer: the
-two calls of a lock, which differ by that much, then share one time that the kernel knows."""
+"""Extra time, at most doubling it, that a call may take: the two calls of a lock, whose times
+differ
+by this much, then share one timeout in the kernel.
+"""
 RETRY_S_MIN: Final = 0.1
 RETRY_S_MAX: Final = 5.0
 """Pause before a lost socket is tried again; doubles up to the second figure."""
 AWAY_S: Final = 10.0
-"""That pause while Zenoh has no way to the shard either; the return of the shard ends it."""
+"""That pause while Zenoh cannot reach the shard either; ends when the shard returns."""
 
 _log = logging.getLogger("enact.link")
 
 
 class Connection:
-    """One connection to a shard; for one call at a time.  Ends with whoever holds it."""
+    """One connection to a shard; for one call at a time.  Closes with its last reference."""
 
     __slots__ = ("__weakref__", "_poll", "_stream", "_wait_s", "shard", "socket")
 
@@ -77,11 +79,11 @@ class Connection:
         self.socket.close()
 
     def send(self, request: Request, timeout_s: float) -> None:
-        """Send a request, whose answer `receive` waits for so long.
+        """Send a request, for whose answer `receive` waits up to `timeout_s`.
 
         Raises:
             OSError: The connection is gone.
-            ProtocolError: The request cannot travel.
+            ProtocolError: The request cannot be sent.
         """
         header, bodies = encode_parts(request)
         if not timeout_s <= self._wait_s <= timeout_s + min(timeout_s, SLACK_S):
@@ -90,15 +92,15 @@ class Connection:
         send_frame(self.socket, header, bodies)
 
     def receive(self, into: memoryview | None = None) -> Answer:
-        """Return the answer to the request that was sent; its data in `into` if they fit.
+        """Return the answer to the sent request, with its data in `into` if they fit.
 
         Raises:
             EOFError: The shard has closed the connection.
-            OSError: The connection is broken, or the time is over.
-            ProtocolError: What came is no answer.
+            OSError: The connection is broken, or time is up.
+            ProtocolError: The data are no answer.
         """
-        # Each signal that Python handles, in its main thread, begins the kernel's time for a
-        # blocked call anew; a poll, which costs 0.5 us, goes on where it was.
+        # Each signal that Python handles in its main thread restarts the kernel's timeout of a
+        # blocked call; a poll, which costs 0.5 us, continues with the remaining time.
         if threading.get_ident() == threading.main_thread().ident and not self._poll.poll(
             self._wait_s * 1e3
         ):
@@ -106,13 +108,13 @@ class Connection:
         kind, header, payload = self._stream.receive(into)
         if kind != Kind.MESSAGE:
             raise ProtocolError(
-                f"shard {self.shard} sent a frame of kind {kind} in place of an answer"
+                f"shard {self.shard} sent a frame of kind {kind} instead of an answer"
                 f" ({header.decode('utf-8', 'replace')})"
             )
         return read_answer(self.shard, header, payload)
 
     def exchange(self, kind: Kind, header: bytes) -> None:
-        """Ask for something and be told that it is so.
+        """Send a frame and wait for the shard's acceptance.
 
         Raises:
             LinkError: The shard refuses, with its reason.
@@ -125,24 +127,24 @@ class Connection:
         if kind_of_answer == Kind.REFUSED:
             raise LinkError(text.decode("utf-8", "replace"))
         if kind_of_answer != Kind.OPENED:
-            raise ProtocolError(f"a frame of kind {kind_of_answer} came in place of a greeting")
+            raise ProtocolError(f"a frame of kind {kind_of_answer} came instead of a greeting")
         if kind == Kind.OPEN and text != self.shard.encode():
             raise LinkError(f"shard {text!r} answers at the socket of {self.shard}")
 
     def fileno(self) -> int:
-        """Return the descriptor that becomes readable when something has come."""
+        """Return the descriptor that becomes readable when data have arrived."""
         return self.socket.fileno()
 
     def take_notices(self, *, wait: bool = False) -> list[Notice | Skipped]:
-        """Return what a shard has sent whole since `WATCH`; empty if that is nothing yet.
+        """Return the complete notices sent since `WATCH`; empty if there are none yet.
 
         Args:
-            wait: Whether to wait until something has come; it may be a part of a notice only.
+            wait: Whether to wait for some data, which may be only a part of a notice.
 
         Raises:
             EOFError: As `receive`.
             OSError: As `receive`.
-            ProtocolError: What came is no notice.
+            ProtocolError: The data are no notice.
         """
         found: list[Notice | Skipped] = []
         frame = self._stream.receive_here(wait=wait)
@@ -156,7 +158,7 @@ class Connection:
             return Skipped(self.shard, *read_skipped(header))
         notice = decode_frame(header, payload) if kind == Kind.MESSAGE else None
         if not isinstance(notice, Notice):
-            raise ProtocolError(f"{type(notice).__name__} came in place of a notice")
+            raise ProtocolError(f"{type(notice).__name__} came instead of a notice")
         return notice
 
     def wake(self) -> None:
@@ -173,13 +175,13 @@ class SocketLine:
     Args:
         shard: The shard's name.
         name: Name of its shared folder, from its WELCOME.
-        nonce: What has to stand in there.
-        greeting: For whom the connections speak, from `socket_frames.greeting_of`.
+        nonce: Required content of its nonce file.
+        greeting: Identifies the connections' session, from `socket_frames.greeting_of`.
         away: Whether the shard is known to be out of reach.
 
     Attributes:
         name: As given.
-        problem: Why the last attempt to connect failed; empty while all is well.
+        problem: Why the last attempt to connect failed; empty without a failure.
     """
 
     def __init__(
@@ -197,7 +199,7 @@ class SocketLine:
         self._greeting = greeting
         self._away = away
         self._idle: list[Connection] = []
-        # Weak: Ctrl-C may come between any two steps of who holds one, and takes it out of use.
+        # Weak: Ctrl-C may hit the holder between any two steps, which abandons the connection.
         self._open: weakref.WeakSet[Connection] = weakref.WeakSet()
         self._mutex = threading.Lock()
         self._retry_at_s = 0.0
@@ -205,30 +207,30 @@ class SocketLine:
         self._closed = False
 
     def take(self) -> Connection | None:
-        """Return a connection for one call; None while there is none to be had."""
+        """Return a connection for one call; None if none is available."""
         try:
             return self._idle.pop()
         except IndexError:
             return self.connect()
 
     def give_back(self, connection: Connection) -> None:
-        """Keep a connection whose call was answered for the next one."""
+        """Keep the connection of an answered call for the next one."""
         kept = len(self._idle) < IDLE_MAX
         if kept:
             self._idle.append(connection)
-        if self._closed:  # perhaps just now, by another thread
+        if self._closed:  # perhaps just closed by another thread
             self.lost(connection)
         elif not kept:
             self.drop(connection)
 
     def drop(self, connection: Connection) -> None:
-        """Throw a connection away: its answer did not come, or made no sense."""
+        """Close a connection whose answer was late or invalid."""
         with self._mutex:
             self._open.discard(connection)
         connection.socket.close()
 
     def lost(self, connection: Connection) -> None:
-        """Note that a connection has broken: the others are doubtful, too."""
+        """Note that a connection has broken: the others are suspect, too."""
         self.drop(connection)
         with self._mutex:
             idle, self._idle = self._idle, []
@@ -236,7 +238,7 @@ class SocketLine:
             self.drop(other)
 
     def connect(self) -> Connection | None:
-        """Open one more connection; None where that fails, or is not yet to be tried again."""
+        """Open one more connection; None if that fails, or if it is too early for a retry."""
         if not self._may_connect():
             return None
         try:
@@ -249,13 +251,13 @@ class SocketLine:
             with self._mutex:
                 self._retry_at_s = time.monotonic() + (AWAY_S if away else self._retry_s)
                 self._retry_s = min(2 * self._retry_s, RETRY_S_MAX)
-            if self.problem != before:  # not at each further attempt
+            if self.problem != before:  # not at every further attempt
                 _log.debug("no socket to shard %s: %s", self.shard, self.problem)
             return None
         self.problem, self._retry_s = "", RETRY_S_MIN
         with self._mutex:
             self._open.add(connection)
-        if self._closed:  # meanwhile, by another thread
+        if self._closed:  # closed meanwhile by another thread
             self.drop(connection)
             return None
         return connection
@@ -283,17 +285,17 @@ class SocketLine:
         return connection
 
     def try_again(self) -> None:
-        """Forget the pause after a failure: the shard is there, as it or Zenoh has just said."""
+        """End the pause after a failure: the shard or Zenoh has just shown that it is there."""
         self._retry_at_s = 0.0
 
     def abandon(self) -> None:
-        """Close what a forked child has inherited, without a word to the shard."""
+        """Close the connections that a forked child has inherited; sends the shard nothing."""
         self._closed = True
         for connection in (*self._open,):
             connection.socket.close()
 
     def close(self) -> None:
-        """End all connections; calls under way return without an answer."""
+        """End all connections; pending calls return without an answer."""
         with self._mutex:
             self._closed = True
             idle, self._idle = self._idle, []

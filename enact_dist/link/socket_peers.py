@@ -1,8 +1,8 @@
-"""Who is at the other end of a Unix socket, and whether it still lives: the kernel's word.
+"""Identifies the process at the other end of a Unix socket, and its death, via the kernel.
 
-That a connection has ended proves nothing about a process: it may have closed its descriptors, and
-a forked child may keep them open.  A descriptor of the *process* (pidfd) proves its death, and
-only that.  Where the kernel gives none, nobody is ever said to be dead.
+The end of a connection proves nothing about a process: it may have closed its descriptors, or a
+forked child may keep them open.  Only a descriptor of the *process* (pidfd) proves its death.  If
+the kernel provides none, no process is reported dead.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from enact_dist.errors import LinkError
 
 _CREDENTIALS: Final = struct.Struct("iII")
 _SO_PEERGROUPS: Final = 59
-_SO_PEERPIDFD: Final = 77  # Linux 6.5; also tells of processes in other containers
+_SO_PEERPIDFD: Final = 77  # Linux 6.5; also works across containers
 GROUPS_MAX: Final = 1024
 LINGER_S: Final = 5.0
 """A process closes its connections a moment before the kernel reports its end."""
@@ -33,7 +33,7 @@ _log = logging.getLogger("enact.link")
 
 
 class Peer(NamedTuple):
-    """The process that connected, as the kernel noted it then (-1 or 0: not to be seen here)."""
+    """The process that connected, as the kernel recorded it then (-1 or 0: not visible here)."""
 
     pid: int
     user: int
@@ -41,17 +41,17 @@ class Peer(NamedTuple):
 
 
 def peer_of(connected: socket.socket) -> Peer:
-    """Return who is at the other end."""
+    """Return the process at the other end."""
     size = _CREDENTIALS.size
     raw = connected.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, size)
     return Peer(*_CREDENTIALS.unpack(raw))
 
 
 def check_peer(connected: socket.socket, *, users: frozenset[int], group: int | None) -> Peer:
-    """Return who is at the other end if it is one of `users` or in `group`.
+    """Return the process at the other end if its user is in `users` or its group is `group`.
 
     Raises:
-        LinkError: It is a stranger; the message names it.
+        LinkError: It belongs to another user; the message names it.
     """
     peer = peer_of(connected)
     if peer.user in users or (group is not None and group in _groups_of(connected, peer)):
@@ -60,8 +60,8 @@ def check_peer(connected: socket.socket, *, users: frozenset[int], group: int | 
     if group is not None:
         allowed += f" or group {group}"
     raise LinkError(
-        f"process {peer.pid} of user {peer.user} and group {peer.group} is at the other end of a"
-        f" socket for {allowed}; run both as the same user, or share a folder of one group"
+        f"process {peer.pid} of user {peer.user} and group {peer.group} connected to a socket for"
+        f" {allowed}; run both processes as the same user, or share a folder of one group"
     )
 
 
@@ -74,7 +74,7 @@ def _groups_of(connected: socket.socket, peer: Peer) -> frozenset[int]:
 
 
 def process_of(connected: socket.socket) -> int | None:
-    """Return a descriptor of the process at the other end, or None where the kernel has none."""
+    """Return a descriptor of the process at the other end, or None if the kernel has none."""
     try:
         raw = connected.getsockopt(socket.SOL_SOCKET, _SO_PEERPIDFD, 4)
         return int(struct.unpack("i", raw)[0])
@@ -85,13 +85,13 @@ def process_of(connected: socket.socket) -> int | None:
         return None
     try:
         return os.pidfd_open(pid)
-    except OSError:  # of another container, or gone before we looked: then its lease ends it
+    except OSError:  # in another container, or gone already: then the lease ends its session
         return None
 
 
 @dataclass(slots=True)
 class _Watched:
-    """One session: its process, its connections, and until when it is watched without any.
+    """One session: its process, its connections, and how long to watch it without any.
 
     The kernel may have had no descriptor of the process (-1) when it connected; the next
     connection asks again.
@@ -133,7 +133,7 @@ class Deaths:
                 return
             try:
                 self._poll.register(process, select.EPOLLIN)
-            except OSError as error:  # the kernel watches no more: its lease ends it
+            except OSError as error:  # the kernel cannot watch more: the lease ends the session
                 os.close(process)
                 _log.warning("the process of session %s is not watched: %s", session[:8], error)
                 return
@@ -141,7 +141,7 @@ class Deaths:
             self._session_of[process] = session
 
     def disconnected(self, session: str, connection: socket.socket) -> None:
-        """Note that a connection has ended; after the last one it is watched a little longer."""
+        """Note that a connection has ended; the process stays watched a little longer."""
         with self._mutex:
             watched = self._watched.get(session)
             if watched is None:
@@ -175,7 +175,7 @@ class Deaths:
             os.eventfd_read(self._bell)
 
     def _sweep(self) -> float:
-        """Forget the processes that have left; return how long to wait, in s (-1: for ever)."""
+        """Drop processes without connections; return how long to wait, in s (-1: forever)."""
         with self._mutex:
             now_s = time.monotonic()
             ends = {s: w.until_s for s, w in self._watched.items() if not w.connections}
@@ -192,7 +192,7 @@ class Deaths:
             os.close(watched.process)
 
     def close(self) -> None:
-        """Watch nobody any more; twice is harmless."""
+        """Stop watching; idempotent."""
         with self._mutex:
             if self._closed:
                 return

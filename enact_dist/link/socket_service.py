@@ -1,9 +1,9 @@
 """Serves one `ShardHost` to the processes of its own host, over a Unix socket.
 
-A client that does not read blocks its own connection and nothing else: see `SocketConnection` for
-requests and answers, `SocketWatcher` for notices.
+A client that does not read blocks only its own connection: see `SocketConnection` for requests and
+answers, `SocketWatcher` for notices.
 
-The kernel tells who connects, and when that process has ended: then its session is ended at once.
+The kernel reports who connects and when that process ends: its session then ends at once.
 """
 
 from __future__ import annotations
@@ -34,29 +34,29 @@ if TYPE_CHECKING:
 
 SOCKET_NAME: Final = "socket"
 CONNECTIONS_MAX: Final = 1024
-"""Connections of one shard: each costs a thread and 0.1 MB."""
+"""Connections to one shard: each costs a thread and 0.1 MB."""
 SESSION_CONNECTIONS_MAX: Final = 128
 """Connections of one session: one per thread that calls at the same time, and one per feed."""
 PROCESS_CONNECTIONS_MAX: Final = 128
-"""Connections of one process that it may have in any case; more only while many are free."""
+"""Connections that each process may always have; more only while many are free."""
 KEPT_FREE: Final = 512
-"""So many connections are for processes with less than that, whatever the others open."""
+"""Connections reserved for processes that have fewer than that."""
 BACKLOG: Final = 256
 DRAIN_ROUNDS: Final = 20
 DRAIN_STEP_S: Final = 0.001
-"""How often and how long a tick waits for requests that have arrived to be handed in."""
+"""How often and how long a tick waits for arrived requests to be submitted."""
 JOIN_S: Final = 0.5
-"""How long a closing service waits for whoever accepts, and then for all connections together."""
+"""How long closing waits for the accepting thread, and then for all connections together."""
 
 _log = logging.getLogger("enact.link")
 
 
 class SocketService:
-    """One shard's face on one Unix socket in its shared folder.
+    """Serves one shard on a Unix socket in its shared folder.
 
     Args:
         host: The shard.
-        folder: Where the socket is made; closed by whoever made it.
+        folder: Contains the socket; its owner closes it.
 
     Raises:
         LinkError: The socket cannot be made.
@@ -90,26 +90,27 @@ class SocketService:
                 if self._closing.is_set():
                     return
                 self.host.count("connections_refused")
-                _log.warning("a connection could not be taken: %s", error)
+                _log.warning("could not accept a connection: %s", error)
                 self._closing.wait(0.05)
                 continue
             connection = SocketConnection(self, connected)
             try:
                 threading.Thread(target=connection.run, name="enact-socket", daemon=True).start()
-            except RuntimeError:  # no more threads
+            except RuntimeError:  # no thread available
                 self.host.count("connections_refused")
                 connected.close()
 
     def admit(self, connection: SocketConnection, session: str) -> None:
-        """Let a connection speak for a session.
+        """Admit a connection for a session.
 
         Raises:
-            LinkError: It comes from a stranger, or there are too many, or the session is another's.
+            LinkError: It is from another user, the session belongs to another process, or there are
+                too many.
         """
         peer = check_peer(connection.connected, users=self._users, group=self._access.group)
         connection.peer = peer
         owner, asker = self.host.owner_of(session), connection.identity
-        if owner and owner != asker:  # the end of this process would end that session
+        if owner and owner != asker:  # else the end of this process would end that session
             raise LinkError(not_yours(session, owner, asker).text)
         with self._mutex:
             mine = self._connections.get(session, set())
@@ -124,20 +125,20 @@ class SocketService:
             self.host.count("quota_refused")
             problem = (
                 f"process {peer.pid} has {PROCESS_CONNECTIONS_MAX} connections or more to shard"
-                f" {self.host.name} open, and the last {KEPT_FREE} are for others"
+                f" {self.host.name} open, and the last {KEPT_FREE} are reserved for others"
             )
         if problem:
             raise LinkError(problem)
         self._deaths.connected(session, connection.connected)
 
     def _problem_with(self, session: str, mine: set[SocketConnection], peer: Peer) -> str:
-        """Return why a process may not have one more connection for a session; "" if it may."""
+        """Return why a process may not open another connection for a session; "" if it may."""
         other = next((one.peer for one in mine if one.peer != peer), None)
         if other is not None:
-            # One session is one process; it would not know what the other one does in its name.
+            # One session is one process; it would not know what another one does in its name.
             return (
                 f"session {session[:8]} belongs to process {other.pid} of user {other.user};"
-                f" process {peer.pid} of user {peer.user} may not speak for it"
+                f" process {peer.pid} of user {peer.user} may not use it"
             )
         if len(mine) >= SESSION_CONNECTIONS_MAX:
             return f"session {session[:8]} has {SESSION_CONNECTIONS_MAX} connections open"
@@ -146,17 +147,17 @@ class SocketService:
         return ""
 
     def is_of_another_process(self, session: str, peer: Peer) -> bool:
-        """Whether a session has connections of another process than this."""
+        """Whether a session has connections from a process other than this one."""
         with self._mutex:
             return any(one.peer != peer for one in self._connections.get(session, ()))
 
     def _has_its_share(self, peer: Peer) -> bool:
-        """Whether a process has to leave the connections that are free to others."""
+        """Whether a process must leave the free connections to others."""
         free = CONNECTIONS_MAX - self._count
         return self._processes[peer] >= PROCESS_CONNECTIONS_MAX and free <= KEPT_FREE
 
     def left(self, connection: SocketConnection, session: str) -> None:
-        """Take note that an admitted connection has ended."""
+        """Record the end of an admitted connection."""
         with self._mutex:
             mine = self._connections.get(session, set())
             mine.discard(connection)
@@ -172,11 +173,11 @@ class SocketService:
         self.host.event(SessionDied(session))
         with self._mutex:
             left = list(self._connections.get(session, ()))
-        for connection in left:  # a forked child may hold them open
+        for connection in left:  # forked children may hold them open
             connection.end()
 
     def drain_inbox(self) -> None:
-        """Wait a moment for requests that have arrived but that the host has not; before a tick."""
+        """Before a tick, wait briefly until arrived requests have been submitted to the host."""
         with self._mutex:
             steps = {c: c.step for mine in self._connections.values() for c in mine}
         waiting = {c.connected.fileno(): c for c, step in steps.items() if step % 3 == 0}
@@ -203,12 +204,12 @@ class SocketService:
             self._watchers = (*self._watchers, watcher)
 
     def unwatch(self, watcher: SocketWatcher) -> None:
-        """Send it no more."""
+        """Stop sending notices to `watcher`."""
         with self._mutex:
             self._watchers = tuple(other for other in self._watchers if other is not watcher)
 
     def _publish(self, notice: Notice) -> None:
-        """Send a notice to all watchers without waiting for any.  The host's mutex is held."""
+        """Send a notice to all watchers without blocking.  The host's mutex is held."""
         watchers = self._watchers
         if watchers:
             header, payload = encode_frame(notice)
@@ -223,7 +224,7 @@ class SocketService:
     # ---------------------------------------------------------------- end
 
     def close(self) -> None:
-        """Take and send nothing more; twice is harmless."""
+        """Stop serving; idempotent."""
         if self._closing.is_set():
             return
         self._closing.set()
@@ -245,12 +246,12 @@ def _listen(folder: SharedFolder) -> socket.socket:
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
         listener.bind(folder.address(SOCKET_NAME))
-        # Nobody gets to it before its mode is right: the folder lets no stranger in either.
+        # Nobody reaches it before its mode is set: the folder keeps other users out, too.
         Path(folder.address(SOCKET_NAME)).chmod(folder.access.socket_mode)
         listener.listen(BACKLOG)
     except OSError as error:
         listener.close()
         raise LinkError(
-            f"no socket can be made in {folder.path}: {error.strerror or error}"
+            f"cannot make a socket in {folder.path}: {error.strerror or error}"
         ) from None
     return listener

@@ -1,10 +1,10 @@
-"""A connection that gets notices: sent at once while it reads, kept for it while not.
+"""A connection that receives notices; they are queued while the watcher does not read.
 
-What it does not read is kept up to `NOTICES_MAX`, and then notices are dropped and counted: a
-watcher sees the gap in their numbers.
+The queue holds up to `NOTICES_MAX` notices; further ones are dropped and counted, and the watcher
+sees the gap in their numbers.
 
-Notices of what it does not watch are not sent: each would wake a process for nothing.  Of a run of
-them it gets the numbers, before the next notice, or when the run is `SKIP_S` old.
+Notices that it does not watch are not sent, since each would wake a process for nothing.  It gets
+only their numbers, before the next notice or once they are `SKIP_S` old.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ if TYPE_CHECKING:
     from enact_dist.link.socket_service import SocketService
 
 NOTICES_MAX: Final = 65_536
-"""Notices kept for a watcher that does not read."""
+"""Notices queued for a watcher that does not read."""
 SKIP_S: Final = 0.25
-"""After so long the numbers of skipped notices are sent by themselves."""
+"""After this time the numbers of skipped notices are sent on their own."""
 
 
 class SocketWatcher:
-    """One watching connection; its own thread is in `run`, whoever publishes is in `put`."""
+    """One watching connection; its own thread calls `run`, publishing threads call `put`."""
 
     __slots__ = (
         "_bell", "_connected", "_interest", "_mutex", "_service", "_skipped", "_skipped_s",
@@ -48,12 +48,12 @@ class SocketWatcher:
         self._skipped_s = 0.0
         self._connected = connected
         self._mutex = threading.Lock()
-        # The first that it is sent, whatever is committed at this moment.
+        # The first frame sent, even if a commit is published at this moment.
         self._waiting = deque([memoryview(prefixed(b"", 0, Kind.OPENED))])
         self._bell = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
 
     def put(self, notice: Notice, frame: bytes) -> None:
-        """Send the frame of a notice, if it is watched; for one thread at a time."""
+        """Send the frame of a notice, if it is watched; by one thread at a time."""
         kept = True
         with self._mutex:
             if self._interest is None or self._interest.covers(notice):
@@ -68,7 +68,7 @@ class SocketWatcher:
         self._count(kept=kept)
 
     def tell_skipped(self) -> None:
-        """Send the numbers of what was skipped a while ago."""
+        """Send the numbers of notices skipped a while ago."""
         if self._skipped is None or time.monotonic() - self._skipped_s < SKIP_S:
             return
         with self._mutex:
@@ -76,7 +76,7 @@ class SocketWatcher:
         self._count(kept=kept)
 
     def _count(self, *, kept: bool) -> None:
-        """Count what was dropped; without the mutex, which others take inside the host's."""
+        """Count dropped notices; without the mutex, which others take inside the host's."""
         if not kept:
             self._service.host.count("notices_dropped")
 
@@ -85,7 +85,7 @@ class SocketWatcher:
         return skipped_frame(*skipped[1:]) if skipped is not None else b""
 
     def _send(self, frame: bytes) -> bool:
-        """Send a frame, or as much as goes without waiting, or keep it; False: it is dropped."""
+        """Send a frame, as far as possible without blocking, or queue it; False: dropped."""
         if self._bell < 0:
             return True
         if self._waiting:
@@ -97,16 +97,16 @@ class SocketWatcher:
             sent = self._connected.send(frame, socket.MSG_DONTWAIT)
         except BlockingIOError:
             sent = 0
-        except OSError:  # its thread notices, too
+        except OSError:  # its own thread notices this, too
             return True
         if sent < len(frame):
-            # Before the bell, at which its thread looks what there is to send, and then waits.
+            # Before the bell, which makes the thread look for frames to send and then wait.
             self._waiting.append(memoryview(frame)[sent:])
             os.eventfd_write(self._bell, 1)
         return True
 
     def run(self) -> None:
-        """Send what was kept, until the connection ends."""
+        """Send the queued frames, until the connection ends."""
         poll = select.poll()
         poll.register(self._bell, select.POLLIN)
         poll.register(self._connected, select.POLLIN)
@@ -120,7 +120,7 @@ class SocketWatcher:
                     if descriptor == self._bell:
                         os.eventfd_read(self._bell)
                     elif event & ~select.POLLOUT:
-                        return  # it has nothing to say: it has ended
+                        return  # a watcher sends nothing: it has ended
                     else:
                         self._flush()
         finally:

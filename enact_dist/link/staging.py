@@ -1,12 +1,12 @@
-"""Large data on their way to a shard: in slices ahead of the commit, which then only names them.
+"""Stages large data at a shard in slices, ahead of the commit, which then only names them.
 
-A commit over a network is a short message whatever it writes, so the urgent ones of this process,
-and those of others, never wait behind it.  Slices go through one window (`Transfer`), to all
-shards of the commit at once; each is told its place, so that it may come twice, late, or out of
-order, and a transfer goes on where a network was cut.
+A commit over a network is therefore always a short message, and urgent commits of this process and
+others never wait behind data.  Slices go to all shards of the commit through one window
+(`Transfer`).  Each slice carries its position, so slices may arrive twice, late or out of order,
+and a transfer resumes after a network cut.
 
-What was staged ends with its session at the shard, or when the shard is told to drop it.  A shard
-that has lost it all the same says so (`no_payload`), and it is brought once more.
+Staged data end with their session at the shard, or when the shard is asked to drop them.  A shard
+that has lost them nevertheless answers `no_payload`, and they are sent again.
 """
 
 from __future__ import annotations
@@ -38,8 +38,9 @@ if TYPE_CHECKING:
     from enact_dist.link.session_client import SessionClient
 
 INLINE_BYTES_MAX: Final = 1 << 20
-"""Data that have no more than this together travel with their commit: one slice costs as much.
-What is beyond goes ahead of it, the largest first."""
+"""Data up to this total size go with their commit, since one slice costs as much.  Beyond it, data
+are staged, the largest first.
+"""
 _NOTHING: Final = Datum(b"", b"", 0)
 
 _log = logging.getLogger("enact.link")
@@ -50,18 +51,18 @@ def stage(
     writes: Mapping[str, Sequence[WriteItem]],
     alive: Callable[[], None],
 ) -> Mapping[str, Sequence[WriteItem]]:
-    """Bring the large data of these writes to their shards; return writes that name them.
+    """Stage the large data of these writes at their shards; return writes that name them.
 
     Args:
         client: The session that will commit them.
-        writes: By shard; data that name a payload already are left as they are.
-        alive: Raises once the lock that they are for is lost.
+        writes: By shard; data that already name a payload stay unchanged.
+        alive: Raises once the lock for these writes is lost.
 
     Raises:
-        LeaseLostError: A shard has restarted, so that the lock is lost.
-        NoRoomError: A shard has no room for them; the text says how much it has and what to do.
+        LeaseLostError: A shard has restarted, which ends the lock.
+        NoRoomError: A shard has no room for them; the message states its limit and what to do.
         ShardUnreachableError: A shard does not answer.
-        EnactError: What `alive` raises.
+        EnactError: Whatever `alive` raises.
     """
     named = {shard: _named(client, each) for shard, each in writes.items()}
     by_shard = {
@@ -73,7 +74,7 @@ def stage(
         try:
             Transfer(client, alive).run(in_turn(by_shard))
         except ShardUnreachableError:
-            raise  # nobody is there to be told
+            raise  # no shard to notify
         except BaseException:
             drop_staged(client, named)
             raise
@@ -81,7 +82,7 @@ def stage(
 
 
 def _named(client: SessionClient, writes: Sequence[WriteItem]) -> Sequence[WriteItem]:
-    """Give each large datum of one shard's writes a name; return `writes` where none travels so."""
+    """Name each large datum of one shard's writes; return `writes` if nothing is staged."""
     inline = [(n, w.datum) for n, w in enumerate(writes) if w.datum and not w.datum.file]
     left = sum(datum.size for _, datum in inline)
     if left <= INLINE_BYTES_MAX or client.carrier.inside:
@@ -98,7 +99,7 @@ def _named(client: SessionClient, writes: Sequence[WriteItem]) -> Sequence[Write
 
 
 def drop_staged(client: SessionClient, writes: Mapping[str, Sequence[WriteItem]]) -> None:
-    """Tell the shards that what was staged for these writes will not be committed."""
+    """Tell the shards that the data staged for these writes will not be committed."""
     drops = [
         (shard, Stage(client.core.session, write.datum.file, 0, 0, _NOTHING))
         for shard, each in writes.items()
@@ -108,8 +109,8 @@ def drop_staged(client: SessionClient, writes: Mapping[str, Sequence[WriteItem]]
     if drops:
         try:
             client.carrier.request_all(drops, timeout_s=CALL_S)
-        except EnactError as error:  # the shard finds out by itself
-            _log.info("staged data were not given up by message: %s", error)
+        except EnactError as error:  # the shard notices by itself
+            _log.info("could not tell a shard to drop staged data: %s", error)
 
 
 def _is_staged(datum: Datum) -> bool:
@@ -128,7 +129,7 @@ def _pieces(client: SessionClient, shard: str, datum: Datum) -> Iterator[Piece]:
 
 
 def _check_staged(shard: str, file: str, answer: Answer) -> None:
-    """Return if a slice has arrived, else raise what the answer stands for."""
+    """Return if the answer confirms a slice, else raise its error."""
     if isinstance(answer, Staged) and answer.file == file:
         return
     if isinstance(answer, EpochChanged):

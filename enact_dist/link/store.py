@@ -1,4 +1,4 @@
-"""The durable store of one shard: applies batches of records whole, and gives them back at start.
+"""The durable store of one shard: applies batches of records atomically, restores them at start.
 
 ::
 
@@ -10,18 +10,18 @@
       store.db-wal
       blobs/      bodies over 64 KiB, named by their rows (blobs)
 
-What it holds after any records is what `core.ledger` says; outcomes of ended sessions go after a
-day.  What `write` promises when it returns: the batch survives `kill -9`; with a durable `Persist`
-in it, a power cut too (also everything written before).  History is no less: a durable version
-stays one when it is replaced.  Rules that a change must keep:
+Its content after a series of records is defined in `core.ledger`; outcomes of ended sessions are
+deleted after a day.  When `write` returns, the batch survives `kill -9`; if a `Persist` in it is
+durable, it also survives a power cut, with everything written before.  This includes history: a
+durable version stays durable when it is replaced.  Rules that a change must keep:
 
-- Order: blob files, then the commit of the rows that name them, then the mark, then the unlinking
-  of files that no row names any more.  A file that was forced to the disk is unlinked only when
-  the batch that took its last row is there too.
-- A durable row names only files that were forced: one that was not (a fork of an `os` datum) is
-  forced first, which moves what is not on the disk yet and copies nothing.
-- After any error the store is dead: what the disk holds is unknown, and a second `fsync` may
-  claim success for what the first one lost.
+- Order: blob files, the commit of their rows, the mark, then unlinking files without rows.  A file
+  that was forced to the disk is unlinked only once the batch that removed its last row is on the
+  disk too.
+- A durable row names only forced files: an unforced one (a fork of an `os` datum) is forced first,
+  which writes what is not yet on the disk and copies nothing.
+- After any error the store is dead: the state of the disk is unknown, and a second `fsync` may
+  report success for writes that the first one lost.
 """
 
 from __future__ import annotations
@@ -68,25 +68,25 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger("enact.store")
 LOG_BYTES: Final = 8 << 20
-"""About so much is written to the log before it is carried into the database."""
+"""Approximate size of the log at which it is carried into the database."""
 FOLDER_MODE: Final = 0o700
-"""A new data folder is for nobody else; one that is there stays as its owner has made it."""
+"""A new data folder is private; an existing one keeps its owner's permissions."""
 _ROW_LOG_BYTES: Final = 8 << 10
 
 
 def open_store(folder: Path, *, unix_s: int, moving: bool = False) -> tuple[Store, Recovered]:
-    """Open the data folder of a shard, checked (see `store_recovery`), in a new, durable epoch.
+    """Open and check the data folder of a shard (see `store_recovery`), in a new durable epoch.
 
     Args:
         folder: Made if it does not exist.
         unix_s: The wall clock, seconds since 1970; the epoch is this or one more than the last.
-        moving: Whether entities may be on their way from or to the folder.
+        moving: Whether the folder may be part of an unfinished rebalance.
 
     Returns:
-        The store, and everything it holds; large bodies are read-only maps of their files.
+        The store and its content; large bodies are read-only maps of their files.
 
     Raises:
-        StoreError: The folder is in use, of another format, damaged, or cannot be written.
+        StoreError: The folder is in use, of another format, damaged, or not writable.
     """
     try:
         folder.mkdir(mode=FOLDER_MODE, parents=True, exist_ok=True)
@@ -106,10 +106,9 @@ def open_store(folder: Path, *, unix_s: int, moving: bool = False) -> tuple[Stor
 
 @contextmanager
 def read_store(folder: Path) -> Iterator[Recovered]:
-    """Show what a folder holds, checked as `open_store` does; its epoch is the stored one.
+    """Return the content of a folder, checked as in `open_store`; its epoch is the stored one.
 
-    The folder stays as it is, and locked meanwhile.  An empty one holds nothing, nor one that is
-    not there.
+    The folder is locked meanwhile and stays unchanged.  An empty or missing folder has no content.
 
     Raises:
         StoreError: As `open_store`.
@@ -131,8 +130,8 @@ def _read_locked(folder: Path) -> tuple[Database, Contents]:
     check_format(folder, is_new=found.is_new)
     check_log(folder, power_cut=found.power_cut)
     if found.is_new:
-        # Before the first byte of the log: only a mark tells a power cut from damage.  One that is
-        # there may be of a start that was killed before it was forced to the disk.
+        # Before the first byte of the log: only a mark distinguishes a power cut from damage.  An
+        # existing one may be from a start that was killed before the mark was on the disk.
         MarkFile.open(folder, 0).close()
         sync_folder(folder)
     database, contents = open_database(folder, found)
@@ -196,8 +195,8 @@ class Store:
         self._closed = False
 
     def _begin(self, contents: Contents, *, wall_ns: int) -> None:
-        """Make the new epoch durable, and leave nothing of the past in the folder."""
-        # A new generation of the log: remains of a torn one must not look like damage later.
+        """Make the new epoch durable, and remove remains of the past from the folder."""
+        # A new generation of the log: remains of a torn one must not be taken for damage later.
         self._database.checkpoint(cut=True)
         changes: dict[Key, bytes | None] = {EPOCH_KEY: epoch_body(contents.recovered.epoch)}
         for key, record in contents.lost.items():
@@ -214,16 +213,16 @@ class Store:
     # ---------------------------------------------------------------- writing
 
     def write(self, batch: Sequence[Persist]) -> None:
-        """Apply a batch whole and in order; see the module for what then survives what.
+        """Apply a batch atomically and in order; see the module for what it survives.
 
         Raises:
             StoreError: The disk is full or fails, now or earlier: nothing of the batch may be
-                acknowledged, and the store takes no more.
+                acknowledged, and the store accepts no more.
         """
         self._guarded(lambda: self._write(batch))
 
     def raise_epoch(self, epoch: int) -> None:
-        """Let every later start come after `epoch`, in which another shard had some of its data.
+        """Make every later epoch exceed `epoch`, in which another shard had some of its data.
 
         Raises:
             StoreError: As in `write`.
@@ -241,7 +240,7 @@ class Store:
         self._guarded(self._rest)
 
     def close(self) -> None:
-        """Carry the log into the database and let the folder go; twice is harmless."""
+        """Carry the log into the database and release the folder; idempotent."""
         if self._closed:
             return
         self._closed = True
@@ -255,8 +254,8 @@ class Store:
             raise StoreError(f"the store {self._folder} is closed", path=str(self._folder))
         if self._failure is not None:
             raise StoreError(
-                f"the store {self._folder} has failed before ({self._failure}) and takes nothing"
-                " more; start the shard again",
+                f"the store {self._folder} has failed before ({self._failure}) and accepts nothing"
+                " more; restart the shard",
                 path=str(self._folder),
             )
         try:
@@ -281,9 +280,9 @@ class Store:
     def _commit(self, changes: dict[Key, bytes | None], *, forced: bool) -> None:
         self._batch += 1
         if all(body is None for body in changes.values()):
-            # The newest row tells how far the store got; a batch must not only take rows away.
+            # The newest row shows how far the store got, so a batch must not only delete rows.
             changes[EPOCH_KEY] = epoch_body(self._epoch)
-        # A new row takes the place of one that goes: as many pages are written as for an update.
+        # A new row replaces a deleted one: as many pages are written as for an update.
         free = [self._ids.pop(key, 0) for key, body in changes.items() if body is None]
         free = [row_id for row_id in reversed(free) if row_id]
         rows: list[DatabaseRow] = []
@@ -308,7 +307,7 @@ class Store:
     # ---------------------------------------------------------------- between batches
 
     def _discard(self, unnamed: list[Blob], *, forced: bool) -> None:
-        """Note which files can be unlinked now, and which once the log is on the disk."""
+        """Record which files can be unlinked now, and which once the log is on the disk."""
         for blob in unnamed:
             later = blob.synced and not forced
             (self._rubbish_once_forced if later else self._rubbish).append(blob.name)

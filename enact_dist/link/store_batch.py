@@ -1,7 +1,7 @@
-"""What the records of one batch change in a store, gathered before anything is written.
+"""What the records of one batch change in a store, collected before anything is written.
 
-Records count one after the other, as in `core.ledger`; a state that is replaced within its batch
-is never written, unless it stays as history.
+Records apply in order, as in `core.ledger`; a state that is replaced within its batch is never
+written unless it stays as history.
 """
 
 from __future__ import annotations
@@ -74,12 +74,12 @@ if TYPE_CHECKING:
 
 
 class _Staged(NamedTuple):
-    """A state to be written.
+    """A state to write.
 
     Attributes:
-        record: What it is.
-        durable: Whether a power cut must not take it.
-        source: The file that has its bytes already, or the row in this batch that will name it.
+        record: The state.
+        durable: Whether it must survive a power cut.
+        source: The file that already has its bytes, or the row in this batch that will name it.
     """
 
     record: SlotRecord
@@ -91,13 +91,13 @@ class Batch:
     """The changes of one batch.
 
     Args:
-        number: The batch's.
-        states: What is stored; told of everything that this batch changes.
+        number: Number of the batch.
+        states: The stored states; updated with every change of this batch.
         outcomes: As `states`.
 
     Attributes:
-        changes: New bodies of rows, None where the row goes; whole after `settle`.
-        forced: Whether a power cut must not take the batch.
+        changes: New bodies of rows, None for a deleted row; complete after `settle`.
+        forced: Whether the batch must survive a power cut.
     """
 
     __slots__ = (
@@ -124,7 +124,7 @@ class Batch:
         self._unnamed_causes: list[Key] = []
 
     def take(self, persist: Persist) -> None:
-        """Let records count, in order."""
+        """Apply records in order."""
         durable = persist.durability is Durability.DURABLE
         self.forced |= durable
         for record in persist.records:
@@ -159,7 +159,7 @@ class Batch:
                 self._remove(versions[old.version])
             versions[old.version] = old.key
         elif old is not None:
-            # What was to be durable and is never written must not be replaced by less.
+            # If a durable state is never written, its replacement must be durable, too.
             before = self._staged.get(old.key)
             durable |= before is not None and before.durable
             self._remove(old.key)
@@ -195,7 +195,7 @@ class Batch:
             self._remove(key)
 
     def _remove(self, key: Key) -> None:
-        """Let a state's row go; what it names goes once everything else is settled."""
+        """Delete a state's row; whatever it names is deleted once everything else is settled."""
         if self._staged.pop(key, None) is not None:
             return
         self.changes[key] = None
@@ -207,7 +207,7 @@ class Batch:
             self._unnamed_causes.append(cause)
 
     def _file_of(self, key: Key | None) -> Blob | Key | None:
-        """Return the file that a row names, or the row if it is still to be written."""
+        """Return the file that a row names, or the row if that is not written yet."""
         if key is None or key in self._staged:
             return key
         return self._states.blobs.get(key)
@@ -224,7 +224,7 @@ class Batch:
         self._staged.update((key, _Staged(write, durable)) for key, write in writes.items())
 
     def _end_prepared(self, lock: LockId) -> None:
-        """Let a prepared lock go; the slots that it has set take over its files."""
+        """Delete a prepared lock; the slots that it has set take over its files."""
         self.changes[prepared_key(lock)] = None
         for key, write in self._states.prepared.pop(lock, {}).items():
             newest = self._states.newest.get(write.slot)
@@ -236,7 +236,7 @@ class Batch:
     # ---------------------------------------------------------------- everything else
 
     def _put(self, record: Record) -> None:
-        """Note what a record changes that is about one row at most."""
+        """Record the change of a record that concerns at most one row."""
         body: bytes | None
         match record:
             case SessionRecord():
@@ -274,11 +274,11 @@ class Batch:
                 self.changes[forced_key(record.lock)] = None
                 return
             case _:
-                raise TypeError(f"no record of a store: {record!r}")
+                raise TypeError(f"not a record of a store: {record!r}")
         self.changes[key] = body
 
     def _forget_ended(self, wall_ns: int) -> None:
-        """Remove the outcomes of sessions that ended long before `wall_ns`."""
+        """Delete the outcomes of sessions that ended long before `wall_ns`."""
         for key in self._outcomes.expired(wall_ns):
             self.changes[key] = None
 
@@ -289,10 +289,10 @@ class Batch:
     # ---------------------------------------------------------------- files and rows
 
     def settle(self, blobs: BlobFolder) -> list[Blob]:
-        """Write large bodies to files and note the rows that name them.
+        """Write large bodies to files and record the rows that name them.
 
         Returns:
-            The files that no row names any more once the batch is committed.
+            The files without a row once the batch is committed.
 
         Raises:
             OSError: As the system reports it.
@@ -327,7 +327,7 @@ class Batch:
         return [blob for blob in gone if blob is not None]
 
     def _shared_blob(self, staged: _Staged) -> Blob | None:
-        """Return the file that has a state's bytes already, None where there is none."""
+        """Return the file that already has a state's bytes; None: there is none."""
         source, datum = staged.source, staged.record.datum
         blob = self._states.blobs.get(source) if isinstance(source, Key) else source
         if blob is None or datum is None or blob.size != datum.size:
@@ -335,7 +335,7 @@ class Batch:
         return self._states.as_forced(blob)
 
     def _shared_cause(self, key: Key, cause: Cause, causes: dict[int, Order]) -> Order:
-        """Let a row name the row of its cause, which is written with the first that does."""
+        """Make a row name the row of its cause, which is written with the first such row."""
         order = causes.get(id(cause))
         if order is None:
             order = causes[id(cause)] = self._next()

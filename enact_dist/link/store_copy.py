@@ -1,17 +1,17 @@
-"""Backs a shard's folder up, while the shard runs too, and restores it.
+"""Backs up and restores a shard's folder, also while the shard runs.
 
-How a copy of files that change becomes one state: the database is copied first and its log after
-it.  While the log's header stays what it was, all that was carried into the database meanwhile is
-in the log as well, and replaces what was copied torn.  Else both are copied again.  Large bodies
-are files that never change; links hold all that are there just before and just after the log is
-read (`held_bodies`).  The mark is copied before all, so the copy is refused if it lacks anything
-that was acknowledged then.  A copy has its name only when every byte of it was checked and is on
-the disk, with a digest (`backup_digests`) that is made of the copy: the shard waits for none.  Who
-makes it may read it and nobody else; what is restored is for those who might read the shard's.
+The database is copied first, its log afterwards.  While the log's header stays the same, everything
+carried into the database during the copy is in the log too and replaces pages that were copied
+torn; otherwise both are copied again.  Large bodies are files that never change: links hold all
+bodies that exist just before and just after the log is read (`held_bodies`).  The mark is copied
+first, so a copy that lacks anything acknowledged by then is refused.  A copy gets its name only
+once every byte is checked and on the disk.  Its digests (`backup_digests`) are computed from the
+copy, so the shard waits for none of this.  Only the user who makes a backup may read it; a restored
+folder gets the permissions of the shard's.
 
-A shard that is restored begins with an epoch above that of its backup, of what was there before,
-and the wall clock: whoever knew a later state is told that the shard has started anew, and no lock
-or commit of before counts.
+A restored shard starts with an epoch above that of its backup, of the folder it replaces, and of
+the wall clock.  A client that knew a later state then sees that the shard has restarted, and no
+earlier lock or commit counts.
 """
 
 from __future__ import annotations
@@ -70,24 +70,24 @@ if TYPE_CHECKING:
 
 DIGESTS: Final = "digests"
 TRIES_MAX: Final = 50
-"""So often the files are copied anew because the shard has begun its log anew meanwhile."""
+"""How often the files are copied again because the shard has restarted its log meanwhile."""
 ASIDE: Final = ".replaced-"
-"""In the names of folders that were put aside, before the second in which they were."""
+"""Follows the name of a folder that was put aside; the second in which that happened follows."""
 
 
 @dataclass(frozen=True, slots=True)
 class Backup:
-    """What a backup says of itself.
+    """The description of a backup.
 
     Attributes:
         cell: Name of the cell.
         shard: Name of the shard.
-        unix_s: When it was begun, seconds since 1970: all that was acknowledged then is in it.
+        unix_s: When it began, seconds since 1970; it holds everything acknowledged by then.
         epoch: The shard's epoch then.
         entities: How many entities it has.
         states: How many states of their slots, replaced ones included.
         size: Bytes of their data.
-        digests: Whether it has digests of its files, or was made before backups had them.
+        digests: Whether it has digests of its files; backups of older releases have none.
     """
 
     cell: str
@@ -104,17 +104,17 @@ class Backup:
 
 
 def back_up(folder: Path, into: Path, *, cell: str, shard: str, unix_s: int) -> Backup:
-    """Copy the folder of a shard, whether it runs or not, to a new folder.
+    """Copy the folder of a shard, running or stopped, to a new folder.
 
     Raises:
-        StoreError: There is no data, it is damaged or in the midst of a rebalance, another backup
-            of it is under way, the copy cannot be written, or `into` is there.
+        StoreError: The folder has no data, is damaged or in the middle of a rebalance, another
+            backup of it is under way, the copy cannot be written, or `into` exists.
     """
     if not holds_store(folder):
-        raise StoreError(f"no shard has its data in {folder}", path=str(folder))
+        raise StoreError(f"{folder} holds no data of a shard", path=str(folder))
     if into.absolute().is_relative_to(folder.absolute()):
         raise StoreError(
-            f"{into} lies in the folder of the shard, {folder}; name a folder elsewhere with --to",
+            f"{into} is inside the shard's folder {folder}; name another place with --to",
             path=str(into),
         )
     refuse_moving(folder)
@@ -138,11 +138,11 @@ def back_up(folder: Path, into: Path, *, cell: str, shard: str, unix_s: int) -> 
 
 
 def _is_there(into: Path) -> StoreError:
-    return StoreError(f"{into} is there already; name a new folder", path=str(into))
+    return StoreError(f"{into} exists already; name a new folder", path=str(into))
 
 
 def _renamed(partial: Path, path: Path) -> bool:
-    """Give a folder its name, which an empty one gives up for it; False: one with data has it."""
+    """Rename a folder, replacing an empty one; return False if the target has data."""
     try:
         partial.rename(path)
     except OSError as failure:
@@ -154,7 +154,7 @@ def _renamed(partial: Path, path: Path) -> bool:
 
 
 def _modes(folder: Path, bodies: HeldBodies, files: Iterable[str]) -> dict[str, str]:
-    """Return who may read the files of a shard; bodies may be gone from its folder meanwhile."""
+    """Return the permissions of a shard's files; it may delete bodies meanwhile."""
     modes = modes_of(folder, (BLOB_FOLDER, *(name for name in files if "/" not in name)))
     for name in files:
         if "/" in name:
@@ -163,7 +163,7 @@ def _modes(folder: Path, bodies: HeldBodies, files: Iterable[str]) -> dict[str, 
 
 
 def _copied(folder: Path, bodies: HeldBodies, partial: Path) -> Recovered:
-    """Copy a state of a folder; return it, with all of its bytes checked."""
+    """Copy a state of a folder; return it, with every byte checked."""
     for _ in range(TRIES_MAX):
         if not _copy_database(folder, bodies, partial):
             continue
@@ -181,14 +181,14 @@ def _copied(folder: Path, bodies: HeldBodies, partial: Path) -> Recovered:
             _check_bodies(contents.recovered)
         return contents.recovered
     raise StoreError(
-        f"{folder} changed so fast that no copy of it came to its end in {TRIES_MAX} tries; back it"
-        " up while less is written, or stopped",
+        f"{folder} changed too fast for a consistent copy in {TRIES_MAX} tries; back it"
+        " up while less is written, or while the shard is stopped",
         path=str(folder),
     )
 
 
 def _copy_database(folder: Path, bodies: HeldBodies, partial: Path) -> bool:
-    """Copy rows and log; False if the log was begun anew meanwhile, so that they do not fit."""
+    """Copy rows and log; return False if the shard restarted its log, so that they do not match."""
     for name in (FORMAT_FILE, MARK_FILE):
         copy_private(folder / name, partial / name)
     log, copy = folder / LOG_FILE, partial / LOG_FILE
@@ -202,7 +202,7 @@ def _copy_database(folder: Path, bodies: HeldBodies, partial: Path) -> bool:
     if _header(log) != header:
         return False
     if header:
-        # Behind its end the copy may have frames that were half written as they were read.
+        # Frames behind its end may have been half written when they were read.
         os.truncate(copy, check_wal(copy).end)
     return True
 
@@ -216,10 +216,10 @@ def _header(log: Path) -> bytes:
 
 
 def _check_bodies(stored: Recovered) -> None:
-    """Read all bytes that nobody has read yet.
+    """Read all bytes that nothing has checked yet.
 
     Raises:
-        StoreError: Some are not as they were written.
+        StoreError: Some differ from what was written.
     """
     for record in (*stored.history, *stored.slots):
         fault = record.datum.fault if record.datum is not None else None
@@ -248,12 +248,12 @@ def _sync(folder: Path) -> None:
 
 
 class Contents(NamedTuple):
-    """What a backup says of itself, and of its files.
+    """The contents of a backup's description.
 
     Attributes:
-        backup: Of itself.
-        files: Their digests; None: it was made before there were any.
-        modes: Who may read them where they are restored; empty: it was made before it said so.
+        backup: The backup itself.
+        files: Digests of its files; None: it is from before backups had digests.
+        modes: Permissions of the restored files; empty: it is from before backups recorded them.
     """
 
     backup: Backup
@@ -262,10 +262,10 @@ class Contents(NamedTuple):
 
 
 def read_backup(path: Path) -> Contents:
-    """Return what a backup says of itself and of its files.
+    """Return the description of a backup and of its files.
 
     Raises:
-        StoreError: It is none, or that is not what it was.
+        StoreError: This is no backup, or its description has changed.
     """
     told, files = read_sealed(path)
     try:
@@ -276,7 +276,7 @@ def read_backup(path: Path) -> Contents:
     except (TypeError, ValueError, AttributeError) as failure:
         raise StoreError(
             f"{path} is no backup of a shard, or its {BACKUP_FILE} is damaged ({failure}); copy the"
-            " backup again from where it is whole, or take another one",
+            " backup again from an intact source, or use another one",
             path=str(path),
         ) from failure
 
@@ -284,25 +284,25 @@ def read_backup(path: Path) -> Contents:
 def restore(
     source: Path, folder: Path, *, cell: str, shard: str, unix_s: int, replace: bool = False
 ) -> tuple[Backup, Path | None]:
-    """Make the folder of a stopped shard what a backup has, every byte of it compared before.
+    """Replace the folder of a stopped shard with a backup, after comparing every byte of it.
 
-    A backup that was made before there were digests has to do with the checks of a shard's start:
-    whoever has no other one would rather have it than nothing.
+    A backup from before digests existed gets only the checks of a shard's start: it may be the only
+    one.
 
     Args:
         source: The backup.
         folder: The shard's folder.
-        cell: Name of the cell; the backup must be of it.
-        shard: Name of the shard, as `cell`.
+        cell: Name of the cell; must match the backup's.
+        shard: Name of the shard; must match the backup's.
         unix_s: The wall clock, seconds since 1970.
-        replace: Whether a folder that is there goes aside; it is not removed.
+        replace: Whether to put an existing folder aside; it is never deleted.
 
     Returns:
-        The backup, and where what was there before is now.
+        The backup, and the new path of the folder that was there before.
 
     Raises:
         StoreError: The backup is of another shard, damaged or from the future; the folder is in
-            use, or is there and not to be replaced; or it cannot be written.
+            use, or exists without `replace`; or it cannot be written.
     """
     contents = read_backup(source)
     backup = contents.backup
@@ -314,7 +314,7 @@ def restore(
     if unix_s < backup.unix_s:
         raise StoreError(
             f"the clock of this host says {_time(unix_s)}, the backup is of {_time(backup.unix_s)};"
-            " the restored shard must begin later than all that clients have seen of it: set the"
+            " the restored shard must start later than anything its clients have seen: set the"
             " clock first"
         )
     try:
@@ -330,10 +330,10 @@ def restore(
 def _put(
     source: Path, contents: Contents, partial: Path, folder: Path, *, unix_s: int, replace: bool
 ) -> Path | None:
-    """Build a folder in `partial` and put it in its place; return where the one before is now."""
+    """Build a folder in `partial` and move it into place; return the path of the previous one."""
     if not folder.exists() or not any(folder.iterdir()):
         _build(source, partial, contents, unix_s=unix_s, epoch=_epoch_before(folder))
-        if not _renamed(partial, folder):  # one was begun meanwhile
+        if not _renamed(partial, folder):  # another start has made one
             raise _has_data(folder)
         return None
     if not replace:
@@ -351,14 +351,14 @@ def _put(
 
 def _has_data(folder: Path) -> StoreError:
     return StoreError(
-        f"{folder} has data; say --replace to put the backup in its place, what is there now is"
-        " kept beside it",
+        f"{folder} has data; use --replace to put the backup in its place (the present folder is"
+        " kept beside it)",
         path=str(folder),
     )
 
 
 def _build(source: Path, partial: Path, contents: Contents, *, unix_s: int, epoch: int) -> None:
-    """Make a folder of a backup, checked whole, whose next epoch is above `epoch`."""
+    """Build a folder from a backup, fully checked, whose next epoch is above `epoch`."""
     backup, files, modes = contents
     names = files if files is not None else files_of(source)
     (partial / BLOB_FOLDER).mkdir(mode=FOLDER_MODE)
@@ -371,8 +371,8 @@ def _build(source: Path, partial: Path, contents: Contents, *, unix_s: int, epoc
         found = _told(stored, cell=backup.cell, shard=backup.shard, unix_s=backup.unix_s)
     if found != dataclasses.replace(backup, digests=True):
         raise StoreError(
-            f"{source} is not what it was when it was made: {found.states} states with"
-            f" {found.size} bytes are there of {backup.states} with {backup.size}; copy it again",
+            f"{source} has changed since it was made: it has {found.states} states with"
+            f" {found.size} bytes instead of {backup.states} with {backup.size}; copy it again",
             path=str(source),
         )
     store, _ = open_store(partial, unix_s=unix_s)
@@ -383,11 +383,11 @@ def _build(source: Path, partial: Path, contents: Contents, *, unix_s: int, epoc
 
 
 def _epoch_before(folder: Path) -> int:
-    """Return the largest epoch that a folder and those that were replaced are known to have had."""
+    """Return the largest epoch known of a folder and of those it replaced."""
     epochs = [0]
     for path in (folder, *folder.parent.glob(f"{folder.name}{ASIDE}*")):
         if holds_store(path):
-            # A folder that cannot be read is a reason to restore one; then the clock has to do.
+            # An unreadable folder is a reason to restore one; then the clock must do.
             with suppress(StoreError), read_store(path) as stored:
                 epochs.append(stored.epoch)
     return max(epochs)

@@ -1,11 +1,11 @@
-"""The rows of one store in SQLite: one table, one writer, a write-ahead log forced out on demand.
+"""The rows of one store in SQLite: one table, one writer, a write-ahead log.
 
 Rules that a change must keep:
 
-- Never `synchronous=OFF`: it would let a checkpoint overwrite the database before the log is on
-  the disk.  `NORMAL` forces nothing out at a commit and everything at a checkpoint.
-- Checkpoints run only here, where their errors are seen; SQLite's automatic one hides them.
-- Locking is `EXCLUSIVE`, so the index of the log lives in memory and no other process writes.
+- Never `synchronous=OFF`: a checkpoint could then overwrite the database before the log is on the
+  disk.  `NORMAL` forces nothing at a commit and everything at a checkpoint.
+- Checkpoints run only here, where their errors are seen; SQLite's automatic ones hide them.
+- Locking is `EXCLUSIVE`, so the log's index stays in memory and no other process writes.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _CORRUPT: Final = frozenset({sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB, sqli
 
 
 class DatabaseRow(NamedTuple):
-    """One row as it is stored; `batch` is the number of the batch that wrote it."""
+    """One stored row; `batch` is the number of the batch that wrote it."""
 
     id: int
     kind: int
@@ -57,14 +57,14 @@ class Database:
 
     Raises:
         OSError: The file cannot be opened.
-        sqlite3.Error: In every method, as SQLite reports it; `is_damage` tells damage from
-            errors of the system.
+        sqlite3.Error: In every method, as SQLite reports it; `is_damage` distinguishes damage from
+            system errors.
     """
 
     __slots__ = ("_connection", "_forced")
 
     def __init__(self, path: Path) -> None:
-        # SQLite gives a new file, and the log beside it, the mode of an empty one that is there.
+        # SQLite gives the database and its log the mode of an existing empty file.
         os.close(os.open(path, os.O_RDONLY | os.O_CREAT | os.O_CLOEXEC, file_mode(path.parent)))
         self._connection = sqlite3.connect(
             path, isolation_level=None, check_same_thread=False, timeout=0.0
@@ -78,9 +78,9 @@ class Database:
             raise
 
     def problems(self, *, may_be_empty: bool) -> list[str]:
-        """Return what is wrong with the file's structure, as far as SQLite's own check goes.
+        """Return what is wrong with the file's structure, according to SQLite's own check.
 
-        SQLite also reads columns by what the file says of its table, so that must be as written.
+        SQLite reads columns by the table definition in the file, so that must be intact.
         """
         rows = self._connection.execute("PRAGMA quick_check(5)").fetchall()
         found = [str(problem) for (problem,) in rows]
@@ -92,7 +92,7 @@ class Database:
         return [f"its tables are {tables!r:.200} instead of one for records"]
 
     def make_table(self) -> None:
-        """Make the table of a database, unless a start before this one came so far."""
+        """Make the table of a database, unless an earlier start has made it."""
         if not self._connection.execute("SELECT 1 FROM sqlite_schema").fetchall():
             self._connection.execute(_TABLE)
 
@@ -104,7 +104,7 @@ class Database:
         yield from map(DatabaseRow._make, cursor)
 
     def commit(self, rows: Iterable[DatabaseRow], gone: Iterable[int], *, forced: bool) -> None:
-        """Put `rows` and remove those with an id in `gone`, all or nothing.
+        """Put `rows` and delete those with an id in `gone`, atomically.
 
         With `forced` everything committed so far is on the disk when this returns.
         """
@@ -126,10 +126,10 @@ class Database:
             raise
 
     def checkpoint(self, *, cut: bool = False) -> None:
-        """Force the log out, carry it into the database, and start it anew.
+        """Force the log to the disk, carry it into the database, and restart it.
 
-        The log keeps its length, so that later commits overwrite it (half the time of one that
-        makes the file longer); with `cut` it is emptied.
+        The log keeps its length, so that later commits overwrite it (twice as fast as one that
+        extends the file); `cut` empties it.
         """
         mode = "TRUNCATE" if cut else "RESTART"
         ((busy, _, _),) = self._connection.execute(f"PRAGMA wal_checkpoint({mode})").fetchall()
@@ -137,15 +137,15 @@ class Database:
             raise sqlite3.OperationalError("the database is read or locked by another process")
 
     def close(self) -> None:
-        """Carry the log into the database and close; an error leaves the log as it is."""
+        """Carry the log into the database and close; an error leaves the log unchanged."""
         with contextlib.suppress(sqlite3.Error):
             self._connection.close()
 
 
 def is_damage(failure: BaseException) -> bool:
-    """Whether SQLite says that the file itself is wrong, not the system below it."""
+    """Whether SQLite reports damage of the file itself, not a system error below it."""
     if isinstance(failure, UnicodeDecodeError):
-        # It quotes what it cannot read, and the quotation is no text.
+        # SQLite quotes what it cannot read, and the quotation may not be text.
         return True
     code = getattr(failure, "sqlite_errorcode", None)
     return isinstance(failure, sqlite3.DatabaseError) and (code or 0) & 0xFF in _CORRUPT

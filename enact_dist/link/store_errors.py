@@ -1,4 +1,4 @@
-"""What an operator reads when the system below a store fails."""
+"""The messages that an operator reads when the system below a store fails."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _DENIED_ERRNOS: Final = frozenset({errno.EACCES, errno.EPERM, errno.EROFS, errno
 
 
 def store_error(folder: Path, failure: OSError | sqlite3.Error) -> StoreError:
-    """Return what an operator must read about an error of the system."""
+    """Return the error that tells an operator about a system error."""
     if (file := _file_in(folder)) is not None:
         return StoreError(
             f"{file} is a file, not a folder, so a shard cannot keep its data in {folder}; name"
@@ -30,27 +30,26 @@ def store_error(folder: Path, failure: OSError | sqlite3.Error) -> StoreError:
         found = f"no room for the data of {folder}: {_free_bytes(folder)} bytes are free there"
         remedy = "free space on its disk, or raise its quota"
     elif number == errno.ENOMEM:
-        found = f"the system gives no room for all large data of {folder} to be mapped"
-        remedy = "raise vm.max_map_count (sysctl), or let fewer versions stay"
+        found = f"the system cannot map all large data of {folder}"
+        remedy = "raise vm.max_map_count (sysctl), or retain fewer versions"
     elif code in {sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED}:
         found = f"the database in {folder} is open in another program"
-        remedy = "close that one (a database browser, a backup)"
+        remedy = "close that program (a database browser, a backup)"
     elif number in _DENIED_ERRNOS or code in {sqlite3.SQLITE_READONLY, sqlite3.SQLITE_CANTOPEN}:
         found = f"{folder} cannot be written by this process"
         remedy = "let the folder and all in it belong to the user that runs the shard"
     else:
         found = f"the disk or file system below {folder} fails"
-        remedy = "look at the system's log, make it sound"
+        remedy = "check the system's log and repair it"
     return StoreError(
-        f"{found} ({failure}): {remedy}, and start the shard again; everything acknowledged before"
-        " is kept",
+        f"{found} ({failure}): {remedy}, and start the shard again; all acknowledged data are kept",
         path=path,
     )
 
 
 def backup_error(folder: Path, into: Path, failure: OSError) -> StoreError:
-    """Return what an operator must read about an error of the system during a backup."""
-    remedy = "name another place with --to, which this user may write and which has room"
+    """Return the error that tells an operator about a system error during a backup."""
+    remedy = "name another place with --to that has room and is writable for this user"
     where = Path(str(getattr(failure, "filename", None) or into))
     if (file := _file_in(into.parent)) is not None:
         found = f"{file} is a file, not a folder: no backup can be written to {into}"
@@ -63,7 +62,7 @@ def backup_error(folder: Path, into: Path, failure: OSError) -> StoreError:
 
 
 def _file_in(folder: Path) -> Path | None:
-    """Return the file that stands where a folder, or one above it, has to be."""
+    """Return the file that takes the place of the folder or one of its parents."""
     for place in (folder, *folder.parents):
         try:
             if place.exists():

@@ -1,6 +1,6 @@
-"""What rows are made of: msgpack lists, read field by field, and the parts that many rows have.
+"""The elements of rows: msgpack lists, read field by field, and parts shared by many rows.
 
-Reading is strict: whatever is not exactly what is written here is damage, not a default.
+Reading is strict: anything other than what is written here is damage, not a default.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ T = TypeVar("T")
 
 
 class DamagedRowError(Exception):
-    """A row is not what a store writes; the message says which and how."""
+    """A row differs from what a store writes; the message says how."""
 
 
 def pack(value: object) -> bytes:
-    """Return a value as it is stored."""
+    """Return a value in its stored form."""
     packed: bytes = msgpack.packb(value, use_bin_type=True)
     return packed
 
 
 class Fields:
-    """The fields of a packed list, each asked for with its type, in order and to the end."""
+    """The fields of a packed list, each read with its type, in order and to the end."""
 
     __slots__ = ("_fields", "_next")
 
@@ -40,16 +40,16 @@ class Fields:
 
     @property
     def empty(self) -> bool:
-        """Whether there is no field at all."""
+        """Whether the list has no fields."""
         return not self._fields
 
     @property
     def at_end(self) -> bool:
-        """Whether all fields were taken."""
+        """Whether all fields were read."""
         return self._next == len(self._fields)
 
     def next(self, asked: type[T]) -> T:
-        """Take the next field, which must be of this type."""
+        """Read the next field, which must be of this type."""
         if self._next >= len(self._fields):
             raise DamagedRowError(
                 f"field {self._next + 1} of {reprlib.repr(self._fields)} is missing"
@@ -61,42 +61,42 @@ class Fields:
         return found
 
     def last(self, asked: type[T]) -> T:
-        """Take the next field, which must be the last."""
+        """Read the next field, which must be the last."""
         found = self.next(asked)
         self.end()
         return found
 
     def end(self) -> None:
-        """Make sure that nothing is left."""
+        """Ensure that no field is left."""
         if not self.at_end:
             raise DamagedRowError(f"{reprlib.repr(self._fields)} has more than {self._next} fields")
 
     def slot(self) -> Slot:
-        """Take the three fields of a slot."""
+        """Read the three fields of a slot."""
         return Slot(self.next(str), self.next(str), self.next(str))
 
     def lock(self) -> LockId:
-        """Take the three fields of a lock's identity."""
+        """Read the three fields of a lock's identity."""
         return LockId(self.next(str), self.next(int), self.next(int))
 
     def token(self) -> Token:
-        """Take a field that holds a token."""
+        """Read a field that holds a token."""
         fields = Fields(self.next(list))
         return Token(fields.next(int), fields.last(int))
 
     def versions(self) -> tuple[SlotVersion, ...]:
-        """Take a field that holds versions of slots."""
+        """Read a field that holds versions of slots."""
         entries = [Fields(entry) for entry in self.next(list)]
         return tuple(SlotVersion(entry.slot(), entry.last(int)) for entry in entries)
 
 
 def packed_versions(versions: tuple[SlotVersion, ...]) -> list[object]:
-    """Return versions of slots as they go into a row."""
+    """Return versions of slots in their stored form."""
     return [[*entry.slot, entry.version] for entry in versions]
 
 
 def packed_cause(cause: Cause) -> list[object]:
-    """Return where a version comes from as it goes into a row."""
+    """Return a version's cause in its stored form."""
     return [
         *cause.lock,
         cause.kind,
@@ -112,7 +112,7 @@ def packed_cause(cause: Cause) -> list[object]:
 
 
 def read_cause(packed: object) -> Cause:
-    """Read where a version comes from."""
+    """Read a version's cause."""
     fields = Fields(packed)
     lock, kind, actor, host = fields.lock(), fields.next(str), fields.next(str), fields.next(str)
     pid, stamp_ns, held_ns = fields.next(int), fields.next(int), fields.next(int)

@@ -1,7 +1,7 @@
-"""What a data folder says of itself before its rows are read, and how one is refused.
+"""Checks of a data folder before its rows are read, and the errors that refuse one.
 
-Refusing costs an operator minutes; serving from a damaged store costs trust in every datum.  So
-each check ends in a `StoreError` that names the file and the way out.
+A refusal costs an operator minutes; serving from a damaged store costs trust in all data.  So each
+failed check raises a `StoreError` that names the file and the remedy.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ DATABASE_FILE: Final = "store.db"
 LOG_FILE: Final = "store.db-wal"
 BLOB_FOLDER: Final = "blobs"
 ACCEPT_LOSS_FILE: Final = "accept-loss"
-"""Made by an operator, taken away by the start that it was made for."""
+"""An operator creates it; the one start that it is meant for deletes it."""
 MOVING_FILE: Final = "moving"
 REBALANCE: Final = "rebalance"
 FORGET: Final = "forget"
@@ -45,28 +45,28 @@ _log = logging.getLogger("enact.store")
 
 
 class Found(NamedTuple):
-    """What a folder says of itself before its database is opened."""
+    """The findings about a folder before its database is opened."""
 
     mark: Mark | None
     is_new: bool
     power_cut: bool
-    """Whether the system has started anew since the store was last opened."""
+    """Whether the system has rebooted since the store was last opened."""
     accepts_loss: bool = False
-    """Whether an operator says that the shard is to start though commits may be missing."""
+    """Whether an operator wants the shard to start although commits may be missing."""
 
     @property
     def is_first(self) -> bool:
-        """Whether no start before this one ever came to its end: nothing was acknowledged."""
+        """Whether no earlier start was ever completed: nothing was acknowledged."""
         return self.mark.is_first if self.mark is not None else self.is_new
 
 
 class MovingMark(NamedTuple):
-    """That entities are being moved from or to a folder, or aspects forgotten.
+    """A mark: entities are being moved from or to a folder, or aspects purged.
 
     Attributes:
-        number: Tells one run from another.
+        number: Identifies the run.
         shards: All shards whose folders take part.
-        aspects: Those that are forgotten, and from which stamp on; none where entities move.
+        aspects: The purged aspects, each with the timestamp from which on; empty for a rebalance.
     """
 
     number: str
@@ -75,24 +75,24 @@ class MovingMark(NamedTuple):
 
     @property
     def what(self) -> str:
-        """What was begun."""
+        """The operation in progress, for messages."""
         return f"forgetting {', '.join(self.aspects)}" if self.aspects else "a rebalance"
 
 
 def way_out(mark: MovingMark) -> str:
-    """Return what lets a run that was cut off come to its end."""
+    """Return the command that completes an interrupted run."""
     command = "enact shard rebalance"
     if mark.aspects:
         only = " ".join(f"--shard {name}" for name in mark.shards)
         command = f"enact shard forget {' '.join(mark.aspects)} {only} --yes"
-    return f"let `{command}` come to its end"
+    return f"let `{command}` finish"
 
 
 def moving_mark(folder: Path) -> MovingMark | None:
-    """Return the mark of a run over several folders that was begun and has not come to its end.
+    """Return the mark of an unfinished run over several folders.
 
     Raises:
-        StoreError: There is one that cannot be read.
+        StoreError: The mark cannot be read.
     """
     path = folder / MOVING_FILE
     try:
@@ -109,10 +109,10 @@ def moving_mark(folder: Path) -> MovingMark | None:
 
 
 def refuse_moving(folder: Path) -> None:
-    """Refuse a folder of which some entities may be on their way, or an aspect half forgotten.
+    """Refuse a folder in an unfinished rebalance or purge.
 
     Raises:
-        StoreError: A rebalance was begun, or a forgetting, and has not come to its end.
+        StoreError: A rebalance or a purge is unfinished.
     """
     mark = moving_mark(folder)
     if mark is not None:
@@ -124,10 +124,10 @@ def refuse_moving(folder: Path) -> None:
 
 
 def refuse_strangers(folder: Path, stored: Recovered, shard: str, placement: PlacementMap) -> None:
-    """Refuse a folder with entities that nobody would look for there.
+    """Refuse a folder with entities that no client would look for there.
 
     Raises:
-        StoreError: By the cell's placement some live on other shards.
+        StoreError: The cell's placement puts some entities on other shards.
     """
     found = strangers(stored, shard, placement)
     if found:
@@ -135,32 +135,32 @@ def refuse_strangers(folder: Path, stored: Recovered, shard: str, placement: Pla
         more = f" and {len(found) - NAMED_MAX} more" if len(found) > NAMED_MAX else ""
         refuse(
             folder,
-            f"holds entities that by the cell.toml do not live on {shard}: {named}{more}",
-            "move them with `enact shard rebalance` while the cell is stopped, or let the cell have"
-            " the shards and pins that it had",
+            f"holds entities that cell.toml places on other shards than {shard}: {named}{more}",
+            "move them with `enact shard rebalance` while the cell is stopped, or restore the"
+            " cell's previous shards and pins",
         )
 
 
 def refuse_far_stamps(folder: Path, stored: Recovered, *, wall_ns: int) -> None:
-    """Refuse a folder whose clock could not go on, and warn of one that is ahead of its host.
+    """Refuse a folder whose clock is exhausted; warn of one that is ahead of its host.
 
     Raises:
-        StoreError: A stamp lies beyond all that clocks give.
+        StoreError: A timestamp exceeds the range of the clock.
     """
     stamp_ns, holder = newest_stamp(stored)
     if stamp_ns > STAMP_NS_MAX:
         refuse(
             folder,
-            f"holds {holder} with stamp {stamp_ns}, beyond the year 2116: no later commit could be"
-            " stamped",
+            f"holds {holder} with timestamp {stamp_ns}, after the year 2116: no later commit could"
+            " get a timestamp",
             "restore a backup from before that commit with `enact shard restore … --replace`, or"
             " give the shard an empty folder and start without its data",
         )
     if stamp_ns > wall_ns + AHEAD_NS_MAX:
         _log.warning(
-            "%s holds %s with a stamp %.1f s ahead of the clock of this host: until its clock gets"
-            " there, other shards refuse commits together with this one; set the clock, or restore"
-            " a backup from before that commit",
+            "%s holds %s with a timestamp %.1f s ahead of this host's clock: until that clock"
+            " catches up, other shards refuse commits together with this one; set the clock, or"
+            " restore a backup from before that commit",
             folder,
             holder,
             (stamp_ns - wall_ns) / 1e9,
@@ -168,7 +168,7 @@ def refuse_far_stamps(folder: Path, stored: Recovered, *, wall_ns: int) -> None:
 
 
 def refuse(path: Path, found: str, remedy: str = _RESTORE) -> NoReturn:
-    """Raise the `StoreError` of a damaged file.
+    """Raise the `StoreError` about a damaged file.
 
     Raises:
         StoreError: Always.
@@ -177,10 +177,10 @@ def refuse(path: Path, found: str, remedy: str = _RESTORE) -> NoReturn:
 
 
 def look_at(folder: Path) -> Found:
-    """Find out what kind of folder this is.
+    """Inspect a folder without opening its database.
 
     Raises:
-        StoreError: Data are there and their database is not.
+        StoreError: The folder has data but no database.
         OSError: As the system reports it.
     """
     mark = read_mark(folder)
@@ -194,19 +194,19 @@ def look_at(folder: Path) -> Found:
         if has_mark or has_log or has_blobs(folder):
             refuse(database, "is missing or empty, but the folder has been in use")
     elif mark is None and not accepted:
-        # A new folder has its mark before its database, so one was there.
+        # A new folder gets its mark before its database, so a mark has existed.
         path = folder / MARK_FILE
         refuse(
             path,
-            f"{'cannot be read' if path.exists() else 'is missing'}, and without it nothing tells"
-            " whether commits that were acknowledged are missing at the end",
+            f"{'cannot be read' if path.exists() else 'is missing'}, and without it nothing shows"
+            " whether acknowledged commits are missing at the end",
             _accept(folder, "with what can be read"),
         )
     return Found(mark, is_new, mark is not None and not mark.same_boot, accepted)
 
 
 def _accept(folder: Path, what: str, first: str = "") -> str:
-    """Return how to start a shard in spite of a loss."""
+    """Return how to start a shard despite a loss."""
     return (
         f"restore the whole folder from a backup; or, to go on {what}, keep a copy of the folder,"
         f" {first}make an empty file '{folder / ACCEPT_LOSS_FILE}', and start the shard"
@@ -219,16 +219,16 @@ def holds_store(folder: Path) -> bool:
 
 
 def has_blobs(folder: Path) -> bool:
-    """Whether anything lies where large bodies do."""
+    """Whether the folder has any files of large bodies."""
     blobs = folder / BLOB_FOLDER
     return blobs.exists() and any(blobs.iterdir())
 
 
 def check_log(folder: Path, *, power_cut: bool) -> None:
-    """Refuse a log that is damaged in its middle.
+    """Refuse a log that is damaged in the middle.
 
     Raises:
-        StoreError: It is damaged, and no power cut explains it.
+        StoreError: It is damaged, and a power cut does not explain it.
         OSError: As the system reports it.
     """
     log = folder / LOG_FILE
@@ -237,7 +237,7 @@ def check_log(folder: Path, *, power_cut: bool) -> None:
         return
     if power_cut:
         _log.warning(
-            "%s: what was written from byte %d on and not forced to the disk is gone after the"
+            "%s: data from byte %d on, which had not been forced to the disk, are gone after the"
             " system's restart",
             log,
             verdict.damaged_at,
@@ -245,25 +245,25 @@ def check_log(folder: Path, *, power_cut: bool) -> None:
         return
     refuse(
         log,
-        f"is damaged at byte {verdict.damaged_at}, and commits that were acknowledged follow",
+        f"is damaged at byte {verdict.damaged_at}, and acknowledged commits follow",
         _accept(
             folder,
-            "without what was written from there on",
+            "without everything written from there on",
             f"cut the log with 'truncate -s {verdict.damaged_at} {log}', ",
         ),
     )
 
 
 def check_reach(folder: Path, found: Found, *, batch: int) -> None:
-    """Refuse a database that does not reach as far as the mark says.
+    """Refuse a database that ends before the batch in the mark.
 
     Args:
         folder: The data folder.
-        found: What it says of itself.
+        found: The findings of `look_at`.
         batch: Number of the newest batch that was read.
 
     Raises:
-        StoreError: Batches are missing that were acknowledged.
+        StoreError: Acknowledged batches are missing.
         OSError: As the system reports it.
     """
     needed = found.mark.needed() if found.mark is not None else None
@@ -273,8 +273,8 @@ def check_reach(folder: Path, found: Found, *, batch: int) -> None:
     if found.accepts_loss:
         missing = "an unknown number of" if needed is None else needed - batch
         _log.critical(
-            "%s says to start all the same: the last batch that can be read is %d, and %s batches"
-            " of commits that were acknowledged may be lost",
+            "%s orders a start despite losses: the last readable batch is %d, and %s batches"
+            " of acknowledged commits may be lost",
             folder / ACCEPT_LOSS_FILE,
             batch,
             missing,
@@ -282,11 +282,11 @@ def check_reach(folder: Path, found: Found, *, batch: int) -> None:
         return
     readable = check_wal(log)
     if log.exists() and log.stat().st_size:
-        # Closing the database cuts the log to what SQLite could read; the whole is evidence.
+        # Closing the database cuts the log to its readable part; the rest is evidence.
         shutil.copyfile(log, log.with_name(log.name + _REFUSED_SUFFIX))
     refuse(
         log,
         f"is cut or damaged from byte {readable.end} on: batch {needed} was"
-        f" acknowledged, the last one that can be read is {batch}",
+        f" acknowledged, but the last readable one is {batch}",
         _accept(folder, "without the missing commits"),
     )

@@ -1,14 +1,14 @@
-"""The mark beside a store: in which boot it was written, and which batches it then holds surely.
+"""The mark beside a store: the boot in which it was written, and the batches that it must hold.
 
-The mark is written after each batch, in place and without forcing it out.  So it never runs ahead
-of what it tells of; after a power cut it may lag by the system's write-back time, after `kill -9`
-it does not.  It answers two questions that the database cannot answer about itself:
+The mark is written after each batch, in place and without forcing it to the disk.  So it never runs
+ahead of the store; it may lag by the system's writeback time after a power cut, but not after `kill
+-9`.  It answers two questions that the database cannot answer about itself:
 
-- Is something acknowledged missing at the end (a cut log, a deleted log, an older copy)?  In the
-  same boot nothing may be, else nothing that was forced to the disk.
-- Can the system have gone down since?  Only then may unforced writes have gone in any order.
+- Is anything acknowledged missing at the end (a cut or deleted log, an older copy)?  In the same
+  boot nothing may be missing; otherwise nothing that was forced to the disk.
+- Can the system have gone down since?  Only then may unforced writes be missing in any order.
 
-So a store whose mark is missing or damaged is refused: it may have less than was acknowledged.
+So a store whose mark is missing or damaged is refused: it may lack acknowledged data.
 """
 
 from __future__ import annotations
@@ -30,23 +30,23 @@ _BOOT_ID: Final = Path("/proc/sys/kernel/random/boot_id")
 
 
 class Mark(NamedTuple):
-    """What the mark of a store says."""
+    """The content of a store's mark."""
 
     boot: bytes
-    """Id of the system's boot in which the store was last opened, 16 bytes; zeros: unknown."""
+    """Id of the boot in which the store was last opened, 16 bytes; zeros: unknown."""
     batch: int
     """Number of the newest batch known to be on the disk."""
     written: int
-    """Number of the newest batch that the system had taken; there unless it went down since."""
+    """Number of the newest batch passed to the system; not lost unless the system went down."""
 
     @property
     def is_first(self) -> bool:
-        """Whether nothing at all was acknowledged yet."""
+        """Whether nothing was acknowledged yet."""
         return self.written == 0
 
     @property
     def same_boot(self) -> bool:
-        """Whether the system has not gone down since; what it does not tell may be another."""
+        """Whether the system has not gone down since; an unknown boot counts as a new one."""
         return self.boot == boot_id() != _UNKNOWN_BOOT
 
     def needed(self) -> int:
@@ -55,7 +55,7 @@ class Mark(NamedTuple):
 
 
 def boot_id() -> bytes:
-    """Return the id of this boot of the system, 16 bytes; zeros where there is none."""
+    """Return the id of this boot of the system, 16 bytes; zeros: unknown."""
     try:
         return uuid.UUID(_BOOT_ID.read_text(encoding="ascii").strip()).bytes
     except (OSError, ValueError):
@@ -63,7 +63,7 @@ def boot_id() -> bytes:
 
 
 def read_mark(folder: Path) -> Mark | None:
-    """Return the mark of a folder, or None if there is none that can be read.
+    """Return the mark of a folder, or None if there is no readable one.
 
     Raises:
         OSError: As the system reports it.
@@ -100,7 +100,7 @@ class MarkFile:
 
     @classmethod
     def open(cls, folder: Path, batch: int) -> Self:
-        """Say durably that this boot has opened the store, and that `batch` is on the disk."""
+        """Record durably that this boot opened the store, and that `batch` is on the disk."""
         flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC
         descriptor = os.open(folder / MARK_FILE, flags, file_mode(folder))
         mark = cls(descriptor, boot_id())
@@ -113,14 +113,14 @@ class MarkFile:
         return mark
 
     def note(self, batch: int, *, forced: bool) -> None:
-        """Say that the system has taken `batch`; with `forced` also that it is on the disk."""
+        """Record that the system has `batch`; with `forced` also that it is on the disk."""
         if forced:
             self._batch = batch
         packed = _LAYOUT.pack(_MAGIC, self._boot, self._batch, batch)
         os.pwrite(self._descriptor, packed + _checksum(packed), 0)
 
     def close(self) -> None:
-        """Let the file go; twice is harmless."""
+        """Close the file; idempotent."""
         if self._descriptor >= 0:
             os.close(self._descriptor)
             self._descriptor = -1

@@ -1,9 +1,10 @@
-"""Rows of commits over shards: what is prepared here, and what was decided here and not told yet.
+"""Rows of commits over several shards: prepared here, or decided here and not yet passed on.
 
-Also what an operator has aborted here while the deciding shard was away.
+Also locks that an operator aborted here while the deciding shard was away.
 
-A prepared lock is one row about the lock and one row per write, in the form of a slot's row, so
-that large bodies go to files like all others.  The rows of one lock come and go together.
+A prepared lock has one row for the lock and one per write.  The latter has the form of a slot's
+row, so that large bodies go to files as usual.  The rows of one lock are added and deleted
+together.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
 
 
 def prepared_key(lock: LockId) -> Key:
-    """Return where a prepared lock stands."""
+    """Return the key of a prepared lock."""
     return key_of(Kind.PREPARED, *lock)
 
 
@@ -56,7 +57,7 @@ def prepared_writes(record: PreparedRecord) -> Iterator[tuple[Key, SlotRecord]]:
 
 
 def read_prepared(key: Key, body: bytes, writes: Mapping[Slot, SlotRecord]) -> PreparedRecord:
-    """Read the row of a prepared lock, with the writes that were read of it."""
+    """Read the row of a prepared lock, with its writes, which were read before."""
     fields = Fields(body)
     token, items, versions = fields.token(), fields.next(list), fields.versions()
     if {entry.slot for entry in versions} != set(writes):
@@ -77,7 +78,7 @@ def read_prepared(key: Key, body: bytes, writes: Mapping[Slot, SlotRecord]) -> P
 
 
 def read_lock(key: Key) -> LockId:
-    """Return the lock of the row of a prepared one, a decision or an abort by hand."""
+    """Return the lock in the key of a prepared lock, a decision or a manual abort."""
     fields = Fields(key.name)
     lock = fields.lock()
     fields.end()
@@ -93,7 +94,7 @@ def read_write_key(key: Key) -> tuple[LockId, Slot]:
 
 
 def decision_key(lock: LockId) -> Key:
-    """Return where a decision stands."""
+    """Return the key of a decision."""
     return key_of(Kind.DECISION, *lock)
 
 
@@ -113,18 +114,18 @@ def read_decision(key: Key, body: bytes) -> DecisionRecord:
 
 
 def forced_key(lock: LockId) -> Key:
-    """Return where a lock stands that was aborted by hand."""
+    """Return the key of a manually aborted lock."""
     return key_of(Kind.FORCED, *lock)
 
 
 def forced_row(record: ForcedRecord) -> tuple[Key, bytes]:
-    """Return the row of a lock that was aborted by hand."""
+    """Return the row of a manually aborted lock."""
     slots = [list(slot) for slot in record.slots]
     return forced_key(record.lock), pack([record.primary, list(record.primary_token), slots])
 
 
 def read_forced(key: Key, body: bytes) -> ForcedRecord:
-    """Read the row of a lock that was aborted by hand."""
+    """Read the row of a manually aborted lock."""
     fields = Fields(body)
     primary, token = fields.next(str), fields.token()
     slots = tuple(_slot(entry) for entry in fields.last(list))

@@ -1,15 +1,15 @@
-"""Reads a store at the start of a shard and refuses whatever is not as it was left.
+"""Reads a store at the start of a shard and refuses anything that is not intact.
 
-What a crash may leave is no damage: a torn tail of the log, drafts and orphans among the blobs.
-What a power cut may leave in addition (only if the system has started anew since) is what was never
-forced to the disk: holes in the log behind the last durable batch, and the bodies of `os` data,
-which then come back as null with the reason `LOST`, in history too.
+Remains of a crash are no damage: a torn tail of the log, drafts and orphans among the blobs.  After
+a power cut (only possible if the system has rebooted since), unforced data may be missing too:
+holes in the log behind the last durable batch, and bodies of `os` data, which come back as null
+with the reason `LOST`, also in history.
 
-What is checked when: at the start every row; of every file that it is there and as long as it was;
-the content of those that hold newest states or prepared writes, and after a power cut of all that
-were not forced.  History may be much longer than that, so the content of its other files is
-checked when somebody first asks for it (`Datum.fault`).  All files are mapped at the start, which
-reads nothing and keeps no descriptor: a body stays readable when its file is forgotten.
+At the start it checks every row, the existence and length of every file, and the content of files
+with newest states or prepared writes; after a power cut, the content of all unforced files.
+History may be much longer, so its other files are checked when their content is first requested
+(`Datum.fault`).  All files are mapped at the start, which reads nothing and keeps no descriptor: a
+body stays readable after its file is deleted.
 """
 
 from __future__ import annotations
@@ -73,26 +73,26 @@ _UNREADABLE: Final = (
     RecursionError,
     msgpack.UnpackException,
 )
-"""What reading a row may raise: none of it is an error of the system."""
+"""Exceptions that mean a damaged row; none of them is a system error."""
 
 _log = logging.getLogger("enact.store")
 
 
 @dataclass(slots=True)
 class Contents:
-    """What a store's database holds, by key.
+    """The content of a store's database, by key.
 
     Attributes:
         recovered: The records; `epoch` is the stored one, 0 in a new folder.
         ids: Row ids by key.
         states: The rows of states of slots and of prepared writes.
-        records: What these rows say.
+        records: The records of these rows.
         orders: When the states of a slot were set, and their rows.
-        causes: Causes with rows of their own.
-        acts: What operators did, and when.
-        ended: When sessions ended whose outcomes are kept still, wall clock in ns.
+        causes: Causes with their own rows.
+        acts: Operator actions, with their order.
+        ended: When sessions with stored outcomes ended, wall clock in ns.
         prepared: Rows of prepared locks, still packed.
-        lost: States whose unforced body a power cut took, to be stored as null.
+        lost: States whose unforced body was lost in a power cut, to be stored as null.
         batch: Number of the newest batch.
     """
 
@@ -110,10 +110,10 @@ class Contents:
 
 
 def open_database(folder: Path, found: Found) -> tuple[Database, Contents]:
-    """Open the database and read all of it.
+    """Open the database and read it completely.
 
     Raises:
-        StoreError: It is damaged, or lacks what was acknowledged.
+        StoreError: It is damaged, or lacks acknowledged data.
         OSError: As the system reports it.
         sqlite3.Error: As SQLite reports it, except for damage.
     """
@@ -141,10 +141,10 @@ def open_database(folder: Path, found: Found) -> tuple[Database, Contents]:
 
 
 def read_contents(database: Database, path: Path) -> Contents:
-    """Read all rows, each checked, and tell newest states from history.
+    """Read and check all rows, and separate newest states from history.
 
     Raises:
-        StoreError: A row is damaged, or one is missing that another one names.
+        StoreError: A row is damaged, or names a missing row.
     """
     contents = Contents()
     for row in database.rows():
@@ -169,7 +169,7 @@ def _read_row(row: DatabaseRow, contents: Contents) -> None:
     if row_checksum(key, row.batch, row.body) != row.crc:
         raise DamagedRowError("its checksum is wrong")
     if contents.ids.setdefault(key, row.id) != row.id:
-        raise DamagedRowError(f"it says the same as row {contents.ids[key]}")
+        raise DamagedRowError(f"it repeats row {contents.ids[key]}")
     contents.batch = max(contents.batch, row.batch)
     recovered = contents.recovered
     match key.kind:
@@ -219,7 +219,7 @@ def _take_state(key: Key, found: StoredSlot, contents: Contents) -> None:
 
 
 def _sort_states(slot: Slot, rows: list[tuple[Order, Key]], contents: Contents) -> None:
-    """Note which of a slot's rows, oldest first, is its newest state and which are history."""
+    """Find out which of a slot's rows, oldest first, is its newest state; the rest is history."""
     _, key = rows.pop()
     newest = contents.records[key]
     contents.states.newest[slot] = State(key, newest.version, newest.volatile)
@@ -231,10 +231,10 @@ def _sort_states(slot: Slot, rows: list[tuple[Order, Key]], contents: Contents) 
 
 
 def read_blobs(contents: Contents, blobs: BlobFolder, *, power_cut: bool) -> None:
-    """Map every blob file and give the states their bodies; see above what is checked.
+    """Map every blob file and assign the bodies to states; see above for the checks.
 
     Raises:
-        StoreError: A file is missing or damaged, and no power cut explains it.
+        StoreError: A file is missing or damaged, and a power cut does not explain it.
         OSError: As the system reports it.
     """
     states = contents.states
@@ -261,7 +261,7 @@ def read_blobs(contents: Contents, blobs: BlobFolder, *, power_cut: bool) -> Non
                 blobs.folder / blob.name,
                 f"holds {record.slot}, version {record.version}, and cannot be used: {file}",
             )
-        _log.warning("%s is lost with the power: %s", record.slot, file)
+        _log.warning("%s was lost in a power cut: %s", record.slot, file)
         states.unname_blob(states.blobs.pop(key))
         lost = replace(record, datum=None, null_reason=NullReason.LOST.name)
         contents.records[key] = contents.lost[key] = lost
@@ -275,7 +275,7 @@ def _mapped(blobs: BlobFolder, blob: Blob, *, whole: bool) -> Mapped | DamagedBl
 
 
 def put_together(contents: Contents, path: Path) -> None:
-    """Give back states, acts and prepared locks as the core knows them.
+    """Return states, operator actions and prepared locks in the form of the core.
 
     Raises:
         StoreError: A prepared lock lacks some of its writes.

@@ -1,14 +1,14 @@
-"""Records as rows: what is stored of each, as msgpack, under which key.
+"""Stored forms of records: msgpack bodies and their keys.
 
-A row is (kind, key, body); a later row of the same kind and key replaces the one before.  Only the
-states of slots have keys of their own each: a state that is replaced and stays as history keeps
-its row as it is, and of a slot's rows the one written last holds its newest state.
+A row is (kind, key, body); a later row of the same kind and key replaces the earlier one.  Only
+states of slots have individual keys: a replaced state that stays as history keeps its row, and the
+latest row of a slot is its newest state.
 
-A cause goes into the row of the state that it made, or, where it made several, into a row that
-those name: else a commit of n data would store n² versions.
+A cause is part of the row of its state.  If it made several states, it has its own row, which
+theirs name: otherwise a commit of n data would store n² versions.
 
-Reading is strict: a row that is not exactly what this module writes is damage, not a default.
-Changing what is written means a new `FORMAT` in `folder_lock`.
+Reading is strict: a row that differs from what this module writes is damage, not a default.  Any
+change of the stored form needs a new `FORMAT` in `folder_lock`.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ INLINE_BYTES_MAX: Final = 64 * 1024
 
 
 class Kind(enum.IntEnum):
-    """What a row is about.  The numbers are on disk."""
+    """The subject of a row.  The numbers are stored on disk."""
 
     EPOCH = 0
     SESSION = 1
@@ -76,7 +76,7 @@ class Key(NamedTuple):
 
 
 class Order(NamedTuple):
-    """When a row was written: in which batch, and as which one of it."""
+    """When a row was written: the batch, and the position in it."""
 
     batch: int
     number: int
@@ -86,12 +86,12 @@ EPOCH_KEY: Final = Key(Kind.EPOCH, b"")
 
 
 def key_of(kind: Kind, *parts: object) -> Key:
-    """Return the key of a row of `kind` about `parts`."""
+    """Return the key of a row of `kind` made of `parts`."""
     return Key(kind, pack(list(parts)))
 
 
 def row_checksum(key: Key, batch: int, body: bytes) -> int:
-    """Return the CRC-32 over everything that a row says."""
+    """Return the CRC-32 over all of a row."""
     head = b"%d %d %d " % (key.kind, batch, len(key.name))
     return zlib.crc32(body, zlib.crc32(key.name, zlib.crc32(head)))
 
@@ -110,7 +110,7 @@ def session_row(record: SessionRecord) -> tuple[Key, bytes]:
 
 
 def ended_row(record: SessionEnded) -> tuple[Key, bytes]:
-    """Return the row of a session that ended."""
+    """Return the row of an ended session."""
     return key_of(Kind.ENDED, record.session), pack([record.wall_ns])
 
 
@@ -120,7 +120,7 @@ def world_row(record: WorldRecord) -> tuple[Key, bytes]:
 
 
 def dropped_row(record: WorldDropped) -> tuple[Key, bytes]:
-    """Return the row of a world context that there was."""
+    """Return the row of a dropped world context."""
     return key_of(Kind.DROPPED, record.name), pack([record.version_base, *_moved(record)])
 
 
@@ -133,7 +133,7 @@ def aspect_row(entry: AspectEntry) -> tuple[Key, bytes]:
 
 
 def forgotten_row(record: AspectForgotten) -> tuple[Key, bytes]:
-    """Return the row of an aspect that there was."""
+    """Return the row of a purged aspect."""
     body = [record.version_base, record.at_ns, *_moved(record)]
     return key_of(Kind.FORGOTTEN, record.name), pack(body)
 
@@ -143,7 +143,7 @@ def _moved(record: WorldDropped | AspectForgotten) -> list[list[list[object]]]:
 
 
 def kept_row(record: KeptRecord) -> tuple[Key, bytes | None]:
-    """Return the row of the versions that a label keeps, None where there are none."""
+    """Return the row of the versions that a label pins; None: there are none."""
     body = pack([packed_versions(record.versions)]) if record.versions else None
     return key_of(Kind.KEPT, record.label), body
 
@@ -156,29 +156,29 @@ def outcome_row(record: OutcomeRecord) -> tuple[Key, bytes]:
 
 
 def outcome_key(session: str, lane: int) -> Key:
-    """Return where a lane's newest outcome stands."""
+    """Return the key of a lane's newest outcome."""
     return key_of(Kind.OUTCOME, session, lane)
 
 
 def audit_row(record: AuditRecord, order: Order) -> tuple[Key, bytes]:
-    """Return the row of an operator's act; `order` keeps acts apart."""
+    """Return the row of an operator's action; `order` makes its key unique."""
     return key_of(Kind.AUDIT, *order), pack(
         [record.wall_ns, record.text, record.kind, record.identity]
     )
 
 
 def slot_key(slot: Slot, order: Order) -> Key:
-    """Return where the state of a slot stands that was set then."""
+    """Return the key of the state of a slot that was set then."""
     return key_of(Kind.SLOT, *slot, *order)
 
 
 def cause_key(order: Order) -> Key:
-    """Return where a cause stands that several states have."""
+    """Return the key of a cause that several states share."""
     return key_of(Kind.CAUSE, *order)
 
 
 def cause_body(cause: Cause) -> bytes:
-    """Return the row of a cause that several states have."""
+    """Return the row of a cause that several states share."""
     return pack(packed_cause(cause))
 
 
@@ -187,9 +187,8 @@ def slot_body(record: SlotRecord, blob: Blob | None, shared_cause: Order | None 
 
     Args:
         record: The state.
-        blob: Where its body went, None if it goes into the row.
-        shared_cause: Which row holds its cause; None where that goes into this one, if there is
-            any.
+        blob: The file of its body; None: the body goes into the row.
+        shared_cause: The row of its cause; None: the cause, if any, goes into this row.
     """
     if record.volatile:
         return pack([])
@@ -210,10 +209,10 @@ def slot_body(record: SlotRecord, blob: Blob | None, shared_cause: Order | None 
 
 
 class StoredSlot(NamedTuple):
-    """A slot's row as read: its record, and where the rest is if not in the row.
+    """A slot's row as read: its record, and where its other parts are.
 
-    With a blob the record's datum has an empty body still, and with a shared cause the record has
-    none.
+    With a blob, the body of the record's datum is still empty; with a shared cause, the record has
+    none yet.
     """
 
     record: SlotRecord
@@ -234,12 +233,12 @@ def read_session(key: Key, body: bytes) -> SessionRecord:
 
 
 def _identity(fields: Fields) -> str:
-    """Take the last field, whose it is, which format 3 has not."""
+    """Read the last field, an identity, which format 3 lacks."""
     return "" if fields.at_end else fields.last(str)
 
 
 def read_ended(key: Key, body: bytes) -> SessionEnded:
-    """Read the row of a session that ended."""
+    """Read the row of an ended session."""
     return SessionEnded(Fields(key.name).last(str), Fields(body).last(int))
 
 
@@ -250,14 +249,14 @@ def read_world(key: Key, body: bytes) -> WorldRecord:
 
 
 def read_dropped(key: Key, body: bytes) -> WorldDropped:
-    """Read the row of a world context that there was."""
+    """Read the row of a dropped world context."""
     name, fields = Fields(key.name).last(str), Fields(body)
     base, moved = fields.next(int), _moved_here(fields)
     return WorldDropped(name, base, tuple((one.next(str), one.last(int)) for one in moved))
 
 
 def read_forgotten(key: Key, body: bytes) -> AspectForgotten:
-    """Read the row of an aspect that there was."""
+    """Read the row of a purged aspect."""
     name, fields = Fields(key.name).last(str), Fields(body)
     base, at_ns, moved = fields.next(int), fields.next(int), _moved_here(fields)
     entity_bases = ((one.next(str), one.next(int), one.last(int)) for one in moved)
@@ -265,7 +264,7 @@ def read_forgotten(key: Key, body: bytes) -> AspectForgotten:
 
 
 def _moved_here(fields: Fields) -> list[Fields]:
-    """Take the last field, if there is one: where entities start that were moved here."""
+    """Read the optional last field: first versions of entities that were moved here."""
     if fields.at_end:
         return []
     moved = [Fields(entry) for entry in fields.last(list)]
@@ -294,7 +293,7 @@ def read_aspect(key: Key, body: bytes) -> AspectEntry:
 
 
 def read_kept(key: Key, body: bytes) -> KeptRecord:
-    """Read the row of the versions that a label keeps."""
+    """Read the row of the versions that a label pins."""
     fields = Fields(body)
     versions = fields.versions()
     fields.end()
@@ -312,7 +311,7 @@ def read_outcome(key: Key, body: bytes) -> OutcomeRecord:
 
 
 def read_audit(body: bytes) -> AuditRecord:
-    """Read the row of an operator's act."""
+    """Read the row of an operator's action."""
     fields = Fields(body)
     wall_ns, text, kind = fields.next(int), fields.next(str), fields.next(str)
     return AuditRecord(wall_ns, text, kind, _identity(fields))
@@ -325,7 +324,7 @@ def read_slot_key(key: Key) -> tuple[Slot, Order]:
 
 
 def read_order(key: Key) -> Order:
-    """Return when an operator's act or a cause with a row of its own was stored."""
+    """Return when an operator's action or a shared cause was stored."""
     fields = Fields(key.name)
     return Order(fields.next(int), fields.last(int))
 

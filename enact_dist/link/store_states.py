@@ -1,7 +1,7 @@
-"""Which rows of a store hold the states of slots, and what several rows name together.
+"""Tracks which rows of a store hold the states of slots, and what several rows share.
 
-A large body and a cause may be named by several rows: a fork has the bytes of its source, a commit
-made several states.  Each is there until the last of these rows is gone.
+Several rows may name one large body or cause: a fork shares the bytes of its source, a commit makes
+several states.  Each is kept until the last of these rows is deleted.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ class State(NamedTuple):
 
 
 class States:
-    """The rows of slots' states and of prepared writes, by what they are about.
+    """The rows of slots' states and of prepared writes, by their subjects.
 
     Attributes:
         newest: The row of each slot's newest state.
-        history: The rows of its replaced states that are kept, by version.
+        history: The rows of its retained older states, by version.
         prepared: The writes of each prepared lock, by their rows.
         blobs: The file that a row names, by row.
         causes: The row of a shared cause that a row names, by row.
@@ -49,9 +49,9 @@ class States:
         self._forced: set[str] = set()
 
     def find(self, slot: Slot, version: int) -> Key | None:
-        """Return the row of one version of a slot, None where it is not stored.
+        """Return the row of one version of a slot, None if it is not stored.
 
-        Nor where two are: versions start again after an aspect was volatile for a while.
+        Also None if there are two: versions start again after an aspect was volatile for a while.
         """
         newest = self.newest.get(slot)
         old = self.history.get(slot, {}).get(version)
@@ -60,25 +60,25 @@ class States:
         return newest.key if old is None else None
 
     def take_out(self, goes: Callable[[Slot], bool]) -> Iterator[Key]:
-        """Yield the rows of all states of the slots that go, and forget them."""
+        """Yield the rows of all states of slots being deleted, and drop them."""
         for slot in [slot for slot in self.newest if goes(slot)]:
             yield self.newest.pop(slot).key
         for slot in [slot for slot in self.history if goes(slot)]:
             yield from self.history.pop(slot).values()
 
     def name_blob(self, key: Key, blob: Blob) -> None:
-        """Note that a row names a file."""
+        """Record that a row names a file."""
         self.blobs[key] = blob
         self._rows[blob.name] += 1
         if blob.synced:
             self._forced.add(blob.name)
 
     def as_forced(self, blob: Blob) -> Blob:
-        """Return a file as it is now: one of its rows may have forced it since that one's."""
+        """Return the current state of a file: a later row may have forced it."""
         return blob._replace(synced=blob.name in self._forced)
 
     def unname_blob(self, blob: Blob) -> Blob | None:
-        """Note that a row that is gone named a file; return the file if none does any more."""
+        """Record that a deleted row named a file; return the file if no row does any more."""
         if not self._last(blob.name):
             return None
         blob = self.as_forced(blob)
@@ -86,12 +86,12 @@ class States:
         return blob
 
     def name_cause(self, key: Key, cause: Key) -> None:
-        """Note that a row names a shared cause."""
+        """Record that a row names a shared cause."""
         self.causes[key] = cause
         self._rows[cause] += 1
 
     def unname_cause(self, cause: Key) -> bool:
-        """Note that a row that is gone named a cause; return whether none does any more."""
+        """Record that a deleted row named a cause; return whether no row does any more."""
         return self._last(cause)
 
     def _last(self, name: str | Key) -> bool:

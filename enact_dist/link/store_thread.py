@@ -1,8 +1,7 @@
 """The thread that writes a shard's records, so that no lock waits while the disk is forced.
 
-Group commit: whatever was submitted while one batch was written makes the next one, and shares its
-one forcing of the disk.  An idle store writes at once; a busy one gets larger batches, not a
-longer queue.
+Group commit: everything submitted while one batch is written forms the next one, forced to the disk
+once.  An idle store writes at once; a busy one gets larger batches instead of a longer queue.
 """
 
 from __future__ import annotations
@@ -19,35 +18,34 @@ if TYPE_CHECKING:
     from enact_dist.core.records import Persist
 
 REPORTED_MAX: Final = 8
-"""Tickets reported at once: about 1 ms, for which a host keeps its mutex."""
+"""Tickets reported at once: about 1 ms, during which the host holds its mutex."""
 HAND_ON_S: Final = 0.00005
-"""How long the thread rests in between: a mutex stays with its releaser if that asks at once."""
+"""Pause in between: a mutex stays with a thread that reacquires it at once."""
 
 
 class BatchStore(Protocol):
-    """What the thread writes to: a `Store`."""
+    """The thread's destination: a `Store`."""
 
     def write(self, batch: Sequence[Persist]) -> None:
-        """Apply a batch whole; raise when it cannot be kept."""
+        """Apply a batch atomically; raise if that fails."""
 
     def rest(self) -> None:
-        """Do what can wait until the batch is acknowledged."""
+        """Do what can wait until after the acknowledgement."""
 
 
 class StoreThread:
-    """Writes what is submitted, in order, and reports it.  Thread-safe.
+    """Writes submitted records in order, and reports them.  Thread-safe.
 
     Args:
-        store: Used by this thread only, until `close` has returned.
-        done: Called from the thread with the tickets of each batch kept, in order, without those
-            that are 0; several times for a large batch, so that others have their turns in between.
+        store: Used only by this thread until `close` has returned.
+        done: Called from the thread with the nonzero tickets of each stored batch, in order;
+            several times for a large batch, so that others get turns in between.
         failed: Called from the thread, once, when the store has failed; nothing is written or
-            reported after that.
+            reported afterwards.
 
     Attributes:
-        writing_since_s: When the batch was begun that is being written, on the monotonic clock;
-            None while nothing is.
-        latencies: How long the batches took, the forcing of the disk included.
+        writing_since_s: Start of the batch being written, on the monotonic clock; None: no batch.
+        latencies: How long batches took, forcing included.
     """
 
     def __init__(
@@ -75,9 +73,9 @@ class StoreThread:
                 self._wake.notify()
 
     def close(self) -> None:
-        """Write and report everything submitted so far, then end; twice is harmless.
+        """Write and report everything submitted so far, then end; idempotent.
 
-        Must not be called while holding a lock that `done` or `failed` takes.
+        Do not call it while holding a lock that `done` or `failed` takes.
         """
         with self._wake:
             self._ending = True
@@ -96,7 +94,7 @@ class StoreThread:
             self._failed(failure)
 
     def _write_batch(self) -> bool:
-        """Write what is queued and report it; return False at the end."""
+        """Write and report the queued records; return False at the end."""
         batch = self._next_batch()
         if batch:
             self.writing_since_s = started_s = time.monotonic()
@@ -111,7 +109,7 @@ class StoreThread:
         return bool(batch)
 
     def _next_batch(self) -> list[Persist]:
-        """Wait for work; return all of it, or nothing at the end."""
+        """Wait for records; return all of them, or nothing at the end."""
         with self._wake:
             while not self._queue and not self._ending:
                 self._wake.wait()

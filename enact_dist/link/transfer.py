@@ -1,12 +1,12 @@
-"""Moves a large amount of data in slices: a window of them is always under way.
+"""Moves large data in slices, with a window of them always in flight.
 
-Each slice is one idempotent request, so a transfer is resumable by itself: what came stays, a
-slice whose answer was lost (or whose link was down) is asked again, nothing else.  The oldest
-slice is waited for; slices of one client come in the order in which they were asked.
+Each slice is one idempotent request, so a transfer is resumable by itself: only slices whose answer
+was lost (or whose link was down) are requested again.  The oldest slice is awaited first; slices of
+one client arrive in the order of their requests.
 
-The window bounds what either end holds at one time.  It opens as answers come and halves where
-one is lost, and how long an answer may take follows the speed seen so far, so that a slow network
-is not asked twice for what it still carries.
+The window bounds what either end holds at one time.  It grows with each answer and halves after a
+loss.  Time limits follow the speed seen so far, so that a slow network is not asked again for
+slices that it still carries.
 """
 
 from __future__ import annotations
@@ -26,20 +26,21 @@ if TYPE_CHECKING:
     from enact_dist.link.session_client import SessionClient
 
 WINDOW_BYTES: Final = 8 << 20
-"""Bytes under way at most: hides the round trip, bounds what a stopped client leaves behind."""
+"""Most bytes in flight: hides the round trip, bounds what a stopped client leaves behind."""
 FIRST_WINDOW_BYTES: Final = 2 << 20
-"""Bytes under way before the first answer has shown how fast the way is."""
+"""Bytes in flight before the first answer has shown the speed."""
 PAUSE_S: Final = 0.02
 PAUSE_S_MAX: Final = 0.3
 """Pause after lost answers; doubles up to the second figure."""
 SLOWEST_BYTES_PER_S: Final = 1e5
-"""No way is taken to be slower than this."""
+"""The lowest speed assumed of any connection."""
 
 
 class Piece(NamedTuple):
-    """One slice: its request, what takes the answer, and where its bytes may be put directly.
+    """One slice: its request, a function that takes the answer, and perhaps a buffer for it.
 
-    `take` raises whatever ends the transfer.  `size` is what travels, in bytes.
+    `take` raises an exception to end the transfer.  `size` is the number of bytes to send or
+    receive.
     """
 
     shard: str
@@ -50,7 +51,7 @@ class Piece(NamedTuple):
 
 
 def in_turn(by_shard: Mapping[str, Iterable[Iterator[Piece]]]) -> Iterator[Piece]:
-    """Yield all slices so that no shard waits until another has had all of its own."""
+    """Yield all slices, alternating between shards so that none waits for another's transfer."""
     rows = zip_longest(*(chain.from_iterable(each) for each in by_shard.values()))
     return (piece for row in rows for piece in row if piece is not None)
 
@@ -59,9 +60,9 @@ class Transfer:
     """One transfer of the calling thread.
 
     Args:
-        client: The session that asks.
-        alive: Raises where nobody wants the data any more; called after each loss.
-        window_bytes: How much may be under way.
+        client: The session that transfers.
+        alive: Raises if the data are no longer wanted; called after each loss.
+        window_bytes: The window's limit.
     """
 
     def __init__(
@@ -83,11 +84,11 @@ class Transfer:
         self._began_s = self._heard_s = time.monotonic()
 
     def run(self, pieces: Iterable[Piece]) -> None:
-        """Move all pieces; returns once each answer was taken.  Counts slices asked again.
+        """Move all pieces; return once all answers are taken.  Counts repeated slices.
 
         Raises:
             ShardUnreachableError: None was answered for 10 s.
-            EnactError: What `alive`, or the `take` of a piece, has raised.
+            EnactError: Whatever `alive` or the `take` of a piece raises.
         """
         left, again = iter(pieces), deque[Piece]()
         try:
@@ -117,7 +118,7 @@ class Transfer:
             self._under_way.append((piece, begun))
 
     def _patience_s(self) -> float:
-        """Return how long the answer to a slice may take behind all that is under way."""
+        """Return how long the answer to a slice may take behind all that is in flight."""
         rate = BYTES_PER_S_MIN
         if self._received:
             rate = self._received / max(1e-6, time.monotonic() - self._began_s)
@@ -140,7 +141,7 @@ class Transfer:
         return None
 
     def _recover(self, shard: str) -> None:
-        """Wait a little before slices are asked again, unless all is over."""
+        """Wait a little before repeating slices, unless the transfer has to end."""
         silent_s = time.monotonic() - self._heard_s
         if silent_s >= self._client.patience_s:
             raise unreachable(shard, silent_s, self._client.carrier.endpoint_of)

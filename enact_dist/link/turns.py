@@ -1,8 +1,8 @@
-"""Whose request is next: the clients of a shard in turn, each one's requests in their order.
+"""Serves the clients of a shard in turn, each one's requests in their order.
 
-A request waits for those that its own client sent before it, and for at most one of each other
-client, however many those have sent.  Everything is bounded, for one client and for all together:
-what has no room is not taken, and whoever brings it counts it.
+A request waits for earlier requests of its own client and for at most one of each other client,
+however many those have sent.  Everything is bounded, per client and in total: requests beyond a
+limit are rejected, and the caller counts them.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ OF_ALL_BYTES_MAX: Final = 512 << 20
 
 
 class _Queue(Generic[T]):
-    """What waits of one client."""
+    """The waiting requests of one client."""
 
     __slots__ = ("bytes", "waiting")
 
@@ -33,10 +33,10 @@ class _Queue(Generic[T]):
 
 
 class Turns(Generic[T]):
-    """Requests that wait, by client.  For one thread.
+    """The waiting requests, by client.  For one thread.
 
     Attributes:
-        put_count: How many were taken in so far; each has the count before it as its number.
+        put_count: Number of requests added so far; each is numbered by the count before it.
     """
 
     __slots__ = ("_bytes", "_queues", "_rotation", "_size", "put_count")
@@ -51,9 +51,9 @@ class Turns(Generic[T]):
         return self._size
 
     def put(self, client: str, size: int, request: T) -> bool:
-        """Let a request of `size` bytes wait for its turn; False if there is no room for it.
+        """Add a request of `size` bytes; return False if it does not fit.
 
-        A client of whom nothing waits has room for one request of any size.
+        A client without waiting requests may add one of any size.
         """
         if self._size >= OF_ALL_MAX or self._bytes + size > OF_ALL_BYTES_MAX:
             return False
@@ -71,10 +71,10 @@ class Turns(Generic[T]):
         return True
 
     def take(self) -> tuple[int, T]:
-        """Take the next request and its number; the turn goes to the next client.
+        """Remove the next request; return it with its number, and pass the turn to the next client.
 
         Raises:
-            IndexError: Nothing waits.
+            IndexError: No request waits.
         """
         client = self._rotation.popleft()
         queue = self._queues[client]

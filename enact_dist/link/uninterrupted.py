@@ -1,8 +1,8 @@
-"""Keep Ctrl-C out of a few statements that must not be left half done.
+"""Keeps Ctrl-C out of a few statements that must not be half executed.
 
-Python raises `KeyboardInterrupt` between any two bytecodes of the main thread.  A shard that lives
-in the process is called from there, and half a decision must not be served.  Masking the signal
-would not do: another thread receives it, and Python still raises in this one.
+Python raises `KeyboardInterrupt` between any two bytecodes of the main thread.  That thread also
+calls a shard in this process, and a half-made decision must not be used.  Masking the signal would
+not help: another thread receives it, and Python still raises in this one.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ _SIGINT: Final = int(signal.SIGINT)
 
 
 class Uninterrupted:
-    """A block of the main thread that Ctrl-C interrupts only at its end; costs 2 us.
+    """Delays Ctrl-C to the end of a block of the main thread; costs 2 us.
 
-    Elsewhere, and where SIGINT raises nothing, it does nothing.  May be used again, not nested.
+    In other threads, and if SIGINT raises nothing, it does nothing.  Reusable, but not nested.
     """
 
     __slots__ = ("_before", "_main", "_pending")

@@ -1,4 +1,4 @@
-"""Names of payloads that are over, by which a late slice is known."""
+"""Names of ended payloads, which identify late slices."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from collections import OrderedDict
 from typing import Final
 
 NUMBERS_MAX: Final = 4096
-"""Names of one series, whose numbers mostly rise; of more the lower half is forgotten."""
+"""Names per series, whose numbers mostly rise; beyond this, the lower half is dropped."""
 SERIES_MAX: Final = 512
-"""Series that are known; of more the one of which no name was used for longest is forgotten."""
+"""Remembered series; beyond this, the one that has been unused for longest is dropped."""
 SERIES_BITS: Final = 60
 """A client counts what it stages from 1 << `SERIES_BITS` on, all else from 1: two series."""
 

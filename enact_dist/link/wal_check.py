@@ -1,10 +1,10 @@
-"""Finds damage in the middle of an SQLite write-ahead log, which SQLite itself passes over.
+"""Finds damage in the middle of an SQLite write-ahead log, which SQLite itself ignores.
 
-SQLite reads a log up to the first frame that does not check and takes everything after it for the
-remains of a crash.  That is right for a torn tail and wrong for a damaged sector: commits that
-were acknowledged would vanish without a word.  The two can be told apart, because each frame's
-checksum continues its predecessor's *stored* checksum.  A frame after the bad one that continues
-its predecessor and carries the same salts was written after it, so the bad one was whole once.
+SQLite reads a log up to the first frame with a wrong checksum and treats the rest as remains of a
+crash.  That is right for a torn tail and wrong for a damaged sector: acknowledged commits would
+silently disappear.  The two can be distinguished because each frame's checksum continues its
+predecessor's *stored* checksum.  If a frame after the bad one continues its predecessor and carries
+the same salts, it was written later, so the bad frame was complete once.
 
 File format: https://www.sqlite.org/fileformat2.html#walformat.  Remains of an older generation of
 the log carry other salts and prove nothing.
@@ -34,13 +34,13 @@ _FRAMES_AT_ONCE: Final = 1024
 
 @dataclass(frozen=True, slots=True)
 class WalVerdict:
-    """What a log holds.
+    """The result of a check.
 
     Attributes:
-        frames: How many frames check, from the first one on.
-        page_bytes: Length of a page, 0 where the header does not say.
-        damaged_at: Offset in bytes of the header or frame that was damaged after it had been
-            written whole; None if there is none.  A torn tail is no damage.
+        frames: Number of valid frames from the start.
+        page_bytes: Length of a page, 0 if the header does not tell.
+        damaged_at: Offset in bytes of the header or frame that was damaged after it was completely
+            written; None: no such damage.  A torn tail is no damage.
     """
 
     frames: int
@@ -49,15 +49,15 @@ class WalVerdict:
 
     @property
     def end(self) -> int:
-        """Offset in bytes behind the last frame that checks, 0 where there is none."""
+        """Offset in bytes behind the last valid frame, 0 without any."""
         length = FRAME_HEADER_BYTES + self.page_bytes
         return HEADER_BYTES + self.frames * length if self.frames else 0
 
 
 def check_wal(path: Path) -> WalVerdict:
-    """Read the log at `path` and say whether anything in its middle is damaged.
+    """Read the log at `path` and look for damage in its middle.
 
-    A missing, empty or cut log is fine: SQLite never acknowledges from what is not there.
+    A missing, empty or cut log passes: other checks detect missing batches.
 
     Raises:
         OSError: As the system reports it.
@@ -85,10 +85,10 @@ def check_wal(path: Path) -> WalVerdict:
 
 
 def _any_belong_together(raw: NDArray[np.uint8], header: NDArray[np.uint32]) -> bool:
-    """Say of a log with a bad header whether frames follow that prove it was good once.
+    """Return whether later frames prove that a log's bad header was valid once.
 
-    SQLite takes such a log for empty.  Whatever the header says may be wrong, so each length of
-    a page is tried; the stored checksum of the header counts like that of a frame.
+    SQLite treats such a log as empty.  Since any field of the header may be wrong, each page length
+    is tried; the header's stored checksum counts like a frame's.
     """
     for page_bytes in sorted(_PAGE_BYTES):
         frames = _frames(raw, page_bytes)
@@ -109,12 +109,12 @@ def _header_checks(raw: NDArray[np.uint8], header: NDArray[np.uint32]) -> bool:
 
 
 def _order(header: NDArray[np.uint32]) -> str:
-    """Byte order of checksummed words; little where a damaged header does not say."""
+    """Byte order of checksummed words; little if a damaged header does not tell."""
     return ">u4" if header[0] == _MAGIC_BIG else "<u4"
 
 
 def _frames(raw: NDArray[np.uint8], page_bytes: int) -> NDArray[np.uint8]:
-    """Return the whole frames of the log, (frames, bytes of a frame) uint8, without a copy."""
+    """Return the complete frames of the log, (frames, bytes of a frame) uint8, without a copy."""
     length = FRAME_HEADER_BYTES + page_bytes
     count = (len(raw) - HEADER_BYTES) // length
     return raw[HEADER_BYTES : HEADER_BYTES + count * length].reshape(count, length)
@@ -126,12 +126,12 @@ def _words(frames: NDArray[np.uint8], begin: int, end: int) -> NDArray[np.uint32
 
 
 def _covered(frames: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return what a frame's checksum covers: eight bytes of its header, then its page."""
+    """Return the part of a frame under its checksum: eight bytes of its header, then its page."""
     return np.hstack([frames[:, :8], frames[:, FRAME_HEADER_BYTES:]])
 
 
 def _continuing(frames: NDArray[np.uint8], header: NDArray[np.uint32]) -> NDArray[np.bool_]:
-    """Say of each frame whether it continues its predecessor's checksum and salts, (frames,).
+    """Return for each frame whether it continues its predecessor's checksum and salts, (frames,).
 
     The first frame continues the header.
     """

@@ -1,14 +1,14 @@
-"""What may pass through the listening Zenoh session of a shard: its own traffic, and nothing else.
+"""Access rules of a shard's listening Zenoh session: its own traffic, and nothing else.
 
-A session that listens relays between those who connect to it in Zenoh's client or router mode:
-without rules a stranger's queryable gets every request of every client, commits with their data
-included, and its notices reach every watcher.  With these rules the shard alone answers its
-requests, publishes its notices and hears tokens.  They cost 15 us a call, need no keys, and look at
-key expressions only: what they let in the shard itself compares (see `enact_dist.core.owners`).
+A listening session relays between peers that connect in Zenoh's client or router mode.  Without
+rules, a stranger's queryable would receive every request of every client, including committed data,
+and its notices would reach every watcher.  With these rules only the shard answers its requests,
+publishes its notices and sees tokens.  They cost 15 us a call, need no keys, and check only key
+expressions; the shard itself checks everything else (see `enact_dist.core.owners`).
 
-What is not allowed Zenoh drops without a word: a query gets no reply, a declaration reaches nobody.
-A query passes only where its key is *included* in an allowed one, so one with wildcards that asks
-several shards or verbs at once does not; the question who is there is the exception.
+Zenoh drops forbidden messages silently: a query gets no reply, a declaration reaches nobody.  A
+query passes only if its key is *included* in an allowed one, so a query with wildcards for several
+shards or verbs does not, except for the discovery of shards.
 """
 
 from __future__ import annotations
@@ -20,12 +20,13 @@ from enact_dist.wire.keys import ANY, ROOT, notice_key, queryable_key, token_key
 
 ANYBODY: Final = "anybody"
 EARLIER_QUESTION: Final = "await_stamp"
-"""With which releases of frames before 7 look for shards: they are told which version is spoken."""
+"""Discovery query of releases with frames before 7: the answer names our version."""
 ACCEPT_PENDING: Final = 10_000
-"""Connections that may be without a greeting at one time: 100, which is Zenoh's own limit, let
-three hundred silent ones keep everybody out for as long as they liked."""
+"""Connections that may be without a greeting at one time.  Zenoh's limit of 100 would let
+three hundred silent ones lock everybody else out indefinitely.
+"""
 ACCEPT_S: Final = 1.0
-"""How long whoever connects has for its greeting."""
+"""How long a new connection may take for its greeting."""
 
 
 def listening_settings(cell: str, shard: str) -> dict[str, object]:

@@ -1,12 +1,12 @@
-"""A second connection to the same shards, for data that travel in slices.
+"""A second connection to the same shards, for data sent in slices.
 
-Zenoh sends urgent messages before others, but what it has handed to the kernel it cannot take
-back: on a slow network a keep-alive would wait behind all that the socket holds.  Beside a
-connection of its own it waits for nothing, and this one may block (no slice is lost, the sender is
-slowed to the speed of the network) or even be given up when its reader stands still: the client's
-token and its calls live on the other one.
+Zenoh sends urgent messages first, but cannot take back data that it has passed to the kernel: on a
+slow network a keep-alive would wait behind everything in the socket.  With a separate connection
+for slices it waits for nothing.  The slice connection may block, which slows the sender to the
+speed of the network and loses no slice; it may even be closed when its reader stalls, since the
+client's token and calls use the other one.
 
-It is opened with the first transfer, takes 3 ms, and connects again by itself.
+It opens with the first transfer, takes 3 ms, and reconnects by itself.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ if TYPE_CHECKING:
 
 
 class BulkWay:
-    """The way of large data beside one Zenoh session.  Thread-safe.
+    """The connection for large data beside one Zenoh session.  Thread-safe.
 
     Args:
-        endpoints: Where that session connects to.
-        lease_s: Its link lease.
+        endpoints: Endpoints of that session.
+        lease_s: Link lease of that session.
         open_s: How long a shard has to answer a connection.
     """
 
@@ -41,7 +41,7 @@ class BulkWay:
         keep_after_fork(self)
 
     def session(self) -> zenoh.Session | None:
-        """Return the session; None while it has no connection."""
+        """Return the session; None while it is not connected."""
         session = self._session
         if session is None:
             with self._mutex:
@@ -54,7 +54,7 @@ class BulkWay:
         return session if session is not None and session.info.peers_zid() else None
 
     def close(self) -> None:
-        """End it and all calls on it; twice is harmless."""
+        """Close the session and end all calls on it; idempotent."""
         with self._mutex:
             self._closed = True
         if self._session is not None:

@@ -1,20 +1,20 @@
 """The carrier between processes and hosts: one Zenoh query per request.
 
-A client holds one Zenoh session per place it connects to: the endpoints it was given, and one for
-each shard it learns of later, because a running session takes no new endpoints.  Each session
-carries the client's liveliness token, so each shard sees the token over its own link and for as
-long as that link lives.  Sessions share their threads; one more costs 0.3 MB.
+A client has one Zenoh session per destination: the given endpoints, and each shard that it learns
+of later, because a running session accepts no new endpoints.  Each session carries the client's
+liveliness token, so each shard sees the token over its own link, as long as that link lives.
+Sessions share their threads; one more costs 0.3 MB.
 
 Rules that a change must keep:
 
 - Channels only, no Python callbacks: a library that holds the interpreter lock for half a minute
   would stall Zenoh's receiving thread, and with it the token (measured).
-- Control calls travel at a high priority, data beside them at a lower one, and what travels in
-  slices on a connection of its own (`zenoh_bulk`), so that a keep-alive never queues behind a
-  mesh.  Until that is connected slices are asked with DROP, which their answers inherit: a slow
-  reader loses an answer instead of the connection that its token lives on.
-- A query without a reply, or with the error "Timeout", is *unknown*.  Two replies to one query
-  mean two daemons under one name: that is an alarm.
+- Control calls have a high priority, data a lower one, and slices a separate connection
+  (`zenoh_bulk`), so that a keep-alive never queues behind a mesh.  Until that is connected, slices
+  are requested with DROP, which their answers inherit: a slow reader then loses an answer instead
+  of the connection with its token.
+- A query without a reply, or with the error "Timeout", is *unknown*.  Two replies to one query mean
+  two daemons with one name: that is an error.
 """
 
 from __future__ import annotations
@@ -57,15 +57,16 @@ _log = logging.getLogger("enact.link")
 CONTROL_BYTES_MAX: Final = 16 << 10
 """Requests with more data than this leave the control priority to the others."""
 FETCH_BYTES: Final = 1 << 20
-"""Slices of this size keep the other clients' answers within some ms of their turn."""
+"""Slices of this size delay the answers to other clients by only a few ms."""
 CONNECT_S: Final = 5.0
 """How long opening a carrier waits for a first connection."""
 POLL_S: Final = 0.005
-"""How often a carrier being opened looks for a connection.  A session opens connected where its
-shard is up, so the first look is the last one; and no channel of Zenoh's Python binding, which
+"""How often a carrier being opened looks for a connection.  A session opens connected if its
+shard is running, so the first look usually suffices; and no channel of Zenoh's Python binding,
+which
 would tell of a later connection, can be waited on for a limited time."""
 REACH_S: Final = 0.3
-"""How long a shard has to show that it is already in reach."""
+"""How long a shard may take to show that it is already within reach."""
 JOIN_S: Final = 1.0
 """How long an ending carrier or feed waits for each of its threads."""
 UNCHECKED_MAX: Final = 256
@@ -84,7 +85,7 @@ _CONTROL, _DATA, _BULK = (
 
 @dataclass(frozen=True, slots=True)
 class _Link:
-    """One Zenoh session of the carrier, with the token that lives as long as it is kept here."""
+    """One Zenoh session of the carrier, with its token, which lives as long as this object."""
 
     session: zenoh.Session
     endpoints: tuple[str, ...]
@@ -104,20 +105,20 @@ class ZenohCarrier:
     """Reaches the shards of a cell over Zenoh.  See `Carrier` for the methods; thread-safe.
 
     Attributes:
-        inside: No shard is in this process.
-        fetch_bytes: How large a slice of a datum is asked for in one call, at most.
+        inside: False: no shard runs in this process.
+        fetch_bytes: The largest slice of a datum that one call requests, in bytes.
 
     Args:
         cell: The cell's name.
         session: Whose liveliness token is held for the life of the carrier.
-        identity: Who asks: stands in the key of every request and of the token.
-        endpoints: Where to connect first; one that answers is enough.
+        identity: The sender; part of the key of every request and of the token.
+        endpoints: Endpoints to connect to first; one that answers is enough.
         ttl_s: The session's lease; a link counts as lost after half of it.
         connect_s: How long to wait for the first connection.
-        open_s: How long a shard has to answer a connection; the end waits for one under way.
+        open_s: How long a shard may take to answer a connection; closing waits for pending ones.
 
     Raises:
-        ShardUnreachableError: Nothing could be connected.
+        ShardUnreachableError: No endpoint could be connected.
         ConfigError: An endpoint cannot be read.
         MisuseError: This process was forked from one that is connected.
     """
@@ -157,7 +158,7 @@ class ZenohCarrier:
         if not wait_connected(first.session, connect_s):
             self.close()
             raise ShardUnreachableError(
-                f"nobody answers at {', '.join(endpoints)} (waited {connect_s:g} s); is the shard"
+                f"no shard answers at {', '.join(endpoints)} (waited {connect_s:g} s); is the shard"
                 " running there? (enact shard run, enact doctor)",
                 endpoint=", ".join(endpoints),
             )
@@ -165,7 +166,7 @@ class ZenohCarrier:
     # ---------------------------------------------------------------- requests
 
     def request(self, shard: str, message: Request, *, timeout_s: float) -> Answer | None:
-        """Send one request and return its answer, or None if there was none in time.
+        """Send one request and return its answer, or None if none came in time.
 
         Raises:
             ProtocolError: An answer cannot be read, or two daemons answer for one shard.
@@ -212,10 +213,10 @@ class ZenohCarrier:
         )
 
     def begin(self, shard: str, message: Request, *, timeout_s: float) -> Begun:
-        """Send one slice's request, whose answer is waited for later.
+        """Send the request for one slice; the caller awaits its answer later.
 
         Raises:
-            ProtocolError: The request cannot travel.
+            ProtocolError: The request cannot be sent.
             MisuseError: As `request`.
         """
         with self._inside:
@@ -260,14 +261,14 @@ class ZenohCarrier:
         return answer_in(sample, shard)
 
     def _check_answered_once(self) -> None:
-        """Look whether an earlier query got a second reply; the present one is under way then."""
+        """Check whether an earlier query got a second reply; called while a query is in flight."""
         try:
             earlier = self._unchecked.popleft()
         except IndexError:
             return
         try:
             second = earlier.try_recv()
-        except zenoh.ZError:  # ended, as it should
+        except zenoh.ZError:  # ended, as expected
             return
         if second is not None and second.ok is not None:
             key = str(second.ok.key_expr)
@@ -282,11 +283,11 @@ class ZenohCarrier:
     # ---------------------------------------------------------------- links
 
     def add_endpoints(self, entries: Sequence[ShardEntry]) -> None:
-        """Connect to further shards, to all that can be; those already in reach stay as they are.
+        """Connect to all further shards that can be reached; existing connections stay.
 
         Raises:
             ConfigError: An endpoint cannot be read.
-            LinkError: Several cannot be connected, for the reasons that it names.
+            LinkError: Some cannot be connected; the message gives the reasons.
             MisuseError: The carrier is closed or was opened before a fork.
         """
         self._check_usable()
@@ -312,7 +313,7 @@ class ZenohCarrier:
             self._presences[name] = ShardPresence(session, key, told)
 
     def _link_reaching(self, shard: str, endpoints: Sequence[str]) -> _Link | None:
-        """Return the link that leads to `shard` already, perhaps by another of its addresses."""
+        """Return the link that already reaches `shard`, perhaps at another of its addresses."""
         for link in self._links:
             if set(link.endpoints) & set(endpoints):
                 return link
@@ -327,7 +328,7 @@ class ZenohCarrier:
         )
         link = _Link(session, endpoints, token, BulkWay(endpoints, self._lease_s, self._open_s))
         with self._mutex:
-            late = self._closed  # by another thread, while this one was opened
+            late = self._closed  # closed by another thread while this link was opened
             if not late:
                 self._links.append(link)
                 for feed, pumps in self._feeds.items():
@@ -338,16 +339,16 @@ class ZenohCarrier:
         return link
 
     def way_to(self, shard: str) -> str:
-        """Return how calls travel, for people."""
+        """Return the transport, for people."""
         return "zenoh"
 
     def away(self, shard: str) -> bool:
-        """Whether Zenoh has noted that a shard is out of reach."""
+        """Whether Zenoh reports a shard as out of reach."""
         presence = self._presences.get(shard)
         return presence is not None and not presence.here
 
     def tell_returns(self, returned: Callable[[str], None]) -> None:
-        """Call `returned` with the name of each shard that comes (back) into reach."""
+        """Call `returned` with the name of each shard that comes (back) within reach."""
         self._returned = returned
 
     def _tell_returned(self, shard: str) -> None:
@@ -355,14 +356,14 @@ class ZenohCarrier:
             self._returned(shard)
 
     def endpoint_of(self, shard: str) -> str:
-        """Return where the shard is expected, for messages to people."""
+        """Return the shard's expected endpoint, for messages to people."""
         endpoints = self._endpoints_of.get(shard) or self._links[0].endpoints
         return ", ".join(endpoints)
 
     # ---------------------------------------------------------------- notices
 
     def subscribe(self, interest: Survey | None = None) -> NoticeQueue:
-        """Open a feed of the notices of all shards, those of shards added later included."""
+        """Open a feed of the notices of all shards, including shards added later."""
         self._check_usable()
         feed = NoticeQueue(interest)
         feed.on_close = lambda: self.stop_feeding(feed)
@@ -370,7 +371,7 @@ class ZenohCarrier:
         return feed
 
     def feed_into(self, feed: NoticeQueue) -> None:
-        """Let the notices of all shards go into `feed`, too, which may have other sources."""
+        """Send the notices of all shards to `feed` too, which may have other sources."""
         with self._mutex:
             self._feeds[feed] = [self._pump_into(feed, link) for link in self._links]
 
@@ -385,7 +386,7 @@ class ZenohCarrier:
         return _Pump(subscriber, thread)
 
     def stop_feeding(self, feed: NoticeQueue) -> None:
-        """Bring no more notices into `feed`."""
+        """Stop sending notices to `feed`."""
         with self._mutex:
             pumps = self._feeds.pop(feed, [])
         if self._pid != os.getpid():
@@ -398,7 +399,7 @@ class ZenohCarrier:
     # ---------------------------------------------------------------- end
 
     def close(self) -> None:
-        """End all connections and pending calls (they return None); twice is harmless."""
+        """End all connections and pending calls (they return None); idempotent."""
         if self._closed or self._pid != os.getpid():
             return
         with self._mutex:
@@ -414,7 +415,7 @@ class ZenohCarrier:
             close_session(link.session)
         for pump in pumps:
             pump.thread.join(JOIN_S)
-        # A thread that comes back from Zenoh while the interpreter ends would abort the process.
+        # A thread that returns from Zenoh while the interpreter exits would abort the process.
         self._inside.wait_empty(JOIN_S)
 
 
@@ -451,11 +452,11 @@ class _Begun:
         self._wait = wait
 
     def wait(self, into: memoryview | None = None) -> Answer | None:
-        """Return the answer; Zenoh lets nobody choose where it is put."""
+        """Return the answer; Zenoh does not let callers provide the buffer."""
         return self._wait()
 
     def abandon(self) -> None:
-        """Do nothing: an answer that nobody takes goes with its handler."""
+        """Do nothing: an unread answer is freed with its handler."""
 
 
 def _pump(notices: zenoh.Handler[zenoh.Sample], feed: NoticeQueue) -> None:
@@ -468,14 +469,14 @@ def _pump(notices: zenoh.Handler[zenoh.Sample], feed: NoticeQueue) -> None:
         try:
             message = decode_frame(_bytes(sample.attachment), _bytes(sample.payload))
         except Exception as error:  # noqa: BLE001 - the next one can be read
-            _log.warning("a notice cannot be read: %s", error)
+            _log.warning("cannot read a notice: %s", error)
             continue
         if isinstance(message, Notice):
             feed.put(message)
 
 
 def _bytes(payload: zenoh.ZBytes | None) -> bytes:
-    """Copy out of Zenoh's buffer: a small piece of it kept would pin 64 KiB."""
+    """Copy out of Zenoh's buffer: keeping a small piece of it would pin 64 KiB."""
     return bytes(payload) if payload is not None else b""
 
 
@@ -483,7 +484,7 @@ def answer_in(sample: zenoh.Sample, shard: str) -> Answer:
     """Return the answer that a reply carries.
 
     Raises:
-        ProtocolError: It cannot be read, or is no answer.
+        ProtocolError: It cannot be read or is no answer.
     """
     return read_answer(shard, _bytes(sample.attachment), _bytes(sample.payload))
 

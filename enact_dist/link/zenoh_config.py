@@ -1,22 +1,23 @@
-"""How Zenoh is set up here, and what its sessions need around them.
+"""Settings of Zenoh sessions, and the handling that they need.
 
-Everybody is a peer: a shard listens, a client connects to each shard it uses (Zenoh 1.10 does not
-relay between peers).  Reasons for the settings, measured with 1.10 on a loopback:
+Every session is a peer: a shard listens, a client connects to each shard it uses (Zenoh 1.10 does
+not relay between peers).  Reasons for the settings, measured with 1.10 on a loopback:
 
-- Multicast and gossip off: with them `open` takes 0.5 s and strangers join.
-- Zenoh's shared memory off: it falls back silently, so that no figure means anything.
-- Link lease = TTL / 2: the token of a stopped process has to vanish before its lease ends.
-- `wait_before_close`: whoever does not read for the time of a link lease is given up, not after
-  5 s; a client waits longer, since only its own thread does, and a busy shard must not lose it.
-  On whoever acknowledges nothing the kernel gives up by then (`zenoh_sockets`): a shard after
-  three quarters of a link lease or 3 s, so that with a TTL above 8 s a cut of some seconds ends
-  the link of whoever was sent something meanwhile, though not its lease.
+- Multicast and gossip off: they make `open` take 0.5 s and let strangers join.
+- Zenoh's shared memory off: it falls back silently, so measurements would mean nothing.
+- Link lease = TTL / 2: the token of a stopped process must disappear before its lease ends.
+- `wait_before_close`: a peer that does not read for the time of a link lease is disconnected,
+  instead of after 5 s.  A client waits longer, since only its own thread does, and a busy shard
+  must not lose it.  The kernel gives up on peers that acknowledge nothing before that
+  (`zenoh_sockets`): for a shard after three quarters of a link lease or 3 s.  So with a TTL above 8
+  s, a cut of some seconds ends the link of a peer that was sent something meanwhile, though not its
+  lease.
 - `max_wait_before_drop_fragments` 2 s: slices of a large datum over a slow network are not
-  dropped after 50 ms; only senders of their own ever wait for it.
-- Reconnection after 50 ms, then more and more rarely up to once a second: a shard that restarts
-  at once is back in use after 0.1 s, and one that stays away costs its clients nothing.
-- `zenoh_access`: a listener relays nothing, and silent connections keep no client out.
-- `zenoh_links`: lost connections hold up no client, and a cut one is back soon.
+  dropped after 50 ms; only dedicated sender threads wait for it.
+- Reconnection after 50 ms, then at increasing intervals up to a second: a shard that restarts
+  quickly is back in use after 0.1 s, and an absent one costs its clients nothing.
+- `zenoh_access`: a listener relays nothing, and silent connections lock no client out.
+- `zenoh_links`: lost connections block no client, and are restored soon.
 
 Sessions must be closed before the interpreter ends (it hangs otherwise), and must never be closed
 or freed in a forked child (that hangs too): `close_session` and `keep_after_fork` see to both.
@@ -44,22 +45,24 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
 QUEUED_MAX: Final = 65_536
-"""Messages in a channel between Zenoh and Python: the network thread must not wait for Python."""
+"""Messages in a channel between Zenoh and Python: Zenoh's thread must not wait for Python."""
 MESSAGE_BYTES_MAX: Final = FRAME_BYTES_MAX + (64 << 10)
-"""Longest message: a frame with its key.  Of a longer one Zenoh keeps nothing."""
+"""Longest message: a frame with its key.  Zenoh drops longer ones."""
 RETRY_MS, RETRY_MS_MAX, RETRY_FACTOR = 50, 1_000, 1.15
-"""Pauses between two attempts to connect to an endpoint without listener: they grow from the first
-to the second figure, or to a part of it that each session draws."""
+"""Pauses between attempts to connect to an endpoint without a listener: they grow from the first
+to the second figure, or to a random part of it.
+"""
 CONNECT_WAIT_MS: Final = 50
-"""How long `open` may wait for a connection; where there is none it goes on trying behind."""
+"""How long `open` may wait for a connection; after that it continues in the background."""
 OPEN_S: Final = 5.0
-"""How long the accepting side of a connection has to answer in Zenoh's protocol."""
+"""How long the accepting side of a connection may take to answer in Zenoh's protocol."""
 CLIENT_BLOCK_S: Final = 3.0
-"""How long a client waits for a shard that does not read before it gives up the connection; no
+"""How long a client waits for a shard that does not read before it closes the connection; no
 shard waits longer for a client either."""
 PATIENCE: Final = 0.75
-"""For how much of a link's lease a shard's bytes may stay unacknowledged: less than all of it, so
-that the kernel has given up before anybody closes the link."""
+"""How much of a link's lease a shard's bytes may stay unacknowledged: less than all of it, so
+that the kernel gives up before anything closes the link.
+"""
 TRANSPORTS_MAX: Final = 20_000
 """Connections of one shard: one for the calls and one for the large data of each session."""
 
@@ -76,9 +79,9 @@ def session_config(
 
     Args:
         listen: Endpoints to listen at ("tcp/0.0.0.0:7447"); clients have none.
-        connect: Endpoints to connect to, and to connect to again whenever a link is lost.
-        lease_s: After so long without a sign of life of this process, a peer drops the link.
-        open_s: How long a connected endpoint has to answer in Zenoh's language.
+        connect: Endpoints to connect to, and to reconnect to after each loss.
+        lease_s: After this time without a sign of life from this process, a peer drops the link.
+        open_s: How long a connected endpoint may take to answer in Zenoh's protocol.
         more: Further settings; those of a shard come from `zenoh_access.listening_settings`.
 
     Raises:
@@ -122,7 +125,7 @@ def session_config(
 
 
 def to_reach(endpoint: str) -> str:
-    """Return an endpoint to connect to on this host where a daemon listens on every address."""
+    """Return an endpoint for connecting on this host to a daemon that listens on every address."""
     return endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
 
 
@@ -154,7 +157,7 @@ def open_session(
     patience_s = min(PATIENCE * lease_s, CLIENT_BLOCK_S) if listen else CLIENT_BLOCK_S
     try:
         _watches[session] = watch = LinkWatch(session, connect, patience_s)
-    except BaseException:  # the system has no more threads
+    except BaseException:  # the system has no more threads, for example
         close_session(session)
         raise
     keep_after_fork(watch)
@@ -164,8 +167,8 @@ def open_session(
 def check_not_forked() -> None:
     """Raise unless Zenoh can be used in this process.
 
-    Its threads are made once and are not in a forked child: `zenoh.open` would wait there for ever,
-    also when every session of the parent was closed before the fork.
+    Its threads are started once and do not exist in a forked child: `zenoh.open` would block there
+    forever, even if the parent had closed every session before the fork.
 
     Raises:
         MisuseError: This process was forked from one that has had a session.
@@ -191,30 +194,30 @@ def _open_error(error: zenoh.ZError, listen: Sequence[str]) -> LinkError:
 
 
 def _reason(error: zenoh.ZError) -> str:
-    """Return the reason without the places in Zenoh's source."""
+    """Return the reason without positions in Zenoh's source."""
     return str(error).split(" at /")[0].replace("[", "").strip()
 
 
 _used_in: set[int] = set()
-"""The processes that have opened sessions: this one, or one that it was forked from."""
+"""The processes that have opened sessions: this one, or ancestors that forked it."""
 _open_sessions: list[tuple[int, zenoh.Session]] = []
 _owners: weakref.WeakSet[object] = weakref.WeakSet()
 _watches: dict[zenoh.Session, LinkWatch] = {}
 
 
 def close_session(session: zenoh.Session) -> None:
-    """Close a session of `open_session`; calls that wait on it end without an answer."""
+    """Close a session of `open_session`; pending calls end without an answer."""
     mine = (os.getpid(), session)
     if mine in _open_sessions:
         _open_sessions.remove(mine)
         session.close()  # type: ignore[no-untyped-call]  # untyped in its stub
         watch = _watches.pop(session, None)
-        if watch is not None:  # else nothing could be declared any more when it was opened
+        if watch is not None:  # otherwise the session was closed while it was opened
             watch.join()
 
 
 def keep_after_fork(owner: object) -> None:
-    """Never free `owner` in a forked child: it holds a session or what one has declared."""
+    """Never free `owner` in a forked child: it holds a session or its declarations."""
     _owners.add(owner)
 
 
@@ -225,10 +228,10 @@ def _after_fork() -> None:
 
 
 def _at_exit() -> None:
-    """Close what was left open: the interpreter would wait for it for ever.
+    """Close sessions left open: the interpreter would wait for them forever.
 
-    Carriers first: they wait for the threads that are inside Zenoh, which must not come back while
-    the interpreter ends (that aborts the process).
+    Carriers come first: they wait for the threads inside Zenoh, which must not return while the
+    interpreter exits (that would abort the process).
     """
     for owner in (*_owners,):
         close = getattr(owner, "close", None)

@@ -1,7 +1,7 @@
-"""Who answers at an endpoint: the first contact with a cell, and a daemon's look before it starts.
+"""Finds shards at an endpoint: for a client's first contact, and before a daemon starts.
 
-A client may know nothing but one endpoint.  It asks `enact/*/*/…`, which every shard in reach
-answers under its full name, and learns the rest of the cell from that shard's welcome.
+A client may know only one endpoint.  It queries `enact/*/*/…`; every shard within reach answers
+with its full name, and the client learns the rest of the cell from that shard's welcome.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ if TYPE_CHECKING:
     from enact_dist.core.messages import Answer, Hello, Request
 
 PROBE_LEASE_S: Final = 1.0
-"""Link lease of the short sessions that only look who is there."""
+"""Link lease of the short sessions that only look for shards."""
 
 
 @dataclass(frozen=True, slots=True)
 class FoundShard:
-    """A shard that answers somewhere, and the cell that it belongs to."""
+    """A shard that answers, and its cell."""
 
     cell: str
     shard: str
 
 
 def find_shards(endpoints: Sequence[str], *, timeout_s: float) -> tuple[FoundShard, ...]:
-    """Ask who is there: shards that answer at one of `endpoints`; empty if nobody does.
+    """Return the shards that answer at one of `endpoints`; empty if none does.
 
     Raises:
         ConfigError: An endpoint cannot be read.
@@ -58,7 +58,7 @@ def discover(endpoints: Sequence[str], hello: Hello, *, timeout_s: float) -> tup
     Raises:
         ShardUnreachableError: None answered within `timeout_s`.
         ConfigError: An endpoint cannot be read.
-        ProtocolError: An answer cannot be read, or is none to a hello.
+        ProtocolError: An answer cannot be read, or does not answer a hello.
     """
     deadline_s = time.monotonic() + timeout_s
     session = open_session(connect=endpoints, lease_s=PROBE_LEASE_S, open_s=timeout_s)
@@ -79,8 +79,8 @@ def discover(endpoints: Sequence[str], hello: Hello, *, timeout_s: float) -> tup
     where = ", ".join(endpoints)
     if silent:
         raise ShardUnreachableError(
-            f"shard {silent} is there at {where}, and did not answer a hello for {timeout_s:g} s;"
-            " perhaps its disk stands still: see its log",
+            f"shard {silent} is running at {where} but did not answer a hello for {timeout_s:g} s;"
+            " perhaps its disk is stalled: see its log",
             shard=silent,
             endpoint=where,
         )
@@ -96,7 +96,7 @@ def discover(endpoints: Sequence[str], hello: Hello, *, timeout_s: float) -> tup
 def ask_shards(
     endpoints: Sequence[str], shards: Sequence[FoundShard], message: Request, *, timeout_s: float
 ) -> dict[FoundShard, Answer]:
-    """Ask each of `shards` the same; return the answers of those that answer in time.
+    """Send one request to each of `shards`; return the answers that come in time.
 
     Raises:
         ConfigError: An endpoint cannot be read.
@@ -107,7 +107,7 @@ def ask_shards(
     session = open_session(connect=endpoints, lease_s=PROBE_LEASE_S, open_s=timeout_s)
     try:
         while (left_s := deadline_s - time.monotonic()) > 0 and len(answers) < len(shards):
-            # One that hangs must leave the others time for a second question, after they connect.
+            # A hung shard must leave the others time for a second query after they connect.
             asked = [
                 (shard, _get(session, _key(shard, message), message, max(0.05, left_s / 2)))
                 for shard in shards
@@ -129,7 +129,7 @@ def _key(shard: FoundShard, message: Request, identity: str = NAMELESS) -> str:
 
 
 def _find(session: zenoh.Session, deadline_s: float) -> tuple[FoundShard, ...]:
-    """Ask until somebody has answered or time is up."""
+    """Query until a shard has answered or time is up."""
     if not wait_connected(session, deadline_s - time.monotonic()):
         return ()
     key = request_key(ANY, ANY, verb_of(QUESTION), NAMELESS)
@@ -141,7 +141,7 @@ def _find(session: zenoh.Session, deadline_s: float) -> tuple[FoundShard, ...]:
         ]
         if keys:
             return tuple({FoundShard(*parse_request_key(key)[:2]): None for key in keys})
-        time.sleep(POLL_S)  # connected, but what the peer serves is not known yet
+        time.sleep(POLL_S)  # connected, but the peer's queryables are not known yet
     return ()
 
 

@@ -1,14 +1,14 @@
-"""Rare events of Zenoh, heard by a thread that sleeps until there is one.
+"""Rare events of Zenoh, received by a thread that sleeps until one comes.
 
-Whoever waits in a channel of Zenoh's binding wakes ten times a second to look for signals: three
-such threads cost an idle client 0.1 % of a core.  The thread of a callback sleeps.  What has to be
-known of it (Zenoh 1.10):
+A thread that waits in a channel of Zenoh's binding wakes ten times a second to check for signals:
+three such threads cost an idle client 0.1 % of a core.  A callback's thread sleeps.  Its properties
+(Zenoh 1.10):
 
 - It takes events from a channel of 256, and Zenoh's receiving thread waits while that is full.
-  Notices and answers, of which there can be many, keep to larger channels.
+  Notices and answers, which may be many, use larger channels.
 - It is a daemon if the thread that declares the listener is one.  Otherwise the interpreter waits
-  for it before it calls `atexit`, where sessions that were left open are closed: for ever.
-- It ends with the session or the listener, and says so by calling `drop`.
+  forever for it before it calls `atexit`, which closes sessions left open.
+- It ends with the session or the listener, and then calls `drop`.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ _log = logging.getLogger("enact.link")
 
 
 class Events(Generic[E]):
-    """A listener, until its session is closed.  Who keeps it never frees it in a forked child.
+    """A listener, until its session is closed.  Its owner must never free it in a forked child.
 
     Args:
-        name: Of the thread, as debuggers show it once there was an event.
-        declare: Declares the listener with the callback that it is given.
-        heard: Called with each event, one at a time, from a thread of the listener's own.
+        name: Name of the thread in debuggers, once there was an event.
+        declare: Declares the listener with the given callback.
+        heard: Called with each event, one at a time, from the listener's thread.
 
     Raises:
         ZError: The session is closed.
@@ -70,14 +70,14 @@ class Events(Generic[E]):
         try:
             self._heard(event)
         except Exception as error:  # noqa: BLE001 - the next event is heard all the same
-            _log.error("an event of a connection could not be dealt with: %s", error)
+            _log.error("cannot handle an event of a connection: %s", error)
 
     def _end(self) -> None:
         self._thread = threading.current_thread()
         self._over.set()
 
     def join(self, wait_s: float) -> None:
-        """Wait for the end of the thread, which follows that of the session."""
+        """Wait for the thread, which ends after the session."""
         ended = self._over.wait(wait_s)
         if ended and self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join(wait_s)

@@ -1,17 +1,16 @@
-"""Looks after the connections of Zenoh's sessions: none holds up others, a cut one is back soon.
+"""Watches the connections of Zenoh's sessions: none blocks others, a cut one is restored soon.
 
-`settle` says what a connection is given as soon as it is there, and why.
+`settle` describes the options that each new connection gets, and why.
 
-A connection that nobody answers is repeated by the kernel once a second at best, so after a cut
-Zenoh is connected again up to 1.1 s late (0.6 s with this).  From the loss of a connection to
-another host on, whoever waits for an answer longer than `LOOK_S` is therefore checked: if a
-connection of our own is answered at once, the network is there again and the waiting one is given
-up; Zenoh tries anew after 50 ms.
+The kernel repeats unanswered connection attempts once a second at best, so after a cut Zenoh would
+reconnect up to 1.1 s late (0.6 s with this).  Therefore, from the loss of a connection to another
+host on, attempts that wait longer than `LOOK_S` are checked: if a connection of our own is answered
+at once, the network is back and the waiting attempt is aborted; Zenoh tries again after 50 ms.
 
 Sockets are found by listing all descriptors of the process.  One thread does that for all sessions
-of the process together, at most once in `COST` times the time that it takes, and the more rarely
-the longer a connection has been lost: what it costs grows neither with the connections nor with
-the time for which a shard is away.
+of the process, at most once in `COST` times its duration, and less often the longer a connection
+has been lost: its cost grows neither with the number of connections nor with the time that a shard
+is away.
 """
 
 from __future__ import annotations
@@ -35,35 +34,35 @@ if TYPE_CHECKING:
     from typing import TypeAlias
 
 LOOK_S: Final = 0.1
-"""How soon is looked after the loss of a connection, and how soon a host has to answer."""
+"""Delay of the first look after a loss, and how soon a host must answer."""
 LOOK_S_MAX: Final = 2.0
-"""The longest pause between two looks."""
+"""Longest pause between two looks."""
 LATER: Final = 10
-"""A look comes a tenth of the time later for which a connection has been lost."""
+"""A look comes after another tenth of the time for which a connection has been lost."""
 COST: Final = 50
 """A look lists all descriptors of the process; the pause after it is this many times as long."""
 FAILED_S: Final = 1.0
 """The pause after a look that failed."""
 JOIN_S: Final = 1.0
 
-_FAILED: Final = "connections are not looked after at the moment: %s"
+_FAILED: Final = "cannot watch connections at the moment: %s"
 _log = logging.getLogger("enact.link")
 
 Host: TypeAlias = "tuple[str, int]"
 
 
 class LinkWatch:
-    """Looks after the connections of a session until that is closed.
+    """Watches the connections of a session until that is closed.
 
     Attributes:
-        lost: Where connections went that are lost, of a session that connects.
+        lost: Destinations of lost connections, of a session that connects.
         patience_s: As given.
-        left: Whether the session is closed: nothing of it is looked after any more.
+        left: Whether the session is closed and no longer watched.
 
     Args:
-        session: Not closed with this.
+        session: Stays open when this ends.
         connect: The endpoints that it connects to.
-        patience_s: How long bytes that it sent may stay unacknowledged.
+        patience_s: How long sent bytes may stay unacknowledged.
     """
 
     def __init__(self, session: zenoh.Session, connect: Sequence[str], patience_s: float) -> None:
@@ -83,12 +82,12 @@ class LinkWatch:
             raise
 
     def note(self, events: Iterable[zenoh.LinkEvent]) -> None:
-        """Take what came and went."""
+        """Take new and lost connections."""
         if self._connects:
             self.lost = _lost_after(events, self.lost)
 
     def join(self) -> None:
-        """Wait for the end of what is heard, which follows that of the session."""
+        """Wait for the event thread, which ends after the session."""
         self._events.join(JOIN_S)
         self.left = True
         _keeper.leave(self)
@@ -98,7 +97,7 @@ Told: TypeAlias = "tuple[LinkWatch, zenoh.LinkEvent]"
 
 
 class _Keeper:
-    """The one thread of this process that looks after connections, while there are sessions."""
+    """The one thread of this process that watches connections, while there are sessions."""
 
     def __init__(self) -> None:
         self._mutex = threading.Lock()
@@ -106,14 +105,14 @@ class _Keeper:
         self._round: _Round | None = None
 
     def enter(self, watch: LinkWatch) -> None:
-        """Look after the connections of a session from now on."""
+        """Watch the connections of a session from now on."""
         with self._mutex:
             if self._round is None:
                 self._round = _Round()
             self._watches.add(watch)
 
     def tell(self, watch: LinkWatch, event: zenoh.LinkEvent) -> None:
-        """Let the thread know what came or went; does not wait for it."""
+        """Report new or lost connections to the thread, without waiting for it."""
         current = self._round
         if current is not None:
             current.told.put((watch, event))
@@ -136,7 +135,7 @@ _keeper = _Keeper()
 
 
 class _Round:
-    """The life of that thread, from the first session to the end of the last one."""
+    """One life of that thread, from the first session to the end of the last one."""
 
     def __init__(self) -> None:
         self.told: queue.SimpleQueue[Told | None] = queue.SimpleQueue()
@@ -152,7 +151,7 @@ class _Round:
             here = self._here()
             if self._over.wait(max(0.0, self._rest_until_s - time.monotonic())):
                 return
-            here += _all_here(self.told)  # they are settled by one look
+            here += _all_here(self.told)  # one look settles all of them
             began_s = time.thread_time()
             pause_s = 0.0
             try:
@@ -165,7 +164,7 @@ class _Round:
             self._rest(time.thread_time() - began_s, pause_s)
 
     def _here(self) -> list[Told]:
-        """Wait for what comes or goes, or until a look is due; return it."""
+        """Wait for events, or until a look is due; return the events."""
         wait_s = max(0.0, self._look_s - time.monotonic()) if self._losing else None
         try:
             first = self.told.get(timeout=wait_s)
@@ -174,14 +173,14 @@ class _Round:
         return [first] if first is not None else []
 
     def _rest(self, cost_s: float, pause_s: float) -> None:
-        """Say when is looked again, after what the last time has cost."""
+        """Return when the next look is due, given the cost of the last one."""
         now_s = time.monotonic()
         self._rest_until_s = now_s + min(FAILED_S, COST * cost_s)
         later_s = min(LOOK_S_MAX, (now_s - self._lost_s) / LATER)
         self._look_s = now_s + max(LOOK_S, later_s, pause_s)
 
     def _note(self, here: Sequence[Told]) -> None:
-        """Count what is lost, and settle what has come if that can be done."""
+        """Record lost connections, and settle new ones if possible."""
         for watch in {watch: None for watch, _ in here}:
             events = [event for of, event in here if of is watch]
             before = watch.lost
@@ -189,7 +188,7 @@ class _Round:
             if watch.lost and watch.lost != before:
                 self._lost_s = self._look_s = time.monotonic()
             (self._losing.add if _hosts_of((watch,)) else self._losing.discard)(watch)
-            if watch.left:  # perhaps just now
+            if watch.left:  # perhaps closed just now
                 self._losing.discard(watch)
         try:
             _settle_new(here)
@@ -197,7 +196,7 @@ class _Round:
             _log.warning(_FAILED, error)
 
     def forget(self, watch: LinkWatch) -> None:
-        """Look no more for what a closed session has lost."""
+        """Stop looking for the lost connections of a closed session."""
         self._losing.discard(watch)
 
     def end(self) -> None:
@@ -209,7 +208,7 @@ class _Round:
 
 
 def _given_up(hosts: Iterable[Host], waited: set[int]) -> set[int]:
-    """Give up what has `waited` since the last look for a host that answers; return what waits."""
+    """Abort attempts waiting since the last look for hosts that answer; return the others."""
     waiting = unanswered(hosts)
     for host, inodes in waiting.items():
         if inodes & waited and _answers(*host):
@@ -218,7 +217,7 @@ def _given_up(hosts: Iterable[Host], waited: set[int]) -> set[int]:
 
 
 def _all_here(told: queue.SimpleQueue[Told | None]) -> list[Told]:
-    """Return all that waits."""
+    """Return all waiting events."""
     here = []
     with contextlib.suppress(queue.Empty):
         while (one := told.get_nowait()) is not None:
@@ -227,14 +226,14 @@ def _all_here(told: queue.SimpleQueue[Told | None]) -> list[Told]:
 
 
 def _has_come(event: zenoh.LinkEvent) -> bool:
-    """Say whether a connection has come; else one has gone."""
+    """Return whether a connection is new; otherwise it was lost."""
     return event.kind == zenoh.SampleKind.PUT
 
 
 def _settle_new(here: Iterable[Told]) -> None:
-    """Settle the connections that have come.
+    """Settle the new connections.
 
-    A thousand that come at once are settled together: each look lists all descriptors.
+    A thousand that come at once are settled by one look, since each look lists all descriptors.
     """
     came = {
         (_port_of(event.link.src), _port_of(event.link.dst)): watch.patience_s
@@ -246,10 +245,10 @@ def _settle_new(here: Iterable[Told]) -> None:
 
 
 def _lost_after(events: Iterable[zenoh.LinkEvent], lost: Sequence[str] = ()) -> list[str]:
-    """Return where connections went that are lost after these events, of `lost` before.
+    """Return the destinations of connections lost after these events, given `lost` before.
 
-    One that comes stands for one that was lost, where there is such a one: for that to the same
-    place, else for the oldest, since a host may have another address now.
+    A new connection replaces a lost one: one to the same endpoint if there is one, else the oldest,
+    since a host may have another address now.
     """
     left = list(lost)
     for event in events:
@@ -271,18 +270,18 @@ def _hosts_of(watches: Iterable[LinkWatch]) -> set[Host]:
 
 
 def _is_elsewhere(address: str) -> bool:
-    """Say whether an IPv4 address is that of another host: the way to our own is never cut."""
+    """Return whether an IPv4 address is another host's: connections to our own are never cut."""
     try:
         socket.inet_aton(address)
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as mine:
             mine.bind((address, 0))
     except OSError as error:
-        return error.errno is not None  # else it is no IPv4 address
+        return error.errno is not None  # otherwise it is no IPv4 address
     return False
 
 
 def _port_of(endpoint: str) -> int:
-    """Return the port of an endpoint, 0 where it has none."""
+    """Return the port of an endpoint, 0 if it has none."""
     port = split_endpoint(endpoint)[2]
     return int(port) if port.isdecimal() else 0
 

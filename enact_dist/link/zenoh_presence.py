@@ -1,6 +1,6 @@
-"""Tells who calls a shard when it comes (back) into reach: nobody has to ask again and again.
+"""Reports when a shard comes (back) within reach, so that callers need not poll.
 
-Zenoh notes on its own when a queryable for a key appears: 7 to 12 ms after the daemon's `ready`,
+Zenoh reports when a queryable for a key appears: 7 to 12 ms after the daemon's `ready`,
 measured on a loopback, against up to a quarter of a TTL until the next keep-alive.
 """
 
@@ -22,12 +22,12 @@ if TYPE_CHECKING:
 class ShardPresence:
     """Watches one shard on one session, until it or the session is closed.
 
-    One that is not closed before its session leaves 15 kB behind (Zenoh 1.10).
+    If it is not closed before its session, it leaks 15 kB (Zenoh 1.10).
 
     Args:
-        session: Not closed with this.
+        session: Stays open when this ends.
         key: A key on which the shard takes requests.
-        returned: Called from another thread each time the shard has come into reach.
+        returned: Called from another thread each time the shard comes within reach.
     """
 
     def __init__(self, session: zenoh.Session, key: str, returned: Callable[[], None]) -> None:
@@ -42,24 +42,24 @@ class ShardPresence:
 
     @property
     def here(self) -> bool:
-        """Whether the shard is in reach, as far as Zenoh has noted."""
-        with self._mutex:  # Zenoh's binding raises where one thread asks and another ends it
+        """Whether the shard is within reach, as far as Zenoh knows."""
+        with self._mutex:  # Zenoh's binding raises if one thread asks while another closes it
             if self._closed:
                 return False
             try:
-                # As it is; Zenoh's stub says otherwise.
+                # The actual type; Zenoh's stub differs.
                 return cast("zenoh.MatchingStatus", self._querier.matching_status).matching
             except zenoh.ZError:  # the session is closed
                 return False
 
     def _heard(self, _: zenoh.MatchingStatus) -> None:
-        # Of a shard that goes and comes at once the later event may be the one of its going.
+        # If a shard leaves and returns at once, the event of its leaving may come last.
         if self.here:
             self._returned()
 
     def close(self, wait_s: float = 0.0) -> None:
-        """End it; wait so long for the end of what calls `returned`.  Twice is harmless."""
-        with self._mutex:  # nor may two threads end it at once
+        """Stop watching; wait up to `wait_s` for the thread that calls `returned`.  Idempotent."""
+        with self._mutex:  # nor may two threads close it at once
             if not self._closed:
                 self._closed = True
                 with contextlib.suppress(zenoh.ZError):  # the session is closed

@@ -1,18 +1,18 @@
-"""Serves one `ShardHost` over Zenoh: requests in, answers and notices out, tokens watched.
+"""Serves one `ShardHost` over Zenoh: receives requests, sends answers and notices, watches tokens.
 
 One queryable receives everything, and one thread takes it all from Zenoh's channel, so the messages
-of one client keep their order.  That thread empties the channel first and then serves the clients
-in turn (`Turns`), so that one who sends a thousand requests delays the others by one of them.  It
-decodes a query, lets the host decide and sends the answer itself; `Senders` moves it to a thread of
-the client's own only where sending might block.
+of one client keep their order.  That thread first empties the channel and then serves the clients
+in turn (`Turns`), so that a client with a thousand requests delays the others by only one.  It
+decodes a query, lets the host decide and sends the answer itself; `Senders` passes it to a thread
+of the client only if sending might block.
 
-A client is the identity in the key of its requests here; all that have no session yet take their
-turns as one, so that a crowd of newcomers delays the others by one request.  Where Zenoh's access
-rules do not bind an identity to a certificate, a hostile program has as many turns as it opens
-sessions under different ones.
+Here a client is the identity in the keys of its requests.  All clients without a session share one
+turn, so that a crowd of newcomers delays the others by one request.  Unless Zenoh's access rules
+bind identities to certificates, a hostile program gets as many turns as it opens sessions under
+different identities.
 
-A query is answered once and then dropped; one that is dropped without an answer tells the client
-*unknown*.  A frame that cannot be read is refused and counted, never followed by anything else.
+A query is answered once and then dropped; a query dropped without an answer means *unknown* to the
+client.  An unreadable frame is refused and counted, and has no other effect.
 """
 
 from __future__ import annotations
@@ -58,34 +58,34 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger("enact.link")
 DATA_SUFFIX: Final = "/data"
-"""Slices of a client count, and wait, apart from its other answers."""
+"""Slices to a client are counted and queued apart from its other answers."""
 _NOTICES: Final = "@notices"
-"""Stands for all watchers together among the clients of `Senders`."""
+"""Represents all watchers together among the clients of `Senders`."""
 NEWCOMERS: Final = "@newcomers"
-"""Stands for all identities without a session together among the clients of `Turns`."""
+"""Represents all identities without a session together among the clients of `Turns`."""
 STAGED_BYTES_MAX: Final = 256 << 20
-"""Bytes of slices that wait for their place: 32 transfers; a client asks again for a lost one."""
+"""Bytes of slices that wait to be stored: 32 transfers; a client asks again for a lost one."""
 PULLED_MAX: Final = 256
 """Queries that are taken from Zenoh's channel between two turns: 1 ms."""
 DRAIN_S_MAX: Final = 0.5
-"""How long a tick waits at most for what has arrived before it: no stall of the shard's timer."""
+"""Longest wait of a tick for requests that arrived before it; too short to stall the timer."""
 DRAIN_STEP_S: Final = 0.001
-"""How long a tick waits for a query that has just been taken from the channel, if one was."""
+"""How long a tick waits for a query that was just taken from the channel."""
 OVERHEAD_BYTES: Final = 1024
-"""What a query that waits is counted with beside its data."""
+"""Overhead that each waiting query adds to the size of its data."""
 TOLD_MAX: Final = 1_000
-"""So many clients whose requests were dropped the log names, each once."""
+"""Number of clients with dropped requests that the log names, each once."""
 SHOWN_CHARACTERS: Final = 200
-"""So much of its name."""
+"""Logged length of a client's name."""
 JOIN_S: Final = 0.5
 """How long a closing service waits for each of its threads."""
 
 
 class ZenohService:
-    """One shard's face on one Zenoh session.  The session is not closed with the service.
+    """Serves one shard on a Zenoh session, which it does not close.
 
     Attributes:
-        senders: Who sends the answers.
+        senders: Sends the answers.
         count: Adds to a counter of the shard.
     """
 
@@ -108,8 +108,8 @@ class ZenohService:
         self._queryable = session.declare_queryable(
             queryable_key(cell, host.name), zenoh.handlers.FifoChannel(QUEUED_MAX), complete=True
         )
-        # The handlers, not their owners: these cannot be undeclared while a thread waits on them,
-        # and have no handler any more for a thread that begins when they are.
+        # The handlers, not their owners: owners cannot be undeclared while a thread waits on them,
+        # and afterwards have no handler for a thread that starts late.
         self._inbox: zenoh.Handler[zenoh.Query] = self._queryable.handler
         self._turns = Turns[_Arrived]()
         self._told: set[str] = set()
@@ -151,14 +151,14 @@ class ZenohService:
                         self._end_drain(self._marked)
         except zenoh.ZError:
             if not self._closed:
-                _log.critical("shard %s: its queryable ended by itself", self._host.name)
+                _log.critical("shard %s: its queryable ended unexpectedly", self._host.name)
         finally:
             self._resting = True
             while turns:
                 turns.take()[1].query.drop()  # type: ignore[no-untyped-call]  # untyped in its stub
 
     def _rest(self) -> None:
-        """Wait for the next query: the channel was empty, so no tick waits for anything."""
+        """Wait for the next query: the channel was empty, so no tick waits."""
         self._resting = True
         self._end_drain(self._drained)
         query = self._inbox.recv()
@@ -166,7 +166,7 @@ class ZenohService:
         self._arrived(query)
 
     def _pull(self) -> bool:
-        """Let the queries that have arrived wait for their turns; say whether these are all."""
+        """Queue the arrived queries for their turns; return whether these were all."""
         try_recv = self._inbox.try_recv
         for _ in range(PULLED_MAX):
             query = try_recv()
@@ -177,7 +177,7 @@ class ZenohService:
         return False
 
     def _mark_drain(self) -> None:
-        """Note what a tick waits for that has begun to wait: all that is here now."""
+        """Record which queries a waiting tick waits for: all that are here now."""
         drained = self._drained
         if drained is not None and drained is not self._marked:
             self._marked, self._mark, self._left = drained, self._turns.put_count, len(self._turns)
@@ -198,7 +198,7 @@ class ZenohService:
             self._dropped(client)
 
     def _dropped(self, client: str) -> None:
-        """Count a request that had no room; name each client in the log once."""
+        """Count a request that did not fit; log each client once."""
         self._host.count("requests_dropped")
         client = client[:SHOWN_CHARACTERS]
         if client not in self._told and len(self._told) < TOLD_MAX:
@@ -211,14 +211,14 @@ class ZenohService:
             )
 
     def drain_inbox(self) -> None:
-        """Wait until what has arrived already is handed in; called from the timer before a tick.
+        """Wait until all arrived requests are submitted; called by the timer before a tick.
 
-        The dispatcher hands it in, so that each client's requests keep their order.
+        The dispatcher submits them, so that each client's requests keep their order.
         """
         drained = self._drained = threading.Event()
         end_s = time.monotonic() + DRAIN_S_MAX
         while not drained.wait(DRAIN_STEP_S):
-            # A dispatcher that still rests has found the channel empty, and then nothing came.
+            # A dispatcher that still rests found the channel empty, and nothing came since.
             if self._resting or self._closed or time.monotonic() > end_s:
                 return
 
@@ -242,7 +242,7 @@ class ZenohService:
                 raise ProtocolError(f"a {verb} came to several shards at once; only a ping may")
         except Exception as error:  # noqa: BLE001 - every query is answered
             if not isinstance(error, ProtocolError):
-                # A fault of the decoder: a client that triggers it must not make the shard deaf.
+                # A bug in the decoder: a client that triggers it must not stop the dispatcher.
                 _log.exception("a frame of %d bytes broke the decoder", len(header or b""))
             self._host.count("frames_refused")
             call = _Call(self, query, key)
@@ -274,7 +274,7 @@ class ZenohService:
             self._staged.put((message, call, identity))
 
     def _stage(self) -> None:
-        """Take the slices of large data to where they belong: making room for them takes time."""
+        """Store slices of large data, in a thread: making room for them takes time."""
         while (staged := self._staged.get()) is not None:
             self._submit(*staged)
             with self._staged_mutex:
@@ -284,11 +284,11 @@ class ZenohService:
         try:
             self._host.submit(message, call, identity)
         except Exception:  # noqa: BLE001 - these threads serve all clients
-            _log.exception("a %s was not taken", type(message).__name__)
+            _log.exception("a %s was not stored", type(message).__name__)
             call.drop()
 
     def reply_key(self, query: zenoh.Query) -> zenoh.KeyExpr | str:
-        """Return the key to answer under: the query's own, unless that asked every shard."""
+        """Return the answer's key: the query's own, unless that addressed every shard."""
         key = query.key_expr
         if ANY not in str(key):
             return key
@@ -297,10 +297,10 @@ class ZenohService:
     # ---------------------------------------------------------------- notices and tokens
 
     def _publish(self, notice: Notice) -> None:
-        """Send a notice if there are watchers; Zenoh drops it for those that do not read.
+        """Send a notice if there are watchers; Zenoh drops it for slow readers.
 
-        Zenoh may wait 1 ms before it drops one message, but 2 s for one in several fragments: such
-        a long notice, and whatever comes after it, is left to a thread.
+        Zenoh may wait 1 ms before it drops one message, but 2 s for a fragmented one.  A thread
+        therefore sends such a long notice and whatever comes after it.
         """
         if not self._publisher.matching_status.matching:  # type: ignore[attr-defined]  # see its stub
             return
@@ -308,7 +308,7 @@ class ZenohService:
         self.senders.send(_NOTICES, _Publication(self._publisher, *encode_frame(notice)))
 
     def _see(self) -> None:
-        """Tell the host which sessions' tokens are there, until the subscription ends."""
+        """Report sessions' tokens to the host, until the subscription ends."""
         try:
             while True:
                 sample = self._sights.recv()
@@ -320,7 +320,7 @@ class ZenohService:
             return
 
     def close(self) -> None:
-        """Take and send nothing more; twice is harmless."""
+        """Stop serving; idempotent."""
         if self._closed:
             return
         self._closed = True
@@ -334,7 +334,7 @@ class ZenohService:
 
 
 class _Arrived(NamedTuple):
-    """One query that waits for its turn, and in which burst it came; see `Senders`."""
+    """A query that waits for its turn, and the burst of its arrival; see `Senders`."""
 
     query: zenoh.Query
     key: str
@@ -344,7 +344,7 @@ class _Arrived(NamedTuple):
 
 
 class _Publication:
-    """A notice on its way to all who watch."""
+    """A notice to all watchers."""
 
     __slots__ = ("_header", "_payload", "_publisher", "size")
 
@@ -355,18 +355,18 @@ class _Publication:
         self.size = len(self._header) + len(self._payload)
 
     def send(self) -> None:
-        """Publish it; a session that is closed meanwhile takes it with it."""
+        """Publish it; it is lost if the session is closed meanwhile."""
         try:
             self._publisher.put(self._payload, attachment=self._header)
         except zenoh.ZError as error:
-            _log.warning("notice not sent: %s", error)
+            _log.warning("cannot send a notice: %s", error)
 
     def drop(self) -> None:
         """Do nothing: a watcher sees the gap in the numbers."""
 
 
 class _Call:
-    """One query on its way to its answer: the host's reply callback, and what is sent then."""
+    """One query until it is answered: the host's reply callback, and then the answer."""
 
     __slots__ = ("_answer", "_client", "_query", "_service", "size")
 
@@ -381,7 +381,7 @@ class _Call:
         self._service.senders.send(self._client, self)
 
     def send(self) -> None:
-        """Encode and send; a connection that has gone takes the answer with it."""
+        """Encode and send; the answer is lost if the connection has gone."""
         query, answer = self._query, self._answer
         try:
             header, bodies = encoded(answer, self._service.count)
@@ -393,12 +393,12 @@ class _Call:
             self.drop()
 
     def drop(self) -> None:
-        """Leave the client without an answer, which tells it to ask again."""
+        """Leave the client without an answer, which makes it repeat the request."""
         self._query.drop()  # type: ignore[no-untyped-call]  # untyped in its stub
 
 
 def _answerable(key: str) -> bool:
-    """Whether an answer to what came on this key can say who gives it."""
+    """Whether the answer to a query on this key can name the answering shard."""
     try:
         return bool(parse_request_key(key))
     except ProtocolError:

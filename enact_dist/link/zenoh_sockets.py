@@ -1,7 +1,7 @@
-"""What Zenoh's TCP sockets need and its settings do not offer: see `settle` and `give_up`.
+"""Options for Zenoh's TCP sockets that its settings do not offer: see `settle` and `give_up`.
 
-Sockets are looked up among the open descriptors of this process; where the system does not list
-them (no Linux) nothing is done.
+Sockets are found among the open descriptors of this process; if the system does not list them (not
+Linux), nothing is done.
 """
 
 from __future__ import annotations
@@ -29,25 +29,25 @@ _log = logging.getLogger("enact.link")
 
 
 def settle(patience_s: Mapping[tuple[int, int], float]) -> int:
-    """Let connections end if their peer acknowledges nothing, and close at once.
+    """Make connections end if their peer acknowledges nothing, and close at once.
 
     Zenoh 1.10 waits for the kernel in two places, each time with threads that serve all clients:
 
-    - A link in mid-transfer is closed only once the kernel has taken what its sender has in hand,
-      and whoever else has a message for it waits meanwhile (zenoh issues 1053 and 1876): among
-      them the one thread that accepts connections, and the one that sends for all.  When a client
-      was cut off while it fetched, its shard answered nobody for 6 s more with a TTL of 12 s.
-      What the kernel has given up by itself is closed at once, and nobody waits for it.
-    - Closing lingers for 10 s (zenoh issue 2350), until all is acknowledged: 12 s from a cut to
-      the next grant with a TTL of 2 s, against 2.0 s now.  Without a linger time the kernel goes
-      on sending what is left, behind the process's back.
+    - A link in mid-transfer is closed only once the kernel has accepted the message being sent.
+      Meanwhile everything that has a message for the link waits (zenoh issues 1053 and 1876),
+      including the one thread that accepts connections and the one that sends for all.  When a
+      client was cut off during a fetch, its shard answered nobody for 6 s more with a TTL of 12 s.
+      A connection that the kernel has given up is closed at once.
+    - Closing lingers for 10 s (zenoh issue 2350), until all is acknowledged: with a TTL of 2 s it
+      took 12 s from a cut to the next grant, against 2.0 s now.  Without a linger time the kernel
+      still sends the rest in the background.
 
     Args:
         patience_s: Own and other port of each connection, and how long sent bytes, or a closed
             window, may stay as they are; only connections with exactly Zenoh's linger time count.
 
     Returns:
-        How many were settled; each is once.
+        How many were settled; each connection is settled once.
     """
     found = 0
     for connection in connections():
@@ -65,7 +65,7 @@ def settle(patience_s: Mapping[tuple[int, int], float]) -> int:
 
 
 def unanswered(hosts: Iterable[tuple[str, int]]) -> dict[tuple[str, int], set[int]]:
-    """Return the inodes of this process's sockets that wait for IPv4 addresses to answer."""
+    """Return the inodes of this process's sockets that are connecting to IPv4 addresses."""
     hosts = tuple(hosts)
     waiting = set()
     for connection in connections():
@@ -74,7 +74,7 @@ def unanswered(hosts: Iterable[tuple[str, int]]) -> dict[tuple[str, int], set[in
                 waiting.add(os.fstat(connection.fileno()).st_ino)
     if not waiting:
         return {host: set() for host in hosts}
-    # The kernel does not tell whom a socket waits for, except in its table.
+    # Only the kernel's table shows the destination of a connecting socket.
     rows = [line.split() for line in _TABLE.read_text().splitlines()[1:]]
     inodes = {(row[2], int(row[9])) for row in rows}
     return {
@@ -83,12 +83,12 @@ def unanswered(hosts: Iterable[tuple[str, int]]) -> dict[tuple[str, int], set[in
 
 
 def _written(address: str, port: int) -> str:
-    """Return an address as the kernel's table has it."""
+    """Return an address in the form of the kernel's table."""
     return f"{int.from_bytes(socket.inet_aton(address), 'little'):08X}:{port:04X}"
 
 
 def give_up(inodes: set[int]) -> None:
-    """End connections that got no answer, so that Zenoh tries again."""
+    """Abort unanswered connection attempts, so that Zenoh tries again."""
     for connection in connections():
         with connection, contextlib.suppress(OSError):
             if os.fstat(connection.fileno()).st_ino in inodes and _state(connection) == _SYN_SENT:
@@ -100,21 +100,21 @@ def _state(connection: socket.socket) -> int:
 
 
 def connections() -> Iterator[socket.socket]:
-    """Yield this process's sockets, each by a descriptor of our own: others may close theirs.
+    """Yield this process's sockets, each as a duplicate descriptor: others may close theirs.
 
-    Nothing that a descriptor stands for is asked: a file of a host that was cut off never answers.
+    Descriptors are never queried for their targets: a file on a disconnected host never answers.
     """
     try:
         entries = list(_DESCRIPTORS.iterdir())
-    except OSError as error:  # no Linux
-        _log.debug("Zenoh's sockets are not to be found: %s", error)
+    except OSError as error:  # not Linux
+        _log.debug("cannot find Zenoh's sockets: %s", error)
         return
     for entry in entries:
-        with contextlib.suppress(OSError):  # closed meanwhile, or too many are open
+        with contextlib.suppress(OSError):  # closed meanwhile, or too many descriptors are open
             if not entry.readlink().name.startswith("socket:"):
                 continue
             mine = os.dup(int(entry.name))
-            # A default timeout of the program lets the next line change what all share.
+            # If the program set a default timeout, the next line would change shared options.
             blocking = socket.getdefaulttimeout() is not None and os.get_blocking(mine)
             try:
                 connection = socket.socket(fileno=mine)

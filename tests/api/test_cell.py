@@ -91,7 +91,7 @@ def test_failed_shard_in_process_is_told_with_its_reason(tmp_path):
         online = cell.world("online")
         online.init(bench, COUNT, 1)
         cell._host._fail(OSError("no space left on device"))
-        with pytest.raises(ShardUnreachableError, match=r"no space left on device.*open it anew"):
+        with pytest.raises(ShardUnreachableError, match=r"no space left on device.*open a new one"):
             Lock(Read(online, bench, COUNT), wait_s=0.05).__enter__()
     with local(tmp_path) as cell:
         assert cell.world("online").entities() == (bench,)

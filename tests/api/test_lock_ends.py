@@ -237,7 +237,7 @@ def test_commit_is_unknown_when_cell_is_closed_before_its_answer(cell, online):
 
     count = Write(online, bench, COUNT)
     meddle(cell, Commit, after=close)
-    with pytest.raises(CommitUnknownError, match="may stand or not"), Lock(count) as held:
+    with pytest.raises(CommitUnknownError, match="took effect is unknown"), Lock(count) as held:
         held[count] = 1
 
 
@@ -274,7 +274,7 @@ def test_waiting_lock_ends_when_its_process_is_told_to_stop(cell, online):
     waiting = Lock(Write(online, bench, COUNT), wait_s=60.0)
     waiting._interrupt = stop
     meddle(cell, Acquire, after=stop.set)
-    with pytest.raises(LockTimeoutError, match="told to stop"):
+    with pytest.raises(LockTimeoutError, match="interrupted after waiting"):
         waiting.__enter__()
     assert [info.granted for info in cell.locks()] == [True]
     end()

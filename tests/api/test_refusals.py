@@ -96,7 +96,7 @@ def test_forgotten_says_from_when_on_all_of_it_is_known(two_shards, loose, order
         online.fork("copy", at=then)
 
     for error in (viewed.value, forked.value):
-        assert "all that was asked is known from" in str(error)
+        assert "everything requested is known from" in str(error)
         later = online.at(Position(error.oldest_ns, then.shard))
         found = later.view(every := ViewEach(later, Entities("**"), COUNT))[every]
         assert len(found) == 2
@@ -194,7 +194,7 @@ def test_view_that_finds_no_moment_waits_for_locks_and_says_who_holds_them(two_s
     finally:
         done.set()
         holder.join()
-    assert str(told.value).endswith("look again, or raise patience_s of connect(…)")
+    assert str(told.value).endswith("try again, or raise patience_s of connect(…)")
     assert len(told.value.holders) == 1
 
 

@@ -58,8 +58,8 @@ def test_used_name_is_never_overwritten(blobs, tmp_path):
     ("spoil", "said"),
     [
         (lambda path: path.unlink(), "is missing"),
-        (lambda path: path.write_bytes(BODY[:-1]), "has 2500000 bytes, stored were 2500001"),
-        (lambda path: path.write_bytes(BODY + b"x"), "has 2500002 bytes, stored were 2500001"),
+        (lambda path: path.write_bytes(BODY[:-1]), "has 2500000 bytes instead of 2500001"),
+        (lambda path: path.write_bytes(BODY + b"x"), "has 2500002 bytes instead of 2500001"),
         (lambda path: path.write_bytes(bytes(1) + BODY[1:]), "its checksum is wrong"),
         (lambda path: path.write_bytes(BODY[:-1] + bytes(1)), "its checksum is wrong"),
         (lambda path: path.write_bytes(b""), "has 0 bytes"),

@@ -39,7 +39,7 @@ def test_folder_with_a_stamp_beyond_all_clocks_does_not_start(folder, tmp_path):
     stamped(folder, (1 << 63) - 1)
 
     with pytest.raises(
-        StoreError, match=r"slot .*a.* with stamp 92\d+, .*shard restore"
+        StoreError, match=r"slot .*a.* with timestamp 92\d+, .*shard restore"
     ) as refused:
         open_host(SETTINGS, folder)
     assert refused.value.path == str(folder)
@@ -56,4 +56,4 @@ def test_folder_that_is_ahead_of_the_clock_starts_with_a_warning(folder, caplog)
     with caplog.at_level(logging.WARNING, "enact.store"):
         open_host(SETTINGS, folder).close()
 
-    assert any("ahead of the clock of this host" in record.message for record in caplog.records)
+    assert any("ahead of this host's clock" in record.message for record in caplog.records)

@@ -214,7 +214,7 @@ def test_a_run_of_one_shard_is_taken_up_on_that_one_alone(tmp_path):
     cell.where = placement("right", pins=[("**", "right")])
     assert killed_at(cell, 4)
     with pytest.raises(
-        StoreError, match=r"of right alone; let `enact shard forget pose --shard right -"
+        StoreError, match=r"covers only right; let `enact shard forget pose --shard right -"
     ):
         forget(whole, ["pose"], now_ns=NOW_NS)
     assert of_aspect(whole["left"])[0]

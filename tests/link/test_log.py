@@ -43,8 +43,8 @@ def test_line_that_cannot_be_made_is_told_and_ends_no_log(monkeypatch):
         found.append(json.loads(lines.readline()))
 
     assert [one["level"] for one in found] == ["INFO", "WARNING", "INFO", "WARNING"]
-    texts = [one["text"].partition(" is lost, ")[2] or one["text"] for one in found]
-    assert texts[:2] == [f"it cannot be made: {kind}" for kind in ("TypeError", "TypeError")]
+    texts = [one["text"].partition(" is lost because it ")[2] or one["text"] for one in found]
+    assert texts[:2] == [f"cannot be formatted: {kind}" for kind in ("TypeError", "TypeError")]
     assert texts[2:] == ["and on", "2 lines of this log were lost"]
     assert found[0]["process"] == found[1]["process"] == "actor mine"
 

@@ -144,7 +144,7 @@ def test_durations_are_counted_in_their_classes():
 
 def test_other_paths_are_not_found(served):
     """The text says what there is."""
-    with pytest.raises(urllib.error.HTTPError, match=r"404: there is /metrics here"):
+    with pytest.raises(urllib.error.HTTPError, match=r"404: this server has only /metrics"):
         served("/")
 
 

@@ -122,8 +122,8 @@ def test_draft_that_is_asked_for_again_is_the_same(desk):
         ({"file": "nonce"}, "no payload"),
         ({"total": (1 << 30) + 1}, "at most 1073741824"),
         ({"total": -1}, "at most 1073741824"),
-        ({"offset": SIZE, "body": b"x"}, "a slice to 100001"),
-        ({"offset": -1, "body": b"x"}, "a slice to 0"),
+        ({"offset": SIZE, "body": b"x"}, "a slice up to 100001"),
+        ({"offset": -1, "body": b"x"}, "a slice up to 0"),
     ],
 )
 def test_draft_that_cannot_be_is_refused(desk, options, said):
@@ -473,7 +473,7 @@ def test_full_folder_is_told_once_a_minute(folder, monkeypatch, caplog):
     clock = ManualClock()
     desk = PayloadDesk(folder, 10 * SIZE, clock=clock)
     said = (
-        f"large data travel over the network, for the shared folder {folder.path} takes none:"
+        f"large data go over the network because the shared folder {folder.path} takes none:"
         " No space left on device"
     )
 

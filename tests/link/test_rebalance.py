@@ -253,7 +253,7 @@ def test_entities_of_other_shards_are_refused_at_the_start(tmp_path, record):
     with read_store(two_stores(tmp_path, left=[record])["left"]) as held:
         refuse_strangers(tmp_path, held, "left", placement("left", "right", pins=[("**", "left")]))
         with pytest.raises(
-            StoreError, match=r"do not live on left: part/1 \(of right\); the shard"
+            StoreError, match=r"on other shards than left: part/1 \(of right\); the shard"
         ):
             refuse_strangers(tmp_path, held, "left", placement("left", "right", pins=[("**", "right")]))  # fmt: skip
 

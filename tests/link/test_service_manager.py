@@ -79,7 +79,7 @@ def test_a_manager_that_is_away_is_named_once(tmp_path, caplog):
     mine.alive("open")
 
     (record,) = caplog.records
-    assert f"the service manager at {tmp_path / 'gone'} does not listen" in record.message
+    assert f"the service manager at {tmp_path / 'gone'} does not answer" in record.message
 
 
 def test_a_full_queue_never_delays_a_ping(manager):

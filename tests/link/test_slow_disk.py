@@ -108,8 +108,8 @@ def test_disk_that_stands_still_is_told_to_the_log(daemon, endpoint, tmp_path, d
         told = until(lambda: len(lines := disk_lines(caplog)) > 1 and lines)
 
     assert len(told) == 2, told
-    assert "has kept nothing for" in told[0]
-    assert "goes on after" in told[1]
+    assert "has written nothing for" in told[0]
+    assert "is back after" in told[1]
     assert shard.host._shard.counters["disk_stalls"] == 1
 
 

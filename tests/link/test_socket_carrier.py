@@ -99,7 +99,7 @@ def test_socket_that_is_asked_for_and_impossible_is_an_error(
     monkeypatch.setenv("ENACT_CARRIER", "socket")
     monkeypatch.setenv("ENACT_SHARED_FOLDER", str(tmp_path))
 
-    with pytest.raises(LinkError, match=r"socket is asked for.*not shared with this process"):
+    with pytest.raises(LinkError, match=r"a socket is required.*not shared with this process"):
         connect(endpoint)
 
 

@@ -41,7 +41,7 @@ def test_a_stopped_shard_comes_back_as_it_was(folder, tmp_path):
     assert (backup.entities, backup.states, backup.size) == (2, 2, LARGE + 200)
     fill(folder, 7)
 
-    with pytest.raises(StoreError, match="has data; say --replace"):
+    with pytest.raises(StoreError, match="has data; use --replace"):
         restore(tmp_path / "copy", folder, unix_s=100, **NAMES)
     _, aside = restore(tmp_path / "copy", folder, unix_s=100, replace=True, **NAMES)
 
@@ -133,7 +133,7 @@ def test_a_shard_that_starts_during_a_restore_loses_nothing(folder, tmp_path, mo
         fill(new, 5)
 
     monkeypatch.setattr(store_copy, "_build", meanwhile)
-    with pytest.raises(StoreError, match="has data; say --replace"):
+    with pytest.raises(StoreError, match="has data; use --replace"):
         restore(tmp_path / "copy", new, unix_s=100, **NAMES)
     assert versions(new) == {"a": 5, "b": 5}
     monkeypatch.undo()
@@ -172,9 +172,9 @@ def test_what_must_not_be_restored_is_refused(folder, tmp_path):
 def test_a_damaged_shard_is_not_backed_up(folder, tmp_path):
     """A backup that cannot be restored would be found out too late; nor is one replaced."""
     (tmp_path / "there").mkdir()
-    with pytest.raises(StoreError, match="there is there already"):
+    with pytest.raises(StoreError, match="there exists already"):
         back_up(folder, tmp_path / "there", unix_s=1, **NAMES)
-    with pytest.raises(StoreError, match="no shard has its data in"):
+    with pytest.raises(StoreError, match="holds no data of a shard"):
         back_up(tmp_path / "there", tmp_path / "copy", unix_s=1, **NAMES)
     next((folder / "blobs").iterdir()).write_bytes(bytes(LARGE))
     with pytest.raises(StoreError, match="its checksum is wrong"):
@@ -187,8 +187,8 @@ def test_one_backup_at_a_time(folder, tmp_path):
     """The second is told so, and takes nothing from under the first; nor does a start."""
     with held_bodies(folder, tmp_path / "first") as bodies:
         bodies.hold(folder / "blobs")
-        by = f"by process {os.getpid()} on host .* into {tmp_path / 'first'}; .*wait for its end"
-        with pytest.raises(StoreError, match=f"a backup of .* is under way, {by}"):
+        by = f"by process {os.getpid()} on host .* into {tmp_path / 'first'}; .*wait until it ends"
+        with pytest.raises(StoreError, match=f"a backup of .* is in progress, {by}"):
             back_up(folder, tmp_path / "copy", unix_s=1, **NAMES)
         fill(folder, 2)
         assert len(list((folder / HELD_FOLDER).glob("*.blob"))) == 1
@@ -258,7 +258,7 @@ def test_a_place_that_is_taken_meanwhile_is_there_already(folder, tmp_path, monk
         (tmp_path / "copy" / "notes.txt").touch()
 
     monkeypatch.setattr(store_copy, "_sync", taken)
-    with pytest.raises(StoreError, match="copy is there already; name a new folder"):
+    with pytest.raises(StoreError, match="copy exists already; name a new folder"):
         back_up(folder, tmp_path / "copy", unix_s=1, **NAMES)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["copy", "left"]
 
@@ -306,7 +306,7 @@ def test_links_that_cannot_be_removed_keep_no_shard_from_its_start(folder, monke
 
     monkeypatch.setattr(held_bodies_module, "shutil", SimpleNamespace(rmtree=refuse))
     fill(folder, 2)
-    assert "stays: [Errno 13] Permission denied" in caplog.text
+    assert "left: [Errno 13] Permission denied" in caplog.text
 
 
 def damages(random, size):
@@ -425,7 +425,7 @@ def test_a_backup_names_no_file_outside_of_it(folder, tmp_path):
         ("file/copy", r"file is a file, not a folder"),
         ("/proc/copy", r"cannot be written to /proc/copy \(.*No such file"),
         ("x" * 300, r"cannot be written to .*File name too long"),
-        ("left/copy", r"lies in the folder of the shard"),
+        ("left/copy", r"is inside the shard's folder"),
     ],
 )
 def test_a_place_that_takes_no_backup_is_named_and_not_the_shard(folder, tmp_path, place, found):
