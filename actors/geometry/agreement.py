@@ -42,13 +42,13 @@ DISAGREEMENT_MAX: Final = 0.10
 together; noise of a depth camera stays below 0.03."""
 
 FRAMES_COMPARED_MAX: Final = 40
-"""Frames looked at, evenly spread, so that a long recording costs no more than a short one."""
+"""Number of frames examined, evenly spread, so that long recordings cost no more."""
 
 
 def check_agreement(directory: Path, frames: Sequence[RecordedFrame]) -> None:
     """Refuse depth in a unit, or poses of a kind, that contradict each other.
 
-    Says nothing when no two views are near enough to be compared.
+    Returns no finding if no two views are close enough to be compared.
 
     Args:
         directory: The recording, for the message.

@@ -1,8 +1,8 @@
 """The two text files of an RGB-D recording: camera intrinsics (JSON) and camera poses (.log).
 
-Both are judged before they are believed: an intrinsics matrix must belong to the images, a pose
+Both are checked before use: an intrinsics matrix must belong to the images, a pose
 must be rigid, and camera positions must be in metres.
-Open3D's own readers accept a mirrored or scaled matrix without a word; these do not.
+Open3D's own readers silently accept a mirrored or scaled matrix; these do not.
 """
 
 from __future__ import annotations

@@ -200,7 +200,7 @@ def _camera(
     """Return a camera of K, R and t as a file gives them.
 
     Raises:
-        InputFileError: They are none; the message names the camera.
+        InputFileError: They are invalid; the message names the camera.
     """
     try:
         k, rotation, t = (np.asarray(part, np.float64) for part in parts)

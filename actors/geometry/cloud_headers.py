@@ -4,7 +4,7 @@ Needed because Open3D 0.20 answers a file that was cut off with memory it never 
 in half came back with all its 200 points, half of them noise, and no error.
 
 The length check is exact for PCD and for PLY files without lists; for meshes it is a lower bound
-(triangles), so whoever decodes them checks the indices as well.
+(triangles), so the decoder checks the indices as well.
 """
 
 from __future__ import annotations

@@ -44,7 +44,7 @@ def draw_points(
         points_m: (N, 3), metres, world.
         colours: RGB, uint8, (N, 3).
         view: Camera and pose; `mesh_picture.viewpoint` makes one.
-        size_m: Edge of the square that stands for a point, one for all or (N,); about the spacing
+        size_m: Edge of the square that represents a point, one for all or (N,); about the spacing
             of the points.
 
     Returns:

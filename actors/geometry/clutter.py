@@ -25,7 +25,7 @@ PLANE_JUDGES: Final = 4000
 """Points that judge a triple: of a plane with a tenth of the scene 400 of them lie on it."""
 
 CLUSTERS_MAX: Final = 64
-"""Largest clusters first: what is beyond is debris, and the time stays bounded."""
+"""Number of largest clusters used: the rest is debris, and the time stays bounded."""
 
 
 def spacing(points_m: Points) -> float:
@@ -62,7 +62,7 @@ def without_large_planes(
         voxel_m: Grid of the thinned scene.
 
     Returns:
-        What is left, (M, 3), and the planes that went, (P, 4): unit normal, offset.
+        The remaining points, (M, 3), and the removed planes, (P, 4): unit normal, offset.
     """
     planes: list[Planes] = []
     random = np.random.default_rng(0)

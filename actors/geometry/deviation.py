@@ -1,4 +1,4 @@
-"""Compare a place of the tray with what should stand there: missing, extra, moved, deformed.
+"""Compare a place of the tray with its expected content: missing, extra, moved, deformed.
 
 what is new -> register the trained surface -> render it into the sensor -> compare pixel by pixel
 (median 5, mean 7x7, limit from the sensor's spread, a band along edges left out) -> largest blob

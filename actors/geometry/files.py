@@ -2,8 +2,8 @@
 
 Two rules a change must keep:
 
-1. Whoever reads a file from a user says which file, what was asked of it, what was found and
-   what to do, in one `InputFileError`; a library's own message never reaches the user alone.
+1. Code that reads a user's file reports the file, what was expected, what was found and what to
+   do, in one `InputFileError`; a library's own message never reaches the user alone.
 2. Output appears under its name only when every byte of every file of the set is on disk.
 """
 

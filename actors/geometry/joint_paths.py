@@ -75,7 +75,7 @@ class JointPath:
         length_rad: The greatest `s`.
 
     Raises:
-        ValueError: No waypoint, or one that is not finite.
+        ValueError: There is no waypoint, or one is not finite.
     """
 
     def __init__(self, waypoints: F64) -> None:
@@ -155,7 +155,7 @@ class PathSpeeds:
     Args:
         arm: The arm.
         path: The path.
-        nominal_m_s: Greatest speed of a capsule's end where nobody is near.
+        nominal_m_s: Greatest speed of a capsule's end while no person is near.
 
     Attributes:
         path: The path.

@@ -44,8 +44,8 @@ class Plan:
 
     Attributes:
         waypoints: (k, n) rad; (0, n) if there is no path.
-        reason: Why there is none; empty if there is one.
-        questions: How often the search asked what is free.
+        reason: Why there is no path; empty if there is one.
+        questions: Number of collision checks of the search.
     """
 
     waypoints: F64
@@ -150,7 +150,7 @@ def _states(waypoints: F64) -> F64:
 
 
 def _with_free_corners(waypoints: F64, passable: Free) -> F64 | None:
-    """Return waypoints whose rounded path is passable; None if there are none.
+    """Return waypoints whose rounded path is free of collisions, or None.
 
     A point halfway into a rounding on each side of its corner makes it half as wide.
     """
@@ -188,7 +188,7 @@ def load() -> None:
 
 @lru_cache(maxsize=1)
 def _ompl() -> tuple[Any, Any, Any]:
-    """Load OMPL once, silent: that a seed is set anew is meant, and failures are returned."""
+    """Load OMPL once, without its log: a new seed is intended, and failures are returned."""
     from ompl import base, geometric, util
 
     util.setLogLevel(util.LogLevel.LOG_NONE)

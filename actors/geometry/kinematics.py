@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class Chain(Protocol):
-    """What this module needs of an arm with n joints, all of which turn."""
+    """What this module needs of an arm with n revolute joints."""
 
     @property
     def dh(self) -> F64:

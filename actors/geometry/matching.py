@@ -79,7 +79,7 @@ class ClusterMatch:
 
 @dataclass(frozen=True, slots=True)
 class ModelMatch:
-    """Where a model stands in a scene.
+    """The pose of a model in a scene.
 
     Attributes:
         ranking: All clusters compared, best first; never empty.

@@ -213,7 +213,7 @@ class _Scene:
         return hits
 
     def is_free(self, places: Floats, towards: Floats) -> npt.NDArray[np.bool_]:
-        """Say for each place whether nothing stands in the given direction."""
+        """Return for each place whether the given direction is unobstructed."""
         rays = np.concatenate([places, towards], axis=1).astype(np.float32)
         blocked = self._rays.test_occlusions(tensor(rays))
         return ~np.asarray(blocked.numpy())
@@ -262,7 +262,7 @@ def _lighting(
     place = hits.place[lit] + hits.normal[lit] * (3e-3 * scene.span_m)
     normal = hits.normal[lit]
     right, down, forward = world_from_camera[:3, :3].T.astype(np.float32)
-    # Over the left shoulder of who looks: right for any world, also one whose z is not up.
+    # Over the viewer's left shoulder: right for any world, even if z does not point up.
     lamp = _unit(-0.8 * forward - 0.55 * right - 0.75 * down)
     lamp_light, sky_light = (np.zeros(len(lit), np.float32) for _ in range(2))
     for _ in range(LAMP_RAYS):

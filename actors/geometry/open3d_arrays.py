@@ -28,7 +28,7 @@ def tensor(array: npt.NDArray[Any], dtype: npt.DTypeLike | None = None) -> Any:
     """
     native = np.dtype(array.dtype if dtype is None else dtype).newbyteorder("=")
     own = np.array(array, native, order="C")
-    return open3d().core.Tensor.from_numpy(own)  # it keeps `own` alive; nobody else has it
+    return open3d().core.Tensor.from_numpy(own)  # it keeps `own` alive; no other reference exists
 
 
 def image(array: npt.NDArray[Any]) -> Any:
@@ -57,5 +57,5 @@ def point_cloud(
 
 def _vectors(array: npt.NDArray[np.floating]) -> Any:
     # Open3D copies, but float32 one by one (half a second for 300,000 points), and it refuses
-    # what is read-only.
+    # read-only arrays.
     return open3d().utility.Vector3dVector(np.require(array, np.float64, ["C", "W"]))

@@ -25,7 +25,7 @@ ACCELERATION: Final = 0.4
 SEEN_M: Final = 0.03
 """Standard deviation of the middle of a body in the tight hull."""
 WALK_M_S: Final = 1.6
-"""Speed of a person whom nobody sees."""
+"""Assumed speed of a person whom no camera sees."""
 BLOCK_M: Final = 0.1
 """Edge of the blocks along which distances within a body are measured."""
 LIMBS: Final = 5

@@ -150,8 +150,8 @@ def paired_images(directory: Path) -> list[tuple[Path, Path]]:
         directory: The recording.
 
     Raises:
-        InputFileError: No images, one kind without the other, or a pair that `rgbd.match` names
-            but nobody finds.
+        InputFileError: No images, one kind without the other, or a pair in `rgbd.match` without its
+            files.
     """
     colours, depths = _images(directory)
     if not depths or not colours:
@@ -278,7 +278,7 @@ def _matched(
             raise InputFileError(
                 match,
                 asked="in each line a depth image and its colour image",
-                found=f"line {line}, {text!r}, of which {len(found)} exist",
+                found=f"line {line}, {text!r}, but {len(found)} of these exist",
                 remedy="add the missing image or remove the line and its pose",
             )
         pairs.append((found[1], found[0]))

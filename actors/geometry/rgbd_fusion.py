@@ -96,8 +96,9 @@ def fuse_frames(
 
     Args:
         frames: At least one.
-        voxel_m: Edge of the grid, metres; the surface is cut off 8 voxels behind what is seen.
-        depth_m_max: Farther measurements are left out.
+        voxel_m: Edge of the grid, metres; the surface is truncated 8 voxels behind each
+            measurement.
+        depth_m_max: Farther measurements are ignored.
 
     Returns:
         The surface in the world frame, small islands removed.

@@ -173,7 +173,7 @@ def assigned(
 
 
 def nearest(place_m: Points, candidates_m: Sequence[Points]) -> int | None:
-    """Return the number of the candidate position nearest to a place, None if there is none."""
+    """Return the number of the candidate position nearest to a place, or None."""
     if not candidates_m:
         return None
     return int(np.argmin([float(np.hypot(*(each - place_m))) for each in candidates_m]))

@@ -85,7 +85,7 @@ class Separation:
         """Return v_max(d), the greatest speed with S(v) <= d; 0 where not even S(0) is.
 
         Args:
-            distance_m: From the person to the robot, metres; infinity if nobody is there.
+            distance_m: From the person to the robot, metres; infinity without a person.
 
         Raises:
             ValueError: The distance is not a number.

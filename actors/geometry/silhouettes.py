@@ -29,9 +29,9 @@ SUBTRACTORS: Final = ("gaussian", "mog2", "knn")
 BOX_PX: Final = 3
 """Edge of the box filter that images and background go through."""
 LEVELS_MIN: Final = 6
-"""A pixel that differs by no more than this is background, however still it was."""
+"""A pixel that differs by at most this is background, however little it varied."""
 SPREADS: Final = 6
-"""A pixel that differs by no more than so many standard deviations is background."""
+"""A pixel that differs by at most so many standard deviations is background."""
 EDGE_FACTOR: Final = 2
 """Smoothing blurs an edge by a pixel.  There a pixel counts only if it differs by so many times
 what a smoothed one may, before smoothing: about five standard deviations of its noise."""

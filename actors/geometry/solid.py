@@ -43,7 +43,9 @@ BEHIND_VOXELS: Final = (1.25, 2.75)
 the first, or walls move inwards (0.4 mm when the say fell from 0 on)."""
 
 HIDDEN_WEIGHT: Final = 0.01
-"""Say of "nobody saw it free" against one view square on: 0.15 moved every wall out by 0.4 mm."""
+"""Weight of "no view saw it free" against one perpendicular view: 0.15 moved every wall out by 0.4
+mm.
+"""
 
 GRAZING_COS: Final = 0.15
 """Surfaces seen flatter than 81 degrees count as if at that, and so do the ends of a surface."""
@@ -61,7 +63,7 @@ SLOPE_LAYERS: Final = 5
 """Layers above the foot that give its slope: 8 mm."""
 
 SLOPE_WITHIN: Final = 0.8
-"""Distances up to here, in reaches, are sure not to be cut off."""
+"""Distances up to here, in reaches, are certainly not truncated."""
 
 SLOPE_SPREAD_VOXELS: Final = 2.0
 """Spread over which the slope is averaged: four times amplified, its noise would show."""
@@ -142,8 +144,8 @@ def _distances(views: Sequence[SeenDepth], axes: Sequence[Pose], voxel_m: float)
             weights[..., layer] += weight
     blind = axes[2] < SEEN_FROM_M
     total[..., blind] = weights[..., blind] = 0.0
-    # A point in nobody's pixel takes its neighbours' mean; for all of them it would draw walls in,
-    # since what is free is surer than what is solid.
+    # A point in no view's pixel takes its neighbours' mean; for all points that would shrink walls,
+    # since free space is more certain than solid.
     lent = _blurred(total) / np.maximum(_blurred(weights), np.float32(1e-9))
     field = np.where(weights > 2.0 * HIDDEN_WEIGHT, total / np.maximum(weights, 1e-9), lent)
     field[..., ~blind] = _blurred(field[..., ~blind])

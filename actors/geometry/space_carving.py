@@ -45,12 +45,12 @@ class Carved:
     """What silhouettes leave of a grid.
 
     Attributes:
-        rows: (N,) voxels of which no camera says that nothing of them meets its mask.
-        outside: (N,) in how many masks the centre does not lie, and ...
+        rows: (N,) voxels that, according to every camera, may meet its mask.
+        outside: (N,) number of masks that do not contain the centre, and ...
         outside_of: (N,) ... the number of the last of those cameras.
-        vetoes: (M,) rows that exactly one camera denies, and ...
+        vetoes: (M,) rows that exactly one camera rejects, and ...
         denied_by: (M,) ... its number.
-        denied_outside: (M,) in how many masks their centre does not lie.
+        denied_outside: (M,) number of masks that do not contain their centre.
     """
 
     rows: Rows
@@ -96,11 +96,11 @@ class Carver:
         ]
 
     def carve(self, grid: VoxelBlocks, *, seen_least: int = 1) -> Carved:
-        """Return what is left of a grid.
+        """Return the voxels of a grid that remain.
 
         Args:
             grid: The voxels.
-            seen_least: A voxel of which fewer cameras have a say is left out.
+            seen_least: Voxels within view of fewer cameras are dropped.
         """
         return self._carved(grid, self._worth_asking(grid), seen_least)
 
@@ -213,7 +213,7 @@ def grid_of(low_m: Numbers, high_m: Numbers, count: int) -> VoxelBlocks:
     """Return a grid of cubes over a box, with so many along its longest edge.
 
     Raises:
-        ValueError: The box is none, or there would be too many voxels.
+        ValueError: The box is invalid, or there would be too many voxels.
     """
     size = np.asarray(high_m, np.float64) - np.asarray(low_m, np.float64)
     if not np.isfinite(size).all() or (size <= 0.0).any():
@@ -239,7 +239,7 @@ def nearest_to_axes(cameras: Sequence[SetCamera]) -> npt.NDArray[np.float64]:
 
 
 def in_front(cameras: Sequence[SetCamera], point_m: Numbers) -> float:
-    """Return the share of the cameras ahead of which a point lies."""
+    """Return the share of the cameras that have a point in front of them."""
     ahead = [camera.axis @ (point_m - camera.centre_m) > 0.0 for camera in cameras]
     return float(np.mean(ahead))
 

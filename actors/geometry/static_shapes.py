@@ -1,12 +1,12 @@
-"""What stands in an empty cell, from depth images of it: surfaces, and boxes that fill them.
+"""Static obstacles of an empty cell, from depth images: surfaces, and boxes that fill them.
 
 Points above the floor that lie close together are one thing.  What is below its points, between
 them on three sides or four, behind them in some images, and was looked through in none, is solid:
 so look into everything that is hollow.  Boxes are laid into what is solid, the largest first, and
 their faces moved to where the points are.
 
-Rules a change must keep: boxes do not reach beyond the thing by more than its points do, since
-nobody is looked for inside of them; the cell's frame has z = 0 on the floor.
+Rules a change must keep: boxes must not extend beyond the points of an object, since people are not
+searched for inside them; the cell's frame has z = 0 on the floor.
 """
 
 from __future__ import annotations
@@ -43,18 +43,18 @@ POINTS_MIN: Final = 400
 CUBE_M: Final = 0.025
 """Edge of the cubes in which what is solid is looked for."""
 BEHIND_SPREADS: Final = 3.0
-"""A cube is looked through if what is seen lies so many spreads of a pixel behind all of it."""
+"""A cube is seen through if the measurement lies so many pixel spreads behind all of it."""
 HIDDEN_MIN: Final = 2
-"""A cube that is solid lies behind what is seen in so many images."""
+"""A solid cube lies behind the measurement in at least so many images."""
 SIDES_MIN: Final = 3
 """Of the four sides of what is solid so many have points; another thing may hide one."""
 FAR_M: Final = 3.0
 """What was measured from further away is too uncertain to be a point of a thing."""
 SOLID_SHARE: Final = 0.9
-"""A box grows by a layer of cubes of which this share is solid."""
+"""A box grows by a layer of cubes if this share of them is solid."""
 BOXES_MAX: Final = 12
 LEFT_SHARE: Final = 0.03
-"""No more boxes are laid when this share of what is solid is left."""
+"""No more boxes are added once only this share of the solid cubes is uncovered."""
 SNAP_CUBES: Final = 1.6
 """Points that are this near to a face of a box tell where it is."""
 VIEW_POINTS_MIN: Final = 1000
@@ -86,7 +86,7 @@ def static_shapes(
     *,
     voxel_m: float = 0.015,
 ) -> list[StaticShape]:
-    """Return what stands in a cell, the largest first.
+    """Return the obstacles of a cell, the largest first.
 
     Args:
         frames: Depth images of the empty cell; poses are in the cell.
@@ -194,7 +194,7 @@ def _turn(points_m: Numbers) -> Numbers:
 def _hidden(
     low: Numbers, counts: npt.NDArray[np.int64], turn: Numbers, frames: Sequence[DepthFrame]
 ) -> Flags:
-    """Return which cubes of a grid lie behind what is seen, and were looked through in no image."""
+    """Return which cubes of a grid lie behind measurements and were never seen through."""
     axes = [low[axis] + CUBE_M * (np.arange(counts[axis]) + 0.5) for axis in range(3)]
     local = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     centres = local @ turn.T

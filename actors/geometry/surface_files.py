@@ -1,7 +1,7 @@
 """A surface as the bytes of a PLY file.
 
 Encoded here rather than by Open3D, which writes straight to the final name and answers a full
-disk with `False`: bytes in hand can be written whole or not at all (`files.write_whole`).
+disk with `False`: encoded bytes can be written atomically (`files.write_whole`).
 """
 
 from __future__ import annotations

@@ -4,11 +4,12 @@ A camera can only ever say that a voxel is free.  It has a say if it sees all of
 its corners lie in the image, at least `NEAREST_M` ahead, and no static obstacle hides one of them;
 corners within an obstacle do not count.
 
-`pixel[v]` is where the camera looks for voxel v: an index into its masks, one behind the other,
-each grown by another number of pixels.  The mask is the one that is grown as far as the corners of
-the voxel lie from its centre in the image, so that a voxel is free only where *nothing* of it meets
-foreground.  Where the camera has no say, the index is that of the *sentinel*, one more byte behind
-the masks that is always foreground.  `cell[b]` is the same for whole blocks in pooled masks.
+`pixel[v]` is where the camera looks for voxel v: an index into its masks, stored one after another,
+each grown by a different number of pixels.  The mask used is the one grown by the distance in the
+image from the voxel's centre to its corners, so a voxel is free only if *no part* of it meets
+foreground.  If the camera does not see the voxel, the index is that of the *sentinel*, one more
+byte after the masks that is always foreground.  `cell[b]` is the same for whole blocks in pooled
+masks.
 
 Distortion lives in these tables; no image is ever undistorted.
 
@@ -53,7 +54,7 @@ INSIDE_M: Final = 0.005
 
 
 class Calibrated(Protocol):
-    """What is asked of a calibration; see `workcell.vocabulary.Calibration`."""
+    """What is needed of a calibration; see `workcell.vocabulary.Calibration`."""
 
     @property
     def camera_matrix(self) -> npt.NDArray[np.float64]:

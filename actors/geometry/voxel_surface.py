@@ -1,7 +1,7 @@
 """The surface of voxels as triangles: surface nets, closed, with its front outside.
 
-A vertex lies in each cube of eight voxel centres that holds both kinds, where the smoothed border
-passes; a quad stands for each pair of neighbouring voxels of both kinds.
+A vertex lies in each cube of eight voxel centres with both kinds, where the smoothed border
+passes; each pair of neighbouring voxels of different kinds makes a quad.
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ Files in `out`:
 model_<product>.png  the trained surface, each planar patch in its colour
 tray_<n>.png         each tray with the deviating regions in red
 report.json          the table
-cell.toml, cell.log  what ran, and what it said, if it ran here
+cell.toml, cell.log  configuration and log of the cell, if it ran here
 ===================  =========================================================
 """
 
@@ -141,7 +141,7 @@ def _shown(demo: PalletizingCell | RunningCell, out: Path, *, up: str, keep_runn
 def _follow(
     cell: Cell, running: PalletizingCell | RunningCell, truths: Sequence[Package], console: Console
 ) -> None:
-    """Show progress until the user was told of every package.
+    """Show progress until the user was notified of every package.
 
     Raises:
         DemoError: The processes ended, or nothing moved for `STALL_S`.
@@ -162,7 +162,7 @@ def _follow(
                 raise DemoError(f"nothing moved for {STALL_S:.0f} s; see {running.log}")
             try:
                 seen = _look(cell)
-            except ShardUnreachableError as error:  # whoever runs it starts it again
+            except ShardUnreachableError as error:  # the operator restarts it
                 if not away:
                     console.print(f"waiting: {error}")
                 away = True
@@ -188,11 +188,11 @@ class _Seen:
     """How far a run is.
 
     Attributes:
-        notices: What the user was told, by place.
-        models: Products that are trained.
-        models_ordered: How many shall be.
-        views: How many views are reconstructed.
-        views_ordered: How many shall be.
+        notices: Notices to the user, by place.
+        models: Number of trained products.
+        models_ordered: Number of products to train.
+        views: Number of reconstructed views.
+        views_ordered: Number of views to reconstruct.
     """
 
     notices: Mapping[str, Notice]

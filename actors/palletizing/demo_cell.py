@@ -55,12 +55,12 @@ def watched_cell(config: Path) -> PalletizingCell:
     """Return a palletizing cell that runs already, in containers for instance.
 
     Args:
-        config: Its `cell.toml`; the simulated sensor of `online-perception` says in there how many
-            packages come, and of which seed they are.
+        config: Its `cell.toml`; the simulated sensor of `online-perception` names there how many
+            packages come and their seed.
 
     Raises:
-        ConfigError: The file cannot be used, or the sensor is not the simulated one, of which
-            alone the truth is known.
+        ConfigError: The file cannot be used, or the sensor is not the simulated one, for which
+                alone the truth is known.
     """
     loaded = load_config(config)
     address = next(

@@ -56,7 +56,7 @@ def rows_of(
     Args:
         packages: The simulated packages, one per stop.
         flags: What the cell found, by place.
-        notices: What the user was told, by place.
+        notices: Notices to the user, by place.
     """
     rows = []
     for stop, package in enumerate(packages):

@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 class DeviationDetection(Actor):
     """Flag every place where something is missing, extra, moved or deformed (ENACT 4.2).
 
-    The place is the entity that both world contexts know: in training what shall stand there, in
-    online what was seen there.
+    The place is the entity in both world contexts: in training with its expected content, in
+    online with what was seen there.
 
     Args:
         moved_m: Largest shift of a sound package.

@@ -75,7 +75,7 @@ class Case:
 
     @property
     def correct(self) -> bool:
-        """Whether the verdict is the one that the truth asks for."""
+        """Whether the verdict agrees with the truth."""
         return self.finding.verdict == VERDICT_OF_KIND[self.package.truth.kind]
 
     @property

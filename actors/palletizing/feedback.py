@@ -21,7 +21,7 @@ class Feedback(Actor):
     triggers = (flags,)
 
     def update(self, lock: Lock) -> None:
-        """Tell what has not been told yet."""
+        """Notify the user of verdicts that have not been reported yet."""
         before: dict[str, Notice] = lock.get(self.notices, {})
         told = dict(before)
         for place, flag in lock[self.flags].items():

@@ -39,8 +39,8 @@ if TYPE_CHECKING:
 class TrainingPerception(Actor):
     """Orbit each product and keep what every viewpoint sees (ENACT 4.2, offline).
 
-    One view per update.  What is left to do follows from what is there: after a crash the orbit
-    goes on with the first missing view.
+    One view per update.  The data show what remains to do: after a crash the orbit
+    continues with the first missing view.
 
     Args:
         sensor: Address of the eye-in-hand sensor (`OrbitSensor`), see `open_sensor`.
@@ -80,8 +80,8 @@ class OnlinePerception(Actor):
     """See what a stop of the conveyor has brought onto the tray (ENACT 4.2, online).
 
     Every piece on the tray is matched to the package entity that was seen there before; where
-    there is none a new one is made.  The patterns are locked meanwhile, so that two perceptions
-    that see one package make one entity.
+    there is none, a new one is made.  The patterns stay locked, so that two perceptions
+    of one package make one entity.
 
     Args:
         sensor: Address of the overhead sensor (`TraySensor`), see `open_sensor`.

@@ -268,7 +268,7 @@ def _refused(error: Exception) -> int:
 
 
 class _Progress:
-    """Counts the views on a terminal; says nothing into a file or pipe."""
+    """Counts the views on a terminal; prints nothing to a file or pipe."""
 
     def __init__(self, recording: Recording) -> None:
         self._views = len(recording.frames)

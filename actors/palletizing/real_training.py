@@ -37,12 +37,12 @@ def trained_surface(
 ) -> ColouredSurface:
     """Let perception, reconstruction and fusion make one surface of a recording.
 
-    Blocks until the surface stands in the training context or an actor fails; a second per view.
+    Blocks until the training context holds the surface or an actor fails; a second per view.
 
     Args:
         perception: With the recording read and checked.
         voxel_m: Edge of the fusion grid, metres; 0 for two pixels at the median depth.
-        progress: Told how many views have their surface.
+        progress: Receives the number of views with a surface.
 
     Raises:
         Exception: What an actor's update raised, `FusionError` for example.

@@ -54,7 +54,7 @@ def open_sensor(address: str) -> Any:  # the caller knows which of the two proto
         address: ``MODULE:FUNCTION?name=value&name=value``; the function gets the values as text.
 
     Raises:
-        ValueError: Not of that form, or there is no such function.
+        ValueError: The text is malformed, or the function does not exist.
     """
     path, _, query = address.partition("?")
     module_name, colon, function_name = path.partition(":")

@@ -5,12 +5,12 @@ entity                  stands for                                              
 ======================  ============================================================  =========
 `product/<name>`        a kind of food package: what to scan, its complete surface    training
 `view/<product>/<i>`    one viewpoint of the eye-in-hand robot around a product       training
-`place/<n>`             n-th place of the plan: what shall stand there; what was seen both
+`place/<n>`             n-th place of the plan: expected content; what was seen       both
 `tray`                  the tray: its empty image                                     training
-`conveyor`              the conveyor: at which stop it stands                         online
+`conveyor`              the conveyor: its present stop                                online
 `package/<id>`          one real thing on the tray                                    online
 `system`                the cell: one flag per judged place                           online
-`user`                  the person to tell: what was told                             online
+`user`                  the operator: notices                                         online
 ======================  ============================================================  =========
 
 Frames: *product* has its origin on the base, z up; *tray* has its origin in the middle of the
@@ -152,7 +152,7 @@ class Deviation:
 
 @dataclass(frozen=True, slots=True)
 class Notice:
-    """What the user was told about a place.
+    """A notice to the user about a place.
 
     Attributes:
         text: The line.
@@ -197,12 +197,13 @@ STANDING: Final = Aspect(
         }
     ),
 )
-"""What stands there (place/*, both): ``training.diff(online, PLACES, [STANDING])`` names what is
-not as it should be."""
+"""Expected content (place/*, both): ``training.diff(online, PLACES, [STANDING])`` names the
+deviations.
+"""
 DEVIATIONS: Final = Aspect("deviation", dict[str, Deviation])
 """The flags, by name of the place (system)."""
 NOTICES: Final = Aspect("notices", dict[str, Notice])
-"""What was told, by name of the place (user)."""
+"""Notices, by name of the place (user)."""
 
 
 def view_entity(product: str, number: int) -> Entity:

@@ -54,7 +54,7 @@ WHAT_IF_S: Final = 10.0
 DEPTH: Final = 3
 """From the speed over the hull to the masks and the images."""
 KEPT_EVERY_S: Final = 1.0
-"""At most so often the nearest approach is kept anew."""
+"""Shortest time between two updates of the nearest approach."""
 ASKED_S: Final = 10.0
 """So long the end of a run waits for what is being kept."""
 NEARER_M: Final = 0.05

@@ -59,7 +59,7 @@ def pictures_of(trace: Trace, notes: Notes) -> dict[str, bytes]:
 
 
 def _datum(trace: Trace, entity: str, aspect: Aspect[Any], stamp_ns: int) -> Any:
-    """Return the datum of a slot that was the newest at a stamp, None where there is none."""
+    """Return the datum of a slot that was the newest at a stamp, or None."""
     before = [kept for kept in trace.of(entity, aspect) if kept.stamp_ns <= stamp_ns]
     return before[-1].datum if before else None
 

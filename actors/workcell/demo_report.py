@@ -18,7 +18,7 @@ TRUTHLESS: Final = frozenset({"sets", "true_voxels", "moments", "paths"})
 
 
 def value_text(name: str, value: float) -> str:
-    """Return a score as it stands in a table."""
+    """Return a score as shown in a table."""
     if not math.isfinite(value):
         return "none"
     if name in TRUTHLESS or float(value).is_integer():

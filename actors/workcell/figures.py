@@ -166,10 +166,10 @@ def hull_figure(
 
     Args:
         grid: The grid.
-        boxes: (n, 15), what stands there.
+        boxes: (n, 15), static obstacles.
         arm: (k, 7), the arm at the exposure.
         hulls: Voxels before the refinement, (N, 3), and the hull after it.
-        before: The hull of the set before: only what has changed is coloured.
+        before: The hull of the previous set: only changes are coloured.
     """
     raw, hull = hulls
     shape = grid.shape
@@ -203,11 +203,11 @@ def world_figure(
 
     Args:
         grid: The grid.
-        boxes: (n, 15), what stands there.
+        boxes: (n, 15), static obstacles.
         arm: (k, 7), the arm.
-        hull: What is occupied.
+        hull: Occupied voxels.
         limbs: (n, 7), capsules of people's limbs.
-        lines: High-level properties, a line each.
+        lines: High-level properties, one per line.
     """
     room, size = box_points(boxes), (640, 470)
     sheet = np.full((size[1], size[0], 3), 248, np.uint8)

@@ -86,7 +86,7 @@ def colour_of(text: str) -> tuple[int, int, int]:
     """Read a colour, a name of `COLOURS` or ``#rrggbb``: red, green, blue.
 
     Raises:
-        ValueError: It is none.
+        ValueError: It is invalid.
     """
     if text in COLOURS:
         return COLOURS[text]
@@ -217,7 +217,10 @@ def _read(file: Path, camera: SetCamera, *, colour: bool) -> Image:
     found = cv2.imdecode(data, flag | cv2.IMREAD_IGNORE_ORIENTATION) if data.size else None
     if found is None:
         raise InputFileError(
-            file, asked="a picture", found=f"{data.size} bytes that are none", remedy="replace it"
+            file,
+            asked="a picture",
+            found=f"{data.size} bytes of another kind",
+            remedy="replace it",
         )
     image = np.asarray(found, np.uint8) if found.dtype == np.uint8 else _eight_bit(found)
     if not colour and image.ndim == 3:
@@ -234,7 +237,7 @@ def _read(file: Path, camera: SetCamera, *, colour: bool) -> Image:
 
 
 def _eight_bit(image: npt.NDArray[np.generic]) -> Image:
-    """Return a mask of more than eight bits as one that is zero at the same places."""
+    """Return a mask of more than eight bits as an eight-bit one with the same zeros."""
     return np.where(np.asarray(image) != 0, np.uint8(255), np.uint8(0))
 
 

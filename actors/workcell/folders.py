@@ -87,12 +87,12 @@ class FolderReport:
     Attributes:
         calibration: Name of the format, and the file.
         cameras: Names of the cameras that were used.
-        missing: Those without a picture.
-        masks_from: Where the masks come from.
+        missing: Cameras without a picture.
+        masks_from: Source of the masks.
         frame: The moment, of `frames`.
-        frames: How many there are.
-        made_by: What made the hull: the cell's actors, or, of very many cameras, carving alone.
-        centre_in_front: Share of the cameras ahead of which the middle lies.
+        frames: Number of moments.
+        made_by: What made the hull: the cell's actors, or, with very many cameras, carving alone.
+        centre_in_front: Share of the cameras that have the centre in front of them.
         low_m: Lowest corner of the box, metres.
         high_m: Highest corner.
         voxel_m: Edge of a voxel.
@@ -250,7 +250,7 @@ def _last_lines(report: FolderReport, out: Path) -> list[str]:
 def _bounds(
     folder: Path, cameras: CameraSet, carver: Carver, unit: str
 ) -> tuple[Numbers, Numbers] | None:
-    """Return the box of `bounds.json`, in its calibration's unit, or the one that is found."""
+    """Return the box of `bounds.json`, in its calibration's unit, or a detected one."""
     file = folder / "bounds.json"
     if not file.is_file():
         return found_bounds(carver)

@@ -5,11 +5,11 @@ immutable values.  Time is an argument, so that tests and simulations run it as 
 
 Rules a change must keep:
 
-1. Silence means stop.  The arm brakes in full as soon as the newest command that it took is older
-   than that command is valid, counted from the exposure that it rests on, whatever the reason.
-2. A command whose stamps are too old is refused when it arrives, as is one from the future and one
-   that rests on an earlier exposure than the last.
-3. The arm leaves a path only at rest, in a place that lies on it.
+1. Silence means stop.  The arm brakes fully once its newest command is older than the command's
+   validity, counted from the exposure that the command is based on, whatever the reason.
+2. A command is refused on arrival if its stamps are too old or in the future, or if it is based on
+   an earlier exposure than the last one.
+3. The arm leaves a path only at rest, at a place on the path.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ ROBOT_S: Final = CYCLE_S + (1.0 + STARTING_SHARE) * BRAKING_RAMP_S
 """From the arrival of a command to full deceleration: one cycle, and the ramp from full
 acceleration.  It is the robot's part of the reaction time T_r."""
 NOMINAL_M_S: Final = 1.5
-"""Greatest speed of the quickest point of the arm where nobody is near."""
+"""Greatest speed of the quickest point of the arm while no person is near."""
 BRAKING_M_S2: Final = 6.0
 """Deceleration of that point on which the protective distance counts."""
 BESIDE_RAD: Final = 0.02
@@ -196,7 +196,7 @@ class Motion:
         self._recent = (*self._recent[1 - JOINTS_KEPT :], (now_ns, q_rad, dq_rad_s))
 
     def joints(self) -> Joints:
-        """Return the last 0.3 s; before they have passed, the first sample stands for what was."""
+        """Return the last 0.3 s; until they have passed, the first sample fills the gap."""
         recent = self._recent
         missing = JOINTS_KEPT - len(recent)
         first_ns = recent[0][0]
@@ -209,7 +209,7 @@ class Motion:
         )
 
     def _limit(self, now_ns: int) -> tuple[float, str]:
-        """Return the speed that is allowed now, and why there is none."""
+        """Return the speed allowed now, and the reason if it is zero."""
         speed = self._speed
         if speed is None:
             return 0.0, self._silence
@@ -270,7 +270,7 @@ class Motion:
         follower, reached = self._follower, self.doing.goals_reached
         if follower is None:
             path = self._followed
-            reason = "no path yet" if path is None else path.reason or "the path begins elsewhere"
+            reason = "no path yet" if path is None else path.reason or "the path starts elsewhere"
             self.doing = Doing("waiting", reason, 0.0, 0.0, -1, reached)
         elif follower.arrived:
             if not self._reached and self._cut_for < 0:

@@ -55,13 +55,13 @@ class Plan:
 
     Attributes:
         grid: The grid.
-        boxes: (n, 15), what stands there.
-        hull: What is occupied.
+        boxes: (n, 15), static obstacles.
+        hull: Occupied voxels.
         arm: (k, 7), the arm.
         tool_path: (n, 3), the tool along the path.
-        ways: (n, 2) each, where people were seen so far.
-        tracks: Where they are.
-        predictions: Where they will be.
+        ways: (n, 2) each, positions of people so far.
+        tracks: Present positions of people.
+        predictions: Predicted positions of people.
         bodies: The true bodies, each (n, 7).
     """
 

@@ -61,7 +61,7 @@ def _hulls(trace: Trace, truth: Truth) -> list[Kept[words.Hull]]:
 
 
 def _empty(trace: Trace, truth: Truth, scores: Mapping[str, float]) -> dict[str, bool]:
-    """S1: nobody is there."""
+    """S1: no person is present."""
     speeds = _speeds(trace, truth)
     return {
         "full speed in every set": bool(speeds) and all(one.datum.scale == 1.0 for one in speeds),
@@ -140,7 +140,7 @@ def _still(trace: Trace, truth: Truth, _: Mapping[str, float]) -> dict[str, bool
 
 
 def _left(trace: Trace, truth: Truth, _: Mapping[str, float]) -> dict[str, bool]:
-    """S6: what is left in the cell stays an obstacle."""
+    """S6: an object left in the cell stays an obstacle."""
     thing = truth.things[0]
     after = [
         kept

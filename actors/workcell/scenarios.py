@@ -45,11 +45,12 @@ class Pause:
     """A stop on a way.
 
     Attributes:
-        waypoint: Number of the point of the way at which it is, from 0.
-        seconds: How long.
-        reach_m: Where the right hand goes meanwhile, x, y, z in the cell frame; None: nowhere.
+        waypoint: Number of the point of the way where it takes place, from 0.
+        seconds: Duration.
+        reach_m: Target of the right hand during the stop, x, y, z in the cell frame; None: no
+            target.
         lean_rad: How far the trunk leans forward.
-        facing_rad: Where the person looks, from x towards y; None: as they came.
+        facing_rad: Viewing direction, from x towards y; None: the walking direction.
     """
 
     waypoint: int
@@ -66,11 +67,11 @@ class Walk:
     Attributes:
         way_m: Points x, y in the cell frame, in order; first and last lie outside the workspace
             unless the person stays.
-        begin_s: When the person stands at the first point; before, nobody is there.
+        begin_s: When the person appears at the first point.
         speed_m_s: Walking speed.
         height_m: Height of the person.
         pauses: Stops, in the order of the way.
-        repeats: After the last point the person walks the way again from its begin.
+        repeats: After the last point the person walks the way again from its start.
     """
 
     way_m: tuple[tuple[float, float], ...]
@@ -83,12 +84,12 @@ class Walk:
 
 @dataclass(frozen=True, slots=True)
 class Thing:
-    """A box that comes to stand in the cell.
+    """A box that is placed in the cell.
 
     Attributes:
         centre_m: x, y, z in the cell frame.
         half_m: Half of its edges.
-        from_s: From when on it stands there.
+        from_s: When it appears.
     """
 
     centre_m: tuple[float, float, float]
@@ -120,12 +121,12 @@ class Scenario:
     Attributes:
         name: Its name in the table above.
         seed: Its seed.
-        seconds: How long it lasts.
+        seconds: Duration.
         walks: One per person, in the order of their numbers.
         things: Boxes that are left in the cell.
-        light: (seconds, factor): from when on all images are that much brighter or darker.
-        faults: What breaks.
-        walk_in: The cabinet is one that a person can walk into.
+        light: (seconds, factor): start and factor of a change in brightness of all images.
+        faults: The faults that occur.
+        walk_in: Whether a person can walk into the cabinet.
     """
 
     name: str

@@ -43,7 +43,7 @@ HIGH_M: Final = (2.0, 2.0, 2.2)
 BLOCK: Final = 4
 """Voxels along the edge of a block; each side of the grid holds whole blocks."""
 NEVER_NS: Final = 1 << 62
-"""A begin that lies in the future of everybody who reads this: nothing plays."""
+"""A start in the far future: nothing plays."""
 GOALS_RAD: Final = (
     (-1.0, 0.9, 0.0, -1.1, 0.0, 1.1, 0.0),
     (0.9, 0.9, 0.0, -1.1, 0.0, 1.1, 0.0),

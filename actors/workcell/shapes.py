@@ -1,4 +1,4 @@
-"""Shape reconstruction (ENACT 4.1): what stands in the cell, once, before people are looked for."""
+"""Shape reconstruction (ENACT 4.1): the static obstacles, before people are tracked."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ SIMULATED = "simulated"
 class ShapeReconstruction(Actor):
     """Make surface and boxes of each static obstacle from a scan of the empty cell; runs once.
 
-    A depth sensor was carried around the cell.  What has surface on all sides and was not looked
-    into counts as solid, and nobody is looked for in what is solid: scan the inside of everything
-    that a person fits into.
-    Obstacles of an earlier scan that this one does not have are deleted.
+    A depth sensor was carried around the cell.  Space that is enclosed by surface and was never
+    seen into counts as solid, and people are not searched for in solid space: scan the inside of
+    everything that a person fits into.  Obstacles of an earlier scan that are missing from this one
+    are deleted.
 
     Args:
         scan: A folder with a recording, as `geometry.recordings` describes, its trajectory in the
@@ -63,7 +63,7 @@ class ShapeReconstruction(Actor):
         """Write surface and boxes of each obstacle.
 
         Raises:
-            ValueError: There is no grid yet, or nothing in the scan; in one line.
+            ValueError: There is no grid yet, or the scan is empty; a one-line message.
         """
         if lock.is_null(self.grid):
             raise ValueError("workspace/grid is null; write it before the scan is looked at")
@@ -89,7 +89,7 @@ def frames_of(scan: str) -> Sequence[DepthFrame]:
 
     Raises:
         InputFileError: The folder holds no recording.
-        ValueError: The seed is none.
+        ValueError: The seed is invalid.
     """
     kind, _, seed = scan.partition(":")
     if kind != SIMULATED:

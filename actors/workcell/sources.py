@@ -1,4 +1,4 @@
-"""Where a camera's images come from: a device, a folder, or one that is registered by a simulator.
+"""Where a camera's images come from: a device, a folder, or a source registered by a simulator.
 
 An address says which: ``KIND:PLACE?name=value&name=value``.
 
@@ -14,7 +14,7 @@ address                                 images
 `playback+robot:…`
 ======================================  ========================================================
 
-``{camera}`` stands for what follows ``camera/`` in the name of the entity.
+``{camera}`` is replaced by what follows ``camera/`` in the name of the entity.
 
 Rules a change must keep: what cannot work is one `CameraError`, found by `open` where it can be;
 a source never gives an old image for a new one.
@@ -74,7 +74,7 @@ class CameraSource(Protocol):
         """Return the image of a tick, (H, W, 3) uint8, BGR; may wait for the exposure.
 
         Raises:
-            CameraError: There is none.
+            CameraError: No image is available.
         """
         ...
 
@@ -96,7 +96,7 @@ def source_of(address: str, camera: str) -> CameraSource:
         camera: Name of the camera: what follows ``camera/`` in that of its entity.
 
     Raises:
-        CameraError: There is no such kind of source, or its options are wrong.
+        CameraError: The kind of source is unknown, or its options are wrong.
     """
     kind, _, rest = address.partition(":")
     place, _, query = rest.partition("?")
@@ -139,7 +139,7 @@ def check_size(where: str, image: object, calibration: Calibration) -> Image:
     """Return an image that fits a calibration.
 
     Raises:
-        CameraError: It is none, or of another size.
+        CameraError: It is no image, or has another size.
     """
     if not isinstance(image, np.ndarray) or image.dtype != np.uint8 or image.ndim != 3:
         raise CameraError(f"{where}: asked for an image; found none that OpenCV can decode")
@@ -267,7 +267,7 @@ class VideoSource:
         """Open the device.
 
         Raises:
-            CameraError: There is none, or OpenCV cannot open it.
+            CameraError: The device is missing, or OpenCV cannot open it.
         """
         import cv2
 

@@ -127,7 +127,7 @@ class Gatherer:
     )
 
     def take(self, recorded: Recorded) -> None:
-        """Keep one version, unless it is null or of an aspect that is none of the workcell's."""
+        """Keep one version, unless it is null or its aspect is not the workcell's."""
         aspect = ASPECTS.get(recorded.slot.aspect)
         if recorded.datum is None or aspect is None:
             return

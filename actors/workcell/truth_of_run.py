@@ -90,7 +90,7 @@ class Truth:
         return found
 
     def distance_to_things(self, points_m: F64, stamp_ns: int) -> F64:
-        """Return the distance of points to the nearest box that stands there by then, metres."""
+        """Return the distance of points to the nearest box present at that time, metres."""
         nearest = np.full(len(points_m), np.inf)
         for thing in self.things:
             if self.at_s(stamp_ns) >= thing.from_s:
@@ -99,7 +99,7 @@ class Truth:
         return nearest
 
     def distance_m(self, stamp_ns: int, q_rad: F64, *, over_workspace: bool = False) -> float:
-        """Return the distance of the arm to who and what is there, metres; infinity if nobody is.
+        """Return the arm's distance to people and objects, metres; infinity if there are none.
 
         Args:
             stamp_ns: When.
@@ -155,7 +155,7 @@ def safety_of(trace: Trace, truth: Truth) -> dict[str, float]:
 
     Productivity is the mean share of the nominal speed while the arm is on a path: beside that of
     an oracle that knows the true distance without delay, and of a fixed zone: full speed while
-    nobody is nearer to any place of the task than the protective distance of the full speed.
+    no person is nearer to any place of the task than the protective distance of the full speed.
     """
     motion = trace.joints()
     chosen = np.array([truth.covers(int(stamp)) for stamp in motion.stamp_ns], np.bool_)
@@ -203,7 +203,7 @@ def _productivity(
 
 
 def _zone_share(trace: Trace, truth: Truth, done: list[words.Execution], radius_m: float) -> float:
-    """Return in which share of the moments nobody is in a fixed zone around the task."""
+    """Return the share of moments without a person in a fixed zone around the task."""
     motion = trace.joints()
     places = motion.q[:: max(1, len(motion.q) // 40)]
     swept = capsules_at(truth.arm, places).reshape(-1, 7)

@@ -9,7 +9,7 @@ entity              stands for                                                  
 `human/<n>`         one person: track, limbs, prediction; in truth: the true body       both
 `robot`             the arm: model, joints, task, path, speed, execution                online
 `system`            the cell: state of safety, state of the cameras                     online
-`scenario`          what the simulators play: which, since when                         truth
+`scenario`          what the simulators play, and since when                            truth
 ==================  ==================================================================  =========
 
 World contexts: *online* is the paper's single context.  *truth* is written by the simulators only
@@ -43,7 +43,7 @@ SYSTEM: Final = Entity("system")
 SCENARIO: Final = Entity("scenario")
 
 CAMERA_COUNT: Final = 8
-"""Cameras of the cell as it is delivered."""
+"""Cameras of the cell in its delivered configuration."""
 PERIOD_S: Final = 0.1
 """Period of the capture and of all that follows from it."""
 JOINT_COUNT: Final = 7
@@ -252,10 +252,10 @@ class Path:
         number: Counts the paths; a new number is a new path.
         from_goal: Goal that it comes from, -1 at the start.
         to_goal: Goal that it leads to.
-        planned_ns: When the planner had it.
+        planned_ns: When planning ended.
         length_rad: Sum of the Euclidean lengths of its pieces.
-        reason: Why there is none, or why it replaced the last one.
-        took_ms: How long planning took.
+        reason: Why there is no path, or why it replaced the last one.
+        took_ms: Duration of planning.
     """
 
     waypoints: npt.NDArray[np.float64]
@@ -394,7 +394,7 @@ BACKGROUND: Final = Aspect("background", Background, Durability.OS)
 SILHOUETTE: Final = Aspect("silhouette", Silhouette, _FLOW, retention=Retention(versions=16))
 """Foreground of the image with the same stamp (camera/*)."""
 ABSENT: Final = Aspect("absent_ns", int, _FLOW, retention=1)
-"""Stamp of the newest set for which another has to stand in (camera/*)."""
+"""Stamp of the newest set that needs a substitute silhouette (camera/*)."""
 GRID: Final = Aspect("grid", Grid, Durability.DURABLE)
 """The voxels (workspace)."""
 EMPTY: Final = Aspect("empty_ns", int, Durability.OS)

@@ -1,9 +1,9 @@
-"""Camera watch: which cameras give images, and silhouettes that stand in for those that do not.
+"""Camera watch: which cameras give images, and substitute silhouettes for those that do not.
 
 A stand-in is all foreground: it vetoes nothing, so the hull only grows.  A set needs no stand-in to
 be used, but it would wait for a missing camera; with one, a dead camera costs no time.
 
-Two actors, since the watch looks at all cameras at every tick and must not keep one of them from
+Two actors, since the watch looks at all cameras at every tick and must not block any of them from
 writing: `CameraWatch` only looks; `StandIn` locks the silhouette of one dead camera at a time.
 """
 
@@ -147,7 +147,7 @@ class StandIn(Actor):
     shared = (silhouette,)
 
     def update(self, lock: Lock) -> None:
-        """Stand in, unless the camera's own silhouette has come after all."""
+        """Write a substitute, unless the camera's own silhouette has arrived after all."""
         stamp_ns = lock[self.absent]
         if lock.is_null(self.calibration) or lock.stamp_ns(self.silhouette) >= stamp_ns:
             return

@@ -72,7 +72,7 @@ def test_shard_whose_disk_stands_still_is_not_taken_for_dead(
         disk.clear()
 
         def connects():
-            with pytest.raises(ShardUnreachableError, match=r"s0 is there.*its disk"):
+            with pytest.raises(ShardUnreachableError, match=r"s0 is running.*its disk"):
                 connect(endpoint, timeout_s=next(longer_s))
 
         def registers():

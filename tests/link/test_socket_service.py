@@ -56,7 +56,7 @@ def test_connection_without_a_greeting_is_refused_and_the_others_served(raw):
     kind, text, _ = Stream(stranger).receive()
 
     assert kind == Kind.REFUSED
-    assert b"begins no frame" in text
+    assert b"starts no frame" in text
     assert counters(raw.shard)["connections_refused"] == 1
     assert isinstance(ask(raw(), ListLocks()), Locks)
 
@@ -139,7 +139,7 @@ def test_process_that_opens_more_than_its_share_leaves_the_rest_to_others(
     other = program(OPENS, folder / "socket", "modest")
 
     assert kind == Kind.REFUSED
-    assert b"the last 4 are for others" in text
+    assert b"the last 4 are reserved for others" in text
     assert other.stdout.readline() == f"{int(Kind.OPENED)}\n"
     assert counters(raw.shard)["quota_refused"] == 1
     kept[0].close()
@@ -483,7 +483,7 @@ def test_watcher_that_says_nonsense_is_refused(raw):
 
     kind, text, _ = Stream(near).receive()
     assert kind == Kind.REFUSED
-    assert b"ListLocks came to say what is watched" in text
+    assert b"ListLocks came instead of what to watch" in text
 
 
 def _write(peer, writer, stream, number):

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 class SimulatedCamera(Camera):
     """Publishes what one camera of the simulated room sees.
 
-    It is told by the truth what plays, and by the arm's joints where the arm is.
+    The truth context names the scenario; the arm's joints give the arm's pose.
 
     Attributes:
         stuck: The source repeats its last image from now on, as a frozen driver does; `enact actor

@@ -219,7 +219,7 @@ class Person:
         self._which = columns["which"].astype(int)
 
     def posture_at(self, at_s: float) -> Posture | None:
-        """Return what the person does at a time of the scenario; None while nobody is there."""
+        """Return what the person does at a time of the scenario; None while absent."""
         if not self.begin_s <= at_s < self.end_s:
             return None
         place = ((at_s - self.begin_s) % self._every_s) * RATE_HZ
@@ -241,12 +241,12 @@ class Person:
         )
 
     def capsules_at(self, at_s: float) -> F64 | None:
-        """Return the body at a time of the scenario, (17, 7); None while nobody is there."""
+        """Return the body at a time of the scenario, (17, 7); None while the person is absent."""
         posture = self.posture_at(at_s)
         return None if posture is None else body(posture, self.height_m)
 
     def centre_at(self, at_s: float) -> F64 | None:
-        """Return x and y of the middle of the body by volume, (2,); None while nobody is there."""
+        """Return x and y of the middle of the body by volume, (2,); None while absent."""
         capsules = self.capsules_at(at_s)
         if capsules is None:
             return None

@@ -1,6 +1,6 @@
 """MuJoCo as a renderer of recordings: soft shadows, its own textures, 0.15 s per view.
 
-It needs EGL or another OpenGL of MuJoCo; where there is none, its error says so.  Geometry,
+It needs EGL or another OpenGL of MuJoCo; without it, the error says so.  Geometry,
 cameras and lamp are those of the composite renderer; lenses have no distortion here.
 """
 

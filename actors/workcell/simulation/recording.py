@@ -1,9 +1,9 @@
 """Recordings of the simulated cameras: made once per scenario and seed, played at the true rate.
 
-    DIR/recording.json           what it is of
-    DIR/truth.npz                bodies (frames, people, 17, 7), NaN where nobody is; joints
+    DIR/recording.json           description
+    DIR/truth.npz                bodies (frames, people, 17, 7), NaN while absent; joints
                                  (frames, 7) if the arm is shown, else (0, 7); boxes (n, 9),
-                                 centre, half sizes and colour of what stands there, room by room
+                                 centre, half sizes and colour of each obstacle, room by room
     DIR/camera_<i>/still.png     the empty room, exactly
     DIR/camera_<i>/windows.npy   (frames, 4), the part that differs from it: first column, first
                                  row, last column + 1, last row + 1; zeros: nothing differs
@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     Draw = Callable[[Scene], Image]
 
 FORMAT: Final = 2
-"""Number of the format; a recording of another one is made anew."""
+"""Number of the format; a recording of another one is made again."""
 QUALITY: Final = 95
 RENDERERS: Final = ("composite", "mujoco")
 
@@ -126,7 +126,7 @@ def kept_recording(
             check_truth(folder, Stage(scenario))
             return folder
     except CameraError:
-        pass  # there is none, or an older version made it: it is made anew
+        pass  # none exists, or an older version made it: make it again
     return record(folder, scenario, renderer=renderer, calibrations=chosen, progress=progress)
 
 

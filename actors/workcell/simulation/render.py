@@ -1,6 +1,6 @@
 """The composite renderer: a backdrop, moving shadows, capsules in front by depth, noise.
 
-What moves is drawn anew in each image, what stands still was drawn once: 2 to 3 ms of one processor
+Moving things are drawn in each image, static things only once: 2 to 3 ms of one processor
 per view of 640 x 480.  The same stamp gives the same image.
 """
 
@@ -216,8 +216,8 @@ class View:
         Args:
             capsules: (n, 7), cell.
             colours: (n, 3), blue, green, red, 0 to 1; None: see `Painter.paint`.
-            boxes: What stands in the room.
-            onto: A view of the same boxes with others in it, which is used up.
+            boxes: Static boxes in the room.
+            onto: A view of the same boxes with other people in it; it is overwritten.
         """
         onto = self.empty(boxes) if onto is None else onto
         return self._painter.paint(onto, self.backdrop(boxes), capsules, colours)

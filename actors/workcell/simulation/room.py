@@ -1,4 +1,4 @@
-"""The simulated room: boxes that stand in it, its lamp, eight cameras; lengths in metres.
+"""The simulated room: its boxes, its lamp, eight cameras; lengths in metres.
 
 Frame of the cell: origin on the floor under the arm's base, z up.
 """
@@ -57,7 +57,7 @@ BOXES: Final = (
     Box("cabinet", (-0.9, 1.1, 0.6), (0.3, 0.25, 0.6), (0.56, 0.52, 0.48)),
     Box("conveyor", (-0.5, -1.3, 0.45), (0.5, 0.2, 0.45), (0.40, 0.44, 0.42)),
 )
-"""What stands in the cell, but for scenarios with a walk-in cabinet."""
+"""The obstacles of the cell, except in scenarios with a walk-in cabinet."""
 
 
 def _walk_in() -> tuple[Box, ...]:
@@ -78,11 +78,11 @@ def _walk_in() -> tuple[Box, ...]:
 
 
 WALK_IN: Final = (*(box for box in BOXES if box.name != "cabinet"), *_walk_in())
-"""What stands in the cell of a scenario in which somebody hides."""
+"""The obstacles of the cell in a scenario in which a person hides."""
 
 
 def boxes_of(scenario: Scenario) -> tuple[Box, ...]:
-    """Return what stands in the cell from the start and is known to it."""
+    """Return the obstacles that the cell knows from the start."""
     return WALK_IN if scenario.walk_in else BOXES
 
 

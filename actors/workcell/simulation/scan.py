@@ -33,9 +33,9 @@ def scan_of_room(
     """Return depth images of the empty cell, from around each thing at two heights.
 
     Args:
-        seed: Of the noise.
-        boxes: What stands in the cell.
-        views: How many images.
+        seed: Seed of the noise.
+        boxes: The obstacles of the cell.
+        views: Number of images.
         camera: The sensor.
     """
     vertices, triangles = _room(boxes)

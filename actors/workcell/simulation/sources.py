@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     Image = npt.NDArray[np.uint8]
 
 EARLY_S: Final = -1.0
-"""A time of every scenario at which nobody is there yet."""
+"""A time before any person appears, in every scenario."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -112,7 +112,7 @@ class LiveSource:
             self._stage = None if playing is None else self.stage_of(playing)
             self._playing = playing
             for boxes in () if self._stage is None else self._stage.rooms:
-                self._view.backdrop(boxes)  # half a second each: now, not while somebody walks
+                self._view.backdrop(boxes)  # half a second each: now, not while a person walks
 
     def stage_of(self, playing: Playing) -> Stage:
         """Return what a scenario puts where.
@@ -140,7 +140,7 @@ class LiveSource:
         """Return the image of a tick.
 
         Raises:
-            CameraError: There is none.
+            CameraError: No image is available.
         """
         self._follow()
         assert self._view is not None
@@ -176,7 +176,7 @@ class LiveSource:
         return self._stage.boxes + self._stage.things_at(at_s)
 
     def _at_s(self, stamp_ns: int) -> float:
-        """Return the second of the scenario, or one at which nobody is there."""
+        """Return the second of the scenario, or a time without people."""
         playing = self._playing
         if playing is None or not 0 <= stamp_ns - playing.start_ns < playing.seconds * 1e9:
             return EARLY_S
@@ -201,7 +201,7 @@ class PlaybackSource(LiveSource):
         """Open the recording.
 
         Raises:
-            CameraError: There is none, or it is not whole, or not of this calibration.
+            CameraError: It is missing, incomplete or of another calibration.
         """
         self._tape = Tape(self._folder, self._number, calibration)
         if self._tape.info.robot and self.draws_arm:

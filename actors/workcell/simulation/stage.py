@@ -26,8 +26,8 @@ class Scene:
     Attributes:
         capsules: (n, 7), cell: the arm first, then the people in order.
         colours: (n, 3), blue, green, red, 0 to 1.
-        boxes: What stands in the room.
-        brightness: Of the images; 1 as the backgrounds were learned.
+        boxes: Static boxes in the room.
+        brightness: Of the images; 1 as in the learned backgrounds.
     """
 
     capsules: F64
@@ -54,12 +54,12 @@ class Stage:
 
     @property
     def boxes(self) -> tuple[Box, ...]:
-        """What stands in the room from the start and is known to the cell."""
+        """The obstacles in the room that the cell knows from the start."""
         return boxes_of(self.scenario)
 
     @property
     def rooms(self) -> tuple[tuple[Box, ...], ...]:
-        """What stands in the room one after the other, with what is left there."""
+        """The successive obstacles in the room, including objects left there."""
         times = sorted(thing.from_s for thing in self.scenario.things)
         return (self.boxes, *(self.boxes + self.things_at(at_s) for at_s in times))
 
@@ -82,7 +82,7 @@ class Stage:
         """Return what a camera can see.
 
         Args:
-            at_s: Time of the scenario; before 0 nobody is there.
+            at_s: Time of the scenario; before 0 no person is present.
             robot: (n, 7) capsules of the arm, cell; None: it is not shown.
         """
         bodies = self.bodies_at(at_s)

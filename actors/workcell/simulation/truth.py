@@ -78,7 +78,7 @@ class TruthRobot(Actor):
 
 
 def body_of(person: Person, at_s: float) -> Body | None:
-    """Return the true body of a person at a time of the scenario; None while nobody is there."""
+    """Return the true body of a person at a time of the scenario; None while absent."""
     capsules, centre = person.capsules_at(at_s), person.centre_at(at_s)
     if capsules is None or centre is None:
         return None
