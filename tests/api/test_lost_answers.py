@@ -91,7 +91,10 @@ def test_commit_raises_unknown_when_no_answer_ever_comes(cell, online, monkeypat
     """CommitUnknownError comes only after the deadline, and names the lock."""
     monkeypatch.setattr(link_client, "FINISH_S", 0.3)
     count = Write(online, counter, COUNT)
-    with pytest.raises(CommitUnknownError, match="took effect is unknown") as caught, Lock(count) as lock:
+    with (
+        pytest.raises(CommitUnknownError, match="took effect is unknown") as caught,
+        Lock(count) as lock,
+    ):
         lock[count] = 1
         deaf = lose(cell, Commit, Outcome, chance=1.1)
     cell._client.carrier = deaf._inner
