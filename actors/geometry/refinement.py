@@ -112,6 +112,18 @@ class Refined:
         """Index of the voxel that is nearest to the robot; -1 if nothing is occupied."""
         return int(self.clearance_m.argmin()) if len(self.rows) else -1
 
+    def limited(self, most: int) -> Refined:
+        """Return the `most` voxels that are nearest to the robot; `counts` has "distant" more."""
+        kept = np.sort(np.argpartition(self.clearance_m, most)[:most])
+        return Refined(
+            rows=self.rows[kept],
+            clearance_m=self.clearance_m[kept],
+            tight=self.tight[kept],
+            component=self.component[kept],
+            counts={**self.counts, "distant": len(self.rows) - most},
+            raw=self.raw,
+        )
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Beside:

@@ -8,12 +8,15 @@ Rules a change must keep:
 1. Silence means stop.  The arm brakes fully once its newest command is older than the command's
    validity, counted from the exposure that the command is based on, whatever the reason.
 2. A command is refused on arrival if its stamps are too old or in the future, or if it is based on
-   an earlier exposure than the last one.
+   an earlier exposure than the last one.  Ages are by the host's clock: when it is set, the newest
+   command is forgotten.
 3. The arm leaves a path only at rest, at a place on the path.
+4. An arm that is not where it was commanded to be gets no more commands.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Protocol
 
@@ -48,6 +51,34 @@ BESIDE_RAD: Final = 0.02
 """So far from where the arm is may a path begin."""
 FUTURE_NS: Final = 20_000_000
 """So far ahead of this host's clock may a stamp be."""
+FOLLOWING_RAD: Final = 0.15
+"""A joint that is farther than this from where it was commanded does not follow: at its greatest
+speed a joint moves half of it in 30 ms."""
+SET_NS: Final = 5_000_000
+"""By so much from one cycle to the next no clock drifts: somebody has set it."""
+AT_ONCE_NS: Final = 1_000_000
+"""Two clocks are compared if reading them took no longer."""
+
+
+class HostClock:
+    """Notices that the host's clock was set: ages by it are wrong then."""
+
+    def __init__(self) -> None:
+        self._ahead_ns: int | None = None
+
+    def was_set(self, now_ns: int, before_ns: int, after_ns: int) -> bool:
+        """Return whether the clock was set since the last call.
+
+        Args:
+            now_ns: The host's clock.
+            before_ns: A clock that nobody can set, read before.
+            after_ns: The same, read after.
+        """
+        if after_ns - before_ns > AT_ONCE_NS:
+            return False
+        ahead_ns = now_ns - before_ns
+        last_ns, self._ahead_ns = self._ahead_ns, ahead_ns
+        return last_ns is not None and abs(ahead_ns - last_ns) > SET_NS
 
 
 class RobotDriver(Protocol):
@@ -143,7 +174,7 @@ class Motion:
         self._asked: tuple[Path, PathSpeeds] | None = None
         self._followed: Path | None = None
         self._follower: PathFollower | None = None
-        self._cut_for = -1
+        self._cut_for: Path | None = None
         self._reached = False
         self._silence = "no speed has been commanded"
         self.doing, self.refused = Doing(), 0
@@ -155,7 +186,7 @@ class Motion:
             Why it is refused; empty if it is taken.
         """
         age_ms = (now_ns - speed.captured_ns) / 1e6
-        if age_ms > speed.valid_ms:
+        if not (age_ms <= speed.valid_ms and math.isfinite(speed.valid_ms)):
             why = f"the command is {age_ms:.0f} ms old, {speed.valid_ms:.0f} are allowed"
         elif age_ms * 1e6 < -FUTURE_NS:
             why = f"the command is {-age_ms:.0f} ms ahead of this host's clock"
@@ -170,7 +201,7 @@ class Motion:
     def follow(self, path: Path) -> None:
         """Take a path; one without waypoints ends the motion where it can stop."""
         asked = self._asked
-        if asked is not None and asked[0].number == path.number:
+        if asked is not None and asked[0].identity == path.identity:
             return
         waypoints = path.waypoints if len(path.waypoints) else self.q_rad[None]
         line = JointPath(waypoints)
@@ -192,7 +223,18 @@ class Motion:
         self._tell(why)
 
     def measured(self, q_rad: F64, dq_rad_s: F64, now_ns: int) -> None:
-        """Keep what the arm has measured."""
+        """Keep what the arm has measured.
+
+        Raises:
+            RuntimeError: The arm is not where it was commanded, or does not say where it is.
+        """
+        off_rad = np.abs(q_rad - self.q_rad)
+        if not (off_rad <= FOLLOWING_RAD).all():
+            joint = int(np.argmax(np.where(np.isfinite(off_rad), off_rad, np.inf)))
+            raise RuntimeError(
+                f"joint {joint + 1} is {off_rad[joint]:.2f} rad from where it was commanded; at"
+                f" most {FOLLOWING_RAD} is allowed; check the arm, then restart it"
+            )
         self._recent = (*self._recent[1 - JOINTS_KEPT :], (now_ns, q_rad, dq_rad_s))
 
     def joints(self) -> Joints:
@@ -246,18 +288,18 @@ class Motion:
 
     def _ends_there(self, follower: PathFollower, path: Path) -> bool:
         """Let the present path end where the next one begins; False if it does not lead there."""
-        if self._cut_for != path.number:
+        if self._cut_for is not path:
             line, start = follower.speeds.path, path.waypoints[0]
             place_rad = line.nearest_rad(start)
             beside_rad = np.linalg.norm(line.at(place_rad)[0][0] - start)
             if beside_rad > BESIDE_RAD or not follower.end_at(place_rad):
                 return False
-            self._cut_for = path.number
+            self._cut_for = path
         return True
 
     def _follow(self, path: Path, speeds: PathSpeeds | None) -> None:
         """Begin a path, or none."""
-        self._followed, self._cut_for, self._reached = path, -1, False
+        self._followed, self._cut_for, self._reached = path, None, False
         self._follower = None
         if speeds is not None:
             self._follower = PathFollower(speeds, cycle_s=CYCLE_S, braking_m_s2=BRAKING_M_S2)
@@ -273,7 +315,7 @@ class Motion:
             reason = "no path yet" if path is None else path.reason or "the path starts elsewhere"
             self.doing = Doing("waiting", reason, 0.0, 0.0, -1, reached)
         elif follower.arrived:
-            if not self._reached and self._cut_for < 0:
+            if not self._reached and self._cut_for is None:
                 self._reached, reached = True, reached + 1
             self.doing = Doing("dwelling", "", 0.0, 0.0, self._number(), reached)
         elif why and follower.speed_rad_s == 0.0:

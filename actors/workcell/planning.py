@@ -133,7 +133,7 @@ class PathPlanning(Actor):
         super().__init__()
         self.predict, self.seed = predict, seed
         self._obstacles: tuple[bytes, Obstacles] | None = None
-        self._followed: tuple[int, PathSpeeds] | None = None
+        self._followed: tuple[object, PathSpeeds] | None = None
         self._blocked = 0
         self._pause = 0
         self._there_since_ns = 0
@@ -279,9 +279,9 @@ class PathPlanning(Actor):
         return self._obstacles[1]
 
     def _speeds_along(self, model: ArmModel, path: Path) -> PathSpeeds:
-        if self._followed is None or self._followed[0] != path.number:
+        if self._followed is None or self._followed[0] != path.identity:
             line = JointPath(path.waypoints)
-            self._followed = path.number, PathSpeeds(model, line, nominal_m_s=NOMINAL_M_S)
+            self._followed = path.identity, PathSpeeds(model, line, nominal_m_s=NOMINAL_M_S)
         return self._followed[1]
 
 

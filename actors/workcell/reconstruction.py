@@ -48,6 +48,9 @@ if TYPE_CHECKING:
 
 AHEAD_NS_MAX: Final = 100_000_000
 """So long after the newest sample of the joints their speed still tells where they are."""
+VOXELS_MAX: Final = 150_000
+"""A hull of more voxels, ten times those of a person, keeps the nearest to the robot: all cameras
+in the dark fill the grid, and 100 versions of that would take 3 GB of the shard."""
 GAP_S: Final = 0.5
 """After so long without a hull a late one is better than none: it says why the robot stands."""
 
@@ -113,6 +116,8 @@ class Reconstruction(Actor):
             [given.get(name) for name in self._names], self._arm(lock, stamp_ns), elapsed_s
         )
         self._last_ns, self._written_ns = stamp_ns, now_ns
+        if self.robot and len(found.rows) > VOXELS_MAX:
+            found = found.limited(VOXELS_MAX)
         nearest = found.nearest
         lock[self.hull] = Hull(
             voxels=blocks.indices(found.rows),

@@ -12,7 +12,7 @@ import time
 from typing import TYPE_CHECKING, Final
 
 from actors.palletizing.sensor import open_sensor
-from actors.workcell.motion import CYCLE_S, Motion
+from actors.workcell.motion import CYCLE_S, HostClock, Motion
 from actors.workcell.vocabulary import (
     EXECUTION,
     JOINTS,
@@ -77,10 +77,12 @@ class RunningArm:
         self._driver.close()
 
     def _run(self) -> None:
-        next_s = time.monotonic()
+        next_s, clock = time.monotonic(), HostClock()
         try:
             while not (self._stop.is_set() and self.motion.doing.speed_m_s == 0.0):
-                now_ns = time.time_ns()
+                before_ns, now_ns = time.monotonic_ns(), time.time_ns()
+                if clock.was_set(now_ns, before_ns, time.monotonic_ns()):
+                    self.motion.silence("the clock of the robot's host was set")
                 if self._stop.is_set():
                     self.motion.silence("the robot's process ends")
                 self.motion.cycle(now_ns)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from actors.geometry.joint_paths import JointPath, PathSpeeds
 from actors.geometry.separation import Reaction, Separation
-from actors.workcell.motion import BRAKING_M_S2, NOMINAL_M_S, ROBOT_S
+from actors.workcell.motion import BRAKING_M_S2, FUTURE_NS, NOMINAL_M_S, ROBOT_S
 from actors.workcell.vocabulary import (
     CAMERA_STATES,
     HULL,
@@ -80,6 +80,10 @@ def judged(
     if misfits > MISFITS_MAX:
         cause = "the background no longer fits"
         return Verdict("fault", 0.0, cause, f"{cause} in {misfits} cameras")
+    if age_s < -FUTURE_NS / 1e9:
+        cause = "the cameras' clock is ahead"
+        text = f"the newest set is {-1e3 * age_s:.0f} ms ahead of this host's clock"
+        return Verdict("fault", 0.0, cause, text)
     if joints_age_s > latest_s:
         cause = "the robot does not tell where it is"
         text = f"no sample of its joints in the {1e3 * joints_age_s:.0f} ms before the exposure"
@@ -132,10 +136,19 @@ class SpeedControl(Actor):
 
     def __init__(self) -> None:
         self._reaction: Reaction | None = None
-        self._speeds: tuple[int, PathSpeeds | None] = (-1, None)
+        self._speeds: tuple[object, PathSpeeds] | None = None
 
     def update(self, lock: Lock) -> None:
-        """Judge the newest hull."""
+        """Judge the newest hull.
+
+        Raises:
+            ValueError: `braking_m_s2` is more than the arm brakes with.
+        """
+        if self.braking_m_s2 > BRAKING_M_S2:
+            raise ValueError(
+                f"braking_m_s2 is {self.braking_m_s2:g}; the arm's loop brakes with"
+                f" {BRAKING_M_S2:g} m/s², and no distance may count on more"
+            )
         hull, captured_ns = lock[self.hull], lock.stamp_ns(self.hull)
         joints, path = lock.get(self.joints), lock.get(self.path)
         states = lock.get(self.cameras, {})
@@ -189,10 +202,10 @@ class SpeedControl(Actor):
         """Return how fast the robot would be where it is on its path, nothing limiting."""
         if model is None or joints is None or path is None or not len(path.waypoints):
             return NOMINAL_M_S
-        number, speeds = self._speeds
-        if number != path.number or speeds is None:
-            speeds = PathSpeeds(model, JointPath(path.waypoints), nominal_m_s=NOMINAL_M_S)
-            self._speeds = path.number, speeds
+        if self._speeds is None or self._speeds[0] != path.identity:
+            line = JointPath(path.waypoints)
+            self._speeds = path.identity, PathSpeeds(model, line, nominal_m_s=NOMINAL_M_S)
+        speeds = self._speeds[1]
         return speeds.nominal_m_s(speeds.path.nearest_rad(joints.q[-1]), AHEAD_S)
 
 

@@ -126,7 +126,8 @@ class Grid:
 class Hull:
     """What is occupied and neither robot nor static (workspace); the stamp is the exposure's.
 
-    All of `voxels` are the safe set: what protects uses all of them.
+    All of `voxels` are the safe set: what protects uses all of them.  Of more than 150,000 only the
+    nearest to the robot are there.
 
     Attributes:
         voxels: (N, 3) int16, indices into the grid.
@@ -134,7 +135,7 @@ class Hull:
         tight: (N,) bool, the voxel belongs to the tight set: figures, tracking, scores.
         component: (N,) int16, number of its connected component, from 0.
         counts: Voxels that each rule of the refinement removed, by name of the rule; "raw" is the
-            number before refinement.
+            number before refinement, "distant" how many are left out because there are too many.
         cameras: Names of the cameras that gave an image, in order; the others stood in.
         nearest_m: Least clearance; infinite if nothing is occupied.
         nearest_voxel: Row of `voxels` that has it; -1 if nothing is occupied.
@@ -249,7 +250,7 @@ class Path:
 
     Attributes:
         waypoints: (n, 7) float64, rad, joined by straight lines; none while no path exists.
-        number: Counts the paths; a new number is a new path.
+        number: Counts the paths since the shard's start.
         from_goal: Goal that it comes from, -1 at the start.
         to_goal: Goal that it leads to.
         planned_ns: When planning ended.
@@ -266,6 +267,11 @@ class Path:
     length_rad: float
     reason: str = ""
     took_ms: float = 0.0
+
+    @property
+    def identity(self) -> tuple[int, int]:
+        """What tells it from all others: after a restart of the shard numbers begin anew."""
+        return self.number, self.planned_ns
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,15 @@ import pytest
 from actors.geometry.capsules import capsule_distances
 from actors.geometry.kinematics import capsules_at, end_velocities
 from actors.geometry.separation import Reaction, Separation
-from actors.workcell.motion import BRAKING_M_S2, CYCLE_S, ROBOT_S, CommandedArm, Motion
+from actors.workcell.motion import (
+    BRAKING_M_S2,
+    CYCLE_S,
+    FOLLOWING_RAD,
+    ROBOT_S,
+    CommandedArm,
+    HostClock,
+    Motion,
+)
 from actors.workcell.simulation.arm import ARM, HOME_RAD
 from actors.workcell.vocabulary import Path, Speed
 
@@ -20,9 +28,9 @@ RIGHT = np.array([0.9, 0.9, 0.0, -1.1, 0.0, 1.1, 0.0])
 FULL = Speed(1.0, math.inf, math.inf, "nobody is there", 250.0, START_NS, START_NS)
 
 
-def path_of(waypoints, number=1, reason=""):
+def path_of(waypoints, number=1, reason="", planned_ns=START_NS):
     waypoints = np.asarray(waypoints, float).reshape(-1, 7)
-    return Path(waypoints, number, 0, 1, START_NS, 0.0, reason)
+    return Path(waypoints, number, 0, 1, planned_ns, 0.0, reason)
 
 
 def speed_at(now_ns, **changes):
@@ -140,6 +148,17 @@ def test_command_on_old_images_is_refused(age_ms, refused):
     assert bool(said) == bool(refused) == bool(motion.refused)
 
 
+@pytest.mark.parametrize("valid_ms", [math.nan, math.inf])
+def test_command_without_an_end_is_refused(valid_ms):
+    """A command that would never grow too old moves nothing."""
+    motion = Motion(ARM, LEFT, START_NS)
+
+    said = motion.obey(speed_at(START_NS, valid_ms=valid_ms), START_NS)
+
+    assert f"{valid_ms:.0f}" in said
+    assert motion.refused == 1
+
+
 def test_command_on_an_earlier_exposure_is_refused():
     """Commands that overtake each other never raise the speed again."""
     motion = Motion(ARM, LEFT, START_NS)
@@ -200,6 +219,41 @@ def test_path_that_begins_elsewhere_is_not_followed():
     assert (waiting.state, waiting.reason) == ("waiting", "the path starts elsewhere")
     assert loop.motion.doing.path_number == 3
     np.testing.assert_allclose(loop.motion.q_rad, LEFT, atol=1e-9)
+
+
+def test_path_of_another_life_of_the_shard_is_followed_though_its_number_was_used():
+    """Numbers begin anew with the shard; when a path was planned tells it from the old one."""
+    loop = Loop()
+    loop.run(0.4)
+
+    loop.motion.follow(path_of([], 1, "no path was found", START_NS + 10**9))
+    loop.run(0.6)
+
+    assert not loop.moves
+    assert loop.motion.doing.reason == "no path was found"
+
+
+@pytest.mark.parametrize("off_rad", [1.01 * FOLLOWING_RAD, math.nan])
+def test_arm_that_is_not_where_it_was_commanded_ends_the_loop(off_rad):
+    """An arm that was stopped by its own controller must not jump after the loop later."""
+    motion = Motion(ARM, LEFT, START_NS)
+    motion.measured(LEFT + 0.9 * FOLLOWING_RAD, np.zeros(7), START_NS)
+    off = np.array([0, 0, off_rad, 0, 0, 0, 0])
+
+    with pytest.raises(RuntimeError, match=r"joint 3 is .* rad from where it was commanded"):
+        motion.measured(LEFT + off, np.zeros(7), START_NS)
+
+
+@pytest.mark.parametrize(("step_ms", "was_set"), [(0, False), (-100, True), (100, True)])
+def test_a_clock_that_was_set_is_noticed(step_ms, was_set):
+    """What tells is how it goes on beside a clock that nobody can set; a held-up loop does not."""
+    clock = HostClock()
+
+    assert not clock.was_set(1000 * MS, 7 * MS, 7 * MS)
+    assert not clock.was_set(3000 * MS, 2007 * MS, 2007 * MS)
+    assert not clock.was_set(3100 * MS, 2017 * MS, 2107 * MS)
+    assert clock.was_set((3110 + step_ms) * MS, 2117 * MS, 2117 * MS) == was_set
+    assert not clock.was_set((3120 + step_ms) * MS, 2127 * MS, 2127 * MS)
 
 
 def test_no_path_ends_the_motion():

@@ -267,7 +267,7 @@ def test_nothing_is_planned_before_there_is_a_task(worlds):
 def test_both_in_one_actor(worlds):
     """As in the paper's Figure 4: path and speed by one actor, from one set."""
     cell = Cell(worlds, PlanningWithSpeed())
-
+    cell.now_ns -= 10 * PERIOD_NS
     cell.see(START)
 
     path = cell.see(START)

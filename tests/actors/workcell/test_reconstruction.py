@@ -190,6 +190,19 @@ def test_a_late_set_is_passed_over_while_hulls_come(cell, monkeypatch):
     assert written == [0, 0, 2]
 
 
+def test_a_hull_of_too_many_voxels_keeps_the_nearest(cell, monkeypatch):
+    """Cameras in the dark fill the grid; the distance is that of all, the rest is counted."""
+    monkeypatch.setattr("actors.workcell.reconstruction.VOXELS_MAX", 500)
+    dark = [np.full_like(bits, 255) for bits in masks()]
+    give_all(cell, FIRST_NS, dark)
+    testing.run_once(Reconstruction(), cell)
+    hull, _ = seen(cell)
+    assert len(hull.voxels) == len(hull.tight) == len(hull.component) == 500
+    assert hull.counts["distant"] > 100_000
+    assert hull.clearance_m.max() < 0.15
+    assert hull.nearest_m == hull.clearance_m.min() < 0.05
+
+
 def test_a_stand_in_and_a_stuck_image_veto_nothing_and_are_not_named(cell):
     """A camera that stands in, or gives the image of the last set again, only adds voxels."""
     whole = Reconstruction()

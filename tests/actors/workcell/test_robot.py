@@ -173,6 +173,20 @@ def test_restarted_robot_goes_on_where_it_was(cell):
     np.testing.assert_array_equal(cell.arm.sent[before][0], last)
 
 
+def test_clock_that_is_set_forgets_the_command(running, monkeypatch):
+    """Set back by less than a command is valid it would let the arm move on images of before."""
+    running.path(HOME_RAD, AWAY)
+    running.command()
+    running.obeyed()
+    running.arm.until(lambda: running.arm.moves)
+
+    monkeypatch.setattr(robot.time, "time_ns", lambda true_ns=time.time_ns: true_ns() - 100 * MS)
+    running.arm.until(lambda: not running.arm.moves)
+
+    arm = robot._arms[running.joints.driver]
+    assert arm.motion.doing.reason == "the clock of the robot's host was set"
+
+
 def test_robot_without_its_arm_says_what_is_missing(cell, monkeypatch):
     """In a process of its own it finds no arm; the error says how to configure it."""
     monkeypatch.setattr(robot, "OPENING_S", 0.01)
@@ -184,6 +198,7 @@ def test_robot_without_its_arm_says_what_is_missing(cell, monkeypatch):
 
 def test_arm_that_fails_is_reported(running):
     """What the driver raises ends the loop, and both actors say so."""
+    assert robot._is_open(running.joints.driver).wait(60.0)
     running.arm.fails = True
     robot._arms[running.joints.driver]._thread.join(60.0)
     running.command()

@@ -50,6 +50,8 @@ SOUND = {
         ({"nearest_m": -0.1}, "stop", "-0.10 m"),
         ({"without_path": "no path was found"}, "stop", "no path was found"),
         ({"age_s": 0.26}, "stop", "260 ms old"),
+        ({"age_s": -0.03}, "fault", "30 ms ahead of this host's clock"),
+        ({"age_s": -0.01}, "run", ""),
         ({"joints_age_s": 0.3}, "fault", "300 ms before the exposure"),
         ({"misfits": 2}, "run", ""),
         ({"misfits": 3}, "fault", "the background no longer fits in 3 cameras"),
@@ -204,6 +206,27 @@ def test_cameras_are_named(cell):
     assert without.reason == "2.00 m to the robot; without camera/3"
     assert fault.limit_m_s == 0.0
     assert cell.get(SYSTEM, SAFETY).state == "fault"
+
+
+def test_no_distance_counts_on_more_braking_than_there_is(cell):
+    """A deceleration that the arm's loop does not have is refused, and no speed is written."""
+    cell.actor.braking_m_s2 = 6.5
+
+    with pytest.raises(ValueError, match=r"braking_m_s2 is 6\.5; the arm's loop brakes with 6"):
+        cell.judge(1.0)
+
+
+def test_speeds_along_a_path_are_those_of_its_own_life_of_the_shard(cell):
+    """Another path may have the number of one that went with the shard."""
+    cell.joints(time.time_ns())
+    cell.put(ROBOT, PATH, Path(np.array([HOME_RAD, AWAY]), 1, 0, 1, 1000, 0.0))
+    quick = cell.judge(0.8)
+    wrist = np.array(HOME_RAD) + np.array([0, 0, 0, 0, 0, 0, 2.0])
+    cell.put(ROBOT, PATH, Path(np.array([HOME_RAD, wrist]), 1, 0, 1, 2000, 0.0))
+
+    slow = cell.judge(0.8)
+
+    assert quick.scale < slow.scale == 1.0
 
 
 def test_safety_is_written_when_it_changes(cell):
