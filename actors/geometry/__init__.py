@@ -4,6 +4,9 @@
 shapes                  what the arrays mean: cloud, surface, depth image, camera
 poses                   rigid transforms, 4x4, named `to_from_of`
 projection              points -> pixels of a calibrated camera, with its distortion
+charuco                 a board: what it looks like, where a picture shows its corners
+camera_calibration      pictures of a board -> lenses and poses of cameras
+bundle_adjustment       … all of them at once, by least squares
 silhouettes             what differs in an image from the empty cell, without its shadows
 voxels                  a grid of voxels, numbered block by block
 visibility              which camera can say what about which voxel

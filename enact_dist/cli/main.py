@@ -45,6 +45,7 @@ MODULES: Final = {
     "bench": "bench",
     "verify": "verify",
     "demo": "demo",
+    "workcell": "workcell",
 }
 """Where each command stands, in the order in which `enact --help` shows them."""
 

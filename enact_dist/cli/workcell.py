@@ -1,0 +1,197 @@
+"""`enact workcell`: what a cell with cameras of one's own needs before it runs."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from enact_dist.cli.output import ProgressLine, print_json, print_table
+from enact_dist.cli.verbs import DONE, FAILED, add_noun, add_verb, verbs_of
+from enact_dist.errors import ConfigError
+
+if TYPE_CHECKING:
+    from actors.geometry.charuco import Board
+    from actors.workcell.calibrate import CalibrateReport
+    from enact_dist.cli.verbs import Verb
+
+BOARD: Final = "8x11,0.024,0.018,4X4_50"
+"""Fits on A4."""
+_EXTRA: Final = ("cv2", "scipy")
+_COLUMNS: Final = (
+    "CAMERA", "PICTURES", "BOARD", "SHARED", "COVERED", "FOCAL PX", "RMS PX", "X, Y, Z M",
+)  # fmt: skip
+
+
+def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
+    """Add the noun and its verbs."""
+    verbs = verbs_of(add_noun(nouns, "workcell", "calibrate the cameras of a cell"))
+    verb = add_verb(
+        verbs,
+        "calibrate",
+        "lenses and poses of cameras from pictures of a ChArUco board",
+        run=run_calibrate,
+        example="enact workcell calibrate --print-board board.pdf\n"
+        "enact workcell calibrate pictures --origin 000\n"
+        "enact workcell calibrate pictures --board 7x5,0.08,0.06,5X5_100 --json\n"
+        "enact demo workcell --cameras pictures",
+    )
+    verb.add_argument(
+        "folder",
+        type=Path,
+        nargs="?",
+        metavar="FOLDER",
+        help="holds images/CAMERA/MOMENT.png; pictures of one MOMENT show the board in one place",
+    )
+    verb.add_argument(
+        "--board",
+        default=BOARD,
+        metavar="B",
+        help="COLUMNSxROWS,SQUARE_M,MARKER_M,DICTIONARY[,legacy] as it was printed (default:"
+        f" {BOARD}, which fits on A4)",
+    )
+    verb.add_argument(
+        "--print-board", type=Path, metavar="FILE", help="write it to print: .pdf, .svg or .png"
+    )
+    verb.add_argument(
+        "--out", type=Path, metavar="FILE", help="what is written (default: FOLDER/cameras.json)"
+    )
+    verb.add_argument(
+        "--origin",
+        default="",
+        metavar="MOMENT",
+        help="the board lay at the cell's origin then: its lower left corner, x right, y up the"
+        " sheet, z out of it (default: a moment at which most cameras saw it)",
+    )
+    verb.add_argument(
+        "--board-at",
+        type=place,
+        default=(0.0, 0.0, 0.0, 0.0),
+        metavar="X,Y,Z,TURN",
+        help="where it lay then instead, face up: metres, and degrees about z",
+    )
+    verb.add_argument(
+        "--intrinsics",
+        type=Path,
+        metavar="DIR",
+        help="keep the lenses of a calibration in that folder, and seek poses only",
+    )
+    verb.add_argument("--k3", action="store_true", help="fit k3, too: wide lenses need it")
+    verb.add_argument("--json", action="store_true", help="print the report as JSON")
+
+
+def place(text: str) -> tuple[float, float, float, float]:
+    """Read where a board lies; an `argparse` type."""
+    try:
+        x_m, y_m, z_m, turn_deg = (float(word) for word in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is no place such as 0.5,0,0.75,90") from None
+    return x_m, y_m, z_m, turn_deg
+
+
+def run_calibrate(arguments: argparse.Namespace) -> int:
+    """Print a board, or calibrate cameras: what the options ask for."""
+    try:
+        return _calibrate(arguments)
+    except ImportError as error:
+        if (error.name or "").partition(".")[0] in _EXTRA:
+            raise ConfigError(
+                f"the calibration needs {error.name}, which is not installed; install its extra:"
+                " pip install -e '.[workcell]' in the clone of enact-dist"
+            ) from error
+        raise
+
+
+def _calibrate(arguments: argparse.Namespace) -> int:
+    from actors.geometry.charuco import board_of
+    from actors.geometry.files import InputFileError
+
+    try:
+        board = board_of(arguments.board)
+    except ValueError as error:
+        raise ConfigError(f"--board: {error}") from None
+    if arguments.print_board:
+        return _print_board(board, arguments)
+    folder: Path | None = arguments.folder
+    if folder is None:
+        raise ConfigError("name the folder of the pictures, or --print-board FILE")
+    line = ProgressLine()
+    try:
+        report = _report_of(folder, board, arguments, line)
+    except InputFileError as error:
+        line.end()
+        print(f"enact workcell: {error}", file=sys.stderr)
+        return FAILED
+    if arguments.json:
+        print_json(report)
+    else:
+        _print(report)
+    for camera, why in report.left_out.items():
+        print(f"enact workcell: camera {camera} is not in {report.file}: {why}", file=sys.stderr)
+    return FAILED if report.left_out else DONE
+
+
+def _report_of(
+    folder: Path, board: Board, arguments: argparse.Namespace, line: ProgressLine
+) -> CalibrateReport:
+    from actors.workcell.calibrate import FILE, CalibrateOptions, calibrate
+
+    options = CalibrateOptions(
+        board,
+        arguments.out or folder / FILE,
+        origin=arguments.origin,
+        board_at=arguments.board_at,
+        intrinsics=arguments.intrinsics,
+        k3=arguments.k3,
+    )
+
+    def progress(done: int, total: int) -> None:
+        line.show(f"pictures {done} of {total}")
+        if done == total:
+            line.show("fitting lenses and poses", at_once=True)
+
+    report = calibrate(folder, options, progress=progress)
+    line.end()
+    return report
+
+
+def _print_board(board: Board, arguments: argparse.Namespace) -> int:
+    from actors.geometry.board_sheet import KINDS, MARGIN_M, sheet
+    from actors.geometry.files import check_output, write_whole
+
+    file: Path = arguments.print_board
+    if arguments.folder is not None:
+        raise ConfigError("--print-board writes a board and ends; leave out FOLDER")
+    if file.suffix.lower() not in KINDS:
+        raise ConfigError(f"--print-board {file}: name a file that ends in {', '.join(KINDS)}")
+    check_output(file.parent)
+    write_whole({file: sheet(board, file.suffix.lower())})
+    wide, high = (1e3 * (edge + 2.0 * MARGIN_M) for edge in (board.width_m, board.height_m))
+    print(
+        f"{file}: {wide:g} x {high:g} mm; print it at 100 %, glue it to something flat, measure a"
+        f" square ({1e3 * board.square_m:g} mm), and say what you measured: --board {board}"
+    )
+    return DONE
+
+
+def _print(report: CalibrateReport) -> None:
+    print(f"board        {report.board}")
+    print(f"origin       the board of moment {report.origin}, of {report.moments} moments")
+    print(f"error        {report.rms_px:.3f} px rms\n")
+    rows = []
+    for one in report.cameras:
+        known: list[Any] = ["-", "-", "-"]
+        if not one.left_out:
+            centre = ", ".join(f"{value:.3f}" for value in one.centre_m)
+            known = [f"{one.focal_px:.1f}", f"{one.rms_px:.3f}", centre]
+        rows.append(
+            [one.camera, one.pictures, one.boards, one.shared, f"{one.covered:.0%}", *known]
+        )
+    print_table(_COLUMNS, rows, empty="no camera")
+    print()
+    for picture in report.contradicting:
+        print(f"left out     {picture}: all others contradict it; was the board moved?")
+    for note in report.notes:
+        print(f"look at      {note}")
+    print(f"written      {report.file}")
