@@ -5,13 +5,13 @@ with a declaration is found when the class is made, not when it runs: see `Decla
 
 What a run promises to `update(self, lock)`:
 
-- All declared requests are granted at once; leaving `update` normally publishes all writes at
+- All declared requests are granted together; leaving `update` normally publishes all writes at
   once, an exception publishes nothing.
 - It is called with the newest data, by one thread at a time.
 - It may be called again for a datum that it has seen: at each start (once per existing entity),
   after its lock was lost (`hold_s` has passed, or the shard was away for long), and after a commit
-  whose answer was lost.  So an update sets what follows from what it reads; it does not count
-  calls, and it moves nothing.  One that moves something says `once = True`.
+  whose answer was lost.  So an update sets results that follow from its inputs; it does not count
+  calls and moves nothing.  An actor that moves something sets `once = True`.
 
 Departure from ENACT 3.1: the paper's actor owns a fixed set of entities E_a; here E_a is a name
 pattern, because its own 4.2 meets new entities at run time.
@@ -169,11 +169,11 @@ class Declaration:
         actor: Name of the class.
         requests: The declared requests by attribute name.
         triggers: Those that trigger.
-        shared: Writes that are declared to have other writers.
+        shared: Writes that declare other writers.
         roles: Names of the world roles that the requests use, in order of appearance.
-        per_entity: Whether some request stands for the triggering entity.
+        per_entity: Whether some request refers to the triggering entity.
         together: The set that triggers, whose views are the `triggers`; None without one.
-        outcome: Where an actor with `once` writes what became of each version; None without.
+        outcome: Where an actor with `once` records the outcome of each version; None without.
     """
 
     actor: str
@@ -224,7 +224,7 @@ class Declaration:
         return f"{self.actor}: {request!r}"
 
     def covers(self, entity: Entity) -> bool:
-        """Say whether all requests that stand for the triggering entity can stand for `entity`."""
+        """Return whether all requests for the triggering entity can refer to `entity`."""
         return all(
             request.entity.matches(entity)
             for request in self.requests.values()
@@ -269,7 +269,7 @@ def stands_for_trigger(request: Declared) -> bool:
 
 
 def narrowed(request: Declared, only: Entity | None) -> Declared:
-    """Return what a request stands for in an actor that works on one entity only."""
+    """Return the bound form of a request in an actor that works on only one entity."""
     if not isinstance(only, Entity) or not stands_for_trigger(request):
         return request
     return type(request)(request.world, only, request.aspect)

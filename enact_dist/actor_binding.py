@@ -51,7 +51,7 @@ class Watched:
 
 
 class BoundActor:
-    """An actor, its cell, and which world context each role stands for.
+    """An actor, its cell, and the world context of each role.
 
     Args:
         actor: The actor.
@@ -174,7 +174,7 @@ class BoundActor:
         return together.pending([str(slot_of(view)) for view in self.set_views()])
 
     def covers(self, entity: Entity) -> bool:
-        """Say whether a change of `entity` is one that the actor can be updated for."""
+        """Return whether a change of `entity` can trigger an update of the actor."""
         return self.declaration.covers(entity) and self.only in (None, entity)
 
     def watched(self) -> tuple[Watched, ...]:
@@ -202,7 +202,7 @@ class BoundActor:
         return tuple(watched)
 
     def _bound_for(self, entity: Entity | None) -> Mapping[Declared, Declared]:
-        """Return what each declared request stands for; made once for each entity."""
+        """Return the bound form of each declared request; made once per entity."""
         found = self._by_entity.get(entity)
         if found is None:
             requests = self.declaration.requests.values()

@@ -1,4 +1,4 @@
-"""Static check of a cell's actors: who reads and writes what, before any of them runs.
+"""Static check of a cell's actors: their reads and writes, before any actor runs.
 
 Reported are (error: `enact up` refuses; warning: it says so and starts; advice: it starts):
 
@@ -279,7 +279,7 @@ def _writers(uses: Sequence[Use]) -> Iterator[Finding]:
         for other in writes[index + 1 :]:
             if one.actor is other.actor or not one.meets(other) or (one.shared and other.shared):
                 continue
-            if one.unsaid or other.unsaid:  # which slot it writes nobody can say
+            if one.unsaid or other.unsaid:  # the slot that it writes is unknown
                 continue
             yield Finding(
                 "error",

@@ -72,7 +72,7 @@ class Drain:
         say = threading.Thread(target=self._say, args=(why,), daemon=True)
         say.start()
         say.join(SAY_S)
-        self._over.set()  # told once, where leaving waits for other actors of the process
+        self._over.set()  # set once, if leaving waits for other actors of the process
         self._leave(CUT_OFF)
 
     def _say(self, why: str) -> None:

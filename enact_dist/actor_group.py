@@ -7,8 +7,8 @@ interpreter, its environment, and the memory of what they import.  Each has its 
   * session: its locks, its lease, its report, its name in `enact actor ls` and `enact why`.  An
     actor whose lease is lost, or that ends, takes no lock of another with it;
   * end: an actor that fails, is done or is restarted (`enact actor restart`) leaves the others
-    running.  It is started again as `enact up` starts a process again: after a growing pause, not
-    at all once it is done or cannot run like this;
+    running.  It is restarted as `enact up` restarts a process: after a growing pause, but not
+    once it is done or cannot run as configured;
   * drain: how long its update may still take after a signal.
 
 A thread cannot be ended from outside.  Where an update does not return within its drain, the other

@@ -63,7 +63,7 @@ class _Box(Generic[P]):
             return self._pending.due_ns()
 
     def fail(self, error: Exception) -> None:
-        """Let the actor's thread raise what ended a watch for good."""
+        """Make the actor's thread raise the error that ended a watch."""
         with self._filled:
             self._error = error
             self._filled.notify_all()
@@ -72,7 +72,7 @@ class _Box(Generic[P]):
         """Return the next run that is due, waiting at most `wait_s` for one; else None.
 
         Raises:
-            Exception: What ended a watch for good.
+            Exception: The error that ended a watch.
         """
         until_ns = monotonic_ns() + round(wait_s * 1e9)
         with self._filled:
@@ -93,7 +93,7 @@ class Inbox(_Box[PendingTriggers]):
     """`PendingTriggers` that the watching threads fill and the actor's thread empties."""
 
     meanwhile = False
-    """Whether it has to hear of changes while an update runs, so by a thread of its own."""
+    """Whether it needs changes during an update, and therefore a separate thread."""
 
     def __init__(self, *, per_entity: bool) -> None:
         super().__init__(PendingTriggers(per_entity=per_entity))
@@ -167,7 +167,7 @@ class SetInbox(_Box[PendingSets]):
         _tell(f"incomplete, outside retention before its update: {told}", count)
 
     def _count(self, how: str, incomplete: IncompleteSet) -> int | None:
-        """Return how often sets without the same data are to be told of now, as `Repeated`."""
+        """Return the count to report now for sets without the same data, as `Repeated`."""
         return self._repeated.tell((how, incomplete.missing), str(incomplete), monotonic_ns())
 
     def tell_left(self) -> None:
@@ -282,7 +282,7 @@ class Watching:
         """Return the next run that is due, waiting at most `wait_s` for one; else None.
 
         Raises:
-            Exception: What ended a watch for good.
+            Exception: The error that ended a watch.
         """
         return self._inbox.take(wait_s)
 

@@ -1,6 +1,6 @@
 """The stop of an actor as its pulse: each time it looks whether to stop, it shows that it lives.
 
-An idle actor looks every 0.1 s, one that waits for a lock or after a refusal as often.  One inside
+An actor that is idle, waits for a lock or was refused looks every 0.1 s.  One inside
 `update` does not look: an update that hangs, or takes longer than the watchdog allows, is silent.
 """
 
@@ -21,7 +21,7 @@ class StopWithPulse(threading.Event):
     """An event whose every look calls `alive`, in the thread that looks.
 
     Args:
-        alive: Told of each sign of life; must not block.
+        alive: Called with each sign of life; must not block.
     """
 
     def __init__(self, alive: Callable[[], None]) -> None:

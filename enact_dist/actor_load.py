@@ -205,7 +205,7 @@ def attributes_of(actor_class: type[Actor]) -> dict[str, object]:
 
 
 def _hint(owner: type, annotation: object) -> object:
-    """Return what an annotation stands for; itself where only a type checker knows its names."""
+    """Return the type of an annotation, or itself if only a type checker knows its names."""
     holder = type(owner.__name__, (), {"__annotations__": {"it": annotation}})
     holder.__module__ = owner.__module__
     try:

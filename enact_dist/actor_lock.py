@@ -31,7 +31,7 @@ class ActorLock(Lock):
     the context `training` could not be told from the context `online`.
 
     Args:
-        bound: Each declared request with what it stands for in this update.
+        bound: Each declared request with its bound form in this update.
         entity: The triggering entity, if there is one.
         wait_s: As for `Lock`.
         hold_s: As for `Lock`.
@@ -98,7 +98,7 @@ class ActorLock(Lock):
         return Slot(context, self.entity.name, aspect)
 
     def _resolve(self, request: R) -> R:
-        """Return what a declared request stands for in this update."""
+        """Return the bound form of a declared request in this update."""
         if isinstance(request, LockRequest) and isinstance(request.world, World):
             return cast("R", self._bound.get(request, request))
         return request

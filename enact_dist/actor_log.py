@@ -41,7 +41,7 @@ class Repeated:
         self._kinds: dict[Hashable, _Kind] = {}
 
     def tell(self, kind: Hashable, text: str, now_ns: int) -> int | None:
-        """Return how often it is to be told as: 0 for the first, None for not now.
+        """Return the count to report: 0 for the first, None for not now.
 
         Args:
             kind: What is counted together; of very many kinds the later ones are.
@@ -67,7 +67,7 @@ class Repeated:
         return count
 
     def left(self) -> list[tuple[int, str]]:
-        """Return what was not told yet, as counts with the newest text of each kind; once."""
+        """Return the unreported counts, each with the newest text of its kind; only once."""
         found = [(kind.untold, kind.newest) for kind in self._kinds.values() if kind.untold]
         for kind in self._kinds.values():
             kind.untold = 0

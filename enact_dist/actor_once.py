@@ -264,7 +264,7 @@ class Once:
         return last.run != self._run or self._begun.get(entity) == last
 
     def _taken(self, lock: OnceLock, last: Outcome | None) -> Outcome | None:
-        """Return the taking of the version that the lock shows; None if there is none to take."""
+        """Return a claim on the version that the lock shows; None if there is none."""
         trigger = self._bound.declaration.triggers[0]
         assert isinstance(trigger, LockRequestOne)
         if lock.is_null(trigger):
@@ -303,7 +303,7 @@ class Once:
         text = f"taken by {found.actor}, which ended before an outcome was written"
         with Lock(outcome, wait_s=self._bound.actor.wait_s) as closing:
             if closing.get(outcome) != found:
-                return  # somebody else has closed it
+                return  # another thread has closed it
             closing[outcome] = replace(found, state="interrupted", text=text)
         self.interrupted += 1
         self.last_interrupted = f"version {found.version} for {outcome!r}"

@@ -38,7 +38,7 @@ class ActorThread:
         worlds: Role → name of a world context; None binds each role to the context of its name.
         name: Name in logs and reports; by default the class's, with that of its `only_entity`.
         wait_s: How long an attempt waits for its lock; None: as long as the actor says.
-        on_error: Told of each error beside the log, in the actor's thread.
+        on_error: Called with each error, besides the log, in the actor's thread.
 
     Raises:
         MisuseError: The actor cannot be bound like this.

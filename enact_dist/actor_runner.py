@@ -65,7 +65,7 @@ if TYPE_CHECKING:
     from enact_dist.terms import Entity
 
 OnError = Callable[["Entity | None", Exception], None]
-"""Told of each error of a run, with the triggering entity; called in the actor's thread."""
+"""Called with each error of a run and the triggering entity, in the actor's thread."""
 
 STOP_LOOK_S: Final = 0.1
 """An idle actor looks at `stop` this often; an `Event` and a `Condition` cannot be awaited both."""
@@ -102,7 +102,7 @@ def run_actor(
         stop: Set from another thread or a signal handler to end the run.
         name: Name in logs and reports; by default the class's, with that of its `only_entity`.
         wait_s: How long an attempt waits for its lock; None: as long as the actor says.
-        on_error: Told of each error beside the log.
+        on_error: Called with each error, besides the log.
 
     Returns:
         What the actor did.
@@ -205,7 +205,7 @@ class ActorRun:
         )
 
     def answer(self, word: str = "") -> None:
-        """Report that words are heard, and what came of the newest one."""
+        """Report that commands are received, and the result of the newest one."""
         self._listens, self._word = True, word[:ERROR_LENGTH_MAX]
         self._report(now=True)
 
@@ -299,7 +299,7 @@ class ActorRun:
             return False
 
     def _run_sets(self, inbox: SetInbox) -> None:
-        """Run once per complete set: first for the newest one that there is, then as they come."""
+        """Run once per complete set: first for the newest existing one, then as they come."""
         views, refused = self._bound.set_views(), 0
         while not self._stop.is_set():
             try:
@@ -373,7 +373,7 @@ class ActorRun:
             raise  # nothing changes by asking again
         except REFUSALS as error:
             if isinstance(error, LockTimeoutError) and self._stop.is_set():
-                return error  # told to stop while it waited: nothing was refused
+                return error  # interrupted while it waited: nothing was refused
             self._refused(entity, error)
             if granted_ns and isinstance(error, LeaseLostError):
                 self._lost.add(entity)

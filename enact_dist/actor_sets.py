@@ -4,8 +4,9 @@ PURE, as `actor_triggers`.  Rules that a change must keep:
 
 1. A set is complete when all members have shown a stamp of it, the same or within `within_ns` of
    each other; complete sets run one by one, in order.  A datum joins the nearest set that lacks it.
-2. It is over, for good, when each missing member has shown a stamp too new for it, or when more
-   than `open_max` sets are open and it is the oldest.  It is counted once, with who was missing.
+2. It is finally over when each missing member has shown a stamp too new for it, or when more
+   than `open_max` sets are open and it is the oldest.  It is counted once, with its missing
+   members.
 3. One that is over, or older than `least_after_ns` by the actor's clock, and has `least` of its
    data runs without the others: that is counted, too (`partial`).
 4. What can be in no set is counted too: a datum without a stamp, one whose set is over (`late`), a
@@ -70,20 +71,20 @@ class PendingSets:
     """The sets of one `Together` trigger.
 
     Args:
-        names: What each member is called.
-        entity: Stands in the runs, where an entity is asked for.
+        names: Names of the members.
+        entity: Entity of the runs, for code that needs one.
         open_max: Sets that are open at once, and complete sets that wait at once.
         within_ns: How far the stamps of one set may lie apart.
         least: With how many of its data a set may run; None: with all.
         least_after_ns: How long after its first datum it then runs.
 
     Attributes:
-        incomplete: Sets that were given up.
-        told: The newest of them.
+        incomplete: Number of incomplete sets that are over.
+        told: The newest of them, as reported.
         partial: Sets that run, or ran, without some of their data.
         last_partial: The newest of them, or nothing.
         skipped: Data, or complete sets, that no update saw because of newer ones.
-        late: Data whose set was over when they came.
+        late: Data that came after their set was over.
         unstamped: Data without a capture stamp.
     """
 

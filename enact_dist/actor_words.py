@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 ACTOR: Final = Entity("actor")
 WORDS: Final = Aspect("actor_words", dict, Durability.VOLATILE, retention=1)
 DONE: Final = "done"
-"""What a report says behind the token of a word that was done; else why it was not."""
+"""Follows the token of an executed command in a report; otherwise the reason follows."""
 ENDS: Final = "ends, to begin anew"
 
 log = logging.getLogger("enact.actor")
@@ -110,7 +110,7 @@ class ListeningForWords:
             try:
                 self._follow()
             except EnactError as error:
-                log.info("%s: no words are heard for now: %s", self._run.name, error)
+                log.info("%s: cannot receive commands for now: %s", self._run.name, error)
                 self._closing.wait(5.0)
 
     def _follow(self) -> None:
@@ -137,7 +137,7 @@ class ListeningForWords:
                 del lock[request]
         if not isinstance(word, dict):
             if word is not None:
-                log.warning("%s: a command that is none was passed over", self._run.name)
+                log.warning("%s: an invalid command was ignored", self._run.name)
             return
         token = str(word.get("token", ""))
         if word.get("restart"):
@@ -152,5 +152,5 @@ class ListeningForWords:
             self._run.answer(f"{token} {error}")
             return
         told = ", ".join(f"{key} = {value}" for key, value in values.items())
-        log.info("%s: %s, as it was told", self._run.name, told)
+        log.info("%s: %s, as commanded", self._run.name, told)
         self._run.answer(f"{token} {DONE}")

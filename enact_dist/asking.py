@@ -21,7 +21,7 @@ def versions_in(answer: Answer) -> Versions:
     """Return an answer that is to list versions.
 
     Raises:
-        EnactError: What a refusal stands for.
+        EnactError: The error of a refusal.
         ProtocolError: It is something else.
     """
     if isinstance(answer, Refused):

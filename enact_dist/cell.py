@@ -175,7 +175,7 @@ class Cell(Closing):
         return kept_versions(self._session, lambda name: WorldContext(name, self._session))
 
     def let_go(self, label: str) -> None:
-        """Let go of what a label keeps; what no other label and no retention keeps is forgotten.
+        """Release the versions of a label; what no other label and no retention keeps is removed.
 
         Nothing where the label keeps nothing.
 
@@ -192,7 +192,7 @@ class Cell(Closing):
         Raises:
             LockHeldError: This thread holds a lock.
             ShardUnreachableError: The position's shard does not answer.
-            MisuseError: `position` is none of this cell; a lock that wrote nothing has none.
+            MisuseError: `position` is not of this cell; a lock that wrote nothing has none.
         """
         refuse_inside_lock("wait")
         self._client.check_usable()
@@ -222,16 +222,16 @@ class Cell(Closing):
             timeout_s: How long the shard may stay without an answer.
 
         Returns:
-            Where it stands in time, or None if nothing was written.
+            The position of the commit, or None if nothing was written.
 
         Raises:
             CommitUnknownError: The shard cannot tell (any more): 64 later commits of the process
                 have ended in this error, too, or the process has been gone for a day.
             PermissionDeniedError: Another process made the commit and lives; nothing was written
-                yet, and only that process can be told that nothing will be.
+                yet, and only that process can rule out that it will be.
             ShardUnreachableError: The shard does not answer.
             LockHeldError: This thread holds a lock.
-            MisuseError: `lock_id` is none of this cell.
+            MisuseError: `lock_id` is not of this cell.
         """
         refuse_inside_lock("outcome")
         return self._client.outcome(lock_id, timeout_s=timeout_s)
@@ -253,17 +253,17 @@ class Cell(Closing):
             world: Its world context.
             entity: Its entity.
             aspect: Its aspect.
-            version: Which version of it; 0 is the newest.
-            depth: How many steps to go back; None: as far as it is known, at most
+            version: Its version; 0 is the newest.
+            depth: How many steps to go back; None: as far as known, at most
                 `lineage.DEPTH_MAX`.
 
         Returns:
-            A tree; what has left its retention stands in it as "forgotten".
+            A tree; versions beyond retention appear in it as "forgotten".
 
         Raises:
             NullDatumError: Nothing was ever set there.
-            ForgottenError: The version itself has left its retention.
-            MisuseError: There is no such version yet, or no such entity or aspect can be.
+            ForgottenError: The version itself is beyond retention.
+            MisuseError: The version does not exist yet, or the entity or aspect is invalid.
             UnknownWorldError: The cell has no world context of that name.
             ShardUnreachableError: A shard does not answer.
         """
@@ -319,7 +319,7 @@ class Cell(Closing):
         return self._ended_by_hand(shard, Break(number, reason, self._epoch(shard)))
 
     def force_abort(self, number: int, *, shard: str, reason: str) -> LockInfo | None:
-        """Give up a lock in doubt whose deciding shard is lost for good; audited by the shard.
+        """Abort a lock in doubt whose deciding shard is permanently lost; the shard audits it.
 
         If that shard had committed the lock after all, only a part of its writes stands then.
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 RUNNING: Final = ("starting", "running", "stuck")
-"""States of an actor's report that are none of an end."""
+"""States in the report of an actor that has not ended."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,8 +85,8 @@ class ActorInfo:
     """One session of a named actor, as the shards see it.
 
     Attributes:
-        lease_left_s: Below 0 for as long as its lease has been over, as no shard hears of it.
-        report: The actor's own statistics; empty where it gives none.
+        lease_left_s: Below 0: time since its lease expired without contact to a shard.
+        report: The actor's own statistics; empty if it sends none.
         namesakes: Further sessions, none of them silent, with an actor of the same name.
     """
 
@@ -119,10 +119,10 @@ class AuditInfo:
 
     Attributes:
         stamp_s: When, by the shard's wall clock, seconds since 1970.
-        kind: "broken" or "forced" (what was done), "confirmed" or "alarm" (what a lost shard said
-            when it was back), "settled" (somebody has seen to all alarms before).
+        kind: "broken" or "forced" (the action), "confirmed" or "alarm" (the answer of a lost shard
+            once it was back), "settled" (an operator has settled all earlier alarms).
         text: Who or what, and the reason that was given.
-        identity: Who asked for it, as actor@host:pid; empty for what the shard found by itself.
+        identity: Requester, as actor@host:pid; empty for the shard's own findings.
     """
 
     shard: str
@@ -166,7 +166,7 @@ def slot_info(shard: str, state: SlotState) -> SlotInfo:
 
 
 def actor_infos(told: Iterable[tuple[str, Answer | None]]) -> tuple[ActorInfo, ...]:
-    """Return the sessions of named actors, of what each shard has told, if it has."""
+    """Return the sessions of named actors, from the answers of all shards that answered."""
     found: dict[str, ActorInfo] = {}
     for shard, answer in told:
         for info in answer.sessions if isinstance(answer, Sessions) else ():
@@ -200,7 +200,7 @@ def _with_namesakes(infos: list[ActorInfo]) -> Iterator[ActorInfo]:
 
 
 def _report(encoded: bytes) -> dict[str, Any]:
-    """Return an actor's report; empty where it is none, as any client may send anything."""
+    """Return an actor's report; empty if invalid, since a client may send anything."""
     import msgpack
 
     try:

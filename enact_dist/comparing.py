@@ -2,8 +2,8 @@
 
 A *comparator* is anything that takes two data of an aspect and returns a `Difference`; an aspect
 names its own with ``Aspect(…, compare=…)``.  `Tolerance` compares plain values, arrays, frozen
-dataclasses, lists and dicts, part by part; `EXACT` is the one that allows nothing, which holds
-where none is named.
+dataclasses, lists and dicts, part by part; `EXACT` allows no difference and is the default
+comparator.
 
 ======================  ==========================================================================
 data                    their distance
@@ -20,9 +20,9 @@ NaN stands for *not known*: it equals NaN, and is infinitely far from every numb
 equals itself only.  The largest is the one that exceeds its tolerance most, not the one of the
 largest number, since fields differ in their units.
 
-Laws: a datum does not differ from itself; distance and verdict are the same either way round; of
-two data of different types nothing but that is said.  The symmetric form of the tolerance is that
-of PEP 485 (`math.isclose`).
+Laws: a datum does not differ from itself; distance and verdict are symmetric; for two data
+of different types only that is reported.  The symmetric form of the tolerance is that of PEP 485
+(`math.isclose`).
 """
 
 from __future__ import annotations
@@ -53,13 +53,13 @@ class Difference:
     """What a comparator found.
 
     Attributes:
-        distance: How far the data are apart, in `unit`, at their worst part; infinite where no
-            number can say it.
-        tolerance: How far they may be there, in `unit`.
-        crossed: Whether they are farther apart than that.
-        unit: "mm", "m", …; empty where the data say it themselves, or where there is none.
+        distance: How far the data are apart, in `unit`, at their worst part; infinite if no
+            number can express it.
+        tolerance: The tolerance there, in `unit`.
+        crossed: Whether the distance exceeds the tolerance.
+        unit: "mm", "m", …; empty if the data name it themselves, or have none.
         where: The worst part: ``.vertices_m[17, 2]``, ``['place/3'].verdict``; empty for the whole.
-        what: What stands there on either side, for people.
+        what: The values on either side, for people.
     """
 
     distance: float
@@ -169,7 +169,7 @@ class Tolerance:
         return self._apart(f"{_shown(left)} against {_shown(right)}", where)
 
     def _apart(self, what: str, where: str) -> Difference:
-        """Return the difference of parts of which no number says how far they are apart."""
+        """Return the difference of parts without a numeric distance."""
         return Difference(math.inf, self.absolute, True, self.unit, where, what)
 
     def _numbers(self, left: float, right: float, where: str) -> Difference:

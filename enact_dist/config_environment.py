@@ -140,7 +140,7 @@ def carrier_of(environment: Mapping[str, str]) -> str:
     """Return the carrier that the environment asks for where no `cell.toml` does.
 
     Raises:
-        ConfigError: There is none of that name.
+        ConfigError: No shard has that name.
     """
     return _carrier(environment.get("ENACT_CARRIER") or CARRIER_DEFAULT)
 

@@ -9,7 +9,7 @@ CARRIERS: Final = ("auto", "zenoh", "socket")
 """How messages may travel between processes; `local()` needs none of them.
 
 "auto" takes a socket between processes of one host and Zenoh for all others; "socket" makes it an
-error where there is none.
+error if there is none.
 """
 
 TTL_S_MIN: Final = 0.2
@@ -17,7 +17,7 @@ TTL_S_MIN: Final = 0.2
 TTL_S_MAX: Final = 60.0
 """A dead holder blocks its data for one TTL, a restarted shard waits one for absent sessions."""
 DRAIN_S_MAX: Final = 3600.0
-"""As long as `enact lock hold` holds a lock unless told."""
+"""Default duration of `enact lock hold`."""
 
 _ENDPOINT: Final = re.compile(r"tcp/(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+):(\d{1,5})\Z")
 _ADDRESS: Final = re.compile(r"((\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+)?:)?\d{1,5}\Z")

@@ -158,7 +158,7 @@ def _is_endpoint(target: str | Path) -> bool:
     """Say whether `target` is written as an endpoint, with a port that there can be.
 
     Raises:
-        ConfigError: It is, and its port is none.
+        ConfigError: It is an endpoint with an invalid port.
     """
     if isinstance(target, Path):
         return False
@@ -185,7 +185,7 @@ _ENDPOINT: Final = "an endpoint looks like 'tcp/host:7447'"
 
 
 def _checked_actor(actor: str) -> str:
-    """Return a name that may stand in logs and tables of others.
+    """Return a name that is safe in logs and tables of others.
 
     Raises:
         ConfigError: It has a character that could not, or is too long.

@@ -1,8 +1,9 @@
-"""A diff that stands: tells when data of two world contexts come to differ, and when no more.
+"""A continuous diff: reports when data of two world contexts start and stop to differ.
 
-It follows both contexts with one watch.  Whatever has changed is looked at again, both sides as one
-cut, and told only if it now stands otherwise than was told last.  Like an actor's trigger it goes
-by levels: the newest data count, and what differed only between two looks is not told.
+It follows both contexts with one watch.  It compares changed slots again, both sides in one
+consistent snapshot, and reports those whose result differs from the last report.  Like an actor's
+trigger it is level-based: the newest data count, and a difference between two looks is not
+reported.
 """
 
 from __future__ import annotations
@@ -34,8 +35,8 @@ class DiffWatch(Following["Comparison"]):
     """An iterator of `Comparison`; also a context manager.  One thread at a time may iterate.
 
     First come the slots that differ now by more than their tolerance, then every slot whose kind
-    has become another one since: `DiffKind.EQUAL` when it differs no more.  A side that is past is
-    seen once and kept; it is asked for anew only where its shard has restarted.
+    has become another one since: `DiffKind.EQUAL` when it differs no more.  A past side is
+    read once and kept; it is read again only if its shard has restarted.
     """
 
     def __init__(
@@ -112,7 +113,7 @@ class DiffWatch(Following["Comparison"]):
     # ---------------------------------------------------------------- looking
 
     def _look(self, compare: Callable[[], None]) -> None:
-        """Compare, anew where data are gone before they were fetched."""
+        """Compare; repeat if data were removed before they were fetched."""
         for attempt in range(1, ATTEMPTS_MAX + 1):
             try:
                 return compare()
@@ -143,7 +144,7 @@ class DiffWatch(Following["Comparison"]):
 
     @contextmanager
     def _in_sight(self, places: Sequence[Place], *, each: bool) -> Iterator[tuple[Sight, Sight]]:
-        """Look at both sides; at one that is past once and for all."""
+        """Read both sides; a past one only once."""
         past = self._past_world
         if past is None:
             with both_in_sight(*self._worlds, places, each=each) as sights:
@@ -157,7 +158,7 @@ class DiffWatch(Following["Comparison"]):
             yield (self._past, sight) if past is self._left else (sight, self._past)
 
     def _tell(self, found: Iterable[tuple[Comparison, bool]]) -> None:
-        """Note how slots stand now; those that stand otherwise than was told come next."""
+        """Record the results of slots; those that differ from the last report are reported next."""
         for row, _ in found:
             place = row.entity.name, row.aspect
             for world, side in zip(self._worlds, (row.left, row.right), strict=True):

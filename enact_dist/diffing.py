@@ -2,7 +2,7 @@
 
 one cut over both -> versions -> the data of those that differ, some at a time -> comparators
 
-Rules a change must keep: what is compared is of one moment where both contexts are of one cell and
+Rules a change must keep: the compared data are of one moment if both contexts are of one cell and
 one time; a version that both sides share, in the same slot or by a fork, is equal without its
 data being fetched; no more than `BATCH_BYTES_MAX` of data, or one pair, are held at a time.
 """
@@ -34,7 +34,7 @@ BATCH_BYTES_MAX: Final = 64 << 20
 """Data of so many bytes are fetched and compared together."""
 BATCH_PAIRS_MAX: Final = 1024
 ATTEMPTS_MAX: Final = 3
-"""How often two contexts are looked at anew when data are gone before they were fetched."""
+"""Retries of a comparison when data were removed before they were fetched."""
 
 
 class DiffKind(StrEnum):
@@ -91,9 +91,9 @@ class Diff:
     Attributes:
         left: Name of the left world context.
         right: Name of the right one.
-        rows: The slots that differ by more than their tolerance, in the order of their names.
+        rows: The slots that differ by more than their tolerance, in order of their names.
         equal: How many slots have equal data.
-        same: How many of these are one version on both sides, whose data were not looked at.
+        same: How many of these are one version on both sides, whose data were not compared.
         within: How many slots differ by no more than their tolerance.
     """
 
@@ -172,7 +172,7 @@ def _counted(left: str, right: str, found: Iterable[tuple[Comparison, bool]]) ->
 
 
 class Pair(NamedTuple):
-    """One slot on both sides; None stands for null."""
+    """One slot on both sides; None: null."""
 
     place: Place
     left: Reading | None
@@ -205,8 +205,8 @@ def compared(
         types: The aspects by name.
 
     Raises:
-        LeaseLostError: Data are gone: look again.
-        DatumTypeError: A datum is not of its aspect's type, or that is another one meanwhile.
+        LeaseLostError: Data were removed: try again.
+        DatumTypeError: A datum is not of its aspect's type, or the type has changed.
     """
     typed = [one for one in types.values() if one.datum_type is not object]
     for session in dict.fromkeys((first.session, second.session)):

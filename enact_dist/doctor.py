@@ -209,8 +209,8 @@ def shared_memory(folder: Path, *, named: bool = False) -> Finding:
     """Check the folder in which processes of one host can share memory.
 
     Args:
-        folder: Where it is, or will be made.
-        named: Whether somebody has chosen it, in `SHARED_FOLDER_VARIABLE`.
+        folder: Path of the folder, which may not exist yet.
+        named: Whether the user has chosen it, in `SHARED_FOLDER_VARIABLE`.
     """
     if named and not os.path.lexists(folder):
         folder = next(parent for parent in folder.absolute().parents if parent.is_dir())

@@ -40,9 +40,9 @@ def differences(
     """Name what the running shards say otherwise than each other, or than the file.
 
     Args:
-        config: The file; None where there is none.
+        config: The file; None: there is none.
         shards: The shards of the running cell.
-        welcomes: What those that answer say of the cell.
+        welcomes: The answers about the cell.
     """
     placements = {name: welcome.placement for name, welcome in welcomes.items()}
     versions = {placement.version: name for name, placement in placements.items()}
@@ -69,12 +69,12 @@ def differences(
 def namesakes(
     cell: str, config: CellConfig | None, welcomes: Mapping[str, Welcome]
 ) -> Iterator[Finding]:
-    """Name the shards that several daemons serve, at any place where somebody expects them.
+    """Name the shards that several daemons serve, at any endpoint known of them.
 
     Args:
         cell: The cell's name.
         config: The file; None where there is none.
-        welcomes: What the shards that answer say of the cell.
+        welcomes: The answers about the cell.
 
     Each shard is asked, too, at which further places others have named it.
     """

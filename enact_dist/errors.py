@@ -11,7 +11,7 @@
     │  ├─ DatumTypeError       a datum that is not of its aspect's type
     │  ├─ UnknownWorldError    a world context that the cell does not have     .known
     │  └─ ConfigError          a cell.toml, folder or option that cannot be used   .line
-    ├─ PermissionDeniedError   who asks may not: another's session, a shard's own word
+    ├─ PermissionDeniedError   not allowed: another's session, a shard's message
     ├─ NullDatumError          the world context does not know this datum      .reason
     ├─ ForgottenError          a past state that has left its retention        .oldest_ns
     ├─ ChangedError            an expected view moved on; nothing written
@@ -22,7 +22,7 @@
     ├─ StoreError              a shard's folder is in use, unreadable or corrupt   .path
     └─ LinkError               the network or the peer must be looked at
        ├─ ShardUnreachableError   no answer                                    .shard .endpoint
-       ├─ ProtocolError        the peer sent what this version cannot read
+       ├─ ProtocolError        the peer sent an unreadable message
        └─ ClockSkewError       two hosts' wall clocks are too far apart        .ahead_s
 """
 
@@ -111,8 +111,9 @@ class ForgottenError(EnactError):
     """A past state of a datum has left its retention; what came after it may be known.
 
     Attributes:
-        oldest_ns: The stamp from which on what was asked is known, nanoseconds since 1970; 0 where
-            that cannot be said.
+        oldest_ns: Timestamp from which on the requested data are known, nanoseconds since 1970; 0
+            if
+            unknown.
     """
 
     def __init__(self, message: str, *, oldest_ns: int = 0) -> None:
@@ -162,7 +163,7 @@ class LeaseLostError(EnactError):
 
 
 class CommitUnknownError(EnactError):
-    """The commit was sent and never answered; it may stand or not.
+    """The commit was sent and never answered; whether it took effect is unknown.
 
     The only error after which a write may be visible.
 

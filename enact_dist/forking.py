@@ -79,7 +79,7 @@ def fork_world(session: Session, source: str, name: str, *, at_ns: int = 0) -> N
         latest = max(forgotten, key=lambda each: each.oldest_ns, default=None)
         for answer in answers.values():
             if isinstance(answer, Refused) and _is_busy(answer):
-                refusal = answer.text  # an undecided commit stands in the way: ask again
+                refusal = answer.text  # an undecided commit delays it: ask again
             elif answer is not None and not isinstance(answer, Forked):
                 _take_back(session, name, [shard for shard in done if shard not in there])
                 raise _failure(latest or answer)
@@ -117,7 +117,7 @@ def _failure(answer: Answer) -> EnactError:
 
 
 def _take_back(session: Session, name: str, shards: list[str]) -> None:
-    """Drop a fork on shards that have just made it; elsewhere the name may be somebody else's."""
+    """Drop a fork on shards that have just made it; elsewhere it may be another client's."""
     for shard, answer in _dropped(session, name, shards, timeout_s=UNDO_S).items():
         if not isinstance(answer, Dropped):
             _log.warning("shard %s may have a part of the fork %s: drop it", shard, name)
@@ -161,7 +161,7 @@ def drop_world(session: Session, name: str) -> int:
 def _dropped(
     session: Session, name: str, shards: Iterable[str], *, timeout_s: float
 ) -> dict[str, Answer | None]:
-    """Ask shards to drop a context, again while one has it in hand for somebody else."""
+    """Ask shards to drop a context; repeat while one works on it for another client."""
     client = session.client
 
     def request_of(_shard: str, epoch: int, count: int) -> DropWorld:

@@ -1,4 +1,4 @@
-"""The versions of a datum that are still known, and those that somebody keeps.
+"""The versions of a datum that are still known, and pinned versions.
 
 ::
 
@@ -54,14 +54,14 @@ class Version(Generic[T]):
         entity: Its entity.
         aspect: Its aspect; of the type `object` if the program has not named the aspect's type.
         version: Its number, counted from 1 by slot.
-        position: Where its commit stands in time.
-        until_ns: Stamp of the version that replaced it, 0 where it is the newest one.
-        stamp_ns: When the datum was captured, 0 where the writer did not say.
+        position: Position of its commit.
+        until_ns: Stamp of the version that replaced it, 0: it is the newest one.
+        stamp_ns: When the datum was captured, 0: unknown.
         size_bytes: Length of the datum's body: arrays, texts and bytes over 256 B, long lists; 0
             for all else.
         null_reason: Why it is null, or the empty string.
         kept: The labels under which it is kept.
-        cause: Who committed it and what went in; None where that is not known.
+        cause: Its writer and inputs; None if unknown.
     """
 
     world: WorldContext
@@ -175,7 +175,7 @@ def keep_versions(session: Session, label: str, versions: Iterable[Version[Any] 
 
 
 def let_go(session: Session, label: str) -> None:
-    """Let go of what a label keeps; see `Cell.let_go`."""
+    """Release the versions of a label; see `Cell.let_go`."""
     _check_label(label)
     _all_kept(session, label, {shard: [] for shard in session.client.shards()})
 
@@ -211,11 +211,11 @@ def listed(
     """Return what a shard knows of one slot's versions.
 
     Args:
-        session: Who asks.
-        shard: The shard that has the slot.
+        session: The asking session.
+        shard: The shard that stores the slot.
         slot: The slot.
         since_ns: Only versions that were current after this stamp.
-        count: Only so many, the newest ones (0: all).
+        count: At most this many, the newest ones (0: all).
 
     Raises:
         ShardUnreachableError: The shard does not answer.

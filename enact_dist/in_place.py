@@ -1,4 +1,4 @@
-"""Data that a block changes in place, of which its commit would know nothing.
+"""Detects data that a block changes in place, which its commit would miss.
 
 What a commit publishes is what was assigned.  Arrays are read-only, so that numpy says so at once;
 a list or dict can be changed all the same, also one inside a dataclass.  So what a block has looked
@@ -46,7 +46,7 @@ codecs.changed.append(_changeable.clear)
 
 
 class Shown(NamedTuple):
-    """A value that a block was handed, and the datum that it stands for."""
+    """A value that a block received, and its datum."""
 
     value: Any
     datum: Datum

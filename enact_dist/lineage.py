@@ -2,9 +2,9 @@
 
 Each version knows the commit that made it and the versions that its lock had read (`lock_reads`).
 Followed back these are its causes (`Cell.why`), followed on its effects (`Cell.impact`), over all
-shards and world contexts.  A cause is remembered as long as the version that it made: what has
-left its retention stands in a tree of causes as "forgotten", by name; effects that are forgotten
-cannot be found.
+shards and world contexts.  A cause is remembered as long as the version that it made: versions
+beyond retention appear in a tree of causes as "forgotten", by name; forgotten effects cannot be
+found.
 """
 
 from __future__ import annotations
@@ -57,15 +57,15 @@ class Made:
         entity: Its entity.
         aspect: Name of its aspect.
         version: Its number.
-        position: Where its commit stands in time.
+        position: Position of its commit.
         age_s: How long ago that was, by the shards' clock.
         kind: "commit" or "fork"; else why no more is known of it: "forgotten" (it has left its
             retention), "unknown" (it is there without its cause) or "null" (it was read where
             there was no datum yet, or none any more after its volatile shard had restarted).
-        actor: Who committed it; the empty string where it gave no name.
-        host: Where that ran.
-        pid: Its process there.
-        stamp_ns: When the datum was captured, as the actor said (0: not).
+        actor: Who committed it; the empty string if it has no name.
+        host: Host of that client.
+        pid: Process of that client.
+        stamp_ns: When the datum was captured, according to the actor (0: unknown).
         held_s: How long the lock had been held when it committed.
         null_reason: Why the version is null; the empty string for a datum.
         left_out: How many further data its lock had read than a commit names.
@@ -168,7 +168,7 @@ def _slot_of(
     session.client.check_usable()
     name = world if isinstance(world, str) else world.name
     if not isinstance(world, str) and getattr(world, "session", None) is not session:
-        raise MisuseError(f"{world!r} is no world context of this cell as it is connected here")
+        raise MisuseError(f"{world!r} is not a world context of this cell through this connection")
     if not isinstance(world, str) and world.past:
         raise MisuseError(f"{world!r} is as it was; name {name!r} and a version of its history")
     if name not in session.client.worlds():
@@ -271,7 +271,7 @@ class _Search:
         unknown = {one: None for one in level if one not in self._known}
         asked = [SlotVersion(one.slot, one.version) for one in unknown if one.version]
         for entry in self._explained(asked):
-            if _read_of(entry) in unknown:  # else the number was given anew, to another version
+            if _read_of(entry) in unknown:  # otherwise the number belongs to another, newer version
                 self._known[_read_of(entry)] = entry
         for one in level:
             self._left_out[one] = self._cause(one).reads_left_out

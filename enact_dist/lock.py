@@ -84,7 +84,7 @@ def refuse_inside_lock(what: str) -> None:
 
 
 class Lock(Triggered):
-    """A set of data, granted at once or not at all.
+    """A set of data, granted together or not granted.
 
     An array arrives read-only: ``lock[joints] += 1`` works on it in place, which numpy refuses
     ("output array is read-only").  Write ``lock[joints] = lock[joints] + 1``.
@@ -106,14 +106,14 @@ class Lock(Triggered):
         ShardUnreachableError: A shard does not answer.
 
     Leaving raises (after a clean block):
-        LeaseLostError: The lock was lost meanwhile; nothing was written.
-        ChangedError: An expected view has moved on; nothing was written.
+        LeaseLostError: The lock was lost; nothing was written.
+        ChangedError: An expected view has changed; nothing was written.
         MisuseError: A list or dict that may be written was changed in place and not assigned;
             nothing was written.
-        CommitUnknownError: The commit was sent and never answered.
+        CommitUnknownError: The commit was sent but never answered.
 
     Attributes:
-        position: Where the commit stands in time, after the block; None before or without writes.
+        position: Position of the commit, after the block; None before or without writes.
         entity: In an actor's `update`, the entity that triggered it.
     """
 
@@ -447,7 +447,7 @@ class Lock(Triggered):
         return state.version if state is not None else 0
 
     def stamp_ns(self, request: LockRequestOne[Any] | Together[Any]) -> int:
-        """Return when the datum, or an actor's set, was captured, as its writer said (0: not)."""
+        """Return when the datum, or an actor's set, was captured (0: its writer did not tell)."""
         if isinstance(request, Together):
             raise MisuseError(f"{request!r} is no part of this lock; an actor's trigger can be")
         slot = slot_of(self._check(request))

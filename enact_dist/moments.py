@@ -1,4 +1,4 @@
-"""Moments of the past: how people write them, and the stamps that they stand for.
+"""Moments of the past: their text forms and timestamps.
 
 Time is that of the shards' commits, a hybrid logical clock in nanoseconds since 1970.  What a
 `Position` says is exact; a `datetime` or a number of seconds is a reading of some wall clock, which

@@ -1,4 +1,4 @@
-"""The lock of an update that acts at most once: held while a version is taken, then no more.
+"""The lock of an update that acts at most once: held only while a version is claimed.
 
 While it is held it is the lock of any update; `begin` is called after its commit, and from there on
 the same object shows what was seen at the grant, holds nothing, and collects what is written.
@@ -53,7 +53,7 @@ class OnceLock(ActorLock):
     _keeps = _lost = False
 
     def own(self, declared: Write[Outcome]) -> Write[Outcome]:
-        """Return what the declared request of the outcomes stands for here."""
+        """Return the bound form of the declared request of the outcomes."""
         return self._resolve(declared)
 
     def keep(self) -> None:

@@ -64,7 +64,7 @@ class Seen(NamedTuple):
 
 
 def is_new(plan: Seen | None, last: Outcome | None) -> bool:
-    """Say whether a version may be acted on, after the one that the outcome is of.
+    """Return whether a version may be acted on, given the outcome of an earlier one.
 
     By the stamp of its commit: a shard that was restored may number from an older version on.
     """

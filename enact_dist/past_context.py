@@ -56,7 +56,7 @@ class PastContext(Context):
 
     @property
     def at_ns(self) -> int:
-        """The stamp as of which it is shown; 0 where data are shown by their capture stamp."""
+        """The timestamp that it shows; 0: data are shown by their capture timestamp."""
         return self.moment.at_ns
 
     @property
@@ -65,7 +65,7 @@ class PastContext(Context):
         return self.moment.captured_ns
 
     def view(self, *requests: LockRequest[Any]) -> Snapshot:
-        """Read data as they were; inside a lock, too, as no lock can stand in the way.
+        """Read past data; allowed inside a lock, since no lock can block it.
 
         Args:
             requests: `View`s and `ViewEach`es of this moment.

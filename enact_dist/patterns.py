@@ -1,7 +1,7 @@
 """Name patterns of entities: what they cover and whether two of them can meet.
 
 ``*`` inside a segment stands for any characters but the slash, a segment ``**`` for any number of
-whole segments, also none.  A shard matches patterns of its clients while everybody else waits, so
+whole segments, also none.  A shard matches patterns of its clients while all others wait, so
 both questions cost time in proportion to the lengths, whatever the pattern says:
 
   * Each star runs up to the next place of the text behind it and is never tried further (an atomic
@@ -65,7 +65,7 @@ def checked_pattern(pattern: object) -> str:
 
 
 def checked_patterns(patterns: Iterable[str]) -> None:
-    """Raise if one of the patterns is none, or if they are too many to be matched at once.
+    """Raise if a pattern is invalid, or if there are too many to match at once.
 
     A name without a star matches itself alone and does not count.
 
@@ -84,7 +84,7 @@ def checked_patterns(patterns: Iterable[str]) -> None:
 
 
 class Patterns:
-    """Several patterns at once: which names one of them covers.  None at all cover every name.
+    """Several patterns together: the names that any of them covers.  No patterns cover all names.
 
     Attributes:
         starred: Those that have to be tried one by one; the others are names, which are looked up.
@@ -117,7 +117,7 @@ def pattern_matches(pattern: str, name: str) -> bool:
 def patterns_overlap(one: str, other: str) -> bool:
     """Say whether two entity patterns could cover one name, its length left aside."""
     ours, theirs = one.split("/"), other.split("/")
-    # `after[j]`: whether what is left of ours can meet what is left of theirs from j on.
+    # `after[j]`: whether the rest of ours can match the rest of theirs from j on.
     after = [all(segment == "**" for segment in theirs[j:]) for j in range(len(theirs) + 1)]
     for segment in reversed(ours):
         here = [False] * (len(theirs) + 1)

@@ -42,7 +42,7 @@ _slot_at: Final = partial(tuple.__new__, Slot)
 _read_of: Final = partial(tuple.__new__, DatumRead)
 """Make them of parts that were looked at before, in a third of the time."""
 AHEAD_BYTES_MAX: Final = 64 << 20
-"""So many bytes are fetched before somebody has asked for each of the data."""
+"""Bytes that are fetched before the data are individually requested."""
 
 
 class Readings:
@@ -179,7 +179,7 @@ class Readings:
         return value
 
     def null_error(self, slot: Slot) -> NullDatumError:
-        """Return the error for reading a slot that was shown null, or not at all."""
+        """Return the error for reading a slot that was null or not shown."""
         return null_error(slot, self.state(slot), self._client.aspect_entries())
 
     def readings(self) -> Iterable[Reading]:
@@ -312,8 +312,8 @@ def check_requested(
     """Raise unless `request` is one of those that the lock or view was made with.
 
     Raises:
-        NotRequestedError: It is another request.
-        MisuseError: It is no request at all.
+        NotRequestedError: The lock does not have this request.
+        MisuseError: It is not a request.
     """
     if not isinstance(request, LockRequest):
         raise MisuseError(

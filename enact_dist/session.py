@@ -101,7 +101,7 @@ class Session:
         return lapses
 
     def greet(self, *, enough: str = "") -> None:
-        """Learn anew which aspects and world contexts the shards know.
+        """Refresh the aspects and world contexts that the shards know.
 
         With the name of an aspect that is `enough` it ends where those that answer at once know it.
 
@@ -140,8 +140,8 @@ class Session:
     ) -> None:
         """Check aspects that are only read; nothing comes to be by being asked for.
 
-        Of one that the cell has, a reader may want more to be retained, and it may be new to some
-        shard: that is said, but not by an observer.
+        A reader of a known aspect may want more retention, and the aspect may be new to some
+        shard: these are registered too, except by an observer.
         """
         client, now_s = self.client, time.monotonic()
         due = [e for e in entries if now_s >= self._looked_up.get(e, -LOOKED_UP_S) + LOOKED_UP_S]
@@ -217,7 +217,7 @@ class Session:
         known = self._entries.get(id(aspect))
         if known is None or known[0] is not aspect:
             if len(self._entries) >= ENTRIES_MAX:
-                self._entries.clear()  # programs that make an aspect anew for each lock
+                self._entries.clear()  # for programs that make a new aspect for each lock
             durability = aspect.durability.value if aspect.durability is not None else ""
             entry = AspectEntry(
                 aspect.name,

@@ -52,7 +52,7 @@ class Viewable(Protocol):
 
     @property
     def session(self) -> Session:
-        """By which it is seen."""
+        """The request that shows it."""
 
 
 class Sight(Closing):
@@ -88,7 +88,7 @@ class Sight(Closing):
         return fetch_all(client, self.session.cache, lock, readings, client.check_usable)
 
     def close(self) -> None:
-        """Let go of its data; twice is harmless."""
+        """Release its data; idempotent."""
         self.session.client.release(self._lock)
 
 
@@ -102,10 +102,10 @@ def look(worlds: Sequence[Viewable], places: Iterable[Place], *, each: bool) -> 
         each: Whether these are patterns.
 
     Raises:
-        ForgottenError: They are of a past that is not known any more.
-        LockTimeoutError: No view of one moment came within `patience_s`.
-        MisuseError: More is asked than one view can hold.
-        UnknownWorldError: The cell has one of them no more; told where patterns show nothing.
+        ForgottenError: The past data are no longer known.
+        LockTimeoutError: No consistent view came within `patience_s`.
+        MisuseError: The requests exceed what one view can hold.
+        UnknownWorldError: The cell no longer has one of them; checked if patterns show nothing.
         ShardUnreachableError: A shard does not answer.
     """
     client = worlds[0].session.client
@@ -158,7 +158,7 @@ def both_in_sight(
 
 
 def past_ns_of(world: Viewable) -> int:
-    """Return the stamp as of which a context is seen (0: the present).
+    """Return the timestamp as of which a context is viewed (0: the present).
 
     Raises:
         MisuseError: It shows data by when they were captured, which are of no one moment.
@@ -187,8 +187,8 @@ def aspects_of(
     """Return the aspects to look at by name, each with its type as far as that is known here.
 
     Args:
-        worlds: Where they are looked at.
-        wanted: Aspects, or names; None stands for all that these cells know.
+        worlds: The world contexts to look at.
+        wanted: Aspects, or names; None: all that these cells know.
         later: Whether an aspect without a type that no cell knows may still come; one with a type
             is null until then, as it is for a view.
 

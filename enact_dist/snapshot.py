@@ -29,13 +29,13 @@ NOW: Final = Moment(0)
 VIEW_S = 10.0
 """How long a view may last."""
 VIEWS_MAX = 3
-"""How often a view is taken anew when its data are gone before they were fetched."""
+"""Retries of a view whose data were removed before they were fetched."""
 
 
 def take_snapshot(
     asked: tuple[LockRequest[Any] | Together[Any], ...], *, register: bool = True
 ) -> Snapshot:
-    """Take a view of what is asked; large data are fetched before this returns."""
+    """Take a view of the requested data; large data are fetched before this returns."""
     together, requests = _spread(asked)
     if not requests:
         raise MisuseError("a view of nothing: name at least one View or ViewEach")

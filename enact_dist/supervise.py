@@ -1,11 +1,11 @@
 """Child processes of one machine: started, restarted with back-off, drained in order, one log.
 
 Rules a change must keep
-  * Shards are up before actors start, and actors are gone before shards stop: an actor that stops
+  * Shards are up before actors start, and actors end before shards stop: an actor that stops
     can still commit, and a shard that stops has no clients left to wait for.
   * A child ends when its process ends: processes that it started may keep its output open.
   * A child never outlives its supervisor, even one that was killed: the kernel sends it SIGTERM.
-  * A child is restarted unless it ended as it should (an actor: 0) or can never run (2: usage or
+  * A child is restarted unless it ended normally (an actor: 0) or can never run (2: usage or
     configuration); pauses double up to `PAUSE_S_MAX` and start again after a good while.
 """
 
@@ -56,7 +56,7 @@ class Task:
         name: How the log names it.
         kind: "shard" or "actor"; decides the order of start and end.
         command: What to run.
-        drain_s: How long it was told to wait for others before it ends.
+        drain_s: How long it may wait for others before it ends.
         env: Environment variables that it has beside those of the supervisor.
     """
 
@@ -246,7 +246,7 @@ def _what_is_left(output: int) -> bytes:
 
 
 class Supervisor:
-    """Runs tasks until it is told to stop.  One thread calls `run`.
+    """Runs tasks until it is stopped.  One thread calls `run`.
 
     Args:
         tasks: What to run; shards start first.

@@ -128,8 +128,8 @@ class Durability(enum.Enum):
     """What a reported commit of an aspect survives.
 
     A commit takes the strictest class of its data.  One over several shards is forced to the disk
-    on each of them, whatever the class: it is all there or not at all, after a power cut too, until
-    a later commit replaces its data.  What is volatile still ends with its shard's process.
+    on each of them, whatever the class: it is atomic, even after a power cut, until
+    a later commit replaces its data.  Volatile data still end with their shard's process.
     """
 
     DURABLE = "durable"
@@ -157,11 +157,11 @@ class Aspect(Generic[T]):
             included; 1 is none) or a `Retention`; ``None`` leaves it to `cell.toml` (there:
             `DEFAULT_RETENTION` unless written otherwise).  Of several that ask, `cell.toml` too,
             the largest figures count.
-        compare: How `WorldContext.diff` tells its data apart; not part of what makes two aspects
-            the same one.
+        compare: How `WorldContext.diff` compares its data; it does not affect whether two aspects
+            are the same.
 
     Raises:
-        ValueError: The name is not allowed, or the retention is none that can be kept to.
+        ValueError: The name is not allowed, or the retention is invalid.
         DatumTypeError: The type is a dataclass that is not frozen, or contains one.
     """
 
@@ -233,7 +233,7 @@ class NullReason(enum.Enum):
 
 
 class Null:
-    """The type of `NULL`, which stands for *no datum* where one is printed or passed on."""
+    """The type of `NULL`, which represents *no datum* in output and arguments."""
 
     __slots__ = ()
     _only: ClassVar[Any] = None

@@ -55,11 +55,11 @@ class Together(Generic[T_co]):
 
     Args:
         requests: Two or more `View`s of single entities; their order is that of the data.
-        by: "stamp": the capture stamp is what the data of a set have in common.
+        by: "stamp": the data of a set share their capture timestamp.
         within_s: How far the stamps of one set may lie apart, seconds; less than half the period at
             which they come, else it cannot be told what belongs to which set.  The stamp of a set
             is the oldest of its data.
-        least: With how many of its data a set runs at the least: as soon as it is clear that the
+        least: The least number of data with which a set runs: as soon as it is certain that the
             others do not come, or `least_after_s` after the first of them has arrived.  The missing
             ones are None in ``lock[together]``, null for the `View` of each, and named by
             `lock.missing`.  None: with all of them.
@@ -94,8 +94,8 @@ class Together(Generic[T_co]):
         for request in self.requests:
             if not isinstance(request, View) or not isinstance(request.entity, Entity):
                 raise TypeError(
-                    f"Together(…) takes a View of one entity each, not {request!r}: what is"
-                    " missing from a set can only be told of entities that are known by name"
+                    f"Together(…) takes a View of one entity each, not {request!r}: what"
+                    " is missing from a set is only defined for named entities"
                 )
         if len(self.requests) < 2 or len(set(self.requests)) < len(self.requests):
             raise ValueError(f"Together({list(self.requests)}) needs two or more different Views")
@@ -156,7 +156,7 @@ class Together(Generic[T_co]):
         }
 
     def newest(self, versions: Sequence[Sequence[Captured]]) -> tuple[int, ...]:
-        """Return the capture stamp of each datum of the newest set; nothing where there is none."""
+        """Return the capture stamp of each datum of the newest set; None if there is none."""
         if not self.within_s and self.least == len(self.requests):
             stamp_ns = newest_set_ns(versions)
             return (stamp_ns,) * len(self.requests) if stamp_ns else ()
@@ -169,7 +169,7 @@ class Together(Generic[T_co]):
 class Captured(NamedTuple):
     """One version of a slot: when it was committed and when its datum was captured.
 
-    `captured_ns` is 0 where the writer did not say; `null` versions have no datum at all.
+    `captured_ns` is 0 if unknown; `null` versions have no datum.
     """
 
     version: int

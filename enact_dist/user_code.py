@@ -18,7 +18,7 @@ _LIBRARIES: Final = (*_BASE, sysconfig.get_path("purelib") + os.sep)
 
 
 def own_frames(frames: Iterable[traceback.FrameSummary]) -> list[traceback.FrameSummary]:
-    """Return the frames of a user's own files; of libraries where there are none, else all."""
+    """Return the frames of a user's own files; without any, of libraries; otherwise all."""
     every = list(frames)
     for others in (_LIBRARIES, _BASE):
         if own := [frame for frame in every if not frame.filename.startswith(others)]:

@@ -1,4 +1,4 @@
-"""A watch: what is there now, then every change in order, none missed unknowingly.
+"""A watch: the present data, then every change in order; gaps are always reported.
 
 Notices are small, best effort and numbered without a gap per shard and epoch.  A number that is
 skipped, a number that a keep-alive knows and no notice brought, or a new epoch means that some
@@ -8,7 +8,7 @@ were missed: the watch then lists the slots again and yields one change per slot
 A shard that is added to the cell is listed as soon as this client knows of it.  What was known of
 entities that have moved there stays known: a state that moved unchanged is no change.
 
-Versions that a restarted shard did not keep begin anew, so its new epoch makes each of its states a
+Versions that a restarted shard did not store start again, so its new epoch makes each state a
 new one: its number does not continue the old count, and how many versions were lost is unknown.
 """
 
@@ -45,9 +45,9 @@ VANISHED: Final = (0, 0)
 
 
 class _Known(NamedTuple):
-    """What is known of a slot, in which epoch of its shard, and whether it was told.
+    """The known state of a slot, the epoch of its shard, and whether it was reported.
 
-    Not told is a slot that was null at the begin: its versions until then are no gap.
+    A slot that was null at the start is not reported: its earlier versions are no gap.
     """
 
     epoch: int
@@ -63,11 +63,11 @@ class Change:
         entity: The entity.
         aspect: Name of the aspect.
         version: The slot's version; starts again for volatile aspects when their shard restarts.
-        position: Where the commit stands in time.
+        position: Position of the commit.
         gap: How many versions of this slot were skipped before this one; at least 1 where its
-            versions began anew, since this watch may have missed the last ones before that.
+            versions started again, since this watch may have missed the last ones before that.
         null: Whether the slot is null now.
-        captured_ns: When the datum was captured, as its writer said (0: not said, or null).
+        captured_ns: When the datum was captured, according to its writer (0: unknown, or null).
         world: Name of the world context.
     """
 
@@ -85,7 +85,7 @@ class Change:
 class _Following:
     """What is known of one shard's notices: all up to `number` of `epoch` are accounted for.
 
-    `behind` is a later number that a keep-alive has told, and since when that is known.
+    `behind` is a later number from a keep-alive, and the time of that keep-alive.
     """
 
     epoch: int = -1
@@ -130,7 +130,7 @@ class Watch(Following[Change]):
         return self._missed
 
     def next(self, timeout_s: float | None = None) -> Change | None:
-        """Return the next change, or None when there is none in time or the watch is closed.
+        """Return the next change, or None if none comes in time or the watch is closed.
 
         Args:
             timeout_s: How long to wait; None waits until `close`, 0 takes what has arrived.
@@ -158,7 +158,7 @@ class Watch(Following[Change]):
         return None
 
     def next_here(self) -> Change | None:
-        """Return the next change of those that came with an earlier one, None if there is none."""
+        """Return the next change of those that came with an earlier one, or None."""
         while not self._pending:
             notice = None if self._closed.is_set() else self._feed.get_here()
             if notice is None:
@@ -196,7 +196,7 @@ class Watch(Following[Change]):
         return known is not None and version < known.state[0] and stamp_ns < known.state[1]
 
     def _pass_over(self, skipped: Skipped) -> None:
-        """Account for notices of other slots; one that is missing before them remains missing."""
+        """Account for notices of other slots; a gap before them remains a gap."""
         following = self._following.get(skipped.shard)
         if (
             following is not None
@@ -206,7 +206,7 @@ class Watch(Following[Change]):
             following.number = skipped.number
 
     def _follow_placement(self) -> None:
-        """Follow the shards that the cell has now; one that was added is behind until listed."""
+        """Follow the shards that the cell has now; a new one counts as behind until listed."""
         placement = self._client.core.placement
         if placement is self._placement:
             return
@@ -254,9 +254,9 @@ class Watch(Following[Change]):
         self._following[shard] = _Following(answer.epoch, answer.notice_number, listed=True)
 
     def _note_vanished(self, shard: str, epoch: int, listed: set[Slot]) -> None:
-        """Tell of slots that the shard lists no more: it kept them in memory and restarted.
+        """Report slots that a shard no longer lists: it kept them in memory and restarted.
 
-        Those that have moved to another shard meanwhile are listed there.
+        Slots that moved to another shard are listed there.
         """
         gone = self._gone_from(shard, listed)
         if gone and epoch != self._following[shard].epoch:

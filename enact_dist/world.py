@@ -43,7 +43,7 @@ class WorldContext(Context):
         self.session = session
 
     def init(self, entity: Entity, aspect: Aspect[T], datum: T) -> bool:
-        """Set a datum where there is none; from here on only through a lock (ENACT 3.3).
+        """Set a datum that is null; afterwards it changes only through a lock (ENACT 3.3).
 
         Args:
             entity: The entity; it exists from here on.
@@ -51,8 +51,8 @@ class WorldContext(Context):
             datum: The initial value; arrays are copied, since the caller keeps references to them.
 
         Returns:
-            Whether this call set it; False leaves the datum that was there.  One that was deleted,
-            or lost with a volatile shard, is set anew.
+            Whether this call set it; False leaves the existing datum.  A datum that was deleted,
+            or lost with a volatile shard, is set again.
 
         Raises:
             LockHeldError: This thread holds a lock.
@@ -77,8 +77,8 @@ class WorldContext(Context):
 
         Raises:
             LockHeldError: This thread holds a lock; name the views in it instead.
-            LockTimeoutError: No view of one moment came within `patience_s`: shards restart again
-                and again, or what is written all the time is locked for long.
+            LockTimeoutError: No consistent view came within `patience_s`: shards keep
+                restarting, or constantly written data are locked for long.
             MisuseError: A request locks.
             NullDatumError: The `Together` has no complete set.
             ShardUnreachableError: A shard does not answer.
@@ -87,7 +87,7 @@ class WorldContext(Context):
         return take_snapshot(requests)
 
     def watch(self, entities: Entities | Entity | str, *aspects: Aspect[Any]) -> Watch:
-        """Follow the changes of matching slots: what is there now, then every change in order.
+        """Follow the changes of matching slots: the present data, then every change in order.
 
         Args:
             entities: A pattern or one entity.
@@ -132,10 +132,10 @@ class WorldContext(Context):
 
         Raises:
             LockHeldError: This thread holds a lock.
-            ForgottenError: A past one has left its retention.
+            ForgottenError: A past context is beyond retention.
             TypeError: An argument is of another type.
             MisuseError: No program has registered one of the named aspects.
-            UnknownWorldError: The cell has one of them no more.
+            UnknownWorldError: The cell no longer has one of them.
             DatumTypeError: An aspect is registered with another type.
             ShardUnreachableError: A shard does not answer.
         """
@@ -162,10 +162,10 @@ class WorldContext(Context):
 
         Raises:
             LockHeldError: This thread holds a lock.
-            ForgottenError: A past one has left its retention.
+            ForgottenError: A past context is beyond retention.
             TypeError: An argument is of another type.
             MisuseError: The two cannot be watched together.
-            UnknownWorldError: The cell has one of them no more.
+            UnknownWorldError: The cell no longer has one of them.
             ShardUnreachableError: A shard does not answer.
         """
         from enact_dist.diff_watch import DiffWatch
@@ -225,9 +225,9 @@ class WorldContext(Context):
             count: Only the newest so many; None: all.
 
         Raises:
-            UnknownWorldError: The cell has this world context no more.
+            UnknownWorldError: The cell no longer has this world context.
             TypeError: `entity` or `aspect` is of another type.
-            MisuseError: `since` is no moment of the past, or `count` no number above 0.
+            MisuseError: `since` is not a past moment, or `count` is not above 0.
             ShardUnreachableError: The entity's shard does not answer.
         """
         check_argument("history(entity, aspect)", "entity", entity, Entity)
@@ -255,7 +255,7 @@ class WorldContext(Context):
                 two as near the later one.
 
         Raises:
-            MisuseError: The moment lies in the future or is none, or both or none are given.
+            MisuseError: The moment is invalid or in the future, or both or neither are given.
         """
         if when is not None and stamp_ns is None and not nearest:
             moment = Moment(stamp_of(when, seen_ns=self._seen_ns))
@@ -278,16 +278,16 @@ class WorldContext(Context):
         Copies pointers, not data, in one step on each shard, and of one cut over all of them.
 
         Args:
-            name: Of the new context; there must be none of that name.
+            name: Name of the new context; it must not exist yet.
             at: As of this moment, as in `at`; None: as it is now, every reported commit included.
 
         Returns:
-            The fork.  Asked again with the same `at`, the one that is there.
+            The fork.  Repeated with the same `at`, the existing one.
 
         Raises:
-            ForgottenError: A state of then has left its retention; no fork is made.
-            MisuseError: There is such a context, or the name or the moment cannot be used.
-            UnknownWorldError: The cell has this world context no more.
+            ForgottenError: A state of that moment is beyond retention; no fork is made.
+            MisuseError: The context exists, or the name or the moment is invalid.
+            UnknownWorldError: The cell no longer has this world context.
             LockHeldError: This thread holds a lock.
             ShardUnreachableError: A shard does not answer; the message says how to go on.
             LinkError: A commit stamped before stays undecided; the message says how to go on.
@@ -300,7 +300,7 @@ class WorldContext(Context):
 
     @property
     def forked_from(self) -> tuple[str, int] | None:
-        """Of which context it is a fork and as of which stamp (ns since 1970); None if of none.
+        """The context that it was forked from, and the timestamp (ns since 1970); None: no fork.
 
         Answers from what this connection last learned; contacts no shard.
         """

@@ -146,7 +146,7 @@ class Writing:
         self.edits += 1
 
     def _written(self, slot: Slot, encoded: Encoded, shard_of: Callable[[Slot], str]) -> _Written:
-        """Return the datum that stands for a value, and where it lies."""
+        """Return the datum of a value, and its location."""
         if encoded.size <= PAYLOAD_BYTES_MIN:
             return _Written(encoded.datum(), None)
         draft = self._payloads.draft(shard_of(slot), encoded.size)
@@ -231,7 +231,7 @@ class Writing:
                 self.data[slot] = replace(datum, body=joined([datum.body], datum.size))
 
     def end(self, *, committed: bool) -> None:
-        """Let go of it after the lock has ended."""
+        """Release it after the lock has ended."""
         for slot in list(self._by_slot):
             if committed:
                 _fix(self._by_slot.pop(slot))

@@ -150,7 +150,7 @@ def _doing(report: ActorStatistics) -> str:
 
 
 def _state(info: ActorInfo, reported: str) -> str:
-    """Return how an actor is: of one that is silent nobody knows whether it still runs."""
+    """Return the state of an actor; a silent one may or may not still run."""
     state = "silent" if info.silent else reported
     return f"{state}, one of {len(info.namesakes) + 1}" if info.namesakes else state
 
@@ -179,7 +179,7 @@ def _draw(config: CellConfig, file: Path) -> None:
     """Write the picture of a cell's actors and data.
 
     Raises:
-        ConfigError: The name of the file is none of an SVG, or no actor of the cell can be loaded.
+        ConfigError: The file's name does not end in .svg, or no actor of the cell can be loaded.
         OSError: The file cannot be written.
     """
     from enact_dist.actor_check import declarations_of

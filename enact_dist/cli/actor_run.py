@@ -357,7 +357,7 @@ def _made(arguments: argparse.Namespace, target: str, *, begun: bool = False) ->
             makes of one when it is loaded is its own business.
 
     Raises:
-        ConfigError: There is none, or it cannot be made.
+        ConfigError: It does not exist and cannot be made.
     """
     from enact_dist.actor import name_of
     from enact_dist.actor_load import check_every_s, configured_actor, load_actor
@@ -401,7 +401,7 @@ def _drain_s(arguments: argparse.Namespace, entry: ActorConfig) -> float:
 
 
 def _begin_with(env: Mapping[str, str]) -> None:
-    """Begin this process anew with these variables, unless it has them.
+    """Restart this process with these variables, unless it has them.
 
     Libraries read some when they are loaded, which they are by now.
     """
@@ -415,7 +415,7 @@ def _cell_file(arguments: argparse.Namespace) -> Path | None:
     try:
         target = cell_target(arguments)
     except ConfigError:
-        return None  # said when the cell is opened
+        return None  # reported when the cell is opened
     return None if is_endpoint(target) else Path(target).expanduser()
 
 

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 LOOK_S: Final = 0.1
 REPORTED_S: Final = 3.0
-"""How long an actor that is ready may take to report that it hears words."""
+"""How long a ready actor may take to report that it receives commands."""
 ANSWER_S: Final = 10.0
 """How long an actor may take to answer: it first finishes its update."""
 RETURN_S: Final = 60.0
@@ -127,7 +127,7 @@ def _found(cell: Cell, name: str) -> list[tuple[ActorInfo, dict[str, Any]]]:
     An actor reports a moment after it is ready, so this looks for up to `REPORTED_S`.
 
     Raises:
-        MisuseError: There is none, or one accepts no commands.
+        MisuseError: There is no such actor, or one accepts no commands.
     """
     end_s = time.monotonic() + REPORTED_S
     while not (found := _rows(cell, name)) or not all(row.get("words_in") for _, row in found):

@@ -1,6 +1,6 @@
 """`enact demo palletizing`: the application of ENACT 4.2, simulated or on real recordings.
 
-`enact demo workcell` stands in `demo_workcell`.
+`enact demo workcell` is in `demo_workcell`.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ def _refuse_mixture(arguments: argparse.Namespace) -> None:
     if arguments.cell and (arguments.views or arguments.model):
         raise ConfigError("--cell watches a cell that runs; recordings need none")
     if arguments.cell and option:
-        raise ConfigError(f"{option} is the choice of whoever starts the cell, not of --cell")
+        raise ConfigError(f"{option} can only be set when the cell is started, not with --cell")
     if option and (arguments.views or arguments.model):
         raise ConfigError(f"{option} belongs to the simulated sensor, not to real recordings")
 

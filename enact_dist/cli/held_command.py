@@ -42,11 +42,11 @@ class HeldCommand:
 
     The command leads a process group of its own, so that a shell's children end with it.  On a
     terminal that group is put into the foreground: Ctrl-C goes to the command, as if it had been
-    typed alone.  It dies with this process, however that ends; only while this process itself is
-    stopped (SIGSTOP) can it run on past the lease, as nobody is there to see the loss.
+    typed alone.  It ends with this process, however that ends.  Only while this process itself is
+    stopped (SIGSTOP) can it run on past the lease, since nothing detects the loss.
 
     Raises:
-        ConfigError: There is no such command.
+        ConfigError: The command does not exist.
     """
 
     def __init__(self, command: Sequence[str]) -> None:

@@ -49,7 +49,7 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
     )  # fmt: skip
     _add_arguments(why, "causes")
     why.add_argument(
-        "--keep", metavar="LABEL", help="keep the versions of the tree until the label is let go"
+        "--keep", metavar="LABEL", help="keep the versions of the tree until the label is released"
     )
     impact = add_verb(
         nouns, "impact", "show what came of a datum: what it was used for, and that in turn",

@@ -57,7 +57,7 @@ def type_to_put(aspect: str, known: Mapping[str, tuple[str, str]], text: str, *,
         raise MisuseError(f"{error}; --new registers it by the value's type")
     value = read(text, object)
     if value is NOTHING:
-        raise MisuseError(f"null does not say of which type the new aspect {aspect!r} is")
+        raise MisuseError(f"null does not tell the type of the new aspect {aspect!r}")
     return np.ndarray if isinstance(value, np.ndarray) else type(value)
 
 
@@ -104,7 +104,7 @@ def _split(text: str) -> Iterator[str]:
 
 
 def read(text: str, datum_type: Any) -> Any:
-    """Return the value that a JSON literal or ``@FILE`` stands for; `NOTHING` for ``null``.
+    """Return the value of a JSON literal or ``@FILE``; `NOTHING` for ``null``.
 
     Raises:
         ConfigError: The literal or the file cannot be read.
@@ -136,7 +136,7 @@ def _read_file(path: Path, datum_type: Any) -> Any:
 
 
 def _fitted(value: object, datum_type: Any) -> Any:
-    """Return a JSON value as the nearest value of a type; what does not fit is left as it is.
+    """Return a JSON value as the nearest value of a type; other values stay unchanged.
 
     JSON has one kind of number, no tuples and only text as keys; everything else must match, and
     is refused with its place when it is encoded.

@@ -17,15 +17,15 @@ if TYPE_CHECKING:
     from enact_dist.world import WorldContext
 
 COMPARED_MAX: Final = 1000
-"""So many names are looked at for one that is close: a few hundredths of a second."""
+"""Names examined for a similar one: takes a few hundredths of a second."""
 
 
 @contextmanager
 def named_if_missing(world: WorldContext | PastContext, slot: tuple[str, str]) -> Iterator[None]:
-    """Let a null datum be told in the words of the command line.
+    """Report a null datum in the terms of the command line.
 
     Args:
-        world: Its world context, as it is or as it was.
+        world: Its world context, present or past.
         slot: Its entity and aspect.
 
     Raises:
@@ -58,7 +58,7 @@ def _likely(world: WorldContext | PastContext, entity: str, aspect: str) -> list
     try:
         infos = world.survey()
     except EnactError:
-        return []  # what was asked for is told all the same
+        return []  # the error itself is reported anyway
     names = (
         f"{info.entity}/{info.aspect}"
         for info in infos

@@ -47,7 +47,7 @@ def _plain(value: object) -> object:
 
 
 def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]], *, empty: str) -> None:
-    """Print rows under their column names, or the sentence `empty` where there are none.
+    """Print rows under their column names, or the sentence `empty` without any.
 
     Each row stays one: control characters of its cells are shown escaped.
     """

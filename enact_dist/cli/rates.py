@@ -1,7 +1,7 @@
 """How often data change, by how much: rates, periods, delays and bandwidths of slots.
 
 Rates and periods are those of the commits' stamps, so a watch that a busy machine keeps waiting
-shows the rate at which the data were committed, not the one at which it heard of them.
+shows the rate of the commits, not the rate at which it received them.
 """
 
 from __future__ import annotations
@@ -128,12 +128,12 @@ class SlotRates:
     _recent: deque[tuple[float, Sample]] = field(default_factory=deque)
 
     def add(self, sample: Sample, now_s: float) -> None:
-        """Count one change more, heard of at `now_s`."""
+        """Count one more change, received at `now_s`."""
         self.whole.add(sample)
         self._recent.append((now_s, sample))
 
     def recent(self, now_s: float) -> Tally:
-        """Return the tally of what was heard of within the last `WINDOW_S`."""
+        """Return the tally of the changes received within the last `WINDOW_S`."""
         while self._recent and self._recent[0][0] < now_s - WINDOW_S:
             self._recent.popleft()
         tally = Tally()

@@ -1,4 +1,4 @@
-"""`enact shard run|ls|check`; what is done to folders of shards stands in modules of its own."""
+"""`enact shard run|ls|check`; operations on shards' folders have their own modules."""
 
 from __future__ import annotations
 
@@ -191,7 +191,7 @@ def check_shards(arguments: argparse.Namespace) -> int:
     """Ask shards how they are; status 3 if one does not answer, 1 if one grants no locks.
 
     *Alive*: the shard's dispatcher answers a request that came over its endpoint; a supervisor
-    should start one that is not alive anew.  *Ready*: it grants locks as well, so it neither waits
+    should restart one that is not alive.  *Ready*: it grants locks as well, so it neither waits
     for leases of before its start to end nor drains before its end; both pass by themselves.
     """
     found = _health(arguments)

@@ -45,7 +45,7 @@ def add_to(verbs: argparse._SubParsersAction[Verb]) -> None:
         add_cell(verb, file_only=True)
         verb.add_argument("--json", action="store_true", help="print JSON instead of a sentence")
     restore.add_argument(
-        "--replace", action="store_true", help="put what is there now aside, beside it"
+        "--replace", action="store_true", help="put the present folder aside, beside it"
     )
 
 

@@ -124,7 +124,7 @@ def _command(aspects: Iterable[str], shards: Iterable[str] = ()) -> str:
 def _folders(
     config: CellConfig, stores: dict[str, str], arguments: argparse.Namespace
 ) -> tuple[dict[str, Path], list[str]]:
-    """Return the folders of the shards that have data here, and what is to be said of others."""
+    """Return the folders of the shards that have data here, and remarks about the others."""
     from enact_dist.link.store_folder import holds_store
 
     for name in (*stores, *arguments.shard):

@@ -78,7 +78,7 @@ def summary(value: object) -> str:
 def visible(text: str) -> str:
     """Return a text with its control characters as escapes, but for tabs and ends of lines.
 
-    Whoever writes a datum must not clear the screen of whoever looks at it.
+    The writer of a datum must not be able to clear a reader's screen.
     """
     if text.isprintable():
         return text

@@ -45,7 +45,7 @@ def print_slots(
         return
     root = Branch(f"{title} ({len(infos)} data)")
     for info in infos:
-        # A space cannot stand in a segment, so an aspect never hides an entity of its name.
+        # A segment cannot contain a space, so an aspect never hides an entity of its name.
         leaf = f"{info.aspect}  {_slot_line(info, at_ns)}"
         root.at(info.entity.name.split("/")).children[f" {info.aspect}"] = Branch(leaf)
     print_tree(root)

@@ -182,7 +182,7 @@ def _refuse_misfits(config: CellConfig) -> None:
 def _refuse_second(config: CellConfig, shard: ShardConfig) -> None:
     """Raise if a shard runs already, and does not end in the time that an ending one has.
 
-    One that a supervisor has left behind ends by itself; one of another `enact up` does not.
+    A process that a supervisor left behind ends by itself; one of another `enact up` does not.
 
     Raises:
         LinkError: It does; the message says where.

@@ -177,7 +177,7 @@ def load_aspect(name: str, target: str) -> Aspect[Any]:
             dicts, since their type is not known.
 
     Raises:
-        ConfigError: There is no such thing, or it is neither.
+        ConfigError: It does not exist, or is neither.
     """
     module, _, attribute = target.partition(":")
     asked = f"[aspects.{name}] compare = {target!r}"

@@ -118,7 +118,7 @@ def _add_keeping(verbs: argparse._SubParsersAction[Verb]) -> None:
     )  # fmt: skip
     add_reader(kept)
     let_go = add_verb(
-        verbs, "let-go", "let go of the versions that a label keeps", run=let_go_of,
+        verbs, "let-go", "release the versions that a label keeps", run=let_go_of,
         example="enact world let-go drop-17",
     )  # fmt: skip
     let_go.add_argument("label", metavar="LABEL", help="as `enact world kept` lists it")
@@ -132,7 +132,7 @@ def show_history(arguments: argparse.Namespace) -> int:
     """Print the known versions of one datum, oldest first.
 
     Raises:
-        NullDatumError: There are none: nothing was ever set there.
+        NullDatumError: There are no versions: nothing was ever set there.
     """
     entity, aspect = arguments.slot
     with open_cell(arguments) as cell:
@@ -203,7 +203,7 @@ def show_past(arguments: argparse.Namespace) -> int:
     """Print a tree of a past world context, or one datum of it.
 
     Raises:
-        ConfigError: No datum is named to get, the name is none, or a tree is to be saved.
+        ConfigError: No datum is named, the name is invalid, or a tree would be saved.
     """
     gets = arguments.what == "get"
     if arguments.out and not gets:
@@ -247,7 +247,7 @@ def fork_world(arguments: argparse.Namespace) -> int:
 
 
 def fork_facts(world: WorldContext) -> dict[str, object] | None:
-    """Return of which world context one was forked and as of when, None if of none."""
+    """Return the source and the moment of a fork; None: it is no fork."""
     origin = world.forked_from
     return {"world": origin[0], "at_ns": origin[1]} if origin is not None else None
 
@@ -322,7 +322,7 @@ def list_kept(arguments: argparse.Namespace) -> int:
 
 
 def let_go_of(arguments: argparse.Namespace) -> int:
-    """Let go of what a label keeps; status 1 if it keeps nothing."""
+    """Release the versions of a label; status 1 if it keeps none."""
     with open_cell(arguments, observer=False) as cell:
         kept = cell.kept()
         versions = kept.get(arguments.label, ())
@@ -330,7 +330,7 @@ def let_go_of(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print_json({"label": arguments.label, "versions": len(versions)})
     elif versions:
-        print(f"{arguments.label}: {len(versions)} versions are let go of")
+        print(f"{arguments.label}: {len(versions)} versions released")
     else:
         print(f"nothing is kept as {arguments.label}; labels: {', '.join(kept) or 'none'}")
     return DONE if versions else FAILED

@@ -158,7 +158,7 @@ class _Display(Protocol):
     """Shows what a watch sees."""
 
     def begin(self, changes: Iterable[Change]) -> None:
-        """Take what is there at the begin, where that is no change."""
+        """Take the initial data, which are no change."""
 
     def show(self, changes: list[Change]) -> None:
         """Show what has come, if anything has."""
@@ -261,7 +261,7 @@ class _Lines:
 
 @dataclass(frozen=True, slots=True)
 class _Absent:
-    """Why there is no datum to show."""
+    """The reason for the missing datum."""
 
     reason: str
 

@@ -31,7 +31,7 @@ class DtypeError(ValueError):
 
 @lru_cache(maxsize=256)
 def describe(dtype: np.dtype[Any]) -> object:
-    """Return what stands for a dtype in the tree.
+    """Return the description of a dtype in the tree.
 
     Raises:
         DtypeError: It holds Python objects, or what numpy's text does not carry.
@@ -60,7 +60,7 @@ def _describe(dtype: np.dtype[Any]) -> object:
 
 
 def read_dtype(node: object) -> np.dtype[Any]:
-    """Return the dtype that a description stands for.
+    """Return the dtype of a description.
 
     Raises:
         DtypeError: It describes none.
@@ -144,7 +144,7 @@ def checked_shape(node: object) -> tuple[int, ...]:
     """Return a shape that was read.
 
     Raises:
-        DtypeError: It is none, or of more than `DIMENSIONS_MAX` dimensions.
+        DtypeError: It is invalid, or has more than `DIMENSIONS_MAX` dimensions.
     """
     if not isinstance(node, tuple | list) or len(node) > DIMENSIONS_MAX:
         raise DtypeError(

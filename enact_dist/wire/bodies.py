@@ -36,7 +36,7 @@ class BodyWriter:
         self._end = 0
 
     def add(self, datum: Datum) -> tuple[bytes, int, int, int, str]:
-        """Take a datum's body; return what stands for the datum in the header.
+        """Add a datum's body; return the datum's entry in the header.
 
         Raises:
             ProtocolError: The datum contradicts itself, or the payload is over its limit.
@@ -73,7 +73,7 @@ class BodyReader:
         self.end = 0
 
     def take(self, raw: Any) -> Datum:
-        """Return the datum that `raw` of the header stands for.
+        """Return the datum of the header entry `raw`.
 
         Raises:
             ProtocolError: It is no datum, or its body is not where the next one must be.

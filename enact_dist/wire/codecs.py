@@ -53,10 +53,10 @@ def register_codec(
 
     Args:
         datum_type: The type; its subclasses are encoded by the same codec.
-        name: What stands for the type on the wire: letters, digits, ``_ . -``, at most 100.
+        name: Name of the type on the wire: letters, digits, ``_ . -``, at most 100.
         encode: Makes plain data of a value: int, float, bool, str, bytes, lists and dicts of
             them, numpy arrays.
-        decode: Makes the value of those again; arrays in them are read-only.
+        decode: Restores the value from these; arrays in them are read-only.
 
     Raises:
         MisuseError: The name is not allowed or belongs to another type, or the type is plain.

@@ -11,7 +11,7 @@ key                                           what
 
 No name starts with ``@`` and Zenoh's wildcards do not match a chunk that does, so requests and the
 rest cannot collide.  `ANY` stands for all shards, all sessions, or (in requests) all cells.  An
-identity (`identity_of`) is who asks: the access rules of a Zenoh session and the shard itself
+identity (`identity_of`) is the sender: the access rules of a Zenoh session and the shard itself
 compare it, see `enact_dist.core.owners`.
 Rules to keep: a key holds only characters that Zenoh allows (no ``# ? $``, no empty chunk), and
 making a key from the parts of one gives the same key again.
@@ -33,13 +33,13 @@ if TYPE_CHECKING:
 ROOT: Final = "enact"
 ANY: Final = "*"
 NOBODY: Final = "-"
-"""Stands for no identity at all; no name starts with a hyphen."""
+"""Represents the absence of an identity; no name starts with a hyphen."""
 SHOWN_CHARACTERS: Final = 64
 """So much of an actor's and a host's name goes into an identity."""
 KEY_CHARACTERS_MAX: Final = 4096
 """Longest key of a request: two names, a verb, and an identity of characters beyond ASCII."""
 NAMELESS: Final = "client"
-"""Stands in the identity of a client that gave no name."""
+"""Part of the identity of a client without a name."""
 
 _NOTICES: Final = "@notices"
 _SESSIONS: Final = "@sessions"
@@ -117,7 +117,7 @@ def _verb(class_name: str) -> str:
 
 @lru_cache(maxsize=4096)
 def parse_request_key(key: str) -> RequestKey:
-    """Take a request's key apart; the identity is left as it stands there.
+    """Take a request's key apart; the identity stays encoded.
 
     Raises:
         ProtocolError: It is no such key.

@@ -47,17 +47,17 @@ PAYLOAD_BYTES_MIN: Final = 64 << 10
 NAME_CHARACTERS_MAX: Final = NAME_LENGTH_MAX
 """Longest name of a context, entity, aspect, shard, session, actor or host."""
 REASON_CHARACTERS_MAX: Final = 500
-"""Longest reason of an act by hand: it is kept for good, and stands in one line of a table."""
+"""Longest reason of a manual action: it is stored permanently and printed in one table line."""
 TEXT_BYTES_MAX: Final = 64 << 10
 """Longest string of a header that is no name: causes, endpoints, fingerprints, reasons."""
 REPORT_BYTES_MAX: Final = 64 << 10
 """Longest report of an actor: each keep-alive carries it."""
 ITEMS_MAX: Final = 4096
 """Most lines of one lock and most writes of one commit.  A shard grants a lock, and applies a
-commit, in one step, which is what makes them atomic, and nobody else is served meanwhile: about
+commit, in one step, which is what makes them atomic, and serves no other client meanwhile: about
 8 us for each slot, so 30 ms for so many, and half a second for 65,536."""
 KEPT_VERSIONS_MAX: Final = 1 << 14
-"""Most versions that one request keeps; a shard keeps no more than 10,000 in all."""
+"""Most versions that one request pins; a shard pins at most 10,000 in all."""
 ENTRIES_MAX: Final = 1 << 18
 """Most entries of any other list of a header; the header's length bounds them earlier."""
 REQUEST_VALUES_MAX: Final = 1 << 18

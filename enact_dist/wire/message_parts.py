@@ -206,7 +206,7 @@ def annotated(cls: type[Any]) -> list[tuple[str, Any]]:
 
 
 def without_none(kind: Any) -> Any:
-    """Return `X` of an annotation `X | None`; any other as it is."""
+    """Return `X` of an annotation `X | None`; any other unchanged."""
     if get_origin(kind) not in (types.UnionType, typing.Union):
         return kind
     (inner,) = (one for one in get_args(kind) if one is not type(None))

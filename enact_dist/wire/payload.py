@@ -1,6 +1,6 @@
 """Data to bytes and back: a tree of plain values in the encoding, their buffers in the body.
 
-The format stands in `enact_dist.wire`.  Laws: what is encoded decodes equal, of the same types;
+`enact_dist.wire` describes the format.  Laws: what is encoded decodes equal, of the same types;
 arrays come back as read-only views of the body; a datum is a copy of its value, made once.
 """
 
@@ -79,7 +79,7 @@ class Encoded:
 
 
 def encode_datum(value: object, datum_type: Any, *, stamp_ns: int = 0) -> Datum:
-    """Return the datum that stands for `value`; later changes of the value do not reach it.
+    """Return the datum of `value`; later changes of the value do not affect it.
 
     Args:
         value: A value of `datum_type`.
@@ -87,14 +87,15 @@ def encode_datum(value: object, datum_type: Any, *, stamp_ns: int = 0) -> Datum:
         stamp_ns: When it was captured, nanoseconds since 1970; 0 where that has no meaning.
 
     Raises:
-        DatumTypeError: The value is not of the type, or the type is none of a datum; the message
+        DatumTypeError: The value is not of the type, or the type is not allowed for data; the
+            message
             names the part.
     """
     return encode_parts(value, datum_type, stamp_ns=stamp_ns).datum()
 
 
 def encode_parts(value: object, datum_type: Any, *, stamp_ns: int = 0) -> Encoded:
-    """Return what the datum that stands for `value` is made of, without a copy.
+    """Return the parts of the datum of `value`, without a copy.
 
     Args:
         value: A value of `datum_type`, not to be changed before its bytes are copied.
@@ -117,7 +118,7 @@ def encode_parts(value: object, datum_type: Any, *, stamp_ns: int = 0) -> Encode
 
 
 def joined(parts: Sequence[bytes | memoryview], size: int) -> bytes | memoryview:
-    """Return a copy of the parts, one after another, which nobody can change.
+    """Return a copy of the parts, one after another, read-only.
 
     `bytes.join` would let all other threads of the process wait: 0.1 s and more for 100 MB.
     """
@@ -156,7 +157,7 @@ def _write(writer: TreeWriter, value: object, datum_type: Any) -> bytes:
 
 
 def decode_datum(datum: Datum, datum_type: Any) -> Any:
-    """Return the value that a datum stands for; arrays in it are read-only views of its body.
+    """Return the value of a datum; arrays in it are read-only views of its body.
 
     Raises:
         DatumTypeError: It is a value of another type.
@@ -175,7 +176,7 @@ def decode_datum(datum: Datum, datum_type: Any) -> Any:
 
 
 def _int_of(datum: Datum) -> int | None:
-    """Return the int that a datum is, the commonest one; None where it is none, or damaged."""
+    """Return the value of a datum that is an int, the commonest type; None if not, or damaged."""
     encoding = datum.encoding
     if len(encoding) > INT_ENCODING_BYTES or encoding[:1] != _VERSION or datum.size or datum.body:
         return None

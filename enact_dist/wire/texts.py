@@ -1,6 +1,7 @@
 """Characters that a text of the protocol has none of, and how a text from anywhere is shown.
 
-A line break in a name forges a line of the log, an escape sequence clears the screen of whoever
+A line break in a name forges a line of the log, an escape sequence clears the screen of a person
+who
 lists the actors, and a mark that turns the direction of writing shows one name as another.
 """
 

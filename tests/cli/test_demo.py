@@ -13,7 +13,7 @@ import pytest
         (("--views", "d", "--model", "m", "--scene", "s"), "--views trains"),
         (("--views", "d", "--packages", "3"), "--packages belongs to the simulated sensor"),
         (("--views", "d", "--keep-running"), "--keep-running belongs to the simulated sensor"),
-        (("--cell", "c", "--seed", "3"), "--seed is the choice of whoever starts the cell"),
+        (("--cell", "c", "--seed", "3"), "--seed can only be set when the cell is started"),
         (("--cell", "c", "--views", "d"), "--cell watches a cell that runs"),
     ],
 )

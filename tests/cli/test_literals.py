@@ -106,5 +106,5 @@ def test_new_aspect_takes_the_type_of_the_value():
     assert literals.type_to_put("a", {}, "3", new=True) is int
     with pytest.raises(MisuseError, match=r"no aspect 'a' is registered \(known: b\)"):
         literals.type_to_put("a", {"b": ("int", "os"), "c": ("", "os")}, "3", new=False)
-    with pytest.raises(MisuseError, match="null does not say"):
+    with pytest.raises(MisuseError, match="null does not tell"):
         literals.type_to_put("a", {}, "null", new=True)

@@ -186,7 +186,7 @@ def test_versions_are_kept_listed_and_let_go(at, made):
         [label, f"{made.name}:system/leg/time_count", "v1"],
     ]
     assert "kept as drop-17" in at("history", made.name, "arm/time_count").out
-    assert at("let-go", label).out == f"{label}: 2 versions are let go of\n"
+    assert at("let-go", label).out == f"{label}: 2 versions released\n"
     assert at("kept").out == "no version is kept under a label\n"
     again = at("let-go", label)
     assert (again.status, again.out) == (1, f"nothing is kept as {label}; labels: none\n")
