@@ -79,7 +79,7 @@ def fork_world(session: Session, source: str, name: str, *, at_ns: int = 0) -> N
         latest = max(forgotten, key=lambda each: each.oldest_ns, default=None)
         for answer in answers.values():
             if isinstance(answer, Refused) and _is_busy(answer):
-                refusal = answer.text  # an undecided commit delays it: ask again
+                refusal = answer.text  # an undecided commit stands in the way: ask again
             elif answer is not None and not isinstance(answer, Forked):
                 _take_back(session, name, [shard for shard in done if shard not in there])
                 raise _failure(latest or answer)

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 WORLDS_TOLD_MAX: Final = 100
 """World contexts that a refusal names: a text has at most 64 KiB."""
 NO_PAYLOAD: Final = "no_payload"
-"""The code of a refusal that leaves the lock as it is: named bytes are not here, send them."""
+"""The code of a refusal that leaves the lock unchanged: named bytes are missing, send them."""
 
 _ACCESSES: Final = frozenset(access.value for access in Access)
 _ACCESSES_EACH: Final = frozenset(access.value for access in Access if access.each)
@@ -127,7 +127,7 @@ def missing_payload(writes: Iterable[WriteItem]) -> Refused | None:
 
 
 def wrong_parties(message: Commit | Prepare, *, peers: Collection[str]) -> Refused | None:
-    """Refuse a commit over shards with one that cannot be told or asked, or with this one.
+    """Refuse a commit over shards with an unreachable participant, or with this shard itself.
 
     Args:
         message: A commit with its participants, or a prepare with its primary.
@@ -158,7 +158,8 @@ def wrong_decision(
 ) -> Refused | None:
     """Refuse the stamp of a decision that no shard with a right clock gives.
 
-    It would become the time of this shard for good, since stamps only grow.  The decision may be
+    It would permanently become the time of this shard, since timestamps only grow.  The decision
+    may be
     said again: it is taken once the clocks agree.  Where this host's clock was set back, what was
     promised lies ahead of it, and an honest decision a little later still.
     """

@@ -344,7 +344,7 @@ class WrongShard:
 
 @dataclass(frozen=True, slots=True)
 class Refused:
-    """The request cannot be carried out as it is; `code` names the error class to raise."""
+    """The request cannot be executed; `code` names the error class to raise."""
 
     code: str
     text: str

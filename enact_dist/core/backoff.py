@@ -9,7 +9,7 @@ if TYPE_CHECKING:
 
 CALLED_NS_MIN: Final = 5_000_000_000
 CALLED_NS_MAX: Final = 20_000_000_000
-"""Pauses of somebody who waits for a shard that is out of reach, from the first to the longest.
+"""Pauses of a client that waits for a shard out of reach, from the first to the longest.
 
 The session's own signs of life find it sooner, once for all who wait, and wake them.
 """
@@ -88,7 +88,7 @@ class SignsOfLife:
         return [shard for shard in shards if asks or shard not in gone]
 
     def used(self, now_ns: int, ttl_ns: int) -> None:
-        """Note that the session has a lock, or that somebody follows what its answers tell."""
+        """Note that the session has a lock, or that a thread needs what its answers report."""
         self._used_until_ns = max(self._used_until_ns, now_ns + ttl_ns)
 
     def is_used(self, now_ns: int) -> bool:

@@ -1,7 +1,8 @@
 """Above which versions slots start, and since when they are known, after something was forgotten.
 
 A context that was dropped and an aspect that was forgotten are gone with all their slots.  What is
-made under the name again starts above all that there was; so does a slot of a context and an aspect
+made under the name again starts above all earlier versions; so does a slot of a context and an
+aspect
 of which both were, above the higher one.  No version is ever used twice.
 """
 

@@ -206,7 +206,7 @@ class Catalogue:
     def _now_shown(self) -> Shown:
         all_aspects = tuple(self.aspects.values())
         if self.bytes <= CATALOGUE_BYTES_MAX:
-            # Made anew after each registration: no step of Python for each entry.
+            # Rebuilt after each registration: no Python step per entry.
             return Shown(tuple(self.worlds), all_aspects, tuple(self._forks.values()), 0)
         all_worlds, half = tuple(self.worlds.values()), CATALOGUE_BYTES_MAX // 2
         aspects = tuple(_that_fit(sorted(all_aspects, key=bytes_in_frame), bytes_in_frame, half))

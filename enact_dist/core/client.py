@@ -5,7 +5,7 @@ One `Client` per process, one lane per thread.  Rules a change must keep:
   * A new epoch of a shard, or a session that it forgot, ends every lock with a grant there; only
     then is the epoch acknowledged by `Hello` ("all my older grants here are dropped").
   * The keep-alive names the lowest seq that each lane still cares for; a grant that the shard lists
-    no more, though it was there when the keep-alive was sent, is lost.
+    no longer, though it existed when the keep-alive was sent, is lost.
   * A seq is used for one lock and never again.
 """
 
@@ -197,7 +197,7 @@ class Client:
     def saw_stamp(self, stamp_ns: int) -> None:
         """Remember the largest stamp seen: later commits come after it everywhere.
 
-        One that no clock gives is passed over: every shard would refuse what comes after it.
+        A timestamp that no clock gives is ignored: every shard would refuse any later one.
         """
         if stamp_ns <= STAMP_NS_MAX:
             self.seen_stamp_ns = max(self.seen_stamp_ns, stamp_ns)

@@ -165,7 +165,7 @@ class Commits:
         return self._ticket
 
     def position_of(self, lock: LockId) -> Position | None:
-        """Return where a lock has committed for good, as far as is still known."""
+        """Return the position at which a lock has finally committed, as far as still known."""
         decision = self._decisions.by_lock.get(lock)
         if decision is not None:
             return decision.position
@@ -197,7 +197,7 @@ class Commits:
                 and tenure is not None
                 and not tenure.bound
             ):
-                # For good: a late copy must not find the lock again at another time of day.
+                # Final: a late copy must not find the lock again later.
                 yield from self._tenures.take_away(tenure, refusal.text, now_ns=now_ns)
             yield Reply(reply_to, refusal)
             return
@@ -218,7 +218,7 @@ class Commits:
         yield from self._make_durable(commit, now_ns=now_ns)
 
     def moved_on(self, expects: Iterable[SlotVersion], lock: LockId) -> SlotVersion | None:
-        """Return an expected slot that has moved on, or that somebody may be about to change."""
+        """Return an expected slot that has changed, or that another lock may be about to change."""
         for slot, version in expects:
             found = self._newest_version(slot)
             if found != version or self._in_the_way(slot, lock):

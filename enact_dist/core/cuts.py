@@ -98,10 +98,10 @@ class Cut:
         """Take an answer of this round; others are too late.
 
         Args:
-            shard: Who has answered.
-            request: What was asked.
-            answer: What came.
-            until_ns: Until when (this host's clock) that shard's grace would wait for us.
+            shard: The answering shard.
+            request: The request.
+            answer: The answer.
+            until_ns: When, by this host's clock, that shard's grace period for us ends.
         """
         if shard in self.left and request.at_ns == self.at_ns:
             del self.left[shard]

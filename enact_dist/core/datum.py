@@ -56,7 +56,7 @@ class Token(NamedTuple):
 
 
 class Position(NamedTuple):
-    """Where a commit stands in time: its hybrid logical stamp and its shard."""
+    """The position of a commit in time: its hybrid logical timestamp and its shard."""
 
     stamp_ns: int
     shard: str
@@ -68,14 +68,14 @@ class Datum:
 
     Attributes:
         encoding: How `wire` reads the body (msgpack, a few bytes up to some kB).
-        body: `size` bytes that nobody changes any more; a memoryview may lie over a mapped file.
+        body: `size` bytes that are never changed any more; a memoryview may cover a mapped file.
             Empty where only `file` says where they are.
         size: Length of the body in bytes.
         stamp_ns: When the datum was captured, nanoseconds since 1970 by the actor's clock; 0
-            where the actor did not say.
+            if the actor did not set it.
         file: Name of the payload at the slot's shard that holds these bytes, so that they need
             not travel with a message ("": none).
-        fault: Says what is wrong with the bytes, "" where nothing is; to be asked before they are
+        fault: Returns what is wrong with the bytes, "" if nothing; to be called before they are
             handed out.  None: they are known to be sound.
     """
 

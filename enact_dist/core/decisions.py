@@ -40,7 +40,7 @@ class Decision:
 
 
 class Decisions:
-    """All decisions of one shard that are still to be told."""
+    """All decisions of one shard that participants have not confirmed yet."""
 
     __slots__ = ("_count", "by_lock")
 
@@ -89,5 +89,5 @@ class Decisions:
             yield Persist(0, (DecisionDone(lock),), Durability.OS)
 
     def next_deadline_ns(self) -> int | None:
-        """Return when somebody is to be told again."""
+        """Return when the next participant is to be notified again."""
         return min((decision.due_ns for decision in self.by_lock.values()), default=None)

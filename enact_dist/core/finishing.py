@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 @dataclass(slots=True)
 class Finishing:
-    """What is to be published, shard by shard, and what is still to be said.
+    """What to publish, by shard, and the messages still to send.
 
     Attributes:
         tokens: The grants; number 0 where something is expected but nothing held.
@@ -72,7 +72,7 @@ class Finishing:
         return None if any(found in each for each in self.expects.values()) else found
 
     def votes_to_ask(self, seen_stamp_ns: int) -> list[tuple[str, Request]]:
-        """Return what to ask the shards that have not said yes."""
+        """Return the requests to the shards that have not agreed yet."""
         calls: list[tuple[str, Request]] = []
         for shard in self.left:
             token, expects = self.tokens[shard], self.expects.get(shard, ())

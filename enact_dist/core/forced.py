@@ -55,7 +55,7 @@ class Audit:
     """The acts of operators here, newest last, and the number of unacknowledged alarms.
 
     Attributes:
-        alarms: How many alarms came after the last time that somebody settled them.
+        alarms: Number of alarms since an operator last settled them.
     """
 
     def __init__(self, recovered: Iterable[AuditRecord]) -> None:
@@ -78,7 +78,7 @@ class Audit:
         return record
 
     def may_settle(self, seen_ns: int) -> bool:
-        """Whether there are alarms, and none that came after `seen_ns` (0: whenever)."""
+        """Whether there are alarms, none of them later than `seen_ns` (0: any time)."""
         return self.alarms > 0 and (not seen_ns or self._newest_alarm_ns <= seen_ns)
 
     def __len__(self) -> int:

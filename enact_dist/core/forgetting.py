@@ -2,11 +2,11 @@
 
 All that the shards have stored goes in, a plan comes out.  Rules that a change must keep:
 
-- A shard lets an aspect go whole, in one batch: its registration, all its slots in all contexts
+- A shard purges a whole aspect in one batch: its registration, all its slots in all contexts
   with their history, and what labels keep of them.
 - Versions are never used twice: on every shard those of an aspect start above all that any shard
-  had, and stamps after all that it has.
-- A commit over shards that names the aspect and is not settled is not to be touched.
+  had, and its timestamps after all that it has.
+- A commit over shards that names the aspect and is undecided must not be touched.
 - A run that was cut off goes on where its records are not: a shard that has one let the aspect go,
   and may have served since; one that was restored from a backup has not, and has none.
 """
@@ -50,16 +50,16 @@ class Going(NamedTuple):
 
 @dataclass(slots=True)
 class Plan:
-    """What is let go.
+    """The plan of a purge.
 
     Attributes:
         known: All aspects that some shard has, or has had.
-        going: What there is of those that go; nothing of it on a shard is left out.
-        records: What each shard stores; none where there is nothing to be done.
-        names: The aspects that are let go.
-        at_ns: From which stamp on each one is, of which there is anything to be done.
-        done: Those of a run that was cut off which every shard has let go.
-        obstacles: Why nothing may be done at all, for people; then the rest means nothing.
+        going: All data of the purged aspects, of every shard.
+        records: The records that each shard stores; none if there is nothing to do.
+        names: The purged aspects.
+        at_ns: The timestamp from which on each aspect with any work is purged.
+        done: Aspects of an interrupted run that every shard has already purged.
+        obstacles: Why nothing may be done, for people; the rest is then meaningless.
     """
 
     known: frozenset[str] = frozenset()

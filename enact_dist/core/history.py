@@ -2,7 +2,8 @@
 
 A replaced state is *held* while its aspect's retention allows (versions, age, bytes), and every one
 stays for two seconds so that cuts can be made (*loose*, where it is not held).  So what is known of
-a slot is a tail of its history without holes.  Beside it stands what labels keep, for good.
+a slot is a tail of its history without holes.  Versions that labels keep are stored separately,
+without limit of time.
 
 Limits of the whole shard come before what an aspect retains: then the oldest goes first; at the cap
 of shared memory, the oldest of the aspects whose history has payloads there.  Whatever
@@ -227,13 +228,13 @@ class History:
         self._close(found)
 
     def _close(self, found: SlotHistory) -> None:
-        """Forget a slot of which nothing is known; what stands in a queue is used again."""
+        """Drop a slot without known versions; its queue entry is reused."""
         left = found.states or found.kept or found.queued
         if not left and self._by_slot.get(found.slot) is found:
             del self._by_slot[found.slot]
 
     def _end_recent(self, before_ns: int) -> None:
-        """Let go of what was replaced before a stamp, and of the oldest of what is too much."""
+        """Remove states replaced before a timestamp, and the oldest beyond the limits."""
         recent = self._recent
         while recent and (
             recent[0][0] < before_ns
@@ -259,7 +260,7 @@ class History:
     def _oldest(self, aspect: str) -> SlotHistory | None:
         """Return the slot of an aspect whose oldest held state was replaced first.
 
-        A slot stands in the queue with a stamp of its past; it is put in order when it is first.
+        A slot is queued under a past timestamp; it is reordered when it comes first.
         """
         queue = self._queues[aspect]
         while queue:
@@ -289,7 +290,7 @@ class History:
             self._drop_oldest(self._queues)
 
     def make_room(self, size: int) -> tuple[int, int]:
-        """Forget the oldest states until so many bytes of payloads are named no more.
+        """Remove the oldest states until so many bytes of payloads are no longer named.
 
         What is kept only to answer as of a recent stamp goes first, then what is oldest in the
         aspects that have payloads: a camera at the cap costs the others nothing.  Where all would
@@ -309,7 +310,7 @@ class History:
         return states - self.count - self._loose, before - self._payloads.spare
 
     def take_forgotten(self) -> tuple[HistoryForgotten, ...]:
-        """Return what the store is to forget, at most one record; then it counts as told."""
+        """Return the deletions for the store, at most one record; they then count as passed on."""
         if not self._forgotten:
             return ()
         record = HistoryForgotten(tuple(self._forgotten))

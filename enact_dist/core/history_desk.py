@@ -91,7 +91,7 @@ class HistoryDesk:
         yield from self._sessions.answer_when_durable(reply_to, answer, records)
 
     def _kept(self, message: KeepVersions) -> tuple[Answer, tuple[Record, ...]]:
-        """Carry out what is asked; return the answer and what the store must keep before it."""
+        """Execute the request; return the answer and the records to store before it."""
         label, history = message.label, self._state.slots.history
         if self._state.sessions.known(message.session) is None:
             return EpochChanged(self._state.epoch), ()
@@ -161,14 +161,14 @@ class HistoryDesk:
     # ---------------------------------------------------------------- what goes
 
     def on_make_room(self, message: MakeRoom, _: int) -> Iterator[Effect]:
-        """Let go of the oldest history at the cap of shared memory."""
+        """Remove the oldest history at the limit of shared memory."""
         gone, size = self._state.slots.make_room(message.bytes)
         if gone:
             self._state.count("history_dropped", gone)
             yield Story("history.dropped", f"{gone} replaced versions of {size} bytes at the cap")
 
     def tidy(self) -> Iterator[Effect]:
-        """Let go of what is too old, and tell the store if no commit has done so."""
+        """Remove expired states, and tell the store unless a commit has done so."""
         history = self._state.slots.history
         history.grow_old(self._state.stamps.last_ns)
         forgotten = history.take_forgotten()

@@ -57,7 +57,7 @@ _WORDS: Final = {Mode.S: "read", Mode.X: "write", Mode.SIX: "read all, write som
 
 
 def holder(state: ShardState, tenure: Tenure, *, now_ns: int) -> Holder:
-    """Describe one lock: who holds or awaits it, since when, and for whom it waits."""
+    """Describe one lock: its holder or waiter, since when, and the locks that block it."""
     session = state.sessions.by_id.get(tenure.lock.session)
     modes = {mode: None for mode in tenure.claim.wants.values() if mode in _WORDS}
     named = (

@@ -51,7 +51,7 @@ class LockDesk:
         self._prepares = prepares
 
     def on_acquire(self, message: Acquire, reply_to: int) -> Iterator[Effect]:
-        """Queue a lock, or return to one that is queued or granted already."""
+        """Queue a lock, or continue with one that is already queued or granted."""
         state, lock = self._state, message.lock
         session = state.session_in_epoch(lock.session, message.epoch)
         refusal = self.refused(session, message.map_version, message.items)

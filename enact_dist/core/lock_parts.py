@@ -1,4 +1,4 @@
-"""A lock as its client sees it: what it asks of which shard, and what it was shown."""
+"""A lock on the client's side: its requests to each shard, and the states it received."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def first_asking(parts: Iterable[Part]) -> Part | None:
 
 
 class Reading(NamedTuple):
-    """What a grant or view showed of one slot, and in which epoch of which shard."""
+    """The state of one slot in a grant or view, with the shard and its epoch."""
 
     shard: str
     epoch: int
@@ -62,7 +62,7 @@ class Reading(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What one lock asks of which shard; both in the order of the shards' names.
+    """The requests of one lock to each shard; both in the order of the shards' names.
 
     A shard appears once in each.  Locks on several shards take their views afterwards, as one cut
     that lies not before `floor_ns`, nor before anything that the locks show; views of the past lie

@@ -77,7 +77,7 @@ class Claim:
     """One lock's place in the table.
 
     Attributes:
-        ticket: Order of arrival at this shard; also the number people see.
+        ticket: Order of arrival at this shard; also the number shown to people.
         blocked: At how many resources something stands in the way (0 when granted).
     """
 
@@ -126,7 +126,7 @@ class _Queue:
         return True
 
     def newly_eligible(self) -> Iterable[Claim]:
-        """Take out and return the waiters that nothing here stands in the way of any more."""
+        """Remove and return the waiters that nothing here blocks any more."""
         found: list[Claim] = []
         for mode in _MODES:
             pending = self.pending[mode]
@@ -236,7 +236,7 @@ class LockTable:
         return claim
 
     def writers_of(self, slot: Slot) -> list[LockId]:
-        """Return who holds a slot for writing, alone or with its whole column."""
+        """Return the holder that may write a slot, alone or with its whole column."""
         found: list[LockId] = []
         for resource in (slot, Column(slot.context, slot.aspect)):
             queue = self._queues.get(resource)

@@ -8,9 +8,9 @@ from enact_dist.core.datum import Datum, LockId, Slot, Token
 
 
 class Cursor(NamedTuple):
-    """Where a listing goes on: made by a shard for itself, and sent back to it as it is.
+    """Where a listing continues: made by a shard for itself, and returned to it unchanged.
 
-    With epoch 0 it means the begin in a request, and in an answer that nothing is left to ask for.
+    Epoch 0 means the start in a request, and the end of the listing in an answer.
     The rest says what comes next: after the entry that `names` and `number` stand for, and of the
     versions of one slot after `version`.
     """
@@ -66,7 +66,7 @@ class SlotState(NamedTuple):
 
 
 class Holder(NamedTuple):
-    """Who holds or awaits a lock, for messages to people."""
+    """The holder or waiter of a lock, for messages to people."""
 
     lock: LockId
     number: int
@@ -117,14 +117,14 @@ class Cause(NamedTuple):
     Attributes:
         lock: The lock that committed it; over several shards all causes of a commit name the same.
         kind: One of `CAUSE_*`.
-        actor: Name of the session, "" where it gave none.
-        host: Where it ran.
+        actor: Name of the session, "" if it has none.
+        host: Its host.
         pid: Its process.
         stamp_ns: Stamp of the commit.
         held_ns: How long the lock had been held when its commit, or its promise, reached the shard.
         reads: Every datum that the lock read or viewed, of a pattern those that its block looked
             at, and each replaced one that it looked at.
-        reads_left_out: How many further ones there were than a message holds.
+        reads_left_out: Number of further ones beyond the limit of a message.
         writes: What the commit set on this shard.
     """
 
@@ -160,7 +160,7 @@ class VersionEntry(NamedTuple):
 
 
 class WorldEntry(NamedTuple):
-    """A world context; a fork names the context that it was forked from and as of which stamp."""
+    """A world context; a fork names its source and the timestamp of the fork."""
 
     name: str
     source: str = ""

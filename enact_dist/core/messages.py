@@ -9,10 +9,10 @@ tuples of these, NamedTuples and dataclasses of the protocol's four files and of
 
 ::
 
-    message_parts      what several messages are made of
-    requests           what is asked, each with the name of its answer
-    answers            what a shard answers
-    messages           notices, and everything of the protocol under one roof
+    message_parts      the parts of several messages
+    requests           the requests, each with the name of its answer
+    answers            the answers of a shard
+    messages           notices, and all names of the protocol
 
 Durations travel, points in time do not (except wall-clock stamps): clocks are never compared.
 

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     Gone = WorldDropped | AspectForgotten
 
 NAMED_MAX: Final = 5
-"""So many entities are named where more stand in the way."""
+"""Number of obstructing entities that a message names."""
 
 
 class Move(NamedTuple):
@@ -81,9 +81,9 @@ class Plan:
     """What a rebalance does.
 
     Attributes:
-        first: What each shard must learn before anything moves; none that knows all.
+        first: Records that each shard needs before anything moves; only shards that lack some.
         moves: The entities, in order of their names.
-        obstacles: Why nothing may be done at all, for people; then the rest means nothing.
+        obstacles: Why nothing may be done, for people; the rest is then meaningless.
     """
 
     first: dict[str, tuple[Record, ...]] = field(default_factory=dict)

@@ -13,7 +13,7 @@ Rules a change must keep
     over shards only go up, so there is no deadlock.
   * Reads and expectations on other shards are validated, writes prepared, after `finish` and
     before the commit: everything was then held at the moment of `finish`.
-  * Until the commit is sent, giving up means abort: releasing the primary makes it so.
+  * Until the commit is sent, giving up means abort: releasing the primary causes it.
   * No answer means unknown.  A commit without an answer is asked about (`Outcome`), never guessed.
   * A `Stale` or lost lock never comes back under its seq.
 """
@@ -72,7 +72,7 @@ RETRY_NS_MAX: Final = 300_000_000
 """Pause after a call without an answer; doubles up to the second figure."""
 OVERLOAD: Final = "overload"
 """The code of refusals by a shard that has not looked at the request."""
-# Tuples: a union would be made anew for each answer.
+# Tuples: a union would be rebuilt for each answer.
 _TO_ANY_REQUEST: Final = (Refused, Forgotten, WrongShard, EpochChanged)
 _DECIDERS: Final = (Commit, Outcome)
 
@@ -119,7 +119,7 @@ class MultiLock:
     # ---------------------------------------------------------------- what to send
 
     def next_calls(self, now_ns: int) -> tuple[list[tuple[str, Request]], int]:
-        """Return the calls to make now, and until when to wait if there are none.
+        """Return the calls to make now; without any, the time until which to wait.
 
         Every returned call must be followed by one `answered`.
         """
@@ -339,7 +339,7 @@ class MultiLock:
         """A shard has ended this lock; give the rest back.
 
         Args:
-            cause: Why, as far as it is known here.
+            cause: The reason, as far as known here.
             asked_of: The part whose shard knows more (`ask_cause`).
         """
         if self.phase is Phase.COMMITTING or not (self.phase.busy or self.phase is Phase.HELD):
@@ -423,7 +423,7 @@ class MultiLock:
         self._after_votes()
 
     def shard_of(self, slot: Slot) -> str:
-        """Return the shard at which this lock has a slot, whatever the client learns meanwhile."""
+        """Return the shard where this lock has a slot, even if the placement changes meanwhile."""
         return shard_of(slot.entity, self.plan.placement)
 
     def _epoch_viewed(self, shard: str) -> int:

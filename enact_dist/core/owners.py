@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from enact_dist.core.sessions import SessionTable
 
 PERMISSION: Final = "permission"
-"""The code of a refusal because of who asks."""
+"""The code of a refusal because of the sender."""
 _SHARD: Final = "shard."
 
 

@@ -46,7 +46,7 @@ Step = tuple[E | None, int, int, Cursor]
 
 
 def page_of(steps: Iterable[Step[E]]) -> tuple[tuple[E, ...], Cursor]:
-    """Return the entries of one page, and where the next one begins (`START`: there is none)."""
+    """Return the entries of one page, and the start of the next one (`START`: none left)."""
     entries: list[E] = []
     size = looked = 0
     end = START

@@ -70,7 +70,7 @@ class Parked(Generic[T]):
         return len(self.by_reply)
 
     def add(self, reply_to: int, question: T, *, session: str, end_ns: int) -> int | None:
-        """Park a question; return the one that its session has parked for too many since."""
+        """Park a request; return the oldest one of its session if that has too many."""
         self.by_reply[reply_to] = Waiting(question, session, end_ns)
         self._by_end.add(end_ns, reply_to)
         of_session = self._of_session.setdefault(session, {})
@@ -87,12 +87,12 @@ class Parked(Generic[T]):
         return question
 
     def ended(self, now_ns: int) -> Iterator[tuple[int, T]]:
-        """Let go of the questions whose wait is over, and yield them."""
+        """Remove and yield the requests whose wait is over."""
         while (first := self._by_end.first()) is not None and first[0] <= now_ns:
             yield first[1], self.take(first[1])
 
     def all(self) -> Iterator[tuple[int, T]]:
-        """Let go of all questions, and yield them in order."""
+        """Remove and yield all requests, in order."""
         for reply_to in list(self.by_reply):
             yield reply_to, self.take(reply_to)
 

@@ -1,4 +1,4 @@
-"""The participant's half of a commit over shards: keep writes and locks until told.
+"""The participant's half of a commit over shards: keep writes and locks until the decision arrives.
 
 ::
 

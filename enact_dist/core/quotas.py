@@ -30,7 +30,7 @@ TOLD_MAX: Final = 1_000
 
 
 class Quotas:
-    """Refuses what is beyond a share, counts it, and lets the log name each identity once."""
+    """Refuses requests beyond a share, counts them, and logs each identity once."""
 
     __slots__ = ("_count", "_told")
 

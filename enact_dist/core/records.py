@@ -27,7 +27,7 @@ class SessionRecord:
 
 @dataclass(frozen=True, slots=True)
 class SessionEnded:
-    """A session that said goodbye or stayed away: forget it, its outcomes after a while."""
+    """A session that ended or stayed away: drop it, and later its outcomes."""
 
     session: str
     wall_ns: int
@@ -35,7 +35,7 @@ class SessionEnded:
 
 @dataclass(frozen=True, slots=True)
 class WorldRecord:
-    """A world context exists; a fork says of which context, as of which stamp."""
+    """A world context exists; a fork names its source and timestamp."""
 
     name: str
     source: str = ""
@@ -57,7 +57,7 @@ class WorldDropped:
 
 @dataclass(frozen=True, slots=True)
 class AspectForgotten:
-    """An aspect is registered no more, and all states of its slots are gone.
+    """An aspect is no longer registered, and all states of its slots are gone.
 
     If it is registered again, versions of its slots start above `version_base`: none is ever used
     twice.  What they were up to the stamp `at_ns` is not known.  For the entities of `entity_bases`
@@ -94,7 +94,7 @@ class AspectRecord:
 
 @dataclass(frozen=True, slots=True)
 class SlotRecord:
-    """The new state of a slot, in place of the one before, which stays if `history` is said.
+    """The new state of a slot, replacing the previous one, which stays if `history` is set.
 
     `volatile` records only say that the slot exists: neither version nor datum is kept.  Where the
     bytes are those of another version that is stored here, `same_as` names it, so that they need
@@ -167,7 +167,7 @@ class PreparedEnded:
 
 @dataclass(frozen=True, slots=True)
 class DecisionRecord:
-    """This shard has committed a lock for all its participants too, who must be told."""
+    """This shard has committed a lock for all its participants too, which must be notified."""
 
     lock: LockId
     position: Position
@@ -183,7 +183,7 @@ class DecisionDone:
 
 @dataclass(frozen=True, slots=True)
 class AuditRecord:
-    """An operator's act or what came of it, kept for good; `kind` is one of `core.forced`.
+    """An operator's action or its outcome, stored permanently; `kind` is one of `core.forced`.
 
     `identity` is who asked for it; "" for what the shard found by itself.
     """

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from enact_dist.retention import Retention
 
 NO_LIMIT: Final = 1 << 62
-"""Stands for a figure without limit; as it may travel, it is below the wire's largest integer."""
+"""Represents "no limit"; below the wire's largest integer, since messages may carry it."""
 
 
 class Limits(NamedTuple):
@@ -54,7 +54,7 @@ def with_larger(entry: AspectEntry, other: AspectEntry) -> AspectEntry:
         largest = Limits(*map(max, limits_of(entry), largest))
     versions, age_ns, size = (0 if figure == NO_LIMIT else figure for figure in largest)
     if not (versions or age_ns or size):
-        versions = NO_LIMIT  # says that there is none at all
+        versions = NO_LIMIT  # means that there is no limit
     return entry._replace(retention=versions, age_ns=age_ns, size=size)
 
 

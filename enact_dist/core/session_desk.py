@@ -111,7 +111,7 @@ class SessionDesk:
             yield from self.answer_when_durable(reply_to, welcome, ())
 
     def _make_room(self) -> Generator[Effect, None, bool]:
-        """End the oldest session that has done nothing since its hello; False if there is none."""
+        """End the oldest session without a request since its hello; False if there is none."""
         for session in self._state.sessions.unproven(self._state.now_ns):
             if session.session not in self._state.tenures.by_session:
                 self._state.count("sessions_displaced")

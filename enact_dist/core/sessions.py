@@ -43,9 +43,9 @@ class Lane:
 
     Attributes:
         top: Highest seq that asked for a lock here; each seq is granted at most once.
-        outcome: What its newest commit did.
+        outcome: Outcome of its newest commit.
         validated: The newest lock whose reads were found intact, with its token.
-        changed: What the newest lock was told whose expectation did not stand.
+        changed: The answer to its newest lock whose expectation failed.
         ended: The newest lock that the shard took away, with the cause.
     """
 
@@ -118,7 +118,7 @@ class SessionTable:
     """All sessions of one shard, and the grace after a restart.
 
     Attributes:
-        shortest_ttl_ns: Of the sessions that there are; None where there is none.
+        shortest_ttl_ns: Shortest lease of all sessions; None without sessions.
     """
 
     __slots__ = (
@@ -191,7 +191,7 @@ class SessionTable:
             self.grace_end_ns = now_ns
 
     def owner(self, session: str) -> str | None:
-        """Return whose a session is, also one that ended; None for one that is not known."""
+        """Return the identity of a session, even of an ended one; None if unknown."""
         found = self.by_id.get(session) or self._retired.get(session)
         return found.identity if found is not None else None
 
@@ -255,7 +255,7 @@ class SessionTable:
         return session, not message.observer and (bound or not session.durable)
 
     def known(self, session: str) -> Session | None:
-        """Return the session if it has said hello in this epoch."""
+        """Return the session if it has sent a hello in this epoch."""
         found = self.by_id.get(session)
         return found if found is not None and found.present else None
 
@@ -276,7 +276,7 @@ class SessionTable:
         return True
 
     def _expect(self, session: str, identity: str) -> None:
-        """Note a token whose session has not said hello; the oldest ones make room."""
+        """Record a token without a hello of its session; the oldest ones make room."""
         self._tokens[session, identity] = None
         while len(self._tokens) > SESSIONS_MAX:
             del self._tokens[next(iter(self._tokens))]

@@ -256,7 +256,7 @@ class Shard:
     def idle(self) -> bool:
         """Whether a draining shard may stop: no commit in flight and no lock held.
 
-        What is prepared, or decided and not told everywhere, comes back with the next start.
+        Prepared locks and unconfirmed decisions come back with the next start.
         """
         held = any(
             tenure.token is not None and (tenure.committing or tenure.prepared is None)

@@ -63,7 +63,7 @@ class ShardSettings:
         ttl_ns_max: Longest lease a session may ask for.
         fetch_bytes_max: Largest part of a datum in one answer.
         shared: Name of this start's folder of shared memory ("": it shares none).
-        shared_nonce: What stands in there for a client to find.
+        shared_nonce: Content of its nonce file, for clients.
         start: A random number of this start.
     """
 
@@ -83,12 +83,13 @@ class ShardState:
 
     Attributes:
         now_ns: Monotonic time of the message being handled.
-        asker: The identity under which it came; "" for what this process itself says.
-        wall_ns: Wall clock at that moment; for stamps only.
+        asker: The identity under which it came; "": this process.
+        wall_ns: Wall clock at that moment; for timestamps only.
         peers: The other shards of the cell.
         pins: Data that a view without a lock keeps fetchable.
-        busy_worlds: What is being done to the context of a name, which is not to be used meanwhile.
-        by_hand: The last lock that people have broken, and the last aborted: asked and answered.
+        busy_worlds: The operation in progress on a context of this name, which is unusable
+            meanwhile.
+        by_hand: The last lock broken and the last one aborted by operators: request and answer.
         draining: The shard is about to stop and grants nothing.
         doubled: The shards of the cell that several daemons serve now, with the start of each.
     """
@@ -223,7 +224,7 @@ class ShardState:
         return Refused("overload", f"world context {world!r} is {act}; ask again")
 
     def numbered(self, number: int, epoch: int) -> Tenure | None:
-        """Return the lock of a number that people were told in an epoch (0: this one)."""
+        """Return the lock with a number that people saw in an epoch (0: this one)."""
         if epoch not in (0, self.epoch):
             return None
         found = (t for t in self.tenures.by_lock.values() if t.claim.ticket == number)

@@ -42,15 +42,15 @@ class SlotHistory:
     """What is known of the replaced states of one slot.  `History` changes it.
 
     Attributes:
-        number: Tells slots apart where they are put in order.
+        number: Unique number of the slot, for sorting.
         states: The replaced states up to the newest one, oldest first, without holes.
         held: How many of them, the latest, are within the slot's retention.
         size: Bytes of their data.
         young: How many states have been replaced so lately that cuts may ask for them.
         until_ns: The stamp of the newest state, which replaced the last of `states`.
-        stored: Whether the versions lie on the disk, too.
-        queued: Whether the slot stands in the queue of its aspect.
-        kept: What labels keep, by version; in `states` or not.
+        stored: Whether the versions are stored on the disk, too.
+        queued: Whether the slot is in the queue of its aspect.
+        kept: Versions that labels keep, by number; in `states` or not.
     """
 
     __slots__ = (

@@ -69,8 +69,8 @@ class SlotMap:
     Args:
         recovered: The newest states that the store has kept.
         policies: How much of its history each aspect retains; may change.
-        since_ns: Stamp of the start of this epoch: what is lost is lost from then on.
-        answer_bytes_max: So many bytes of small data travel with one answer.
+        since_ns: Stamp of the start of this epoch: lost data count as lost from then on.
+        answer_bytes_max: Limit of the bytes of small data in one answer.
         dropped: The contexts that were dropped, and above which versions theirs start now.
         forgotten: The aspects that were forgotten, likewise.
 
@@ -218,7 +218,7 @@ class SlotMap:
         )
 
     def forgotten(self, items: Iterable[Item], at_ns: int) -> Forgotten | None:
-        """Return what is asked and not known any more as of a stamp, None if all is known."""
+        """Return the requested data no longer known as of a timestamp; None if all are known."""
         latest, unknown = Forgotten(Slot("", "", ""), 0), False
         for item in items:
             each = ACCESSES[item.access].each
@@ -282,7 +282,7 @@ class SlotMap:
         return here and self.history.is_stored(slot)
 
     def make_room(self, size: int) -> tuple[int, int]:
-        """Forget the oldest replaced states until so many bytes of payloads are named no more."""
+        """Remove the oldest replaced states until so many payload bytes are no longer named."""
         return self.history.make_room(size)
 
     # ---------------------------------------------------------------- the present
@@ -360,7 +360,7 @@ class SlotMap:
     def shown(self, items: Iterable[Item], at_ns: int = 0) -> Shown:
         """Return what a grant or view shows of `items` as of a stamp (0: now).
 
-        Slots stand in order, patterns expanded to those that are not null.
+        Slots are in order, with patterns expanded to slots that are not null.
         """
         states: list[SlotState] = []
         pins: dict[tuple[Slot, int], Datum] = {}

@@ -57,7 +57,7 @@ class Stamps:
     def too_far_ahead(self, seen_ns: int, *, wall_ns: int) -> bool:
         """Whether a stamp from elsewhere would drag this clock away from the wall clock.
 
-        What this clock has said itself is never too far, nor what the wall clock has shown.
+        Times that this clock or the wall clock has given are never too far ahead.
         """
         return seen_ns > max(max(wall_ns, self._wall_ns_max) + AHEAD_NS_MAX, self.last_ns)
 

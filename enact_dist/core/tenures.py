@@ -214,7 +214,7 @@ class Tenures:
         return list(self._over)
 
     def session_ended(self, name: str) -> None:
-        """Look at a session no more if it has no locks, at the next tick if some are bound."""
+        """Stop watching a session without locks; watch it at the next tick if some are bound."""
         self._lease_ends.drop(name)
         self._over.pop(name, None)
         if name in self.by_session:

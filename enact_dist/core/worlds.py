@@ -132,7 +132,7 @@ class WorldDesk:
             yield from self._make(act)
 
     def _fork_refused(self, message: Fork) -> Answer | None:
-        """Return what a fork is answered that is not to be made, None if it is."""
+        """Return the answer to a fork that must not be made; None if it may be made."""
         state, world = self._state, message.world
         wrong = wrong_name("world context", world, slashes=False) or state.busy_world(world)
         if wrong is not None:
@@ -207,7 +207,7 @@ class WorldDesk:
             content = newest if is_newest else slots.as_of(source, message.at_ns)
             since_ns = slots.known_since_ns(source, newest)
             if since_ns > latest.oldest_ns:
-                latest = Forgotten(source, since_ns)  # from then on all of them are known
+                latest = Forgotten(source, since_ns)  # from this timestamp on all are known
             if isinstance(content, int):
                 unknown = True
             elif content is not NOTHING:

@@ -1,6 +1,6 @@
 """Recordings: every version of chosen slots in a file that others can open, and back into a cell.
 
-A recording is an MCAP file.  Each version stands in it exactly, for `replay`, and once more as a
+A recording is an MCAP file.  Each version is in it exactly, for `replay`, and once more as a
 message that Foxglove shows and Rerun converts.
 
 ==============================  =======================  =========================================
@@ -33,7 +33,7 @@ module          what it does
 `exporting`     one world context as of one moment, into a file
 ==============  ==================================================================================
 
-What the data of an aspect look like is said in `cell.toml` (`enact_dist.config_shows`).  The
+`cell.toml` describes how to show the data of an aspect (`enact_dist.config_shows`).  The
 packages that all this needs are those of the extra ``record``.
 """
 

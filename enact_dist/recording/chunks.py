@@ -33,7 +33,7 @@ CHANNEL_BYTES_MAX: Final = 64 << 10
 """Longest record of a channel: some names, and a type's fingerprint."""
 PIECE_BYTES: Final = 1 << 20
 IN_MEMORY_BYTES: Final = 16 << 20
-"""Up to this size a chunk is unpacked once and stays in memory meanwhile."""
+"""Up to this size a chunk is unpacked once and stays in memory."""
 
 _HEAD: Final = struct.Struct("<QQQII")
 _LENGTH: Final = struct.Struct("<Q")
@@ -47,7 +47,7 @@ class DamagedChunkError(Exception):
 
 
 class RawMessage(NamedTuple):
-    """One message: of which channel, under which time of the log, its bytes."""
+    """One message: its channel, log time and bytes."""
 
     channel_id: int
     log_time: int

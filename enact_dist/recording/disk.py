@@ -1,6 +1,6 @@
 """The thread that writes a recording, behind a queue that is bounded in bytes.
 
-Whoever records waits for room here, and never with more than one batch in hand.  So a slow disk
+The recorder waits for room here, and never with more than one batch in hand.  So a slow disk
 costs no memory: the versions stay with their shards, as long as their history keeps them.
 """
 

@@ -132,7 +132,7 @@ def encode_recorded(recorded: Recorded) -> bytes:
 
 
 def decode_recorded(message: bytes) -> Recorded:
-    """Return the version that a message stands for.
+    """Return the version in a message.
 
     Raises:
         ProtocolError: It is damaged, or of another format.

@@ -31,7 +31,7 @@ class ExportSummary:
 
     Attributes:
         path: The file.
-        at_ns: The stamp as of which it is.
+        at_ns: The timestamp of the exported state.
         versions: Data in it.
         size_bytes: Bytes on the disk.
         counts: What else happened, by name (see `file.RecordingFile`).
@@ -48,11 +48,11 @@ def world_as_of(world: WorldContext, at_ns: int = 0) -> Iterator[Recorded]:
     """Yield every datum of a world context, all of one moment, over all shards.
 
     Not more than `PORTION_BYTES` are in memory at once, or the largest datum; the shards keep the
-    rest meanwhile.
+    rest until then.
 
     Args:
         world: The world context.
-        at_ns: The stamp as of which; 0: now.
+        at_ns: The timestamp to export; 0: now.
 
     Raises:
         ForgottenError: A state as of `at_ns` has left its retention.
@@ -99,8 +99,8 @@ def export_world(
     Args:
         world: The world context.
         path: The file; it must not exist.
-        at_ns: The stamp as of which; 0: now.
-        shows: What the data of an aspect look like; what it does not name is guessed.
+        at_ns: The timestamp to export; 0: now.
+        shows: How to show the data of an aspect; unnamed aspects are guessed.
         compression: "none", "lz4" or "zstd".
 
     Raises:
@@ -111,7 +111,7 @@ def export_world(
     declared = dict(shows or {})
     log_ns = at_ns or time.time_ns()
     versions = world_as_of(world, at_ns)
-    first = next(versions, None)  # what is forgotten is told before there is a file
+    first = next(versions, None)  # forgotten data raise before the file is made
     file = RecordingFile(
         path,
         {"worlds": world.name, "entities": "**", "aspects": "", "begin_ns": str(log_ns)},

@@ -53,9 +53,9 @@ class RecordingFile:
 
     Args:
         path: The file; it must not exist.
-        facts: What the first metadata record says beside the format.
-        aspects: The catalogue entry of each aspect, told with its channel.
-        shows: What the data of which aspect look like; None writes exact messages only.
+        facts: Content of the first metadata record besides the format.
+        aspects: The catalogue entry of each aspect, written with its channel.
+        shows: How to show the data of each aspect; None writes only exact messages.
         compression: "none", "lz4" or "zstd".
         chunk_bytes: Size from which a chunk ends.
         chunk_s: Age from which a chunk ends.
@@ -112,8 +112,8 @@ class RecordingFile:
         """Write the data of one commit.
 
         Args:
-            versions: All that it has set, as far as it is recorded.
-            log_ns: The stamp under which it stands in the file.
+            versions: All recorded versions of the commit.
+            log_ns: Its log time in the file.
 
         Raises:
             OSError: The disk refuses.
@@ -185,7 +185,7 @@ class RecordingFile:
         return facts
 
     def _note_newer_types(self) -> None:
-        """Say once more of which type an aspect is, where a newer one has succeeded the first."""
+        """Write an aspect's type again after a newer one has succeeded the first."""
         for topic, facts in self._exact_facts.items():
             now = self._facts_of(facts["world"], facts["aspect"])
             if now != facts:
@@ -225,7 +225,7 @@ class RecordingFile:
         return max(0.0, self._held_since_s + self._chunk_s - time.monotonic())
 
     def end_chunk(self) -> None:
-        """Force what is there to the disk as a whole chunk.
+        """Force the pending data to the disk as a complete chunk.
 
         Raises:
             OSError: The disk refuses.
@@ -259,7 +259,7 @@ class RecordingFile:
             self._stream.close()
 
     def abandon(self) -> None:
-        """Leave the file as it is, without its end; never raises for a disk that refuses."""
+        """Leave the file without its end; raises nothing if the disk fails."""
         try:
             self._stream.raw.close()
         except OSError:

@@ -33,7 +33,7 @@ _log = logging.getLogger("enact.recording")
 
 
 class OtherWriters:
-    """What somebody else writes, too; told of before the first commit, and once when it happens.
+    """Slots with other writers; reported before the first commit, and once when they write.
 
     Args:
         warn: Takes each warning.
@@ -79,7 +79,7 @@ class OtherWriters:
                 )
 
     def look_at(self, session: Session, lock: MultiLock) -> None:
-        """Warn of slots of a granted lock that somebody has written since the replay did."""
+        """Warn of slots of a granted lock that another client wrote after the replay."""
         for reading in lock.states:
             state = reading.state
             made_ns = self._made.get(state.slot, 0)

@@ -9,7 +9,7 @@ import numpy as np
 from enact_dist.recording.geometry import is_rigid
 
 NUMBER_MAX: Final = 1e15
-"""Greater sizes and focal lengths are none."""
+"""Larger sizes and focal lengths are invalid."""
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -25,7 +25,7 @@ class Part(NamedTuple):
 
 
 def part_at(value: object, path: str) -> object:
-    """Return the part of a datum at a dotted path; None where there is none."""
+    """Return the part of a datum at a dotted path; or None."""
     for name in path.split(".") if path else ():
         value = value.get(name) if isinstance(value, dict) else None
     return value
@@ -57,7 +57,7 @@ def number_of(value: object) -> float:
 
 
 def guess(value: object) -> str:
-    """Return the kind that a datum is shown as where nobody says one."""
+    """Return the default kind for showing a datum."""
     if isinstance(value, np.ndarray):
         if is_image(value) and value.ndim == 3:
             return "image"

@@ -1,6 +1,6 @@
 """A datum as messages that Foxglove shows and Rerun converts: images, clouds, meshes, poses, JSON.
 
-What is a picture of what stands in `enact_dist.config_shows`.  Geometry is protobuf: Rerun converts
+`enact_dist.config_shows` lists what is shown as which kind.  Geometry is protobuf: Rerun converts
 Foxglove's schemas in that encoding only, and an image in JSON would be a third larger for its
 base64.  Stamps inside messages are the capture's, else the commit's.
 """
@@ -408,7 +408,7 @@ def plain(value: object) -> object:
 
 
 def json_bytes(message: dict[str, object]) -> bytes:
-    """Return a JSON message as it stands in the file."""
+    """Return a JSON message in its stored form."""
     return json.dumps(message, ensure_ascii=False, allow_nan=False).encode()
 
 

@@ -4,7 +4,7 @@ A recording that was cut off, by `kill -9` or a power cut, has no index and may 
 record; one of a disk that lost power may end in zeros.  So the file is read from its begin, each
 record against the file's length and each chunk against its checksum (`chunks`), and what follows
 the first record that is not whole is counted as missing.  A recording may come from anywhere: what
-it claims takes no memory, and its names are checked before anybody is told them.
+it claims takes no memory, and its names are checked before they are shown.
 """
 
 from __future__ import annotations
@@ -66,8 +66,8 @@ class Commit(NamedTuple):
 
     Attributes:
         number: Its number in the recording; 0: what was there when the recording began.
-        log_ns: The stamp under which it stands in the file.
-        versions: What it has set, in the order of the file.
+        log_ns: Its log time in the file.
+        versions: Its versions, in the order of the file.
     """
 
     number: int

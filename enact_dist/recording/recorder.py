@@ -73,16 +73,16 @@ class RecordingSummary:
     Attributes:
         path: The file.
         seconds: How long it was recorded.
-        commits: Commits in it, whole; what was there at its begin does not count as one.
+        commits: Commits in it, whole; the initial data do not count as one.
         versions: Versions in it.
         initial: … of which were there when it began.
         size_bytes: Bytes on the disk.
         chunks: Whole chunks on the disk.
         gaps: Versions that are missing, by reason.
         gap_slots: Versions that are missing, by slot.
-        out_of_order: Commits whose notice came so late that they stand behind later ones.
+        out_of_order: Commits whose notice came so late that they follow later ones.
         counts: What else happened, by name (see `file.RecordingFile`).
-        unknown_aspects: Aspects that were asked for and that the cell does not know so far.
+        unknown_aspects: Requested aspects that the cell does not know so far.
     """
 
     path: str
@@ -301,7 +301,7 @@ class Recorder:
                 self._aspects[aspect] = client.aspect_entries()[aspect]
 
     def _fill(self, slot: Slot, shard: str, change: Change) -> None:
-        """Look in the history for versions of which no notice came."""
+        """Search the history for versions without a notice."""
         first, last = change.version - change.gap, change.version - 1
         try:
             found = between(self._session, slot, shard, first, last) if first <= last else []

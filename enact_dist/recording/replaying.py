@@ -163,21 +163,21 @@ class Replay:
         warn: Callable[[str], None] | None = None,
         show: Callable[[str], None] = lambda _: None,
     ) -> ReplaySummary:
-        """Commit all that was chosen, or until `stop` is set; a commit is made whole or not at all.
+        """Commit all that was chosen, or until `stop` is set; each commit is atomic.
 
         Args:
             stop: Ends the replay.
-            loop: Begin anew at the end.
+            loop: Start again at the end.
             tell: Called after each commit.
-            warn: Called with a sentence for each slot that somebody else writes, too; None: a
+            warn: Called with a sentence for each slot that has other writers; None: a
                 warning of the log.
-            show: Called with a line on the recording and on what is to be set, before anything is.
+            show: Called with a line about the recording and its target, before any commit.
 
         Raises:
             ConfigError: The recording has no such aspect.
             MisuseError: A world context has data, and `overwrite` was not asked; none is made.
-            ProtocolError: The recording holds what this version cannot read.
-            LockTimeoutError: Somebody else holds the data.
+            ProtocolError: The recording holds data that this version cannot read.
+            LockTimeoutError: Another client holds the data.
             DatumTypeError: The cell knows an aspect with another type; no world context is made.
         """
         stop = stop or threading.Event()

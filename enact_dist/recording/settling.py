@@ -32,7 +32,7 @@ ANSWER_S: Final = 0.25
 
 
 class Settling:
-    """What was told and rests.  Used by one thread."""
+    """The announced commits that are settling.  Used by one thread."""
 
     def __init__(self, client: CellClient) -> None:
         self._client = client
@@ -42,7 +42,7 @@ class Settling:
         self._settled_ns = 0
 
     def told(self, stamp_ns: int) -> None:
-        """Note that a shard has told of a commit."""
+        """Record that a shard has announced a commit."""
         self._told.append((time.monotonic(), stamp_ns))
 
     def settled_ns(self, rest_s: float) -> int:

@@ -19,7 +19,7 @@ _CORNERS: Final = {
 }
 """Corners of the face of a unit cube by axis and side, counterclockwise as seen from outside."""
 VOXELS_MAX: Final = 1 << 20
-"""Extent of a grid along one axis, beyond which nobody means voxels."""
+"""Largest plausible extent of a voxel grid along one axis."""
 
 
 def voxel_faces(voxels: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
