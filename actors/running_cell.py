@@ -204,9 +204,9 @@ def placed(config: dict[str, Any], data: Path, ports: Sequence[int]) -> None:
 
 
 def kept_ports(count: int) -> list[socket.socket]:
-    """Return sockets, each of which keeps a port of this host that nobody listens at.
+    """Return sockets, each of which reserves a port of this host without a listener.
 
-    The system gives it to nobody else, before a shard listens there or while it is started again;
+    The system gives it to no other process, before a shard listens there or while it restarts;
     who says SO_REUSEADDR, as Zenoh does, listens beside a socket that does not listen.
     """
     kept = [socket.socket() for _ in range(count)]

@@ -1,6 +1,7 @@
 """Pockets: connected space that no camera can see and that is large enough to hold a person.
 
-Who goes into one vanishes.  A pocket is *held* from the set on in which whatever visible touched it
+A person who enters one disappears from view.  A pocket is *held* from the set on in which whatever
+visible touched it
 is gone, until as much visible volume stands beside it again; one that reaches the side of the grid
 may be entered unseen and is always held.  One that comes into being because a camera ceases to look
 is held if something was in it.
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     Rows = npt.NDArray[np.integer]
 
 PERSON_M3_MIN: Final = 0.020
-"""A pocket of less volume hides nobody."""
+"""A pocket of less volume hides no person."""
 LEFT_SHARE: Final = 0.5
 """If this share of the volume that touched a pocket stands beside it, it has come out."""
 BESIDE_BLOCKS: Final = 3
@@ -65,7 +66,7 @@ class Pockets:
         return self._held | self._always
 
     def _find(self, unseen: Flags) -> None:
-        """Join unseen voxels to pockets and drop those that hide nobody."""
+        """Join unseen voxels to pockets and drop those too small to hide a person."""
         from scipy import ndimage
 
         grid = self._grid

@@ -1,10 +1,10 @@
 """What of a visual hull is neither robot nor static nor impossible: refinement by knowledge.
 
 ====  ===========  =================================================  ===========================
-rule  in counts    what                                               why it loses nobody
+rule  in counts    what                                               why it loses no person
 ====  ===========  =================================================  ===========================
-R0    static       voxels within known obstacles go                   nobody is inside of those
-R1    robot        voxels that touch the robot at the exposure go     it is at rest before anybody
+R0    static       voxels within known obstacles go                   no person is inside them
+R1    robot        voxels that touch the robot at the exposure go     it is at rest before a person
                                                                       comes that near
 R2    small        a component with less than 0.5 l of visible        smaller than a hand; of a
                    volume that the robot does not explain goes, and   body at least one voxel has
@@ -14,7 +14,7 @@ R3    explained    a voxel within 10 cm of the robot goes if each     a hidden p
                    camera that sees it sees it on the robot           have to fit into that shell,
                                                                       which is thinner than the
                                                                       distance at which it rests
-R4    unreachable  a block goes that nobody reaches at 3 m/s from     people do not appear out of
+R4    unreachable  a block goes that is beyond reach at 3 m/s from    people do not appear out of
                    where something was in the last half second, or    nothing; if they seem to,
                    from outside; not the third set in a row in which  they have been overlooked
                    that takes the volume of a person away
@@ -68,7 +68,7 @@ VISIBLE_M3_MIN: Final = 0.0005
 RIM_M3_MAX: Final = 0.005
 """R2: a component with no voxel in the tight set is a rim of something; up to so much goes."""
 SPEED_MAX_M_S: Final = 3.0
-"""R4: faster than anybody in a workcell."""
+"""R4: faster than any person in a workcell."""
 GAP_MAX_S: Final = 1.0
 """R4: after a longer gap between sets anything may be anywhere."""
 RECENT_S: Final = 0.5
@@ -175,10 +175,10 @@ class Refinement:
         """Return what is occupied at an exposure.
 
         Args:
-            silhouettes: (H, W / 8) uint8 per camera, None where one has none.
+            silhouettes: (H, W / 8) uint8 per camera, None for a camera without one.
             robot: (n, 7) capsules at the exposure, metres, cell; None if the pose is not known:
                 then nothing is taken for the robot, and everything is at distance 0.
-            elapsed_s: Time since the set of the last call; what is beyond `GAP_MAX_S` starts anew.
+            elapsed_s: Time since the set of the last call; beyond `GAP_MAX_S` the state is reset.
 
         Raises:
             ValueError: Silhouettes of another number or size than the calibrations.
@@ -228,7 +228,7 @@ class Refinement:
         ]
 
     def _note_live(self, live: tuple[int, ...]) -> None:
-        """Count anew who has a say where, if other cameras than before gave a silhouette."""
+        """Recount the cameras that see each voxel, if other cameras gave silhouettes."""
         if live == self._live:
             return
         self._live = live
@@ -248,7 +248,7 @@ class Refinement:
         robot: Numbers | None,
         outline: list[npt.NDArray[np.uint8]],
     ) -> Rows:
-        """Return the voxels in which somebody can be (R4), or all if a person has appeared."""
+        """Return the voxels that people can have reached (R4), or all if a person has appeared."""
         reachable = self._reachable(elapsed_s)
         if reachable is None:
             self._appeared = 0

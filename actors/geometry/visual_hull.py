@@ -1,7 +1,7 @@
 """The visual hull of a set of silhouettes: all voxels that no camera says to be free.
 
-Two levels: blocks of 4 x 4 x 4 voxels are looked up in pooled masks, what is left voxel by voxel,
-each camera only on what the last one left.  Two levels are all of an octree that pays.
+Two levels: blocks of 4 x 4 x 4 voxels are looked up in pooled masks, the rest voxel by voxel,
+each camera only on what the last one left.  More levels of an octree do not pay.
 
 Rules a change must keep: numpy only; a camera without a silhouette vetoes nothing; the result is
 the same in whatever order the cameras are asked.

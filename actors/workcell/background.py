@@ -36,8 +36,8 @@ CHECKED_ROWS: Final = 8
 class BackgroundLearning(Actor):
     """Learn what a camera sees of the empty cell.
 
-    Takes images with a stamp after the operator's word that the cell is empty, five per second.
-    A new word begins anew; after a restart a background that is newer than the word is kept.
+    Uses images captured after the operator declared the cell empty, five per second.
+    A new declaration starts again; after a restart a newer background is kept.
 
     Args:
         images: How many images make a background.
@@ -85,7 +85,7 @@ class BackgroundLearning(Actor):
 class BackgroundSubtraction(Actor):
     """Find the silhouette of what is not the empty cell in each image.
 
-    Without a background there is no silhouette, and so no set.
+    Without a background no silhouette is written, and so no set is complete.
 
     Attributes:
         subtractor: "gaussian", "mog2" or "knn".

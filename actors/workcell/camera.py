@@ -67,7 +67,7 @@ class Capture:
         """Return the image of a tick, and when it was exposed, ns since 1970.
 
         Raises:
-            CameraError: There is none, or not in time.
+            CameraError: No image came, or none in time.
         """
 
         def take() -> tuple[Image, int]:
@@ -174,7 +174,7 @@ class Camera(Actor):
         """Publish the image of the tick.
 
         Raises:
-            CameraError: There is none.
+            CameraError: No image is available.
         """
         assert self._capture is not None
         calibration = lock.get(self.calibration)

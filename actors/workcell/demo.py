@@ -12,7 +12,7 @@ figure3_top.png     its eight masks, changed pixels in colour
 figure3_bottom.png  its hull before and after the refinement
 plan.png            the cell from above: tracks, prediction, path, truth
 timeline.png        distance, allowed and actual speed
-cell.toml cell.log  what ran, and what it said
+cell.toml cell.log  configuration and log of the cell
 ==================  ==========================================================================
 """
 
@@ -85,9 +85,9 @@ class Outcome:
     """What came of a run.
 
     Attributes:
-        scores: By name.
+        scores: Scores by name.
         cores: Processor time per second of each process.
-        report: As it is written.
+        report: The report as written.
     """
 
     scores: dict[str, float]

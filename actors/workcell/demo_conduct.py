@@ -126,7 +126,7 @@ class Conductor:
         period_ns = round(words.PERIOD_S * 1e9)
         start_ns = (time.time_ns() + round(LEAD_S * 1e9)) // period_ns * period_ns
         options = self._options
-        self._play(start_ns + round(READY_S * 1e9))  # the arm is seen, nobody comes yet
+        self._play(start_ns + round(READY_S * 1e9))  # the arm is seen, no person has entered yet
         self._wait(self._stale, "stages without a fresh datum")
         start_ns = (time.time_ns() + round(LEAD_S * 1e9)) // period_ns * period_ns
         self._play(start_ns)

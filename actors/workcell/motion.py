@@ -55,7 +55,7 @@ FOLLOWING_RAD: Final = 0.15
 """A joint that is farther than this from where it was commanded does not follow: at its greatest
 speed a joint moves half of it in 30 ms."""
 SET_NS: Final = 5_000_000
-"""By so much from one cycle to the next no clock drifts: somebody has set it."""
+"""No clock drifts this much from one cycle to the next: it has been set."""
 AT_ONCE_NS: Final = 1_000_000
 """Two clocks are compared if reading them took no longer."""
 
@@ -71,7 +71,7 @@ class HostClock:
 
         Args:
             now_ns: The host's clock.
-            before_ns: A clock that nobody can set, read before.
+            before_ns: An earlier reading of a clock that cannot be set.
             after_ns: The same, read after.
         """
         if after_ns - before_ns > AT_ONCE_NS:

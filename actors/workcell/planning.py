@@ -1,4 +1,4 @@
-"""Path planning (ENACT 4.1): a path to the next goal that leads around whoever is there."""
+"""Path planning (ENACT 4.1): a path to the next goal around the people in the cell."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 MARGIN_M: Final = 0.05
 """What a planned path keeps from everything."""
 STATIC_MARGIN_M: Final = 0.02
-"""What is left of it along a path that is still good, from static obstacles."""
+"""The remaining clearance from static obstacles along a path that is still valid."""
 COARSER: Final = 2
 """Voxels of the hull along an edge of a cell in which is planned: 5 cm."""
 HEIGHT_M: Final = 2.0
@@ -103,8 +103,8 @@ class PathPlanning(Actor):
     """Keep a path to the next goal of the task, at each hull.
 
     The next second of the path is looked at.  If it is blocked in two sets in a row, another path
-    is planned, from where the arm can stop.  While there is none, the path has no waypoints and
-    says why.  What people will be in the way of is avoided where there is another way.
+    is planned, from where the arm can stop.  Without one, the path has no waypoints and
+    says why.  Predicted positions of people are avoided if another way exists.
 
     Attributes:
         predict: Whether predictions count.
@@ -212,7 +212,7 @@ class PathPlanning(Actor):
         why: str,
         from_goal: int | None = None,
     ) -> None:
-        """Write a path from a state to a goal, or that there is none.
+        """Write a path from a state to a goal, or the absence of one.
 
         Args:
             lock: Of the update.

@@ -104,7 +104,7 @@ class Reconstruction(Actor):
         one_thread()
 
     def update(self, lock: Lock) -> None:
-        """Write what is occupied, with the stamp of the set; nothing for one that is too late."""
+        """Write the occupied voxels with the stamp of the set; skip a set that is too late."""
         stamp_ns, now_ns = lock.stamp_ns(self.silhouettes), time.time_ns()
         fresh = now_ns - self._written_ns < GAP_S * 1e9
         if fresh and now_ns - stamp_ns > self.late_s * 1e9:
@@ -133,7 +133,7 @@ class Reconstruction(Actor):
             lock[self.raw_hull] = blocks.indices(found.raw)
 
     def _prepared(self, lock: Lock) -> tuple[Refinement, VoxelBlocks]:
-        """Return refinement and grid; make the tables anew where something of the cell changed.
+        """Return refinement and grid; rebuild the tables if the cell has changed.
 
         Raises:
             ValueError: Grid or calibration of a camera are missing or wrong, or an obstacle has a

@@ -68,10 +68,10 @@ def judged(
     """Return what follows from a set of images.
 
     Args:
-        nearest_m: Distance from what is occupied to the robot at the exposure.
-        age_s: Of the exposure, now.
-        joints_age_s: Of the newest sample of the joints, at the exposure.
-        nominal_m_s: Speed of the quickest point on the path if nothing limits.
+        nearest_m: Distance from occupied space to the robot at the exposure.
+        age_s: Present age of the exposure.
+        joints_age_s: Age of the newest joint sample at the exposure.
+        nominal_m_s: Speed of the fastest point on the path without a limit.
         separation: The quantities of the protective distance.
         latest_s: Oldest exposure, and oldest sample of the joints, on which the robot may move.
         misfits: Cameras whose background no longer fits.
@@ -210,7 +210,7 @@ class SpeedControl(Actor):
 
 
 def _missing(path: Path | None) -> str:
-    """Return why there is no path; empty if there is one."""
+    """Return the reason for a missing path; empty if there is a path."""
     if path is None:
         return "none is planned yet"
     return "" if len(path.waypoints) else path.reason

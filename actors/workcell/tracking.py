@@ -43,11 +43,11 @@ if TYPE_CHECKING:
 AT_S: Final = tuple(k / 10.0 for k in range(1, 11))
 """For when a person is predicted, seconds after the stamp."""
 EDGE_M: Final = 0.4
-"""So near to a side of the workspace a person who is seen no more has left."""
+"""A person last seen this near to a side of the workspace has left."""
 GATE_M: Final = 0.35
 """Distance from where a person is expected at which they are recognised, whatever the spread."""
 HIDDEN_RADIUS_MAX_M: Final = 1.5
-"""Greatest radius of a prediction of someone whom nobody sees."""
+"""Greatest radius of the prediction of a hidden person."""
 RADIUS_M: Final = (0.25, 0.6)
 """Least and greatest radius of a body."""
 
@@ -55,9 +55,9 @@ RADIUS_M: Final = (0.25, 0.6)
 class HumanTracking(Actor):
     """Keep an entity for each person, with track, limbs and prediction, at each hull.
 
-    A person is a component of the tight hull of 20 litres or more.  Someone who is seen no more
-    has left if they were at a side of the workspace; else they are hidden, and can come out again
-    wherever they can have walked to.
+    A person is a component of the tight hull of 20 litres or more.  A person no longer seen
+    has left if last seen at a side of the workspace; otherwise they are hidden, and may reappear
+    wherever they may have walked.
 
     Attributes:
         hidden_s_max: How long someone stays hidden before the track ends.
