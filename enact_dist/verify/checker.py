@@ -38,7 +38,7 @@ NOTHING: Final = None
 
 
 class Told(enum.Enum):
-    """What a thread was told of its lock's end."""
+    """The outcome of a lock as its thread learned it."""
 
     COMMITTED = "committed"
     NOT = "not committed"
@@ -84,11 +84,11 @@ class LockStory:
     Attributes:
         id: The lock; what it wrote names it as writer.
         begun_ns: When it was asked for, on a clock that all stories share.
-        ended_ns: When its thread was told how it ended; None: never.
-        told: What its thread was told.
+        ended_ns: When its thread learned how it ended; None: never.
+        told: The outcome that its thread learned.
         reads: What it read under protection: reads, what it overwrote, views it expected.
         views: What it saw without protection.
-        writes: The slots in which everybody must find it once it has committed.
+        writes: The slots in which all readers must find it once it has committed.
         outlives_restarts: A promise over shards: held over restarts, which empty volatile slots.
         captured: What it saw by capture stamp.
     """
@@ -207,7 +207,7 @@ class Checker:
                 before = state.version
 
     def told_anomalies(self) -> Iterator[Anomaly]:
-        """I3, I5: told committed is there, told not is not, and nothing is there by half."""
+        """I3, I5: confirmed commits are there, refused ones are not, and none is there by half."""
         for story in self._stories.values():
             if story.id in self._lost:
                 continue
@@ -223,7 +223,7 @@ class Checker:
                 yield Anomaly("told committed, but lost", (f"{story.id}: not in {missed}",))
 
     def reading_anomalies(self) -> Iterator[Anomaly]:
-        """What a committed lock read, and what any lock viewed, was committed by somebody."""
+        """What a committed lock read, and what any lock viewed, was committed by some lock."""
         for story in self.committed:
             for slot, name in (*story.reads, *story.views):
                 if name not in self._positions.get(slot, _ONLY_NOTHING):

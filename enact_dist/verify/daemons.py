@@ -1,4 +1,4 @@
-"""Real shards and clients as processes of a throw-away cell, for whoever measures or breaks them.
+"""Real shards and clients as processes of a throw-away cell, for measurements and fault injection.
 
 A process here is asked with lines on its standard input and tells with lines on its output; the
 clock that its lines quote is the machine's monotonic one, which all processes share.
@@ -43,7 +43,7 @@ class KeptPorts:
         self._kept: list[socket.socket] = []
 
     def free(self) -> int:
-        """Return a port that nobody listens at."""
+        """Return a port without a listener."""
         kept = socket.socket()
         self._kept.append(kept)
         kept.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -70,15 +70,15 @@ class LineProcess:
     """A child process, `python -m module words…`, whose lines can be waited for.
 
     Args:
-        module: What to run; its arguments are `words`.
+        module: Module to run, with `words` as its arguments.
         words: See `module`.
-        log: Gets what it writes to its standard error.
+        log: Receives its standard error.
         before: A command that ends by running the one that follows it, such as `nsenter`.
         environment: Its variables; those of this process unless given.
 
     Attributes:
         started_s: Monotonic time just before it was started.
-        ready_s: When it said that it serves; 0 for clients.
+        ready_s: When it reported that it is ready; 0 for clients.
     """
 
     def __init__(
@@ -139,7 +139,7 @@ class LineProcess:
     def _error(self, found: str) -> LinkError:
         log = self._log.read_text(errors="replace")[-LOG_BYTES:].strip()
         error = LinkError(f"{self.name} {found}; its log ends with: {last_said(log) or 'nothing'}")
-        error.add_note(log)  # for whoever wants the traceback, and for nobody else
+        error.add_note(log)  # shown only with the traceback
         return error
 
     def tell(self, line: str) -> None:
@@ -190,7 +190,7 @@ class LineProcess:
 class CellProcesses:
     """The shards of one cell on the loopback, and clients that join it.  A context manager.
 
-    All of them do as the cell's file says, whatever this process has been told otherwise.
+    All of them do as the cell's file says, whatever this process's own settings are.
 
     Args:
         folder: Existing and empty: for `cell.toml`, data and logs.

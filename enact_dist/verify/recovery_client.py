@@ -60,7 +60,7 @@ def _writes(cell: Cell) -> list[Write[int]]:
 
 
 def _lock_once(writes: list[Write[int]], *, said: str = "") -> None:
-    """Take a lock over all of it and give it back; says when it had it, if there is a word.
+    """Take a lock over all of it and release it; print when it was granted, if asked to.
 
     What is found lost at the end, or away at the beginning, is asked for again.
     """

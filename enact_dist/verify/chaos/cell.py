@@ -218,7 +218,7 @@ class TestedCell:
             self.watcher.expect("never said")
 
     def watcher_ended(self) -> bool:
-        """Whether the watcher is there no more."""
+        """Whether the watcher has ended."""
         return hasattr(self, "watcher") and self.watcher.status is not None
 
     def close(self) -> None:

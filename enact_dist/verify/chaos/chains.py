@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 _ANY_TIME: Final = (0, 1 << 62)
 _FIRST: Final = 0
-"""Epoch under which slots that keep their versions over restarts are told."""
+"""Epoch used for slots that keep their versions over restarts."""
 
 
 class History:
@@ -37,8 +37,8 @@ class History:
 
     Attributes:
         chains: Slot → its states.
-        oddities: What is wrong before any order is looked for.
-        guessed: States that one of several locks has written, and nobody saw.
+        oddities: Errors found before any order is searched.
+        guessed: States that one of several locks has written and no lock saw.
     """
 
     def __init__(self, evidence: Evidence) -> None:
@@ -90,7 +90,7 @@ class History:
 
     def _note_seen(self, record: LockRecord) -> None:
         for slot, version, writer, protected in record.seen:
-            seen = self._seen[slot]  # a slot that was looked at has a chain, be it empty
+            seen = self._seen[slot]  # a slot that was looked at has a chain, perhaps empty
             if version == 0 or writer == UNSEEN:
                 continue
             at = (_epoch(record, slot), version)

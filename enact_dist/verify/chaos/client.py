@@ -1,4 +1,4 @@
-"""One client process under test: locks at random until it is told to stop, or killed.
+"""One client process under test: locks at random until it is stopped or killed.
 
 ``python -m enact_dist.verify.chaos.client CELL JOURNAL NAME SEED TTL_S AHEAD_NS THREADS``; it says
 `started` and, after a line on its standard input, `done`.
@@ -34,7 +34,7 @@ class ClientProcess:
         self._connections = 0
 
     def run(self) -> None:
-        """Work until a line comes, or the end of input because whoever started this is gone."""
+        """Work until a line comes, or the end of input because the parent process is gone."""
         threading.Thread(target=self._listen, daemon=True).start()
         while not self._stop.is_set():
             try:
@@ -54,7 +54,7 @@ class ClientProcess:
         self._stop.set()
 
     def _work(self, cell: Cell) -> None:
-        """Work with one connection until told to stop, or until it takes a new one."""
+        """Work with one connection until stopped, or until it takes a new one."""
         anew = threading.Event()
         failures: list[BaseException] = []
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     import argparse
 
 SECONDS: Final = 60.0
-"""How long a run is unless told otherwise."""
+"""Default duration of a run."""
 PROGRESS_S: Final = 5.0
 
 

@@ -110,7 +110,7 @@ def load(folder: Path) -> Evidence:
     """Read the folder of a run.
 
     Raises:
-        ConfigError: It is none, or a journal cannot be read.
+        ConfigError: It is no evidence, or a journal cannot be read.
     """
     try:
         evidence = Evidence(json.loads((folder / SETTINGS).read_text()))

@@ -44,7 +44,7 @@ COUNTED: Final = (
     "commits_repeated",
     "commits_changed",
 )
-"""Counters of the shards that are told; those of the last half second of a killed shard lack."""
+"""Reported counters of the shards; the last half second of a killed shard is missing."""
 FACTS_MAX: Final = 20
 
 
@@ -59,7 +59,7 @@ class Spread:
 
 
 def spread(durations_ns: Iterable[int]) -> Spread:
-    """Return the spread of durations; zeros where there are none."""
+    """Return the spread of durations; zeros without any."""
     found = sorted(duration / 1e9 for duration in durations_ns)
     if not found:
         return Spread(0, 0.0, 0.0, 0.0)
@@ -76,9 +76,9 @@ class Verdict:
 
     Attributes:
         missing: Kinds of faults that this machine does not allow.
-        commits: Locks that wrote and were told so; `reads`: those that only looked.
+        commits: Locks with a confirmed commit; `reads`: those that only read.
         fenced: Commits that were sent and refused, since the lock was lost by then.
-        guessed: Versions that one of several locks wrote and nobody saw.
+        guessed: Versions that one of several locks wrote and no lock saw.
     """
 
     settings: dict[str, Any]

@@ -4,8 +4,8 @@
 
     s0 ──┐            one host per shard, per group of clients and for the watcher, each with an
     s1 ──┤            address of 198.18.77.0/24, a name, a /dev/shm, a monotonic clock and a boot
-    g0 ──┼── switch   id of its own; files and processes they share.  A cut from A to B loses what
-    g1 ──┘            A sends to B: nobody is told.
+    g0 ──┼── switch   id of its own; files and processes they share.  A cut from A to B drops
+    g1 ──┘            all that A sends to B, silently.
 
 Each namespace lives as long as a child that waits for the end of its standard input: when this
 process ends, however it ends, all of them are gone.  Without root they stand in a user namespace.

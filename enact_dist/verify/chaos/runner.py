@@ -32,7 +32,7 @@ REST_S: Final = 30.0
 
 @dataclass(frozen=True, slots=True)
 class ChaosSettings:
-    """What a run is told.
+    """The settings of a run.
 
     Attributes:
         seconds: How long faults happen.
@@ -110,7 +110,7 @@ def run(settings: ChaosSettings, folder: Path, *, progress: Callable[[str, float
 
 
 def _rest(cell: TestedCell, log: Journal) -> None:
-    """Let everything end by itself, and look at what is left."""
+    """Let everything end by itself, and check the final state."""
     cell.wait_ready()
     for client in cell.clients.values():
         client.process.tell("stop")

@@ -58,7 +58,7 @@ class Cable:
         delay_s: How long each frame takes.
         jitter_s: By how much some take longer, evenly spread; they stay in order.
         loss: Part of the frames that is lost, from 0 to 1.
-        bytes_per_s: How much it carries; 0 stands for any amount.
+        bytes_per_s: Its bandwidth; 0: unlimited.
     """
 
     delay_s: float = 0.0
@@ -136,7 +136,7 @@ class Switch:
         seed: Losses and jitter are drawn from it, of each direction apart.
         ports: Packet sockets of the interfaces.
         control: Descriptor of the lines.
-        say: Gets what is said.
+        say: Receives the messages.
     """
 
     def __init__(
@@ -243,7 +243,7 @@ def open_port(interface: str) -> socket.socket:
     """Return a socket through which all frames of an interface come and go.
 
     Raises:
-        OSError: There is none of that name, or the system does not allow it.
+        OSError: There is no interface of that name, or the system does not allow it.
     """
     port = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0)
     port.setsockopt(_PACKET, _VNET_HEADER, 1)

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 LOG: Final = "watcher.log"
 PERIOD_S: Final = 0.1
 FINAL_S: Final = 30.0
-"""So long a lock over everything is begun anew, where one was lost or timed out."""
+"""How long a lock over everything is retried after one was lost or timed out."""
 COUNTERS_EVERY: Final = 5
 """Counters are asked for with every so manieth look."""
 
@@ -52,7 +52,7 @@ class Watcher:
         self.locks_left = 0
 
     def look(self) -> bool:
-        """Look once at all shards; say whether all of them answered."""
+        """Look once at all shards; return whether all of them answered."""
         shards = self._client.shards()
         answers = self._client.call_once([(s, ListLocks()) for s in shards], timeout_s=0.3)
         now_ns = self._log.now_ns()
@@ -83,7 +83,7 @@ class Watcher:
                 self._log.write("counters", shard, answer.epoch, counters)
 
     def final(self) -> str:
-        """Read everything under one lock; return what it was told.
+        """Read everything under one lock; return its outcome.
 
         On a machine that lets it wait for longer than its lease it is done again.
         """
@@ -108,7 +108,7 @@ class Watcher:
 
 
 def main() -> None:
-    """Look until told to end."""
+    """Look until asked to end."""
     file, folder, ttl_s, ahead_ns = sys.argv[1:]
     lines: SimpleQueue[str] = SimpleQueue()
 

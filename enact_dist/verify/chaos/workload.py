@@ -1,8 +1,8 @@
 """What the clients do: random locks of every kind, through the public API alone.
 
-Every datum says who wrote it: ``lock version epoch``, then padding, so that whoever reads it can
-tell a history.  `version` is the one that it gets if its lock commits, `epoch` the one of its
-shard; a volatile slot counts anew after a restart, so both are needed there.
+Every datum says who wrote it: ``lock version epoch``, then padding, so that a reader can
+reconstruct a history.  `version` is the one that it gets if its lock commits, `epoch` the one of
+its shard; a volatile slot counts anew after a restart, so both are needed there.
 """
 
 from __future__ import annotations

@@ -37,11 +37,11 @@ class Attacker:
     Attributes:
         config: The cell.
         zenoh: Its way to all shards.
-        welcome: What the first shard said to its hello.
+        welcome: The first shard's answer to its hello.
         session: Its own.
         victim: The honest client's session.
-        tally: What its messages came to.
-        heard: What it heard and should not have.
+        tally: Outcomes of its messages.
+        heard: Messages that it received but should not have.
         open: Sockets that it keeps open.
     """
 
@@ -77,7 +77,7 @@ class Attacker:
             self.zenoh.post(FIRST, message)
 
     def park(self, messages: Iterable[Request]) -> None:
-        """Send what is answered late, no more at once than the shard takes in."""
+        """Send requests that are answered late, at most as many at once as the shard accepts."""
         for number, message in enumerate(messages):
             self.zenoh.post(FIRST, message, parked=True)
             if number % WINDOW == 0:

@@ -24,7 +24,7 @@ BEGUN_S: Final = 3.0
 
 
 def _attack(attack: Attack, attacker: Attacker, stop: threading.Event) -> None:
-    """Repeat rounds until told to stop; what a round finds closed, the next one opens again."""
+    """Repeat rounds until stopped; each round reopens what the last one found closed."""
     while not stop.is_set():
         try:
             attack.round(attacker)
@@ -55,7 +55,7 @@ def main(file: str, name: str, victim: str) -> None:
         stop.set()
         told = {"tally": Counter(zenoh.tally), "heard": Counter(attacker.heard)}
         print("told", json.dumps(told), flush=True)
-        os._exit(0)  # what still waits for a shard must not keep anybody
+        os._exit(0)  # threads that still wait for a shard must not delay the exit
 
 
 if __name__ == "__main__":

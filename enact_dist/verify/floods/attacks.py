@@ -21,12 +21,12 @@ class Attack:
     """One kind of flood.
 
     Attributes:
-        name: In the table.
+        name: Name in the table.
         round: Done again and again.
         expected: Names of refusals, at least one of which the attacker has to get; none: it gets
-            no answer at all.
-        shards: How many the cell has.
-        mode: Of the attacker's Zenoh session.
+            no answer.
+        shards: Number of shards in the cell.
+        mode: Mode of the attacker's Zenoh session.
     """
 
     name: str

@@ -84,8 +84,8 @@ def parked(attacker: Attacker) -> None:
 def sessions(attacker: Attacker) -> None:
     """Open more sessions than a shard keeps.
 
-    While all clients shared one bound, the shard refused everybody from then on, after a restart
-    too.
+    While all clients shared one bound, the shard then refused every client, even after a
+    restart.
     """
     for _ in range(12_000):
         attacker.post(hello(fresh_session()))
@@ -132,8 +132,8 @@ def reports(attacker: Attacker) -> None:
 def registrations(attacker: Attacker) -> None:
     """Register worlds, aspects and fingerprints, and fork, without an end.
 
-    Without bounds three messages made the shard's welcome longer than a frame: nobody could say
-    hello any more, after a restart neither.
+    Without bounds three messages made the shard's welcome longer than a frame: no client could send
+    a hello any more, not even after a restart.
     """
     for _ in range(3):
         attacker.number += 1
@@ -255,7 +255,7 @@ def large_socket_frames(attacker: Attacker) -> None:
 
 
 def silent_tcp(attacker: Attacker) -> None:
-    """Connect to the shard's port and say nothing.
+    """Connect to the shard's port and send nothing.
 
     A hundred such connections kept every newcomer waiting for 10 s.
     """
@@ -269,7 +269,7 @@ def silent_tcp(attacker: Attacker) -> None:
 
 
 def silent_socket(attacker: Attacker) -> None:
-    """Connect to the shard's socket, and say nothing or half a word."""
+    """Connect to the shard's socket, and send nothing or an incomplete frame."""
     _forget_half(attacker, kept_max=1500)
     for index in range(400):
         with contextlib.suppress(OSError, LinkError):

@@ -39,15 +39,15 @@ class Figures:
     """What one flood came to.
 
     Attributes:
-        name: Of the attack.
+        name: Name of the attack.
         carrier: How the honest client's calls travel.
-        updates: Of the honest client, committed and counted once each.
+        updates: Updates of the honest client, committed and counted once each.
         p50_ms: Median of its updates.
-        p99_ms: What 99 of 100 of them took at most.
+        p99_ms: 99th percentile of its updates.
         longest_ms: The slowest one.
         newcomers_s: From `connect` to the first update, of each client that joined meanwhile.
-        tally: What the attacker's messages came to, by name.
-        heard: What it heard of others.
+        tally: Outcomes of the attacker's messages, by name.
+        heard: Messages of others that it received.
         counters: The shard's, before it is stopped.
         restart_s: From the start of the daemon on the same folder until it serves; -1 if it does
             not.
@@ -140,7 +140,7 @@ def judge(figures: Figures, seen: Mapping[str, Any], updates: int) -> None:
 
 
 def judge_attacker(attack: Attack, figures: Figures) -> None:
-    """Note that the attacker heard others, or that nothing of what it sent was refused."""
+    """Record that the attacker received messages of others, or was never refused."""
     if figures.heard:
         figures.problems.append(f"the attacker heard {figures.heard}")
     if attack.expected and not attack.expected & figures.tally.keys():

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import argparse
 
 SECONDS: Final = 60.0
-"""How long it goes on if nothing is said."""
+"""Default duration."""
 TOLD_S: Final = 5.0
 """How often it says how far it is."""
 

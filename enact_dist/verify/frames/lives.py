@@ -189,7 +189,7 @@ class _Life:
 
 
 class _CoreLife(_Life):
-    """The core alone: time and disk move when told."""
+    """The core alone: time and disk advance on command."""
 
     def live(self) -> None:
         self.now_ns, self.wall_ns = 1_000_000 * MS, WALL_NS

@@ -49,7 +49,7 @@ class Captures:
     ) -> Steps[tuple[Item, ...]]:
         """Return the items, the views among them with the stamp of their newest set.
 
-        Where there is no set, they ask for a stamp that some of them had, or nobody has.
+        Without a set, they ask for a timestamp that only some slots, or none, have had.
         """
         slots = [Slot(*item[1:4]) for item in items if not Access(item.access).writes]
         versions = yield from self._versions(host, slots)

@@ -178,13 +178,13 @@ class ClientHost(Host):
         take(None)
 
     def notices_end_of(self, shard: str) -> None:
-        """The link to a shard broke: whoever waits for its answer is told that none will come."""
+        """The link to a shard broke: waiting threads learn that no answer will come."""
         for number, call in list(self._calls.items()):
             if call.shard == shard:
                 self._time_is_up(number)
 
     def _late(self, number: int, call: _Call, answer: Answer) -> None:
-        """Deliver an answer that nobody waits for any more, where the faults say so."""
+        """Deliver an answer that no thread waits for any more, if the faults demand it."""
         del self._calls[number]
         coming = (self._late_answers.next() & 0xFFFF) < self._faults.late_answers * 0x10000
         if coming and self.world.schedule.allows(self._late_answers.fault):
@@ -267,7 +267,7 @@ class ClientHost(Host):
             self.call(shard, farewell, lambda _answer: None)
 
     def dies(self) -> None:
-        """End without a word: nothing is sent any more."""
+        """End silently: nothing is sent any more."""
         self.end_life()
         self._calls.clear()
         self.threads_left = 0

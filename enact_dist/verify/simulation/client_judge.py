@@ -1,4 +1,4 @@
-"""The rules of clients: alone with a lock (I7), nothing stale, what they are told is true (I5)."""
+"""The rules of clients: alone with a lock (I7), nothing stale, true answers (I5)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 class ClientJudge:
-    """Looks at what clients believe, read and are told."""
+    """Checks what clients believe, read and learn."""
 
     def __init__(self, world: World, history: History, model: Model) -> None:
         self._world, self._history, self._model = world, history, model
@@ -36,7 +36,7 @@ class ClientJudge:
         self.check_beliefs(host)
 
     def check_beliefs(self, host: ClientHost) -> None:
-        """I7: whoever believes in a lock now is alone with it."""
+        """I7: a client that believes in a lock now is alone with it."""
         entries = self._history.entries
         mine = _believed(host)
         if not mine:
@@ -96,7 +96,7 @@ class ClientJudge:
                     self._fail("a process sees its own commits", entry.id, state, stamp_ns)
 
     def told(self, host: ClientHost, entry: Entry) -> None:
-        """A thread was told how its lock ended: is it true?"""
+        """Check the outcome of a lock that its thread has learned."""
         self._world.tally[f"told: {entry.told.value if entry.told else '-'}"] += 1
         applied = any(entry.id in picture.applied for picture in self._model.pictures.values())
         refusal = entry.lock.refusal

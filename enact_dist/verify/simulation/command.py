@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from enact_dist.verify.simulation.scenario import Result
 
 SEEDS: Final = 200
-"""How many seeds run if nothing is said."""
+"""Default number of seeds."""
 INTERRUPTED: Final = 130
 
 _SHOWN: Final = (

@@ -40,7 +40,7 @@ class Faults:
     busy: float = 0.0
     """Share of pauses of a client in which its liveliness token stays (a held interpreter lock)."""
     tokens: bool = True
-    """Whether shards see liveliness tokens at all; without them keep-alives alone renew."""
+    """Whether shards see liveliness tokens; without them keep-alives alone renew."""
     starves_per_s: float = 0.0
     """Clients that send no keep-alive for up to 10 s, because the thread that does it starves."""
     partitions_per_s: float = 0.0

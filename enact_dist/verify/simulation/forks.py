@@ -47,7 +47,7 @@ NAMES: Final = 2
 TRIES: Final = 60
 """How often a shard is asked for one thing: longer than any partition lasts."""
 IN_USE: Final = 0.3
-"""Share of the contexts that somebody tries to drop under a lock."""
+"""Share of the contexts that a client tries to drop under a lock."""
 LATE: Final = 0.3
 """How often a copy of an earlier request comes in between."""
 _AGO_NS: Final = (0, 0, 0, 0, 50 * MS, 500 * MS)
@@ -154,7 +154,7 @@ class Forker:
         yield from self._workload.do(host, lane, reads)
 
     def _late_copy(self, host: ClientHost, luck: Random) -> Thread:
-        """Let a copy of an earlier request come late, in some cases; nobody minds its answer."""
+        """Let a copy of an earlier request come late, sometimes; no thread awaits its answer."""
         sent = self._sent.get(host.name, [])
         if sent and luck.random() < LATE:
             self._world.tally["copies of forks and drops that came late"] += 1

@@ -1,7 +1,7 @@
 """What some of the simulated processes do besides: look back, and keep what they have found.
 
 A thread lists the versions of a few slots, asks for many slots as of a stamp at, before or after
-one of them, and puts versions under labels and lets go of them again.
+one of them, and puts versions under labels and removes the labels again.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ if TYPE_CHECKING:
     from enact_dist.verify.simulation.world import World
 
 SHARE: Final = 0.5
-"""Share of the runs in which somebody looks back."""
+"""Share of the runs in which a client views the past."""
 LABELS: Final = 2
 """Labels of one process."""
 
 
 class Historian:
-    """Looks back, keeps and lets go."""
+    """Views the past, and adds and removes labels."""
 
     def __init__(self, world: World, history: History, model: Model, workload: Workload) -> None:
         self._world, self._history = world, history
@@ -106,7 +106,7 @@ class Historian:
     def _keeps(
         self, host: ClientHost, shard: str, entries: list[VersionEntry], luck: Random
     ) -> Thread:
-        """Keep one or two versions under a label, or let go of what it keeps."""
+        """Keep one or two versions under a label, or remove the label."""
         client, label = host.client, f"{host.name}/{luck.randrange(LABELS)}"
         chosen = [luck.choice(entries).state for _ in range(luck.choice((0, 0, 1, 2)))]
         versions = tuple(SlotVersion(state.slot, state.version) for state in chosen)

@@ -1,4 +1,4 @@
-"""What the clients asked for and were told, lock by lock: the evidence of a run."""
+"""Requests and outcomes of the clients, lock by lock: the evidence of a run."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ class Entry:
 
     Attributes:
         begun_ns: When it was asked for, in true time.
-        ended_ns: When its thread was told how it ended (None: never, its process died).
-        told: What its thread was told.
+        ended_ns: When its thread learned how it ended (None: never, its process died).
+        told: The outcome that its thread learned.
         newer: The aspect that it writes with the newer type ("": none).
     """
 
@@ -57,7 +57,7 @@ class Entry:
 
     @property
     def past_ns(self) -> int:
-        """As of which stamp it views the past, 0 where it does not."""
+        """The timestamp of its past view; 0: none."""
         return self.lock.plan.past_ns
 
     def readings(self) -> list[Reading]:

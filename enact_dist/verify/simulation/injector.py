@@ -123,7 +123,7 @@ class Injector:
         self._world.after(delay_ns, lambda: self._fire(fault, partial(self._crash, host), luck))
 
     def _drain_one(self, luck: Random) -> str:
-        """Stop a shard as a signal does: it answers who is parked, grants no more, and ends."""
+        """Stop a shard as a signal does: it answers parked requests, grants no more, and ends."""
         host, delay_ns = self._shard(luck), luck.randrange(S)
         if not host.up:
             return ""
@@ -296,7 +296,7 @@ class Injector:
         self._at_decision(self._decisions, [primary.name, *commit.participants], "before")
 
     def on_decision(self, primary: ShardHost, told: Sequence[str]) -> None:
-        """A decision is durable and its participants are about to hear of it."""
+        """A decision is durable and its participants are about to be notified."""
         self._at_decision(self._told, [primary.name, *told], "after")
 
     def _at_decision(self, place: Place, names: list[str], when: str) -> None:

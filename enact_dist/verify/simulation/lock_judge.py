@@ -106,7 +106,7 @@ class LockJudge:
                     self._fail("I14 one outcome per lane", session.session, lane)
 
     def _check_waiters(self, host: ShardHost, picture: Picture) -> None:
-        """Whoever waits does so for somebody who holds or came earlier, and nobody in a circle."""
+        """Each waiter waits for a holder or an earlier request, and never in a cycle."""
         state = host.shard.state
         everybody = list(state.tenures.by_lock.values())
         waits = self._waits[host.name] = {}
@@ -134,7 +134,7 @@ class LockJudge:
         return tenure is not None and tenure.token is None
 
     def _check_circle(self, first: LockId) -> None:
-        """Follow who waits for whom over all shards, as they last looked at the time."""
+        """Follow the waits-for edges over all shards, as of their last look at the clock."""
         reached, ahead = {first}, [first]
         while ahead:
             lock = ahead.pop()

@@ -331,7 +331,7 @@ class Model:
             self._fail("a promise is on disk before it is given", answer)
 
     def _check_end_told(self, host: ShardHost, lock: LockId, picture: Picture) -> None:
-        """Who hears that a participant has finished may forget that the lock was decided."""
+        """Once a participant reports the end, the primary may forget the decision."""
         persist = picture.in_flight.get(lock)
         if persist is not None and not any(
             kept is persist for kept in reversed(host.disk.log[: host.disk.synced])

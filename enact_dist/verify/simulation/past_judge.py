@@ -84,7 +84,7 @@ class PastJudge:
         return (NullReason.NEVER_SET.name,)
 
     def check_forgotten(self, answer: Forgotten, asked: TakeView, picture: Picture) -> None:
-        """Only what may be forgotten is, and what is said to be known is.
+        """Only data that may be forgotten are, and data reported as known are known.
 
         A restart may know a slot from a prepared commit alone, whose data a power cut took: this
         picture lacks it, so the slot that the answer names counts as asked for.
@@ -185,7 +185,7 @@ class PastJudge:
         raise AssertionError(key)
 
     def check_kept(self, asked: KeepVersions, answer: Kept, picture: Picture) -> None:
-        """What a shard has said to keep under a label survives; a further page promises nothing."""
+        """Versions that a shard keeps under a label survive; a further page promises none."""
         kept = picture.labels.get(asked.label)
         if asked.after == START and kept is not None and set(kept) == set(answer.versions):
             picture.confirmed_labels[asked.label] = None

@@ -158,7 +158,7 @@ def _memory_of(datum: Datum | None) -> Plain | None:
 
 
 def _shown(shard: Shard) -> Iterator[Datum | None]:
-    """Yield all data that a shard that rests can still show to somebody."""
+    """Yield all data that an idle shard can still show."""
     slots = shard.state.slots
     for column in slots.columns():
         for slot, content in slots.matching(column, "**"):

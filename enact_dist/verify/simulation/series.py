@@ -20,7 +20,7 @@ _FRESH_NS = 1_000_000
 
 
 def fresh_seed() -> int:
-    """Return a first seed that nobody has begun with: milliseconds since 1970.
+    """Return an unused first seed: milliseconds since 1970.
 
     No machine runs a thousand seeds per second, so that a later series never meets an earlier one.
     """

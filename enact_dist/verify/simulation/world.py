@@ -48,7 +48,7 @@ class World:
     """The queue of events, the schedule of faults and the tallies of one run.
 
     Attributes:
-        story: What happened, line by line with its true time in ns; None if nobody asks for it.
+        story: What happened, line by line with its true time in ns; None if not wanted.
     """
 
     schedule: Schedule
@@ -74,7 +74,7 @@ class World:
         self.now_ns = max(self.now_ns, end_ns)
 
     def tell(self, *parts: object) -> None:
-        """Add a line to the story of the run, if somebody asks for it."""
+        """Add a line to the story of the run, if wanted."""
         if self.story is not None:
             self.story.append((self.now_ns, " ".join(str(part) for part in parts)))
 
