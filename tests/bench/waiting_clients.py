@@ -5,8 +5,8 @@
 Two shards, and clients that take a lock over both, again and again.  Both shards are stopped
 (SIGSTOP) for so long, and continued.  Prints one line of JSON: processor time of the clients, in
 cores, before, while they wait (in the first 3 s, in which connections are found to be lost, after
-these, and over all), and when each of them had its next lock, in seconds after the shards went on.  `before`
-and `waiting` are split by the names of threads (those of Python have that of the process) into
+these, and over all), and when each of them had its next lock, in seconds after the shards went on.
+All but the last are split by the names of threads (those of Python have that of the process) into
 cores in user time, cores in system time, and wake-ups per second.  With `--idle` the clients only
 keep their sessions.  Goals: 0.1 core for 200 that wait, all answered within 5 s, 0.002 core for one
 that is idle.
@@ -153,7 +153,7 @@ def measure(folder: Path, arguments: argparse.Namespace) -> dict[str, object]:
         before, before_by = shares(pids, 10.0)
         for shard in cell.shards.values():
             shard.signal(signal.SIGSTOP)
-        first = cores(pids, LOST_S)
+        first, first_by = shares(pids, LOST_S)
         waiting, waiting_by = shares(pids, arguments.seconds - LOST_S)
         part = LOST_S / arguments.seconds
         began_s = time.monotonic()
@@ -169,6 +169,7 @@ def measure(folder: Path, arguments: argparse.Namespace) -> dict[str, object]:
         "before": round(before, 4),
         "before_by": before_by,
         "first": round(first, 4),
+        "first_by": first_by,
         "waiting": round(waiting, 4),
         "waiting_by": waiting_by,
         "stopped": round(part * first + (1 - part) * waiting, 4),
