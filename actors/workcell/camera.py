@@ -195,7 +195,17 @@ class Camera(Actor):
             self._opened = None
             raise
         lock.put(self.image, image, stamp_ns=exposed_ns)
+        self.taken(lock, image, exposed_ns)
         self._capture.prepare(lock.tick_ns + PERIOD_NS)
+
+    def taken(self, lock: Lock, image: Image, exposed_ns: int) -> None:
+        """Do with an image what belongs to its update; a camera that only publishes does nothing.
+
+        Args:
+            lock: Of the update.
+            image: (H, W, 3) uint8, BGR; it has been put.
+            exposed_ns: Its stamp.
+        """
 
     def stop(self) -> None:
         """Close the source."""

@@ -205,6 +205,7 @@ def _reported(cell: Cell, options: Options, notes: Notes, console: Console) -> O
         "seconds": options.seconds,
         "source": options.source,
         "embedded": options.embedded,
+        "separate": options.separate,
         "events": notes.lines,
         "what_if": what_if,
         "recording_missing": trace.missing,

@@ -25,9 +25,17 @@ TEMPLATE: Final = Path(__file__).with_name("cell.toml")
 SETUP: Final = "setup"
 """The actor that is done once it has written what is known; all others go on."""
 
+CAMERA: Final = "actors.workcell.simulation.camera:SimulatedCamera"
+SMART_CAMERA: Final = "actors.workcell.simulation.camera:SimulatedSmartCamera"
+DONE_BY_SMART: Final = (
+    "actors.workcell.background:BackgroundLearning",
+    "actors.workcell.background:BackgroundSubtraction",
+)
+"""What a smart camera does beside giving images."""
+
 
 def configured(template: str, options: Options) -> dict[str, Any]:
-    """Return the parsed `cell.toml` of a run: scenario, seed, source of the images, grid.
+    """Return the parsed `cell.toml` of a run: scenario, seed, source of the images, grid, layout.
 
     Args:
         template: The text of the `cell.toml` of the application.
@@ -42,8 +50,12 @@ def configured(template: str, options: Options) -> dict[str, Any]:
         "voxel_m": options.voxel_m,
     }
     for table in actors.values():
-        if table["class"].endswith(":SimulatedCamera"):
+        if table["class"] == CAMERA:
             table["args"] = {**table.get("args", {}), "source": options.source}
+            table["class"] = CAMERA if options.separate else SMART_CAMERA
+    if not options.separate:
+        for name in [name for name, table in actors.items() if table["class"] in DONE_BY_SMART]:
+            del actors[name]
     return config
 
 

@@ -29,6 +29,8 @@ class Options:
         source: Address of the cameras' source; one of `PLAYED` alone plays what is kept for it.
         voxel_m: Edge of a voxel.
         embedded: All in this process, in place of processes.
+        separate: Camera, learning and subtraction are actors of their own, as in Figure 4 of the
+            paper, in place of one `SmartCamera` per camera.
         quiet: Print the report as JSON in place of progress and table.
         keep_running: Leave the cell up afterwards, until Ctrl-C.
 
@@ -43,6 +45,7 @@ class Options:
     source: str = PLAYED[0]
     voxel_m: float = 0.025
     embedded: bool = False
+    separate: bool = False
     quiet: bool = False
     keep_running: bool = False
 

@@ -41,6 +41,11 @@ def add_to(verbs: argparse._SubParsersAction[Verb]) -> None:
         "--renderer", choices=("composite", "mujoco"), default="composite", help="of --record"
     )
     demo.add_argument("--embedded", action="store_true", help="all in one process")
+    demo.add_argument(
+        "--separate",
+        action="store_true",
+        help="camera, learning and subtraction as actors of their own, as in the paper's Figure 4",
+    )
     demo.add_argument("--json", action="store_true", help="print the report as JSON")
     demo.add_argument(
         "--keep-running", action="store_true", help="leave the cell up afterwards, until Ctrl-C"
@@ -98,6 +103,7 @@ def _run(arguments: argparse.Namespace) -> int:
     options = Options(
         out,
         embedded=arguments.embedded,
+        separate=arguments.separate,
         quiet=arguments.json,
         keep_running=arguments.keep_running,
         **given,
@@ -123,7 +129,17 @@ def _run_folder(arguments: argparse.Namespace, out: Path) -> int:
 
 
 def _refuse_mixture(arguments: argparse.Namespace) -> None:
-    simulated = ("scenario", "seed", "seconds", "voxel_m", "live", "play", "record", "embedded")
+    simulated = (
+        "scenario",
+        "seed",
+        "seconds",
+        "voxel_m",
+        "live",
+        "play",
+        "record",
+        "embedded",
+        "separate",
+    )
     real = ("grid", "unit", "frame", "key", "distortion")
     for names, fits, where in (
         (simulated, not arguments.cameras, "the simulated cell, not to --cameras"),

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from actors.workcell.camera import Camera
 from actors.workcell.simulation.sources import LiveSource
+from actors.workcell.smart_camera import SmartCamera
 from actors.workcell.sources import CameraError
 from actors.workcell.vocabulary import JOINTS, PLAYING, ROBOT, SCENARIO
 from enact_dist import Lock, View, World
@@ -52,3 +53,7 @@ class SimulatedCamera(Camera):
         """Tell the source what plays and where the arm is."""
         assert self._simulated is not None
         self._simulated.look(lock.get(self.playing), lock.get(self.joints), stuck=self.stuck)
+
+
+class SimulatedSmartCamera(SimulatedCamera, SmartCamera):
+    """Publishes what one camera of the simulated room sees, and its silhouette."""

@@ -7,23 +7,28 @@ import pytest
 
 from actors.geometry.silhouettes import unpacked
 from actors.workcell.background import BackgroundLearning, BackgroundSubtraction, checksum
+from actors.workcell.smart_camera import SmartCamera
+from actors.workcell.sources import source_of
 from actors.workcell.vocabulary import (
     BACKGROUND,
+    CALIBRATION,
     EMPTY,
     IMAGE,
     SILHOUETTE,
     WORKSPACE,
     Background,
+    Calibration,
     camera_entity,
 )
 from enact_dist import Lock, View, Write, testing
 
-pytest.importorskip("cv2", exc_type=ImportError)
+cv2 = pytest.importorskip("cv2", exc_type=ImportError)
 
 CAMERA = camera_entity(2)
 PERIOD_NS = 100_000_000
 SHAPE = (48, 64, 3)
 PERSON = np.s_[10:40, 20:35]
+CALIBRATED = Calibration(np.eye(3), np.zeros(5), np.eye(4), SHAPE[1], SHAPE[0])
 
 
 @pytest.fixture
@@ -187,3 +192,40 @@ def test_checksums_differ_by_noise_and_are_never_zero(random):
     """Two images of the same scene differ; 0 is kept for stand-ins."""
     assert checksum(image_of(random)) != checksum(image_of(random))
     assert checksum(np.zeros((0, 8, 3), np.uint8)) == 1
+
+
+def test_a_smart_camera_gives_what_camera_learning_and_subtraction_give(random, tmp_path):
+    """Image and silhouette of a tick bear its stamp; no more than five images per second count."""
+    clock = testing.ManualClock()
+    begin_ns = clock.wall_ns()
+    for number in range(9):
+        image = image_of(random, person=number >= 7)
+        cv2.imwrite(str(tmp_path / f"{number:03d}.png"), image)
+    source = source_of(f"folder:{tmp_path}?begin={begin_ns}", "2")
+    smart = actor_of(SmartCamera, images=3)
+    smart.make_source = lambda: source
+    with testing.worlds("online", clock=clock) as cell:
+        put(cell, CAMERA, CALIBRATION, CALIBRATED)
+        for number in range(9):
+            if number == 1:
+                put(cell, WORKSPACE, EMPTY, clock.wall_ns() - 1)
+            assert testing.run_once(smart, cell) == 1
+            assert (seen(cell, CAMERA, BACKGROUND) is None) == (number < 5)  # 1, 3 and 5
+            assert (seen(cell, CAMERA, SILHOUETTE) is None) == (number < 6)
+            clock.advance(0.1)
+        stamp_ns = begin_ns + 8 * PERIOD_NS
+        background, learned_ns = seen(cell, CAMERA, BACKGROUND)
+        assert (background.frames, learned_ns) == (3, begin_ns + 5 * PERIOD_NS)
+        np.testing.assert_array_equal(seen(cell, CAMERA, IMAGE)[0], image)
+        found, found_ns = seen(cell, CAMERA, SILHOUETTE)
+        assert found_ns == seen(cell, CAMERA, IMAGE)[1] == stamp_ns
+        subtraction = actor_of(BackgroundSubtraction)
+        testing.run_once(subtraction, cell)
+        alone, alone_ns = seen(cell, CAMERA, SILHOUETTE)
+        assert alone_ns == stamp_ns
+        assert (alone.foreground_px, alone.image_checksum) == (
+            found.foreground_px,
+            found.image_checksum,
+        )
+        np.testing.assert_array_equal(alone.packed, found.packed)
+        assert unpacked(found.packed, 64)[PERSON].mean() > 0.97 * 255

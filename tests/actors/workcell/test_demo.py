@@ -10,6 +10,7 @@ import pytest
 pytest.importorskip("cv2", exc_type=ImportError)
 pytest.importorskip("mcap", exc_type=ImportError)
 
+from actors.running_cell import toml_of
 from actors.workcell import demo_conduct
 from actors.workcell import vocabulary as words
 from actors.workcell.demo import run_quietly
@@ -35,7 +36,9 @@ def test_shipped_cell_fits_together():
 def test_cell_of_a_run_differs_only_in_what_a_run_chooses(tmp_path):
     """Scenario, seed, length, grid and source are the run's; all else is the shipped cell."""
     shipped = tomllib.loads(TEMPLATE.read_text())
-    options = Options(tmp_path, scenario="S3", seed=5, seconds=9.0, source="live", voxel_m=0.05)
+    options = Options(
+        tmp_path, scenario="S3", seed=5, seconds=9.0, source="live", voxel_m=0.05, separate=True
+    )
 
     run = configured(TEMPLATE.read_text(), options)
 
@@ -50,6 +53,20 @@ def test_cell_of_a_run_differs_only_in_what_a_run_chooses(tmp_path):
         assert run["actors"][f"camera-{number}"].pop("args")["source"] == "live"
         shipped["actors"][f"camera-{number}"].pop("args")
     assert run == shipped
+
+
+@pytest.mark.parametrize("separate", [False, True])
+def test_both_layouts_of_the_cameras_fit_together(tmp_path, separate):
+    """A smart camera stands in for three actors; what else there is, is the same."""
+    from enact_dist.actor_check import check_cell
+    from enact_dist.config import load_config
+
+    config = configured(TEMPLATE.read_text(), Options(tmp_path, separate=separate))
+    (tmp_path / "cell.toml").write_text(toml_of(config))
+
+    assert len(config["actors"]) == 34 - (0 if separate else 2 * words.CAMERA_COUNT)
+    found = check_cell(load_config(tmp_path / "cell.toml"))
+    assert [one.text for one in found if one.level == "error"] == []
 
 
 def test_decisions_are_made_without_the_truth():
