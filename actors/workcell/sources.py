@@ -5,8 +5,8 @@ An address says which: ``KIND:PLACE?name=value&name=value``.
 ======================================  ========================================================
 address                                 images
 ======================================  ========================================================
-`v4l2:/dev/video0?size=640x480&fps=10`  of a camera that `cv2.VideoCapture` opens, or of a video
-                                        file, one image per tick
+`v4l2:/dev/video0?size=640x480&fps=30`  of a camera that `cv2.VideoCapture` opens, or of a video
+                                        file, one image per tick; see `video`
 `folder:/data/images/{camera}`          files, in the order of their names, one per tick;
                                         `?begin=STAMP_NS` plays them once from that tick on, else
                                         they repeat, all cameras in step
@@ -24,9 +24,8 @@ from __future__ import annotations
 
 import importlib
 import re
-import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Protocol, cast
+from typing import TYPE_CHECKING, Final, Protocol, cast
 from urllib.parse import parse_qsl
 
 import numpy as np
@@ -45,6 +44,7 @@ if TYPE_CHECKING:
 ENDINGS: Final = (".png", ".jpg", ".jpeg", ".ppm", ".pgm")
 """Files of a folder that are images."""
 PERIOD_NS: Final = round(PERIOD_S * 1e9)
+_VIDEO: Final = "actors.workcell.video"
 _SIMULATED: Final = "actors.workcell.simulation.sources"
 
 
@@ -107,8 +107,9 @@ def source_of(address: str, camera: str) -> CameraSource:
             f"{address}: asked for options as name=value&name=value; found {query!r} ({error})"
         ) from None
     place = place.replace("{camera}", camera)
+    video_source = importlib.import_module(_VIDEO).VideoSource
     kinds: Mapping[str, Callable[[str, dict[str, str]], CameraSource]] = {
-        "v4l2": VideoSource,
+        "v4l2": video_source,
         "folder": FolderSource,
     }
     if kind in kinds:
@@ -163,7 +164,7 @@ class FolderSource:
     def __init__(self, place: str, options: dict[str, str]) -> None:
         check_options(f"folder:{place}", options, "begin")
         self._folder, self._files = Path(place), list[Path]()
-        self._begin_ns = _number(f"folder:{place}", options, "begin")
+        self._begin_ns = number_option(f"folder:{place}", options, "begin")
         self._calibration: Calibration | None = None
 
     @property
@@ -232,117 +233,7 @@ class FolderSource:
                 )
 
 
-class VideoSource:
-    """A camera that OpenCV opens, or a video file.
-
-    The images of a device are stamped by its driver where that gives the time; else when they
-    arrive.  Images from before a tick are dropped, so that the driver's queue makes nothing late.
-
-    Args:
-        place: Device such as `/dev/video0`, or a file.
-        options: `size` as `640x480`, `fps`.
-    """
-
-    def __init__(self, place: str, options: dict[str, str]) -> None:
-        self._place, self._where = place, f"v4l2:{place}"
-        check_options(self._where, options, "size", "fps")
-        size = re.fullmatch(r"(\d+)x(\d+)", options.get("size", "0x0"))
-        if size is None:
-            raise CameraError(
-                f"{self._where}: asked for size=WIDTHxHEIGHT; found {options['size']!r}"
-            )
-        self._size = int(size[1]), int(size[2])
-        self._fps = _number(self._where, options, "fps")
-        self._is_device = not Path(place).is_file()
-        self._device: Any = None  # a cv2.VideoCapture: OpenCV loads on use
-        self._calibration: Calibration | None = None
-        self._exposed_ns, self._count = 0, 0
-
-    @property
-    def exposed_ns(self) -> int:
-        """When the driver says that the last image was exposed; 0 of a file."""
-        return self._exposed_ns
-
-    def open(self, calibration: Calibration) -> None:
-        """Open the device.
-
-        Raises:
-            CameraError: The device is missing, or OpenCV cannot open it.
-        """
-        import cv2
-
-        self._calibration = calibration
-        if self._device is not None:
-            return
-        asked = "asked for a camera or a video file"
-        if not Path(self._place).exists():
-            raise CameraError(
-                f"{self._where}: {asked}; found no such device or file; `v4l2-ctl --list-devices`"
-                " lists cameras"
-            )
-        device = cv2.VideoCapture(self._place)
-        if not device.isOpened():
-            raise CameraError(
-                f"{self._where}: {asked}; found one that OpenCV cannot open; is it in use, may this"
-                " user read it?"
-            )
-        if self._is_device:
-            width, height = self._size if self._size[0] else (calibration.width, calibration.height)
-            device.set(cv2.CAP_PROP_FRAME_WIDTH, width)
-            device.set(cv2.CAP_PROP_FRAME_HEIGHT, height)
-            device.set(cv2.CAP_PROP_BUFFERSIZE, 1)
-            if self._fps:
-                device.set(cv2.CAP_PROP_FPS, self._fps)
-        self._device = device
-
-    def frame(self, stamp_ns: int) -> Image:
-        """Return the first image of the device from a tick on, or the next of the file.
-
-        Raises:
-            CameraEndedError: The file is over.
-            CameraError: The device gives no image, or one of another size.
-        """
-        import cv2
-
-        assert self._device is not None, "open first"
-        assert self._calibration is not None
-        while True:
-            if not self._device.grab():
-                if self._is_device:
-                    raise CameraError(
-                        f"{self._where}: asked for an image; the device gave none; is it connected?"
-                    )
-                raise CameraEndedError(f"{self._where}: the video ended after {self._count} images")
-            self._count += 1
-            if not self._is_device:
-                break
-            driver_ms = self._device.get(cv2.CAP_PROP_POS_MSEC)
-            self._exposed_ns = wall_ns_of(driver_ms)
-            if self._exposed_ns >= stamp_ns - PERIOD_NS // 4:
-                break
-        _, image = self._device.retrieve()
-        return check_size(self._where, image, self._calibration)
-
-    def close(self) -> None:
-        """Release the device."""
-        if self._device is not None:
-            self._device.release()
-            self._device = None
-
-
-def wall_ns_of(driver_ms: float) -> int:
-    """Return the time of a driver, which counts from the start of the machine, as ns since 1970.
-
-    What is no such time (0, or more than a minute away from now) is replaced by now.
-    """
-    now_ns, since_start_ns = time.time_ns(), time.monotonic_ns()
-    exposed_ns = round(driver_ms * 1e6)
-    if abs(since_start_ns - exposed_ns) > 60_000_000_000:
-        return now_ns
-    return now_ns - (since_start_ns - exposed_ns)
-
-
-def _number(where: str, options: Mapping[str, str], name: str) -> int:
+def number_option(where: str, options: Mapping[str, str], name: str) -> int:
     """Return a whole number of the options, 0 without one."""
     text = options.get(name, "0")
     if not text.isdecimal():
