@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from actors.geometry.capsules import distance_to_points
+from actors.geometry.separation import LATEST_S
 from actors.workcell import vocabulary as words
+from actors.workcell.motion import BRAKING_M_S2, NOMINAL_M_S, ROBOT_S
 from actors.workcell.scenarios import scenario_of
 from actors.workcell.trace import TRUTH
 from actors.workcell.truth_of_run import PERIOD_NS, truth_of
@@ -17,12 +19,25 @@ from actors.workcell.truth_of_run import PERIOD_NS, truth_of
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
+    import numpy.typing as npt
+
     from actors.workcell.scenarios import Scenario
     from actors.workcell.trace import Kept, Trace
     from actors.workcell.truth_of_run import Truth
 
 REST_SCALE = 0.02
 """Below this share of the nominal speed the arm counts as at rest."""
+NEEDED = frozenset(
+    ("sets_missed", "sets_incomplete", "robot_p99_ms", "lost_near_voxels", "phantom_p99_l")
+) | {"moments"}
+"""What every run must have measured; without it a goal would count as met by a run that did
+nothing."""
+MOMENTS_S = 50.0
+"""Least samples of the arm per second; a shard that restarts loses some of the 100."""
+PLACE_M = 0.6
+"""So near to the middle of a person something must be occupied, or a track be theirs."""
+REST_S = LATEST_S + NOMINAL_M_S / BRAKING_M_S2 + ROBOT_S + 0.025
+"""So long after the last exposure that a command rests on the arm is at rest."""
 HAND_M = 0.42
 """Nearest true distance that a reaching hand may come to a moving arm."""
 
@@ -36,7 +51,11 @@ def checks_of(trace: Trace, scores: Mapping[str, float]) -> dict[str, bool]:
     """
     truth = truth_of(trace)
     name = _playing(trace).name
-    found = {"no moment faster than ISO/TS 15066 allows": scores.get("violations", 1.0) == 0.0}
+    found = {
+        "no moment faster than ISO/TS 15066 allows": scores.get("violations", 1.0) == 0.0,
+        "every figure was measured": scores.keys() >= NEEDED
+        and scores["moments"] >= MOMENTS_S * truth.seconds,
+    }
     found |= _CHECKS.get(name, _nothing)(trace, truth, scores)
     return {text: bool(held) for text, held in found.items()}  # numpy's are no JSON
 
@@ -72,20 +91,20 @@ def _empty(trace: Trace, truth: Truth, scores: Mapping[str, float]) -> dict[str,
 
 def _past(trace: Trace, truth: Truth, _: Mapping[str, float]) -> dict[str, bool]:
     """S2: full speed again a second after everybody has left the workspace."""
-    speeds, slow = _speeds(trace, truth), []
-    empty_since = 0
+    speeds, after = _speeds(trace, truth), []
+    empty_since = -math.inf  # nobody has been there yet
     for kept in speeds:
         inside = any(
             bool((np.abs(body[:, :2]) < truth.half_m).all(1).any())
             for body in truth.bodies_at(kept.stamp_ns)
         )
         empty_since = 0 if inside else empty_since + 1
-        if empty_since > round(1.0 / words.PERIOD_S) and kept.datum.scale < 1.0:
-            slow.append(kept)
+        if empty_since > round(1.0 / words.PERIOD_S):
+            after.append(kept.datum.scale)
     slowed = any(kept.datum.scale < 1.0 for kept in speeds)
     return {
         "the robot slows down for who walks past": slowed,
-        "full speed a second after they have left": not slow,
+        "full speed a second after they have left": bool(after) and min(after) == 1.0,
     }
 
 
@@ -112,15 +131,16 @@ def _reach(trace: Trace, truth: Truth, _: Mapping[str, float]) -> dict[str, bool
 
 def _hidden(trace: Trace, truth: Truth, scores: Mapping[str, float]) -> dict[str, bool]:
     """S4: who hides stays known, and keeps their place occupied."""
-    behind = [
-        kept
-        for kept in _hulls(trace, truth)
-        if (centres := truth.centres_at(kept.stamp_ns))
-        and np.abs(centres[0][0]).max() < float(truth.half_m[0]) - 0.3
-    ]
-    lost = [kept for kept in behind if not len(kept.datum.voxels)]
+    grid = trace.newest(words.WORKSPACE.name, words.GRID)
+    held = []
+    for kept in _hulls(trace, truth):
+        middles = [middle for middle, *_ in truth.centres_at(kept.stamp_ns)]
+        if middles and np.abs(middles[0]).max() < float(truth.half_m[0]) - 0.3:
+            places = grid.origin_m[:2] + (kept.datum.voxels[:, :2] + 0.5) * grid.voxel_m
+            off_m = np.linalg.norm(places - middles[0], axis=1)
+            held.append(bool(off_m.min(initial=math.inf) < PLACE_M))
     return {
-        "the place of who hides stays occupied": bool(behind) and not lost,
+        "the place of who hides stays occupied": bool(held) and all(held),
         "no voxel is lost near the robot": scores.get("lost_near_voxels", 1.0) == 0.0,
     }
 
@@ -194,7 +214,7 @@ def _restarts(trace: Trace, truth: Truth, _: Mapping[str, float]) -> dict[str, b
         if not truth.covers(int(stamp)):
             continue
         newest = stamps[stamps <= stamp].max(initial=truth.start_ns)
-        late += (stamp - newest) / 1e9 > 0.25 + 0.5 and bool(np.abs(dq).max() > 0.02)
+        late += (stamp - newest) / 1e9 > REST_S and bool(np.abs(dq).max() > 0.02)
     gaps = int((np.diff(stamps) > 5 * PERIOD_NS).sum())
     last_s = truth.at_s(int(stamps[-1]))
     return {
@@ -219,12 +239,19 @@ def _dark(trace: Trace, truth: Truth, _: Mapping[str, float]) -> dict[str, bool]
 
 def _two(trace: Trace, truth: Truth, _: Mapping[str, float]) -> dict[str, bool]:
     """S11: two people are two tracks."""
-    at_once: dict[int, int] = {}
+    tracks: dict[int, list[npt.NDArray[np.float64]]] = {}
     for human in trace.entities(words.TRACK):
         for kept in trace.of(human, words.TRACK):
-            if truth.covers(kept.stamp_ns):
-                at_once[kept.stamp_ns] = at_once.get(kept.stamp_ns, 0) + 1
-    return {"two tracks at once": max(at_once.values(), default=0) >= 2}
+            tracks.setdefault(kept.stamp_ns, []).append(kept.datum.position_m[:2])
+    both = []
+    for hull in _hulls(trace, truth):
+        middles = [middle for middle, *_ in truth.centres_at(hull.stamp_ns)]
+        if len(middles) > 1 and np.abs(middles).max() < float(truth.half_m[0]) - 0.3:
+            there = tracks.get(hull.stamp_ns, [])
+            near = [[float(np.linalg.norm(m - one)) < PLACE_M for one in there] for m in middles]
+            own = {row.index(True) for row in near if any(row)}
+            both.append(len(own) == len(middles))
+    return {"two tracks, each at its person": bool(both) and sum(both) > 0.8 * len(both)}
 
 
 _CHECKS: Mapping[str, Callable[[Trace, Truth, Mapping[str, float]], dict[str, bool]]] = {

@@ -60,7 +60,8 @@ def test_lost_voxels_and_missed_sets_are_counted() -> None:
 
     assert found["sets_missed"] == 1.0
     assert found["lost_share"] * found["true_voxels"] == pytest.approx(3.0)
-    assert {"sets_missed", "lost_share"} <= set(missed(found)) | {"lost_share"}
+    assert "sets_missed" in missed(found)
+    assert ("lost_share" in missed(found)) == (found["lost_share"] > 0.0002)
 
 
 def test_an_arm_that_is_too_fast_near_a_person_is_a_violation() -> None:
