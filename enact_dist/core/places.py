@@ -62,7 +62,9 @@ class PlaceDesk:
                 yield Story("shard.namesakes", message.text, grave=True)
         elif before is not None:
             del doubled[shard]
-            yield Story("shard.alone", f"no second daemon serves shard {shard} any more")
+            count = "one daemon answers" if message.starts else "no daemon answers"
+            text = f"{count} for shard {shard} now; another one may be stopped or cut off"
+            yield Story("shard.alone", text)
 
     def _all(self) -> tuple[ShardEntry, ...]:
         """Return the places of this shard's own file, then those that others have named."""

@@ -67,19 +67,28 @@ def serving(
         ProtocolError: An answer cannot be read.
     """
     found: dict[int, Serving] = {}
-    wanted = FoundShard(cell, shard)
     for endpoint in dict.fromkeys(map(to_reach, endpoints)):
-        if split_endpoint(endpoint)[0] not in PROTOCOLS or not somebody_listens(endpoint):
-            continue
-        try:
-            answer = ask_shards([endpoint], [wanted], Ping(), timeout_s=timeout_s).get(wanted)
-        except ConfigError as error:
-            _log.warning("shard %s is announced at an invalid endpoint: %s", shard, error)
-            continue
-        if isinstance(answer, Pong):
-            one = Serving(endpoint, answer.start, answer.epoch, answer.uptime_ns / 1e9)
-            found.setdefault(answer.start, one)
-    return tuple(found.values())
+        if (one := _serving_at(cell, shard, endpoint, timeout_s)) is not None:
+            found.setdefault(one.start, one)
+    if len(found) < 2:
+        return tuple(found.values())
+    # One that restarted between two questions has answered as two: what it was is not there now.
+    again = (_serving_at(cell, shard, one.endpoint, timeout_s) or one for one in found.values())
+    return tuple({one.start: one for one in again}.values())
+
+
+def _serving_at(cell: str, shard: str, endpoint: str, timeout_s: float) -> Serving | None:
+    if split_endpoint(endpoint)[0] not in PROTOCOLS or not somebody_listens(endpoint):
+        return None
+    wanted = FoundShard(cell, shard)
+    try:
+        answer = ask_shards([endpoint], [wanted], Ping(), timeout_s=timeout_s).get(wanted)
+    except ConfigError as error:
+        _log.warning("shard %s is announced at an invalid endpoint: %s", shard, error)
+        return None
+    if not isinstance(answer, Pong):
+        return None
+    return Serving(endpoint, answer.start, answer.epoch, answer.uptime_ns / 1e9)
 
 
 def told_places(

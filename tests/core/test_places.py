@@ -77,3 +77,13 @@ def test_two_daemons_are_an_alarm_once_and_until_one_is_gone(bench):
     ]
     assert bench.shard.counters["namesakes_found"] == 2
     assert bench.shard.state.doubled == {}
+
+
+@pytest.mark.parametrize(("starts", "count"), [((1,), "one daemon"), ((), "no daemon")])
+def test_end_of_an_alarm_says_no_more_than_was_heard(bench, starts, count):
+    """A daemon that does not answer may be there all the same."""
+    bench.event(Served("far", (1, 2), "2 daemons"))
+    bench.event(Served("far", starts, ""))
+
+    text = bench.stories[-1].text
+    assert text == f"{count} answers for shard far now; another one may be stopped or cut off"

@@ -13,6 +13,7 @@ from enact_dist.core.messages import (
     ListSessions,
     Pin,
     PlacementMap,
+    Pong,
     Sessions,
     ShardEntry,
 )
@@ -22,6 +23,7 @@ from enact_dist.doctor_cell import namesakes
 from enact_dist.errors import LinkError
 from enact_dist.link.namesakes import Comparing, Doubts, Serving, moved_places, serving
 from enact_dist.link.shard_daemon import DaemonSettings, start_shard
+from enact_dist.link.zenoh_discovery import FoundShard
 
 COUNT = Aspect("count", int)
 ASK_S = 10.0
@@ -188,6 +190,22 @@ def test_places_that_cannot_be_do_not_keep_the_others_from_being_asked(begin, fr
     found = serving("cell", "left", (*nowhere, first, second), timeout_s=ASK_S)
 
     assert len(found) == 2
+
+
+def test_daemon_that_restarts_between_two_questions_is_one(monkeypatch):
+    """It has two addresses, and answered at the first one before it ended."""
+    starts = iter((1, 2, 2, 2))
+    shard = FoundShard("cell", "left")
+
+    def ask(*_, **__):
+        return {shard: Pong("left", 1, True, "", 0, next(starts))}
+
+    monkeypatch.setattr("enact_dist.link.namesakes.somebody_listens", lambda _: True)
+    monkeypatch.setattr("enact_dist.link.namesakes.ask_shards", ask)
+
+    found = serving("cell", "left", ("tcp/127.0.0.1:1", "tcp/127.0.0.1:2"), timeout_s=ASK_S)
+
+    assert [one.start for one in found] == [2]
 
 
 def test_shard_that_ran_twice_is_asked_about_after_one_of_them_was_silent(monkeypatch):
