@@ -8,6 +8,7 @@ recording and draws.  Files in `out`:
 run.mcap            everything but the images, for `enact replay`, Foxglove and the evaluation
 report.json         the table
 figure1.png         limbs, voxels, models and properties of the nearest approach
+figure4.svg         all actors, and what they read and write, drawn from their declarations
 figure3_top.png     its eight masks, changed pixels in colour
 figure3_bottom.png  its hull before and after the refinement
 plan.png            the cell from above: tracks, prediction, path, truth
@@ -30,10 +31,11 @@ from actors.geometry.files import write_whole
 from actors.running_cell import DemoError
 from actors.workcell.demo_cell import EmbeddedCell, RunningCell
 from actors.workcell.demo_conduct import Conductor, recording
-from actors.workcell.demo_lineage import show_lineage, show_past, show_what_if
+from actors.workcell.demo_lineage import show_lineage, show_past, stop_checks
 from actors.workcell.demo_options import PLAYED
-from actors.workcell.demo_pictures import pictures_of
+from actors.workcell.demo_pictures import figure4, pictures_of
 from actors.workcell.demo_report import report_bytes, report_of, table_of
+from actors.workcell.demo_what_if import show_what_if
 from actors.workcell.evaluation import score
 from actors.workcell.scenario_checks import checks_of
 from actors.workcell.scenarios import scenario_of
@@ -116,7 +118,7 @@ def _run(options: Options, console: Console) -> Outcome:
         how = "in this process" if options.embedded else "a shard and processes are up"
         console.print(f"{how}; log in {running.log}")
         notes = _conducted(cell, running, options, console)
-        outcome = _reported(cell, options, notes, console)
+        outcome = _reported(cell, running, options, notes, console)
         if options.keep_running:
             console.print(f"the cell stays up: enact world tree online --cell {running.config}")
             _until_interrupted(running)
@@ -180,7 +182,9 @@ def _conducted(cell: Cell, running: DemoCell, options: Options, console: Console
     return conductor.notes
 
 
-def _reported(cell: Cell, options: Options, notes: Notes, console: Console) -> Outcome:
+def _reported(
+    cell: Cell, running: DemoCell, options: Options, notes: Notes, console: Console
+) -> Outcome:
     """Score, print and draw; return what came of it."""
     path = options.out / "run.mcap"
     if notes.nearest_ns:
@@ -192,6 +196,11 @@ def _reported(cell: Cell, options: Options, notes: Notes, console: Console) -> O
     every = max(1, math.ceil(options.seconds * 10.0 / HULLS_SCORED))
     scores = score(trace, every=every)
     checks = checks_of(trace, scores)
+    if options.scenario == "S9":
+        checks |= {"the fork was tried": what_if is not None}
+    checks |= what_if.checks() if what_if is not None else {}
+    if options.scenario == "S12":
+        checks |= stop_checks(notes)
     console.print("", table_of(scores), "", sep="\n")
     for text, held in checks.items():
         console.print(f"[{'green' if held else 'red'}]{'holds' if held else 'fails'}[/]  {text}")
@@ -207,12 +216,15 @@ def _reported(cell: Cell, options: Options, notes: Notes, console: Console) -> O
         "embedded": options.embedded,
         "separate": options.separate,
         "events": notes.lines,
-        "what_if": what_if,
+        "what_if": what_if.facts() if what_if is not None else None,
         "recording_missing": trace.missing,
         "cores": notes.cores,
     }
     report = report_of(scores, facts, checks)
-    contents = {options.out / "report.json": report_bytes(report)}
+    contents = {
+        options.out / "report.json": report_bytes(report),
+        options.out / "figure4.svg": figure4(running.config),
+    }
     contents |= {options.out / name: png for name, png in pictures_of(trace, notes).items()}
     write_whole(contents)
     return Outcome(scores, notes.cores, report)

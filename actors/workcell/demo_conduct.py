@@ -270,7 +270,8 @@ class Conductor:
         """Keep all versions of a tree under a label, in place of what it kept before."""
         if label in self._cell.kept():
             self._cell.let_go(label)
-        self._cell.keep(label, (cause for cause in tree.walk() if cause.known))
+        with contextlib.suppress(ForgottenError):  # images go first; all else is kept
+            self._cell.keep(label, (cause for cause in tree.walk() if cause.known))
 
     def _say(self, now_s: float, text: str) -> None:
         line = f"{now_s:6.1f} s  {text}"

@@ -1,30 +1,22 @@
-"""What a run shows of its world contexts: why it stopped, what was then, what could have been."""
+"""What a run shows of its world contexts: why it stopped, and what was then."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
 from actors.workcell import vocabulary as words
-from actors.workcell.demo_conduct import DEPTH, WHAT_IF, WHAT_IF_S, masks_of
+from actors.workcell.demo_conduct import DEPTH, masks_of
 from actors.workcell.trace import ONLINE
-from enact_dist import Aspect, View
-from enact_dist.actor_process import ActorThread
+from enact_dist import View
 from enact_dist.cli.lineage import drawn
 from enact_dist.cli.output import print_tree
-from enact_dist.errors import EnactError
-from enact_dist.recording import Replay
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from rich.console import Console
 
     from actors.workcell.demo_conduct import Notes
     from enact_dist import Cell
     from enact_dist.lineage import CauseTree
-
-REPLAYED = ("hull", "prediction", "track", "joints")
-"""What the planner of a fork reads; all else is as it was when the fork was made."""
 
 
 def show_lineage(tree: CauseTree, console: Console) -> None:
@@ -63,57 +55,18 @@ def show_past(cell: Cell, notes: Notes, console: Console) -> None:
     console.print(f"{len(masks)} masks of that stamp, kept under the label nearest")
 
 
-def show_what_if(
-    cell: Cell, recording: Path, notes: Notes, console: Console
-) -> dict[str, object] | None:
-    """Let another planner try ten recorded seconds in the fork, print the difference, drop it.
-
-    Args:
-        cell: The cell, with the fork that was made while the run went on.
-        recording: What was recorded.
-        notes: When the fork was made.
-        console: Where progress and table are printed.
-
-    Returns:
-        What came of it, for the report; None where it could not be done.
-    """
-    from actors.workcell.planning import PathPlanning
-
-    console.print(f"\nwhat if: a planner with no regard to predictions, in {WHAT_IF}", style="bold")
-    path = Aspect(words.PATH.name, words.Path)
-    try:
-        fork = cell.world(WHAT_IF)
-        first = fork.history(words.ROBOT, path, count=1)
-        replay = Replay(
-            cell,
-            recording,
-            worlds={ONLINE: WHAT_IF},
-            only_worlds=(ONLINE,),
-            aspects=REPLAYED,
-            overwrite=True,
-        )
-        replay.between(notes.forked_ns, notes.forked_ns + round(WHAT_IF_S * 1e9))
-        planner = PathPlanning()
-        planner.predict = False
-        with ActorThread(planner, cell, {"online": WHAT_IF}, name="what-if-planner"):
-            summary = replay.run(warn=lambda _: None)
-        begun = first[0].version if first else 0
-        there = [version for version in fork.history(words.ROBOT, path) if version.version > begun]
-        here = [
-            version
-            for version in cell.world(ONLINE).history(words.ROBOT, path)
-            if 0 <= version.position.stamp_ns - notes.forked_ns <= WHAT_IF_S * 1e9
-        ]
-        diff = cell.world(ONLINE).diff(fork, words.ROBOT, [path])
-        console.print(
-            f"{summary.versions} versions of {WHAT_IF_S:g} s replayed: {len(there)} paths in the"
-            f" fork, {len(here)} online; online never saw them"
-        )
-        differ = [str(row.difference or row.kind.value) for row in diff.rows]
-        console.print("online against the fork: " + ("; ".join(differ) or "no difference"))
-        return {"paths_fork": len(there), "paths_online": len(here), "differences": differ}
-    except EnactError as error:
-        console.print(f"not possible: {error}")
-        return None
-    finally:
-        cell.drop_world(WHAT_IF)
+def stop_checks(notes: Notes) -> dict[str, bool]:
+    """Return whether the tree of the first stop ends at all masks of one stamp."""
+    tree = notes.stop
+    masks = masks_of(tree) if tree is not None else []
+    stamps = {mask.stamp_ns for mask in masks}
+    whole = len(masks) == words.CAMERA_COUNT and len(stamps) == 1
+    images = {
+        cause.entity
+        for cause in (tree.walk() if tree is not None else ())
+        if str(cause.aspect) == words.IMAGE.name and cause.stamp_ns in stamps
+    }
+    return {
+        f"the first stop leads to {words.CAMERA_COUNT} masks of one stamp": whole,
+        "and to their images": whole and images == {mask.entity for mask in masks},
+    }

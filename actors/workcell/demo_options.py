@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from pathlib import Path
+from typing import Final
 
 from actors.workcell.scenarios import DEFAULT, SECONDS, scenario_of
+from actors.workcell.simulation.recording import read_info
+from actors.workcell.sources import CameraError
 from enact_dist.errors import ConfigError
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 PLAYED: Final = ("playback+robot", "playback")
 """Sources that play views which were drawn before; their address names a folder."""
+VOXEL_M_MIN: Final = 0.01
+VOXEL_M_MAX: Final = 0.2
+"""A voxel of 1 cm takes 35 million; one of 20 cm is larger than an arm."""
 SEED: Final = 1
 """The seed of a plain run."""
 
@@ -35,7 +38,8 @@ class Options:
         keep_running: Leave the cell up afterwards, until Ctrl-C.
 
     Raises:
-        ConfigError: There is no such scenario, or the options contradict each other.
+        ConfigError: There is no such scenario, a value is out of range, or the options contradict
+            each other, or the folder to play holds no recording.
     """
 
     out: Path
@@ -50,6 +54,19 @@ class Options:
     keep_running: bool = False
 
     def __post_init__(self) -> None:
+        if not VOXEL_M_MIN <= self.voxel_m <= VOXEL_M_MAX:
+            raise ConfigError(
+                f"--voxel-m is {self.voxel_m:g}; a voxel of {VOXEL_M_MIN:g} to {VOXEL_M_MAX:g} m is"
+                " small enough for a person and large enough for the memory"
+            )
+        if self.out.exists() and not self.out.is_dir():
+            raise ConfigError(f"--out {self.out} is a file; name a folder, it need not exist")
+        kind, _, folder = self.source.partition(":")
+        if kind in PLAYED and folder:
+            try:
+                read_info(Path(folder))
+            except CameraError as error:
+                raise ConfigError(str(error)) from error
         scenario = scenario_of(self.scenario, self.seed, self.seconds)
         if self.embedded and scenario.faults:
             raise ConfigError(

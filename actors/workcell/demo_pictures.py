@@ -19,8 +19,14 @@ from actors.workcell import vocabulary as words
 from actors.workcell.evaluation import along
 from actors.workcell.figures import hull_figure, masks_figure, world_figure
 from actors.workcell.truth_of_run import PERIOD_NS, truth_of
+from enact_dist.actor_check import declarations_of
+from enact_dist.actor_graph import graph_of
+from enact_dist.actor_graph_svg import svg_of
+from enact_dist.config import load_config
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     import numpy.typing as npt
 
     from actors.workcell.demo_conduct import Notes
@@ -30,6 +36,17 @@ if TYPE_CHECKING:
 
     F64 = npt.NDArray[np.float64]
     Picture = npt.NDArray[np.uint8]
+
+
+def figure4(config: Path) -> bytes:
+    """Draw the actors of a cell and the data that they declare to read and write, as SVG.
+
+    Args:
+        config: Its `cell.toml`.
+    """
+    parsed = load_config(config)
+    actors, _ = declarations_of(parsed)
+    return svg_of(graph_of(actors), f"cell {parsed.name}").encode()
 
 
 def pictures_of(trace: Trace, notes: Notes) -> dict[str, bytes]:

@@ -25,6 +25,7 @@ import numpy as np
 from actors.geometry.capsules import distance_to_points
 from actors.geometry.kinematics import capsules_at
 from actors.workcell import vocabulary as words
+from actors.workcell.reaction import reaction_of
 from actors.workcell.trace import T, trace_of
 from actors.workcell.truth_of_run import Truth, safety_of, truth_of
 
@@ -103,6 +104,10 @@ GOALS: Final[Mapping[str, Goal]] = {
     "speed_kept": Goal("mean share of the nominal speed"),
     "productivity_oracle": Goal("the same, of an oracle's", low=0.9),
     "productivity_zone": Goal("the same, of a fixed stop zone's", low=2.0),
+    "reaction_p50_ms": Goal("true S(full speed) → lower command, p50, ms"),
+    "reaction_max_ms": Goal("true S(full speed) → lower command, greatest, ms"),
+    "rest_max_ms": Goal("true S(0) → arm at rest, greatest, ms"),
+    "jerk_max_rad_s3": Goal("jerk of a joint, greatest, rad/s³"),
     "paths": Goal("paths planned"),
     "replan_p99_ms": Goal("planning, p99, ms", high=100),
     "paths_touching": Goal("planned paths that touch the hull", 0, 0),
@@ -129,6 +134,7 @@ def score(trace: Trace, *, every: int = 1) -> dict[str, float]:
         **_tracks(trace, truth),
         **_planning(trace, truth),
         **safety_of(trace, truth),
+        **reaction_of(trace, truth),
     }
     return {name: found[name] for name in GOALS if name in found}
 

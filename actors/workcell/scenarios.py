@@ -201,12 +201,15 @@ def scenario_of(name: str, seed: int, seconds: float = SECONDS) -> Scenario:
         seconds: How long it lasts; faults and changes of light come at shares of it.
 
     Raises:
-        ConfigError: There is no scenario of that name, or `seconds` is not positive.
+        ConfigError: There is no scenario of that name, `seconds` is not positive, or `seed` is
+            negative.
     """
     if name not in SCENARIOS:
         raise ConfigError(f"no scenario {name!r}; there are {', '.join(SCENARIOS)}")
     if not seconds > 0.0:
         raise ConfigError(f"a scenario lasts {seconds} s; it needs more than 0")
+    if seed < 0:
+        raise ConfigError(f"the seed is {seed}; it must be a whole number, 0 or above")
     generator = np.random.default_rng([seed, SCENARIOS.index(name)])
     walks = tuple(_moved(walk, generator) for walk in _walks(name, seconds))
     left = (

@@ -2,7 +2,9 @@
 
 import dataclasses
 import json
+import re
 import tomllib
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,13 +17,16 @@ from actors.workcell import demo_conduct
 from actors.workcell import vocabulary as words
 from actors.workcell.demo import run_quietly
 from actors.workcell.demo_cell import TEMPLATE, configured
-from actors.workcell.demo_conduct import recording
+from actors.workcell.demo_conduct import recording, told
 from actors.workcell.demo_options import Options
+from actors.workcell.demo_pictures import figure4
 from actors.workcell.demo_report import markdown_of, report_of, value_text
 from actors.workcell.scenarios import Fault, scenario_of
 from actors.workcell.setup import Setup, grid_of
 from actors.workcell.trace import trace_of
+from actors.workcell.truth_of_run import truth_of
 from enact_dist import Lock, Write, local, testing
+from enact_dist.config import load_config
 from enact_dist.errors import ConfigError
 
 
@@ -129,6 +134,22 @@ def test_faults_do_not_go_with_one_process(tmp_path):
         Options(tmp_path, scenario="S7", embedded=True)
 
 
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"voxel_m": 0.0}, "--voxel-m is 0"),
+        ({"voxel_m": 5.0}, "--voxel-m is 5"),
+        ({"seed": -1}, "the seed is -1"),
+        ({"source": "playback+robot:/nowhere"}, "/nowhere: asked for a recording"),
+        ({"scenario": "S99"}, "no scenario 'S99'"),
+        ({"out": Path(__file__)}, "is a file; name a folder"),
+    ],
+)
+def test_options_that_cannot_work_are_one_line_each(tmp_path, given, said):
+    with pytest.raises(ConfigError, match=re.escape(said)):
+        Options(**{"out": tmp_path, **given})
+
+
 def test_report_names_what_was_missed():
     """Infinities are no JSON; a table for a document has a column per run."""
     scores = {"robot_p99_ms": 120.0, "violations": 0.0, "distance_max_m": float("inf")}
@@ -137,6 +158,20 @@ def test_report_names_what_was_missed():
     assert report["scores"]["distance_max_m"] is None
     assert "| ≤ 100 | 120 | 120 |" in markdown_of([scores, scores], ["one", "two"])
     assert value_text("lost_share", 0.0001) == "0.0100%"
+
+
+def test_figure_4_is_drawn_from_the_declarations():
+    """Every entity of the cell, and every class of its actors, is in the picture."""
+    picture = figure4(TEMPLATE).decode()
+    actors = {one.class_path.rpartition(":")[2] for one in load_config(TEMPLATE).actors}
+    assert picture.startswith("<svg")
+    assert {name for name in actors if name not in picture} == set()
+
+
+def test_a_state_without_a_reason_is_one_word():
+    assert told(words.Safety("run", "", 0)) == "run"
+    assert told(words.Safety("run", "; without camera/3", 0)) == "run: without camera/3"
+    assert told(words.Safety("stop", "someone is too near", 0)) == "stop: someone is too near"
 
 
 @pytest.mark.timing
@@ -164,3 +199,38 @@ def test_the_robot_rests_while_its_reconstruction_is_dead_and_goes_on(tmp_path, 
     assert max(seconds) > killed_s + 0.5  # and somebody does again
     for name in ("report.json", "timeline.png", "cell.toml", "run.mcap"):
         assert (tmp_path / name).stat().st_size > 1000
+
+
+@pytest.mark.timing
+def test_the_cell_goes_on_after_a_camera_the_speed_control_and_the_shard_were_killed(
+    tmp_path, monkeypatch
+):
+    """Real processes: no moment is too fast, each comes back by itself, and the person stays."""
+    faults = (
+        Fault(1.0, "kill", "camera-3"),
+        Fault(6.0, "kill", "speed"),
+        Fault(11.0, "kill", "cell"),
+    )
+
+    def with_faults(name, seed, seconds):
+        return dataclasses.replace(scenario_of(name, seed, seconds), faults=faults)
+
+    monkeypatch.setattr(demo_conduct, "scenario_of", with_faults)
+    options = Options(tmp_path, scenario="S8", seconds=22.0, source="live", voxel_m=0.05)
+
+    outcome = run_quietly(options)
+
+    assert outcome.scores["violations"] == 0.0
+    trace = trace_of(tmp_path / "run.mcap")
+    truth = truth_of(trace)
+    hulls = [
+        (truth.at_s(kept.stamp_ns), kept.datum)
+        for kept in trace.of(words.WORKSPACE.name, words.HULL)
+        if truth.covers(kept.stamp_ns)
+    ]
+    assert any("camera/3" not in hull.cameras for at_s, hull in hulls if at_s > 1.0)
+    after = [(at_s, hull) for at_s, hull in hulls if at_s > 13.0]
+    assert any("camera/3" in hull.cameras for _, hull in after)
+    assert any(len(hull.voxels) for _, hull in after)  # what plays has outlived the shard
+    assert outcome.report["checks"]["the robot goes on by itself"]
+    assert sum("kill" in line for line in outcome.report["events"]) == len(faults)

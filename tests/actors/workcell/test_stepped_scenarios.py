@@ -11,12 +11,18 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import pytest
 
+from actors.workcell import vocabulary as words
+from actors.workcell.demo_conduct import DEPTH, Notes
+from actors.workcell.demo_lineage import stop_checks
 from actors.workcell.evaluation import score
+from actors.workcell.planning import PathPlanning
 from actors.workcell.scenario_checks import checks_of
+from enact_dist import Lock, View, Write, testing
 
 from .stepped import stepped
 
 if TYPE_CHECKING:
+    from enact_dist.world import WorldContext
 
     from .stepped import Stepped
 
@@ -50,21 +56,66 @@ PARTS = {
     "S8": Part(6.0, 0.0, 6.0),
     "S10": Part(6.0, 1.4, 6.0),
     "S11": Part(20.0, 1.4, 5.0),
+    "S12": Part(20.0, 1.2, 6.0),
 }
 
 
-def played(monkeypatch: pytest.MonkeyPatch, name: str) -> tuple[Stepped, dict[str, bool]]:
-    """Play the part of a scenario and return the cell and what held."""
-    part = PARTS[name]
-    with stepped(monkeypatch, name, seed=SEED, seconds=part.seconds, begin_s=part.begin_s) as cell:
-        cell.until(part.end_s, before=lambda: cell.break_as_planned(RESTART_S))
-        trace = cell.trace()
-        return cell, checks_of(trace, score(trace, every=5))
+def play(cell: Stepped, part: Part) -> dict[str, bool]:
+    """Play the part of a scenario and return what held."""
+    cell.until(part.end_s, before=lambda: cell.break_as_planned(RESTART_S))
+    trace = cell.trace()
+    return checks_of(trace, score(trace, every=5))
 
 
 @pytest.mark.parametrize("name", PARTS)
 def test_a_scenario_holds_what_it_must(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    _, held = played(monkeypatch, name)
+    """What the demo checks on the truth; S12 traces its stop back to the images, too."""
+    part = PARTS[name]
+    with stepped(monkeypatch, name, seed=SEED, seconds=part.seconds, begin_s=part.begin_s) as cell:
+        held = play(cell, part)
+        if name == "S12":
+            notes = Notes(stop=cell.cell.why("online", words.ROBOT, words.SPEED, depth=DEPTH))
+            held |= stop_checks(notes)
 
     assert len(held) > 1
     assert [what for what, right in held.items() if not right] == []
+
+
+def test_online_never_sees_what_the_planner_of_a_fork_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    """S9: the fork gets hulls, predictions and joints as they come, and plans paths of its own."""
+    read = (
+        (words.WORKSPACE, words.HULL),
+        (words.human_entity(0), words.PREDICTION),
+        (words.ROBOT, words.JOINTS),
+    )
+    with stepped(monkeypatch, "S9", seed=SEED, seconds=20.0, begin_s=0.8) as cell:
+        cell.until(1.2)
+        online, fork = cell.cell.world("online"), cell.cell.world("online").fork("what_if")
+        planner, seen = PathPlanning(), []
+        planner.predict = False
+
+        def hand_on() -> None:
+            for entity, aspect in read:
+                view, copy = View(online, entity, aspect), Write(fork, entity, aspect)
+                seen_there = online.view(view)
+                state = seen_there.state(view)
+                if state is not None and seen_there.get(view) is not None:
+                    with Lock(copy) as lock:
+                        lock.put(copy, seen_there[view], stamp_ns=state.captured_ns)
+            before = _newest_path(online)
+            testing.run_once(planner, cell.cell, {"online": "what_if"})
+            assert _newest_path(online) == before
+            seen.append(_newest_path(fork))
+
+        begun = _newest_path(fork)
+        while seen[-1:] in ([], [begun]) and cell.at_s < 9.0:
+            cell.until(cell.at_s + 0.1, after=hand_on)
+
+        assert seen[-1] > begun  # it did plan
+        view = View(fork, words.ROBOT, words.PATH)
+        assert len(fork.view(view)[view].waypoints) > 1
+
+
+def _newest_path(world: WorldContext) -> int:
+    """Return the number of the newest version of the path in a world context."""
+    return world.history(words.ROBOT, words.PATH, count=1)[-1].version
