@@ -7,11 +7,16 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from actors.geometry.capsules import bounds
 from actors.geometry.joint_paths import JointPath, PathSpeeds
+from actors.geometry.kinematics import capsules_at
 from actors.geometry.separation import Reaction, Separation
 from actors.workcell.motion import BRAKING_M_S2, FUTURE_NS, NOMINAL_M_S, ROBOT_S
 from actors.workcell.vocabulary import (
     CAMERA_STATES,
+    GRID,
     HULL,
     JOINTS,
     MODEL,
@@ -122,6 +127,7 @@ class SpeedControl(Actor):
     joints = View(online, ROBOT, JOINTS)
     path = View(online, ROBOT, PATH)
     model = View(online, ROBOT, MODEL)
+    grid = View(online, WORKSPACE, GRID)
     cameras = View(online, SYSTEM, CAMERA_STATES)
     speed = Write(online, ROBOT, SPEED)
     safety = Write(online, SYSTEM, SAFETY)
@@ -133,6 +139,9 @@ class SpeedControl(Actor):
     uncertainty_m: float = 0.05
     latest_s: float = 0.25
     """Oldest exposure on which the robot may move, whatever was measured."""
+    open_sides: bool = False
+    """People can stand right beside the watched volume, where no voxel is: the robot then keeps the
+    protective distance from the volume's sides, too."""
 
     def __init__(self) -> None:
         self._reaction: Reaction | None = None
@@ -164,7 +173,7 @@ class SpeedControl(Actor):
             uncertainty_m=self.uncertainty_m,
         )
         verdict = judged(
-            nearest_m=hull.nearest_m,
+            nearest_m=min(hull.nearest_m, self._to_sides_m(lock)),
             age_s=age_s,
             joints_age_s=max(0.0, (captured_ns - joints_ns) / 1e9),
             nominal_m_s=nominal_m_s,
@@ -195,6 +204,18 @@ class SpeedControl(Actor):
             self._reaction = Reaction(period_s=PERIOD_S, robot_s=ROBOT_S, latest_s=self.latest_s)
         self._reaction.seen(age_s)
         return self._reaction
+
+    def _to_sides_m(self, lock: Lock) -> float:
+        """Return how far the arm is from the sides of the watched volume, if these are open."""
+        if not self.open_sides:
+            return math.inf
+        grid, model, joints = lock.get(self.grid), lock.get(self.model), lock.get(self.joints)
+        if grid is None or model is None or joints is None:
+            return 0.0
+        boxes = bounds(capsules_at(model, joints.q[-1])[0])[..., :2]
+        high_m = grid.origin_m[:2] + grid.voxel_m * np.array(grid.shape[:2])
+        low = (boxes[:, 0] - grid.origin_m[:2]).min()
+        return float(min(low, (high_m - boxes[:, 1]).min()))
 
     def _nominal_m_s(
         self, model: ArmModel | None, path: Path | None, joints: Joints | None

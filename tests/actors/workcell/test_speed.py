@@ -2,16 +2,20 @@
 
 import math
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from actors.geometry.capsules import bounds
+from actors.geometry.kinematics import capsules_at
 from actors.geometry.separation import Separation
 from actors.workcell.motion import NOMINAL_M_S, ROBOT_S
 from actors.workcell.simulation.arm import ARM, HOME_RAD
 from actors.workcell.speed import SpeedControl, judged
 from actors.workcell.vocabulary import (
     CAMERA_STATES,
+    GRID,
     HULL,
     JOINTS,
     MODEL,
@@ -22,6 +26,7 @@ from actors.workcell.vocabulary import (
     SYSTEM,
     WORKSPACE,
     CameraState,
+    Grid,
     Hull,
     Joints,
     Path,
@@ -117,7 +122,12 @@ class Cell:
 
 
 @pytest.fixture
-def cell():
+def cell(monkeypatch):
+    """A cell whose clock stands, here and in the actor, so that nothing grows older by the load."""
+    now_ns = time.time_ns()
+    stopped = SimpleNamespace(time_ns=lambda: now_ns)
+    monkeypatch.setattr("actors.workcell.speed.time", stopped)
+    monkeypatch.setitem(globals(), "time", stopped)
     with testing.worlds("online") as worlds:
         yield Cell(worlds)
 
@@ -227,6 +237,26 @@ def test_speeds_along_a_path_are_those_of_its_own_life_of_the_shard(cell):
     slow = cell.judge(0.8)
 
     assert quick.scale < slow.scale == 1.0
+
+
+def test_open_sides_keep_the_robot_from_who_stands_beside_the_volume(cell):
+    """Nobody is seen outside the grid: with open sides the distance to these counts."""
+    cell.joints(time.time_ns())
+    cell.path(HOME_RAD, AWAY)
+    fenced = cell.judge(math.inf)
+    cell.actor.open_sides = True
+    unknown = cell.judge(math.inf)
+    cell.put(WORKSPACE, GRID, Grid(np.array([-1.3, -1.2, 0.0]), 0.1, (28, 24, 20)))
+
+    beside = cell.judge(math.inf)
+
+    tool_m = bounds(capsules_at(ARM, HOME_RAD)[0])[:, 1, 0].max()
+    separation = Separation(reaction_s=0.25 + ROBOT_S)
+    assert fenced.limit_m_s == math.inf
+    assert unknown.limit_m_s == 0.0
+    assert 0.6 < 1.5 - tool_m < 1.2
+    assert beside.limit_m_s == pytest.approx(separation.speed_max_m_s(1.5 - tool_m))
+    assert beside.nearest_m == math.inf
 
 
 def test_safety_is_written_when_it_changes(cell):
