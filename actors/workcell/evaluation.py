@@ -17,6 +17,7 @@ import json
 import math
 import sys
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -27,16 +28,19 @@ from actors.geometry.kinematics import capsules_at
 from actors.workcell import vocabulary as words
 from actors.workcell.reaction import reaction_of
 from actors.workcell.trace import T, trace_of
+from actors.workcell.true_hull import TrueVoxels
 from actors.workcell.truth_of_run import Truth, safety_of, truth_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
     import numpy.typing as npt
 
+    from actors.workcell.scenarios import Scenario
     from actors.workcell.trace import Kept, Trace
 
     F64 = npt.NDArray[np.float64]
+    Samples = dict[str, npt.NDArray[np.float64]]
 
 NEAR_M: Final = 0.5
 """Within this distance of the robot no voxel of a person may be lost."""
@@ -126,17 +130,104 @@ def score(trace: Trace, *, every: int = 1) -> dict[str, float]:
         ConfigError: The run has no truth, no arm or no grid.
     """
     truth = truth_of(trace)
+    samples = samples_of(trace, every=every)
+    if len(samples["share"]):
+        samples |= beside(truth.scenario)
+    return in_order(_rates(trace, truth) | _latencies(trace, truth) | scores_of([samples]))
+
+
+def in_order(scores: Mapping[str, float]) -> dict[str, float]:
+    """Return scores in the order of the table."""
+    return {name: scores[name] for name in GOALS if name in scores}
+
+
+def samples_of(trace: Trace, *, every: int = 1) -> Samples:
+    """Return all single figures of a run that its scores are made of, but rates and latencies.
+
+    Args:
+        trace: The versions of the run, with what was played.
+        every: Only each so-many-th hull is compared voxel by voxel.
+
+    Raises:
+        ConfigError: The run has no truth, no arm or no grid.
+    """
+    truth = truth_of(trace)
     found = {
-        **_rates(trace, truth),
-        **_latencies(trace, truth),
         **_voxels(trace, truth, every=every),
         **_distances(trace, truth),
-        **_tracks(trace, truth),
+        "track": _tracks(trace, truth),
         **_planning(trace, truth),
         **safety_of(trace, truth),
         **reaction_of(trace, truth),
     }
-    return {name: found[name] for name in GOALS if name in found}
+    return {name: np.asarray(values, np.float64) for name, values in found.items()}
+
+
+@lru_cache(maxsize=4)
+def beside(scenario: Scenario) -> Samples:
+    """Return how fast an oracle and a fixed zone let the robot be in a scenario."""
+    from actors.workcell.closed_loop import ClosedLoop, Sight
+
+    found = {}
+    for name, sight in (("oracle_share", Sight.ORACLE), ("zone_share", Sight.ZONE)):
+        trace = ClosedLoop(scenario, sight=sight).run()
+        found[name] = safety_of(trace, truth_of(trace))["share"]
+    return found
+
+
+def scores_of(runs: Sequence[Samples]) -> dict[str, float]:
+    """Return the scores of one run or of several together.
+
+    Productivity is the mean share of the nominal speed while the arm is not at a goal, beside that
+    of two other robots in the same scenario, with the same arm, task, planner, reaction time and
+    formula: one goes by the true distance and the true bodies (the oracle), one runs at full speed
+    while nobody is nearer to any place of its task than the protective distance of the full speed,
+    and rests else (the fixed zone).
+
+    Args:
+        runs: Of `samples_of`, at least one.
+    """
+    every = {
+        name: np.concatenate([run[name] for run in runs if name in run])
+        for name in dict.fromkeys(name for run in runs for name in run)
+    }
+    found: dict[str, float] = {}
+
+    def told(name: str, of: str, figure: Callable[[F64], float]) -> None:
+        if len(every.get(of, ())):
+            found[name] = float(figure(every[of]))
+
+    def percentile(share: float) -> Callable[[F64], float]:
+        return lambda values: float(np.percentile(values, share))
+
+    told("lost_near_voxels", "lost_near", np.sum)
+    told("lost_share", "lost", lambda lost: lost.sum() / max(every["real"].sum(), 1.0))
+    told("true_voxels", "real", np.sum)
+    told("iou_p50", "iou", np.median)
+    told("phantom_p99_l", "phantom_l", percentile(99))
+    told("distance_p50_m", "distance_error_m", np.median)
+    told("distance_p1_m", "distance_error_m", percentile(1))
+    told("distance_max_m", "distance_error_m", np.max)
+    told("nearest_true_m", "distance_m", np.min)
+    if math.isinf(found.get("nearest_true_m", 0.0)):
+        del found["nearest_true_m"]
+    if len(every.get("track", ())):
+        position, velocity, ahead = np.median(every["track"], axis=0).tolist()
+        found["track_position_p50_m"] = position
+        found["track_velocity_p50_m_s"] = velocity
+        found["track_ahead_p50_m"] = ahead
+    told("violations", "too_fast", np.sum)
+    told("moments", "too_fast", len)
+    told("speed_kept", "share", np.mean)
+    for name in ("oracle", "zone"):
+        share = every.get(f"{name}_share")
+        if share is not None and len(share) and share.mean() > 0.0 and "speed_kept" in found:
+            found[f"productivity_{name}"] = found["speed_kept"] / float(share.mean())
+    found["paths"] = float(len(every.get("touching", ())))
+    if len(every.get("planned_ms", ())) > 1:
+        told("replan_p99_ms", "planned_ms", percentile(99))
+    told("paths_touching", "touching", np.sum)
+    return found
 
 
 def missed(scores: Mapping[str, float]) -> list[str]:
@@ -194,57 +285,24 @@ def _latencies(trace: Trace, truth: Truth) -> dict[str, float]:
     return found | _quantiles("robot", ages, "ms")
 
 
-class _Voxels:
-    """The voxels of the grid in which there can be a person, and whether they count."""
-
-    def __init__(self, trace: Trace) -> None:
-        grid = trace.newest(words.WORKSPACE.name, words.GRID)
-        self.origin_m, self.voxel_m = grid.origin_m, grid.voxel_m
-        self.shape = grid.shape
-        self.boxes = [
-            trace.newest(name, words.BOXES).reshape(-1, 15) for name in trace.entities(words.BOXES)
-        ]
-
-    def centres(self, index: npt.NDArray[np.integer]) -> F64:
-        """Return the centres of voxels, (n, 3), metres."""
-        return np.asarray(self.origin_m + (index + 0.5) * self.voxel_m)
-
-    def of(self, body: F64) -> npt.NDArray[np.int64]:
-        """Return the voxels (n, 3) whose centres lie in a body and in no static obstacle."""
-        ends, radius = body[:, :6].reshape(-1, 2, 3), body[:, 6:]
-        low = ((ends.min(1) - radius).min(0) - self.origin_m) / self.voxel_m
-        high = ((ends.max(1) + radius).max(0) - self.origin_m) / self.voxel_m
-        first = np.clip(np.floor(low).astype(int), 0, self.shape)
-        last = np.clip(np.ceil(high).astype(int) + 1, 0, self.shape)
-        axes = [np.arange(one, other) for one, other in zip(first, last, strict=True)]
-        index = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-        if not len(index):
-            return index
-        index = index[distance_to_points(body, self.centres(index)) <= 0.0]
-        return index[~self.static(self.centres(index))]
-
-    def static(self, points_m: F64) -> npt.NDArray[np.bool_]:
-        """Say which points lie in a static obstacle, or within one and a half voxels of it."""
-        inside = np.zeros(len(points_m), np.bool_)
-        for box in (row for rows in self.boxes for row in rows):
-            local = (points_m - box[:3]) @ box[6:].reshape(3, 3)
-            inside |= (np.abs(local) <= box[3:6] + 1.5 * self.voxel_m).all(1)
-        return inside
-
-    def number(self, index: npt.NDArray[np.integer]) -> npt.NDArray[np.int64]:
-        """Return one number per voxel."""
-        return np.asarray(np.ravel_multi_index(tuple(index.T.astype(np.int64)), self.shape))
+def voxels_of(trace: Trace) -> TrueVoxels:
+    """Return the voxels of the grid of a run."""
+    boxes = [trace.newest(name, words.BOXES) for name in trace.entities(words.BOXES)]
+    return TrueVoxels(trace.newest(words.WORKSPACE.name, words.GRID), boxes)
 
 
-def _voxels(trace: Trace, truth: Truth, *, every: int) -> dict[str, float]:
+def _voxels(trace: Trace, truth: Truth, *, every: int) -> dict[str, list[float]]:
     """Compare hulls with bodies, voxel by voxel.
 
     Lost is a voxel whose centre lies in a body, outside of static obstacles and of the robot, that
     the safe set does not have.  The robot is grown as the refinement grows it.
     """
-    voxels, motion = _Voxels(trace), trace.joints()
-    lost_near = lost = total = 0
-    ious, phantoms = [], []
+    voxels, motion = voxels_of(trace), trace.joints()
+    near: list[float] = []
+    far: list[float] = []
+    count: list[float] = []
+    ious: list[float] = []
+    phantoms: list[float] = []
     for kept in _during(trace.of(words.WORKSPACE.name, words.HULL), truth)[::every]:
         bodies, hull = truth.bodies_at(kept.stamp_ns), kept.datum
         safe = voxels.number(hull.voxels)
@@ -256,27 +314,19 @@ def _voxels(trace: Trace, truth: Truth, *, every: int) -> dict[str, float]:
         index, clearance_m = index[outside], clearance_m[outside]
         real = voxels.number(index)
         gone = ~np.isin(real, safe)
-        lost_near += int((gone & (clearance_m < NEAR_M)).sum())
-        lost += int((gone & (clearance_m >= NEAR_M)).sum())
-        total += len(real)
+        near.append(float((gone & (clearance_m < NEAR_M)).sum()))
+        far.append(float((gone & (clearance_m >= NEAR_M)).sum()))
+        count.append(float(len(real)))
         if len(real) and all(truth.inside(body) for body in bodies):
             tight = safe[hull.tight]
             common = int(np.isin(tight, real).sum())
             ious.append(common / (len(tight) + len(real) - common))
         phantoms.append(_phantom_l(voxels, hull, bodies, truth, kept.stamp_ns))
-    if not phantoms:
-        return {}
-    return {
-        "lost_near_voxels": float(lost_near),
-        "lost_share": lost / max(total, 1),
-        "true_voxels": float(total),
-        **({"iou_p50": float(np.median(ious))} if ious else {}),
-        "phantom_p99_l": float(np.percentile(phantoms, 99)),
-    }
+    return {"lost_near": near, "lost": far, "real": count, "iou": ious, "phantom_l": phantoms}
 
 
 def _phantom_l(
-    voxels: _Voxels, hull: words.Hull, bodies: Sequence[F64], truth: Truth, stamp_ns: int
+    voxels: TrueVoxels, hull: words.Hull, bodies: Sequence[F64], truth: Truth, stamp_ns: int
 ) -> float:
     """Return the volume of the safe set that is far from everything real, litres."""
     if not len(hull.voxels):
@@ -287,27 +337,24 @@ def _phantom_l(
     return float((far_m > PHANTOM_M).sum()) * voxels.voxel_m**3 * 1000.0
 
 
-def _distances(trace: Trace, truth: Truth) -> dict[str, float]:
+def _distances(trace: Trace, truth: Truth) -> dict[str, list[float]]:
     """Compare the nearest clearance with the true distance of body and arm at the exposure."""
-    motion, errors, nearest = trace.joints(), [], []
+    motion = trace.joints()
+    errors: list[float] = []
+    nearest: list[float] = []
     for kept in _during(trace.of(words.WORKSPACE.name, words.HULL), truth):
         true_m = truth.distance_m(kept.stamp_ns, motion.at(kept.stamp_ns), over_workspace=True)
         nearest.append(true_m)
         if true_m < CLOSE_M:
             errors.append(kept.datum.nearest_m - true_m)
-    found = {"nearest_true_m": min(nearest)} if nearest and min(nearest) < math.inf else {}
-    if not errors:
-        return found
-    low, middle = np.percentile(errors, [1, 50])
-    return found | {
-        "distance_p1_m": float(low),
-        "distance_p50_m": float(middle),
-        "distance_max_m": max(errors),
-    }
+    return {"distance_error_m": errors, "distance_m": nearest}
 
 
-def _tracks(trace: Trace, truth: Truth) -> dict[str, float]:
-    """Compare each track with the person who is nearest to it."""
+def _tracks(trace: Trace, truth: Truth) -> F64:
+    """Compare each track with the person who is nearest to it: (n, 3) errors.
+
+    Of position, m, of velocity, m/s, and of where they are half a second later, m.
+    """
     errors: list[tuple[float, float, float]] = []
     for human in trace.entities(words.TRACK):
         for kept in _during(trace.of(human, words.TRACK), truth):
@@ -332,41 +379,31 @@ def _tracks(trace: Trace, truth: Truth) -> dict[str, float]:
                     float(np.linalg.norm(guess - ahead)),
                 )
             )
-    if not errors:
-        return {}
-    position, velocity, ahead_m = np.median(errors, axis=0).tolist()
-    return {
-        "track_position_p50_m": position,
-        "track_velocity_p50_m_s": velocity,
-        "track_ahead_p50_m": ahead_m,
-    }
+    return np.array(errors).reshape(-1, 3)
 
 
-def _planning(trace: Trace, truth: Truth) -> dict[str, float]:
-    """Count paths, and those that touch what was occupied in the set that they were planned on."""
+def _planning(trace: Trace, truth: Truth) -> dict[str, list[float]]:
+    """Tell of each path whether it touches what was occupied in the set it was planned on."""
     paths = [
         kept
         for kept in trace.of(words.ROBOT.name, words.PATH)
         if truth.covers(kept.stamp_ns) and len(kept.datum.waypoints)
     ]
-    if not paths:
-        return {"paths": 0.0}
     hulls = {kept.stamp_ns: kept.datum for kept in trace.of(words.WORKSPACE.name, words.HULL)}
-    voxels, touching = _Voxels(trace), 0
+    voxels = voxels_of(trace)
+    touching: list[float] = []
     for kept in paths:
         hull = hulls.get(kept.stamp_ns)
         if hull is None or not len(hull.voxels):
+            touching.append(0.0)
             continue
         points = voxels.centres(hull.voxels)
-        touching += any(
-            float(distance_to_points(arm, points).min()) < 0.0
-            for arm in capsules_at(truth.arm, along(kept.datum.waypoints))
+        states = capsules_at(truth.arm, along(kept.datum.waypoints))
+        touching.append(
+            float(any(float(distance_to_points(arm, points).min()) < 0.0 for arm in states))
         )
     planned = [kept.datum.took_ms for kept in paths if kept.datum.took_ms > 0.0]
-    found = {"paths": float(len(paths)), "paths_touching": float(touching)}
-    return found | (
-        {"replan_p99_ms": float(np.percentile(planned, 99))} if len(planned) > 1 else {}
-    )
+    return {"touching": touching, "planned_ms": planned}
 
 
 def along(waypoints: F64, step_rad: float = 0.1) -> F64:

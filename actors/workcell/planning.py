@@ -142,6 +142,10 @@ class PathPlanning(Actor):
         """Load the planner before any lock is held."""
         load()
 
+    def now_ns(self) -> int:
+        """Return the time, ns since 1970; a simulation has its own."""
+        return time.time_ns()
+
     def update(self, lock: Lock) -> None:
         """Look at the path; plan another one where that is due."""
         if any(map(lock.is_null, (self.model, self.task, self.joints, self.grid))):
@@ -253,7 +257,7 @@ class PathPlanning(Actor):
             number=number,
             from_goal=from_goal,
             to_goal=goal,
-            planned_ns=time.time_ns(),
+            planned_ns=self.now_ns(),
             length_rad=length_rad,
             reason=found.reason or why,
             took_ms=1e3 * (time.monotonic() - began_s),

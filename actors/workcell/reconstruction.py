@@ -41,6 +41,7 @@ from enact_dist import Actor, Together, View, ViewEach, World, Write
 if TYPE_CHECKING:
     import numpy.typing as npt
 
+    from actors.geometry.visibility import CameraTable
     from enact_dist import Lock
 
     Bits = npt.NDArray[np.uint8]
@@ -103,9 +104,13 @@ class Reconstruction(Actor):
         """Let OpenCV work in the actor's own thread."""
         one_thread()
 
+    def now_ns(self) -> int:
+        """Return the time, ns since 1970; a simulation has its own."""
+        return time.time_ns()
+
     def update(self, lock: Lock) -> None:
         """Write the occupied voxels with the stamp of the set; skip a set that is too late."""
-        stamp_ns, now_ns = lock.stamp_ns(self.silhouettes), time.time_ns()
+        stamp_ns, now_ns = lock.stamp_ns(self.silhouettes), self.now_ns()
         fresh = now_ns - self._written_ns < GAP_S * 1e9
         if fresh and now_ns - stamp_ns > self.late_s * 1e9:
             return
@@ -131,6 +136,12 @@ class Reconstruction(Actor):
         )
         if lock.get(self.wanted, 0) > 0:
             lock[self.raw_hull] = blocks.indices(found.raw)
+
+    def tables(
+        self, blocks: VoxelBlocks, calibrations: list[Calibration], boxes: list[F64]
+    ) -> list[CameraTable]:
+        """Return what each camera can say about the voxels of a grid."""
+        return [camera_table(blocks, calibration, boxes) for calibration in calibrations]
 
     def _prepared(self, lock: Lock) -> tuple[Refinement, VoxelBlocks]:
         """Return refinement and grid; rebuild the tables if the cell has changed.
@@ -160,7 +171,7 @@ class Reconstruction(Actor):
             check_calibration(name, calibration)
         grid = lock[self.grid]
         blocks = VoxelBlocks(grid.origin_m, grid.voxel_m, grid.shape)
-        tables = [camera_table(blocks, calibration, boxes) for calibration in calibrations]
+        tables = self.tables(blocks, calibrations, boxes)
         self._made = Refinement(VisualHull(blocks, tables), calibrations, boxes), blocks
         self._made_of, self._last_ns = made_of, 0
         return self._made

@@ -147,6 +147,10 @@ class SpeedControl(Actor):
         self._reaction: Reaction | None = None
         self._speeds: tuple[object, PathSpeeds] | None = None
 
+    def now_ns(self) -> int:
+        """Return the time, ns since 1970; a simulation has its own."""
+        return time.time_ns()
+
     def update(self, lock: Lock) -> None:
         """Judge the newest hull.
 
@@ -161,7 +165,7 @@ class SpeedControl(Actor):
         hull, captured_ns = lock[self.hull], lock.stamp_ns(self.hull)
         joints, path = lock.get(self.joints), lock.get(self.path)
         states = lock.get(self.cameras, {})
-        age_s = (time.time_ns() - captured_ns) / 1e9
+        age_s = (self.now_ns() - captured_ns) / 1e9
         reaction = self._measured(age_s)
         joints_ns = int(joints.stamp_ns[-1]) if joints is not None else 0
         nominal_m_s = self._nominal_m_s(lock.get(self.model), path, joints)

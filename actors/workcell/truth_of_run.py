@@ -19,6 +19,7 @@ from actors.workcell.trace import TRUTH
 if TYPE_CHECKING:
     import numpy.typing as npt
 
+    from actors.workcell.scenarios import Scenario
     from actors.workcell.trace import Trace
 
     F64 = npt.NDArray[np.float64]
@@ -36,6 +37,7 @@ class Truth:
     """What really was.
 
     Attributes:
+        scenario: What was played.
         arm: The arm.
         people: Everybody who comes.
         things: Boxes that are left.
@@ -44,6 +46,7 @@ class Truth:
         half_m: Half of the workspace along x and y.
     """
 
+    scenario: Scenario
     arm: words.ArmModel
     people: tuple[Person, ...]
     things: tuple[Thing, ...]
@@ -129,6 +132,7 @@ def truth_of(trace: Trace) -> Truth:
     grid = trace.newest(words.WORKSPACE.name, words.GRID)
     scenario = scenario_of(playing.scenario, playing.seed, playing.seconds)
     return Truth(
+        scenario=scenario,
         arm=trace.newest(words.ROBOT.name, words.MODEL),
         people=tuple(Person(walk) for walk in scenario.walks),
         things=scenario.things,
@@ -147,68 +151,30 @@ def _surface(thing: Thing, step_m: float = 0.03) -> F64:
     return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
 
 
-def safety_of(trace: Trace, truth: Truth) -> dict[str, float]:
-    """Score safety and productivity at each sample of the arm, 100 times per second.
+def safety_of(trace: Trace, truth: Truth) -> dict[str, F64]:
+    """Return what safety and productivity are scored on.
 
-    A violation is a moment in which the arm was faster than ISO/TS 15066 allows for the *true*
-    distance of that moment, without any reaction time: T_r is used up.
-
-    Productivity is the mean share of the nominal speed while the arm is on a path: beside that of
-    an oracle that knows the true distance without delay, and of a fixed zone: full speed while
-    no person is nearer to any place of the task than the protective distance of the full speed.
+    `too_fast` is, at each sample of the arm, 100 times per second, whether the arm was faster than
+    ISO/TS 15066 allows for the *true* distance of that moment, without any reaction time: T_r is
+    used up.  `share` is the share of the nominal speed at each command while the arm was not at a
+    goal.
     """
-    motion = trace.joints()
-    chosen = np.array([truth.covers(int(stamp)) for stamp in motion.stamp_ns], np.bool_)
-    if not chosen.any():
-        return {}
-    stamps, q, dq = motion.stamp_ns[chosen], motion.q[chosen], motion.dq[chosen]
-    fastest = np.linalg.norm(end_velocities(truth.arm, q, dq), axis=-1).max((1, 2))
-    distances = np.array(
-        [truth.distance_m(int(stamp), joints) for stamp, joints in zip(stamps, q, strict=True)]
-    )
-    spent = Separation(reaction_s=0.0)
-    allowed = np.array([spent.speed_max_m_s(distance) for distance in distances])
-    found = {
-        "violations": float(((fastest > allowed) & (fastest > RESTING_M_S)).sum()),
-        "moments": float(len(stamps)),
-    }
-    return found | _productivity(trace, truth, stamps, distances)
-
-
-def _productivity(
-    trace: Trace, truth: Truth, stamps: npt.NDArray[np.int64], distances: F64
-) -> dict[str, float]:
     done = [
         kept.datum
         for kept in trace.of(words.ROBOT.name, words.EXECUTION)
-        if truth.covers(kept.datum.captured_ns)
+        if truth.covers(kept.datum.captured_ns) and kept.datum.state != "dwelling"
     ]
-    on_path = [one for one in done if one.state != "dwelling"]
-    quick = [one.speed_m_s / one.scale for one in on_path if one.scale > 0.3]
-    if not quick:
-        return {"speed_kept": 0.0} if on_path else {}
-    kept = float(np.mean([one.scale for one in on_path]))
-    nominal = float(np.median(quick))
-    rows = np.clip(
-        np.searchsorted(stamps, [one.captured_ns for one in on_path]), 0, len(stamps) - 1
-    )
-    law = Separation()
-    shares = [min(1.0, law.speed_max_m_s(float(one)) / nominal) for one in distances[rows]]
-    zone = _zone_share(trace, truth, on_path, law.protective_m(nominal))
-    return {
-        "speed_kept": kept,
-        "productivity_oracle": kept / max(float(np.mean(shares)), 1e-9),
-        **({"productivity_zone": kept / zone} if zone > 0.0 else {}),
-    }
-
-
-def _zone_share(trace: Trace, truth: Truth, done: list[words.Execution], radius_m: float) -> float:
-    """Return the share of moments without a person in a fixed zone around the task."""
+    share = np.array([one.scale for one in done], np.float64)
     motion = trace.joints()
-    places = motion.q[:: max(1, len(motion.q) // 40)]
-    swept = capsules_at(truth.arm, places).reshape(-1, 7)
-    clear = [
-        all(distance_between(swept, body) > radius_m for body in truth.bodies_at(one.captured_ns))
-        for one in done
+    chosen = np.array([truth.covers(int(stamp)) for stamp in motion.stamp_ns], np.bool_)
+    if not chosen.any():
+        return {"too_fast": np.empty(0), "share": share}
+    stamps, q, dq = motion.stamp_ns[chosen], motion.q[chosen], motion.dq[chosen]
+    fastest = np.linalg.norm(end_velocities(truth.arm, q, dq), axis=-1).max((1, 2))
+    distances = [
+        truth.distance_m(int(stamp), joints) for stamp, joints in zip(stamps, q, strict=True)
     ]
-    return float(np.mean(clear))
+    spent = Separation(reaction_s=0.0)
+    allowed = np.array([spent.speed_max_m_s(distance) for distance in distances])
+    too_fast = (fastest > allowed) & (fastest > RESTING_M_S)
+    return {"too_fast": too_fast.astype(np.float64), "share": share}

@@ -145,7 +145,8 @@ def run(arguments: argparse.Namespace) -> int:
             names = with_room(place, names, named=bool(arguments.names))
         floors = stack.enter_context(Floors(folder, memory))
         told = stack.enter_context(_progress())
-        measured = Run(place, floors, seconds_s=arguments.seconds_s or SECONDS_S, told=told)
+        seconds_s = arguments.seconds_s or SECONDS_S
+        measured = Run(place, floors, seconds_s=seconds_s, told=told, seeds=arguments.seeds)
         failed = [name for name in names if not _ran(name, measured)]
         rows = measured.rows()
     if arguments.json:

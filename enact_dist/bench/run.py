@@ -40,14 +40,21 @@ class Run:
         floors: What the machine and the transport can do.
         seconds_s: Measuring time of each case, all rounds together.
         told: Called with what is being measured.
+        seeds: How many seeds are played, where a bench plays any.
     """
 
     def __init__(
-        self, place: Place, floors: Floors, *, seconds_s: float, told: Callable[[str], None]
+        self,
+        place: Place,
+        floors: Floors,
+        *,
+        seconds_s: float,
+        told: Callable[[str], None],
+        seeds: int = 1,
     ) -> None:
         self.place, self.floors = place, floors
         self.seconds_s = seconds_s
-        self.told = told
+        self.told, self.seeds = told, seeds
         self._figures: dict[Key, Sample] = {}
         self._times_us: dict[Key, list[float]] = {}
         self._cases: dict[Key, Case] = {}

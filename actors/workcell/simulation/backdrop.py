@@ -110,7 +110,9 @@ def backdrop_of(calibration: Calibration, boxes: Sequence[Box]) -> Backdrop:
     direct = np.where(shadowed, 0.0, (1.0 - AMBIENT) * facing)
     colours = np.array([*(box.colour for box in boxes), WALL_COLOUR, FLOOR_COLOUR], np.float32)
     which = np.where((which == len(boxes)) & (normals[:, 2] > 0.5), which + 1, which)
-    albedo = colours[which] * _texture(points, normals, which)[:, None]
+    # The room keeps its texture, whatever is put into it: only what moves may change an image.
+    bears = np.where(which >= len(boxes), which - len(boxes) - 2, which)
+    albedo = colours[which] * _texture(points, normals, bears)[:, None]
     image = np.clip(255.0 * albedo * (AMBIENT + direct)[:, None] * 1.25, 0.0, 255.0)
     matrix, lamp_from_cell = lamp()
     under = points @ lamp_from_cell[:3, :3].T + lamp_from_cell[:3, 3]
