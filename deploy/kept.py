@@ -23,7 +23,7 @@ from environment import PYTHON, ROOT, give_up, say
 
 REQUIREMENTS = ROOT / "deploy" / "requirements"
 WHEELS = ROOT / "deploy" / "wheels"
-LOCKS = ("build.txt", "core.txt", "record.txt", "perception.txt")
+LOCKS = ("build.txt", "core.txt", "record.txt", "perception.txt", "workcell.txt")
 SUITE = "bookworm"
 BASE_TAG = f"enact-ci-base:{SUITE}"
 BASE_PACKAGES = "python3,python3-pip,python3-venv,ca-certificates,usr-is-merged"
@@ -138,7 +138,7 @@ def wheels() -> Path:
     platforms += [f"manylinux2014_{machine}", f"linux_{machine}"]
 
     def make(folder: Path) -> None:
-        say("fetching wheels (260 MB, once)")
+        say("fetching wheels (380 MB, once)")
         run(
             *pip(), "download", "--quiet", "--only-binary=:all:", "--no-deps", "--require-hashes",
             "--python-version=3.11", "--implementation=cp",

@@ -28,7 +28,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from actors.geometry.files import write_whole
-from actors.running_cell import DemoError
+from actors.running_cell import DemoCell, DemoError
 from actors.workcell.demo_cell import EmbeddedCell, RunningCell
 from actors.workcell.demo_conduct import Conductor, recording
 from actors.workcell.demo_lineage import show_lineage, show_past, stop_checks
@@ -49,7 +49,6 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
-    from actors.running_cell import DemoCell
     from actors.workcell.demo_conduct import Notes
     from actors.workcell.demo_options import Options
     from enact_dist import Cell
@@ -113,7 +112,7 @@ def run_quietly(options: Options) -> Outcome:
 
 def _run(options: Options, console: Console) -> Outcome:
     options = with_recording(options, console)
-    running: DemoCell = EmbeddedCell(options) if options.embedded else RunningCell(options)
+    running = _cell_of(options)
     with running, running.joined() as cell:
         how = "in this process" if options.embedded else "a shard and processes are up"
         console.print(f"{how}; log in {running.log}")
@@ -123,6 +122,12 @@ def _run(options: Options, console: Console) -> Outcome:
             console.print(f"the cell stays up: enact world tree online --cell {running.config}")
             _until_interrupted(running)
     return outcome
+
+
+def _cell_of(options: Options) -> DemoCell:
+    if options.cell is not None:
+        return DemoCell(options.cell, log="the logs of its processes")
+    return EmbeddedCell(options) if options.embedded else RunningCell(options)
 
 
 def with_recording(options: Options, console: Console) -> Options:

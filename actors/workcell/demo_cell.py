@@ -10,15 +10,16 @@ from typing import TYPE_CHECKING, Any, Final, Self
 from actors import running_cell
 from actors.geometry.files import write_whole
 from actors.running_cell import DemoCell, placed, toml_of
+from actors.workcell.demo_options import Options
 from enact_dist import local
 from enact_dist.actor_load import configured_actor
 from enact_dist.actor_process import ActorThread
 from enact_dist.config import load_config
+from enact_dist.errors import ConfigError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from actors.workcell.demo_options import Options
     from enact_dist import Cell
 
 TEMPLATE: Final = Path(__file__).with_name("cell.toml")
@@ -32,6 +33,38 @@ DONE_BY_SMART: Final = (
     "actors.workcell.background:BackgroundSubtraction",
 )
 """What a smart camera does beside giving images."""
+
+
+def options_of(config: Path, out: Path, *, quiet: bool = False) -> Options:
+    """Return what the `cell.toml` of a cell that runs already says of its scenario.
+
+    Args:
+        config: The file; the args of its actor `setup` name scenario, seed, seconds and grid.
+        out: Folder for pictures, report, recording; it exists.
+        quiet: Print the report as JSON.
+
+    Raises:
+        ConfigError: The file cannot be used, or is not of a simulated workcell, or its scenario
+            breaks processes.
+    """
+    actors = load_config(config).actors
+    setup = next((one for one in actors if one.class_path.endswith(".setup:Setup")), None)
+    camera = next((one for one in actors if one.class_path in {CAMERA, SMART_CAMERA}), None)
+    if setup is None or camera is None:
+        raise ConfigError(
+            f"{config}: asked for a simulated workcell, with an actor"
+            " actors.workcell.setup:Setup and simulated cameras; found none; only of a simulated"
+            " one is the truth known",
+            path=str(config),
+        )
+    given: dict[str, Any] = {
+        name: value
+        for name, value in setup.options.items()
+        if name in {"scenario", "seed", "seconds", "voxel_m"}
+    }
+    source = str(camera.options.get("source", "live"))
+    separate = camera.class_path == CAMERA
+    return Options(out, source=source, separate=separate, quiet=quiet, cell=config, **given)
 
 
 def configured(template: str, options: Options) -> dict[str, Any]:

@@ -36,6 +36,7 @@ class Options:
             paper, in place of one `SmartCamera` per camera.
         quiet: Print the report as JSON in place of progress and table.
         keep_running: Leave the cell up afterwards, until Ctrl-C.
+        cell: The `cell.toml` of a cell whose processes run already, to be conducted and scored.
 
     Raises:
         ConfigError: There is no such scenario, a value is out of range, or the options contradict
@@ -52,6 +53,7 @@ class Options:
     separate: bool = False
     quiet: bool = False
     keep_running: bool = False
+    cell: Path | None = None
 
     def __post_init__(self) -> None:
         if not VOXEL_M_MIN <= self.voxel_m <= VOXEL_M_MAX:
@@ -72,4 +74,10 @@ class Options:
             raise ConfigError(
                 f"scenario {self.scenario} kills and freezes processes, and --embedded has one;"
                 " leave out one of both"
+            )
+        if self.cell is not None and scenario.faults:
+            raise ConfigError(
+                f"{self.cell}: scenario {self.scenario} kills and freezes processes, and those of"
+                " this cell run elsewhere; name another scenario in the args of its actor setup",
+                path=str(self.cell),
             )

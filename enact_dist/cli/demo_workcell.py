@@ -27,6 +27,7 @@ def add_to(verbs: argparse._SubParsersAction[Verb]) -> None:
         example="enact demo workcell\n"
         "enact demo workcell --scenario S3 --seconds 30 --seed 2 --out workcell\n"
         "enact demo workcell --live --json\n"
+        "enact demo workcell --cell cell.toml --out workcell\n"
         "enact demo workcell --cameras pictures --out hull",
     )
     demo.add_argument("--scenario", metavar="S", help="visit (the default) or S1 to S12")
@@ -49,6 +50,12 @@ def add_to(verbs: argparse._SubParsersAction[Verb]) -> None:
     demo.add_argument("--json", action="store_true", help="print the report as JSON")
     demo.add_argument(
         "--keep-running", action="store_true", help="leave the cell up afterwards, until Ctrl-C"
+    )
+    demo.add_argument(
+        "--cell",
+        type=Path,
+        metavar="FILE",
+        help="the cell.toml of a workcell that runs already, to be conducted and scored",
     )
     real = demo.add_argument_group("real pictures of calibrated cameras instead of the simulation")
     real.add_argument("--cameras", type=Path, metavar="FOLDER", help="pictures or masks")
@@ -87,7 +94,12 @@ def _run(arguments: argparse.Namespace) -> int:
     if arguments.cameras:
         return _run_folder(arguments, out)
     from actors.workcell.demo import record_views, run_demo
+    from actors.workcell.demo_cell import options_of
     from actors.workcell.demo_options import Options
+
+    if arguments.cell:
+        out.mkdir(parents=True, exist_ok=True)
+        return run_demo(options_of(arguments.cell, out, quiet=arguments.json))
 
     given: dict[str, Any] = {
         name: getattr(arguments, name, None)
@@ -141,6 +153,13 @@ def _refuse_mixture(arguments: argparse.Namespace) -> None:
         "separate",
     )
     real = ("grid", "unit", "frame", "key", "distortion")
+    if arguments.cell:
+        for name in (*simulated, *real, "cameras", "keep_running"):
+            if getattr(arguments, name) not in {None, False}:
+                raise ConfigError(
+                    f"--{name.replace('_', '-')} is the choice of those who started the cell that"
+                    " --cell names; leave out one of both"
+                )
     for names, fits, where in (
         (simulated, not arguments.cameras, "the simulated cell, not to --cameras"),
         (real, bool(arguments.cameras), "--cameras FOLDER"),

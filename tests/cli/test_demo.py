@@ -55,6 +55,8 @@ def test_missing_extra_is_named_with_its_command(enact, monkeypatch):
         (("--scenario", "S8", "--embedded"), "--embedded has one"),
         (("--cameras", "d", "--live"), "--live belongs to the simulated cell"),
         (("--grid", "64"), "--grid belongs to --cameras FOLDER"),
+        (("--cell", "c.toml", "--seed", "2"), "--seed is the choice of those who started the cell"),
+        (("--cell", "c.toml", "--cameras", "d"), "--cameras is the choice of those who started"),
     ],
 )
 def test_options_of_the_workcell_that_do_not_fit_are_refused(enact, words, reason, tmp_path):

@@ -14,7 +14,8 @@ TWO = ("--env-file", "deploy/multihost.env", *ONE, "--file", "deploy/compose.mul
     ("options", "services"),
     [
         (ONE, 12),
-        ((*ONE, "--profile", "tools"), 13),
+        ((*ONE, "--profile", "tools"), 14),
+        ((*ONE, "--profile", "workcell"), 32),
         ((*TWO, "--profile", "shards"), 5),
         ((*TWO, "--profile", "perception"), 7),
     ],

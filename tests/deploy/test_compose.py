@@ -6,7 +6,9 @@ from pathlib import Path
 import pytest
 
 from enact_dist.cli.main import build_parser
+from enact_dist.config import load_config
 
+WORKCELL = Path(__file__).parents[2] / "actors" / "workcell" / "cell.toml"
 TEXT = (Path(__file__).parents[2] / "deploy" / "compose.yaml").read_text("utf-8")
 
 
@@ -19,3 +21,18 @@ def test_a_shard_of_the_compose_file_drains_before_it_is_killed(name):
 
     assert (arguments.drain_s or 0.0) >= 5.0
     assert float(grace_s) > arguments.drain_s + 5.0
+
+
+def test_the_workcell_of_the_compose_file_runs_every_process_of_its_cell_once():
+    """A process that the cell gets runs in containers, too."""
+    cell = load_config(WORKCELL)
+    processes = {one.process or one.name for one in cell.actors}
+    found = re.findall(r"  workcell-[\w-]+:\n.*\n    command: \[actor, run, ([^\]]*)\]", TEXT)
+
+    run = [words.removeprefix("--process, ").partition(",")[0] for words in found]
+
+    assert sorted(run) == sorted(processes)
+    for words, name in zip(found, run, strict=True):
+        shared = any(one.process == name for one in cell.actors)
+        assert words.startswith("--process") == shared, name
+    assert [shard.name for shard in cell.shards] == re.findall(r"shard, run, (cell)", TEXT)
