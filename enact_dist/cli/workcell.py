@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from enact_dist.cli.output import ProgressLine, print_json, print_table
-from enact_dist.cli.verbs import DONE, FAILED, add_noun, add_verb, verbs_of
-from enact_dist.errors import ConfigError
+from enact_dist.cli.verbs import DONE, FAILED, add_noun, add_verb, verbs_of, whole
+from enact_dist.errors import ConfigError, EnactError
 
 if TYPE_CHECKING:
     from actors.geometry.charuco import Board
@@ -35,6 +35,7 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
         example="enact workcell calibrate --print-board board.pdf\n"
         "enact workcell calibrate pictures --origin 000\n"
         "enact workcell calibrate pictures --board 7x5,0.08,0.06,5X5_100 --json\n"
+        "enact workcell calibrate pictures --from 'v4l2:/dev/video0?size=640x480' --shots 20\n"
         "enact demo workcell --cameras pictures",
     )
     verb.add_argument(
@@ -79,6 +80,18 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
     )
     verb.add_argument("--k3", action="store_true", help="fit k3, too: wide lenses need it")
     verb.add_argument("--json", action="store_true", help="print the report as JSON")
+    live = verb.add_argument_group("pictures by cameras that are connected")
+    live.add_argument(
+        "--from",
+        dest="sources",
+        nargs="+",
+        metavar="ADDRESS",
+        help="take them into FOLDER first, whenever the board lies still in a new place; the"
+        " cameras are named 0, 1, 2 … in this order",
+    )
+    live.add_argument(
+        "--shots", type=whole, default=30, metavar="N", help="at how many places (default 30)"
+    )
 
 
 def place(text: str) -> tuple[float, float, float, float]:
@@ -118,6 +131,8 @@ def _calibrate(arguments: argparse.Namespace) -> int:
         raise ConfigError("name the folder of the pictures, or --print-board FILE")
     line = ProgressLine()
     try:
+        if arguments.sources:
+            _take(folder, board, arguments, line)
         report = _report_of(folder, board, arguments, line)
     except InputFileError as error:
         line.end()
@@ -130,6 +145,24 @@ def _calibrate(arguments: argparse.Namespace) -> int:
     for camera, why in report.left_out.items():
         print(f"enact workcell: camera {camera} is not in {report.file}: {why}", file=sys.stderr)
     return FAILED if report.left_out else DONE
+
+
+def _take(folder: Path, board: Board, arguments: argparse.Namespace, line: ProgressLine) -> None:
+    """Take pictures of the board.
+
+    Raises:
+        EnactError: A camera cannot be used.
+    """
+    from actors.workcell.board_shots import opened_sources, take_shots
+    from actors.workcell.sources import CameraError
+
+    try:
+        with opened_sources(arguments.sources) as sources:
+            take_shots(folder, sources, board, arguments.shots, tell=line.show)
+    except CameraError as error:
+        raise EnactError(str(error)) from error
+    finally:
+        line.end()
 
 
 def _report_of(

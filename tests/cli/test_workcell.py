@@ -27,6 +27,7 @@ def test_a_board_is_written_to_print(enact, tmp_path):
         (("--print-board", "b.jpg"), 2, "name a file that ends in .png, .svg, .pdf"),
         (("d", "--print-board", "b.png"), 2, "leave out FOLDER"),
         (("no-such-folder",), 1, "found no such folder; check the path"),
+        (("d", "--from", "v4l2:/dev/no-such?size=64x48"), 1, "found no such device or file"),
     ],
 )
 def test_what_cannot_be_done_is_one_line(enact, words, status, reason):
