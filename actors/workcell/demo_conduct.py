@@ -57,6 +57,8 @@ KEPT_EVERY_S: Final = 1.0
 """Shortest time between two updates of the nearest approach."""
 ASKED_S: Final = 10.0
 """So long the end of a run waits for what is being kept."""
+LOOKING_ON_NICE: Final = 10
+"""Nice value of the threads that record and look on: a tenth of the weight of an actor."""
 NEARER_M: Final = 0.05
 """The nearest approach is kept anew only if it is so much nearer."""
 
@@ -235,6 +237,7 @@ class Conductor:
             return
 
         def ask() -> None:
+            give_way()
             with contextlib.suppress(EnactError):  # a shard that dies keeps nothing
                 act()
 
@@ -332,6 +335,15 @@ def masks_of(tree: CauseTree) -> list[CauseTree]:
     return sorted(masks, key=lambda cause: str(cause.entity))
 
 
+def give_way() -> None:
+    """Let this thread run only where what it watches leaves a processor idle, or nearly so.
+
+    Who records or looks on must not make a robot's command late.
+    """
+    with contextlib.suppress(OSError):  # a host on which threads have no priority of their own
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), LOOKING_ON_NICE)
+
+
 @contextlib.contextmanager
 def recording(cell: Cell, path: Path) -> Iterator[None]:
     """Record a cell exactly, without messages for viewers, while the block runs.
@@ -348,6 +360,7 @@ def recording(cell: Cell, path: Path) -> Iterator[None]:
     stop, errors = threading.Event(), []
 
     def run() -> None:
+        give_way()
         try:
             recorder.run(stop)
         except (EnactError, OSError) as error:

@@ -1,7 +1,9 @@
 """Bench `workcell`: the application of ENACT 4.1 as processes, scored on its simulated truth.
 
 A run of `enact demo workcell` whose pictures are thrown away: every score with its goal, and the
-processor time of its processes.  Scenario `visit`, seed 1, views played, arm drawn.
+processor time of its processes.  Scenario `visit`, seed 1, views played, arm drawn.  Afterwards the
+same updates run without sharing, in one thread of this process; what the processes take beyond that
+is the framework's own share: shard, sessions, copies, and being processes.
 
 With `--embedded` its quality alone: S1 to S12 in simulated time, one after another in two
 processes.  Nothing of it depends on the machine but how long planning takes.
@@ -22,6 +24,8 @@ if TYPE_CHECKING:
     from enact_dist.bench.run import Run
 
 NAME: Final = "workcell"
+SHARE_CORES: Final = 0.3
+"""What the framework may take of the processors."""
 TIMES: Final = 20
 """The cell runs this many times as long as a line of another bench: 60 s by default."""
 EMBEDDED_TIMES: Final = 4
@@ -35,9 +39,12 @@ def run_workcell(run: Run) -> None:
         MisuseError: The extras of the workcell are not installed, or the cell failed.
     """
     try:
+        from rich.console import Console
+
         from actors.running_cell import DemoError
-        from actors.workcell.demo import run_quietly
+        from actors.workcell.demo import run_quietly, with_recording
         from actors.workcell.demo_options import Options
+        from actors.workcell.unshared import UnsharedCell
     except ImportError as error:
         raise MisuseError(
             f"bench workcell needs {error.name}, which is not installed; install its extras:"
@@ -49,14 +56,22 @@ def run_workcell(run: Run) -> None:
     seconds = TIMES * run.seconds_s
     run.told(f"workcell: {seconds:g} s, after about a minute of preparation")
     with tempfile.TemporaryDirectory(prefix="enact-bench-workcell-") as folder:
+        options = Options(Path(folder), seconds=seconds, quiet=True)
         try:
-            report = run_quietly(Options(Path(folder), seconds=seconds, quiet=True))
-        except DemoError as error:
+            report = run_quietly(options)
+            run.told(f"workcell: the same work without sharing, {seconds:g} s")
+            alone = UnsharedCell(with_recording(options, Console(quiet=True))).run()
+        except (DemoError, TimeoutError) as error:
             raise MisuseError(str(error)) from error
     _add_scores(run, report.scores)
     sets = round(report.scores.get("sets", 0.0))
     cores = report.cores
     run.add_row(value_row(NAME, "processors, all processes", sum(cores.values()), "cores", sets))
+    run.add_row(value_row(NAME, "the same work in one process, not shared", alone, "cores", sets))
+    share, goal_text = sum(cores.values()) - alone, f"≤ {SHARE_CORES:g}"
+    met = share <= SHARE_CORES
+    title = "the framework's own share"
+    run.add_row(value_row(NAME, title, share, "cores", sets, goal_text, met=met))
     for name in ("cell", "reconstruction", "camera-0"):
         if name in cores:
             title = "the shard" if name == "cell" else name

@@ -2,7 +2,10 @@
 
 import dataclasses
 import json
+import os
+import pickle
 import re
+import threading
 import tomllib
 from pathlib import Path
 
@@ -23,9 +26,11 @@ from actors.workcell.demo_pictures import figure4
 from actors.workcell.demo_report import markdown_of, report_of, value_text
 from actors.workcell.scenarios import Fault, scenario_of
 from actors.workcell.setup import Setup, grid_of
-from actors.workcell.trace import trace_of
+from actors.workcell.simulation.truth import TruthHuman
+from actors.workcell.trace import ASPECTS, trace_of
 from actors.workcell.truth_of_run import truth_of
-from enact_dist import Lock, Write, local, testing
+from actors.workcell.unshared import PlainEach, PlainLock, Version
+from enact_dist import Entity, Lock, View, Write, local, testing
 from enact_dist.config import load_config
 from enact_dist.errors import ConfigError
 
@@ -126,6 +131,50 @@ def test_a_recording_gives_back_what_was_committed(tmp_path):
     assert [one.datum.scale for one in kept] == [0.0, 0.5, 1.0]
     assert [one.stamp_ns for one in kept] == [1000, 1001, 1002]
     assert [one.committed_ns for one in kept] == sorted(one.committed_ns for one in kept)
+
+
+def test_who_looks_on_gives_way_to_the_cell():
+    """Only the thread that looks on: its process goes on as it was."""
+    found = []
+
+    def look_on():
+        demo_conduct.give_way()
+        found.append(os.getpriority(os.PRIO_PROCESS, threading.get_native_id()))
+
+    before = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
+    thread = threading.Thread(target=look_on)
+    thread.start()
+    thread.join()
+
+    assert found == [demo_conduct.LOOKING_ON_NICE]
+    assert os.getpriority(os.PRIO_PROCESS, threading.get_native_id()) == before
+
+
+def test_updates_without_sharing_do_what_they_do_in_a_cell():
+    """A set-up, and people of a scenario, leave the same data in a dictionary as on a shard."""
+    slots = {}
+    clock = testing.ManualClock()
+    tick_ns = clock.wall_ns()
+    actors = Setup("S2", 3, 12.0), TruthHuman()
+    start_ns = tick_ns - 4_000_000_000
+    playing = words.Playing("S2", 3, start_ns, 12.0, robot=True)
+    with testing.worlds("online", "truth", clock=clock) as cell:
+        for actor in actors:
+            testing.run_once(actor, cell)
+            actor.update(PlainLock(slots, None, tick_ns))
+            request = Write(cell.world("truth"), words.SCENARIO, words.PLAYING)
+            with Lock(request) as lock:
+                lock[request] = playing
+            slots["truth", words.SCENARIO.name, words.PLAYING.name] = Version(playing, 0, 2)
+        for (world, entity, aspect), version in slots.items():
+            request = View(cell.world(world), Entity(entity), ASPECTS[aspect])
+            there = cell.world(world).view(request)[request]
+            assert pickle.dumps(there) == pickle.dumps(version.datum)
+        assert ("truth", "human/0", "body") in slots
+        bodies = PlainEach(PlainLock(slots, None, tick_ns), ("truth", "human/*", "body"))
+        assert list(bodies) == [Entity("human/0")]
+        bodies.pop(Entity("human/0"))
+        assert not bodies
 
 
 def test_faults_do_not_go_with_one_process(tmp_path):
