@@ -1,10 +1,10 @@
 """Pockets: connected space that no camera can see and that is large enough to hold a person.
 
 A person who enters one disappears from view.  A pocket is *held* from the set on in which whatever
-visible touched it
-is gone, until as much visible volume stands beside it again; one that reaches the side of the grid
-may be entered unseen and is always held.  One that comes into being because a camera ceases to look
-is held if something was in it.
+visible touched it is gone, until as much visible volume stands beside it again; one that reaches
+the side of the grid may be entered unseen and is always held.  While something visible touches a
+pocket, the near part of it counts as occupied: a person half inside is only half seen.  One that
+comes into being because a camera ceases to look is held if something was in it.
 
 Rules a change must keep: a pocket smaller than a person is never held, because who reaches into it
 stays visible outside; when other cameras than before give silhouettes, what was held stays held.
@@ -135,6 +135,23 @@ class Pockets:
         if not self.count or not self.held.any():
             return np.zeros(len(rows), bool)
         return np.asarray(np.append(self.held, False)[self._of_row[rows]])
+
+    def entered(self, rows: Rows, touched: Flags, near: Flags) -> Flags:
+        """Return which voxels a person can reach into who stands in the opening of a pocket.
+
+        What of them is outside is seen, what is inside is not: it counts before they have vanished.
+
+        Args:
+            rows: (N,) voxels that no camera says to be free.
+            touched: Blocks (i, j, k) that something visible touches.
+            near: Blocks so near to something visible as a person reaches.
+        """
+        if not self.count:
+            return np.zeros(len(rows), bool)
+        pocket, block = self._of_row[rows], rows >> 6
+        inside = pocket >= 0
+        open_now = np.unique(pocket[inside & touched.ravel()[block]])
+        return np.asarray(inside & near.ravel()[block] & np.isin(pocket, open_now))
 
     def note(self, rows: Rows, component: Rows, visible: Flags) -> None:
         """Take what is occupied in a set.

@@ -83,6 +83,8 @@ SAYS_MIN: Final = 5
 """R5: so many cameras must have a say for one to be outvoted."""
 BLIND_SHARE: Final = 0.15
 """R5: a camera that alone denies more than this share of what the others leave is half blind."""
+ENTERED_BLOCKS: Final = 8
+"""So deep in a pocket are the unseen parts of who stands in its opening: an arm and a trunk."""
 NEIGHBOURS_MIN: Final = 14
 """A voxel of the tight set has at least so many of its 26 neighbours in it."""
 
@@ -343,9 +345,10 @@ class Refinement:
         visible = self._says[rows] > 0
         touched = np.zeros(shape, bool)
         touched.ravel()[rows[visible] >> 6] = True
-        touched = grown(touched, 1)
+        near, touched = grown(touched, ENTERED_BLOCKS), grown(touched, 1)
         held = self._pockets.held_voxels(rows)
         stays = visible | touched.ravel()[rows >> 6] | held
+        stays |= self._pockets.entered(rows, touched, near)
         counts["unseen"] = int(len(rows) - stays.sum())
         occupied = np.zeros(shape, bool)
         occupied.ravel()[rows[stays] >> 6] = True

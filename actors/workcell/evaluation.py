@@ -133,7 +133,8 @@ def score(trace: Trace, *, every: int = 1) -> dict[str, float]:
     samples = samples_of(trace, every=every)
     if len(samples["share"]):
         samples |= beside(truth.scenario)
-    return in_order(_rates(trace, truth) | _latencies(trace, truth) | scores_of([samples]))
+    of_run = _rates(trace, truth) | _latencies(trace, truth) | reaction_of(trace, truth)
+    return in_order(of_run | scores_of([samples]))
 
 
 def in_order(scores: Mapping[str, float]) -> dict[str, float]:
@@ -158,7 +159,6 @@ def samples_of(trace: Trace, *, every: int = 1) -> Samples:
         "track": _tracks(trace, truth),
         **_planning(trace, truth),
         **safety_of(trace, truth),
-        **reaction_of(trace, truth),
     }
     return {name: np.asarray(values, np.float64) for name, values in found.items()}
 

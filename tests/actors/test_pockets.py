@@ -107,3 +107,22 @@ def test_when_other_cameras_look_what_was_held_stays_held(larger):
     assert after.held.all()
     note(after, rows_of((28, 16, 20), (31, 20, 23)))
     assert after.held.all()
+
+
+def test_who_stands_in_the_opening_can_reach_the_near_part():
+    """What is unseen and near counts at once; so does nothing of a pocket that nobody touches."""
+    pockets = pockets_of(HIDDEN)
+    blocks = np.zeros(GRID.block_shape, bool)
+    blocks.ravel()[BESIDE >> 6] = True
+    near = np.zeros(GRID.block_shape, bool)
+    near[5:] = True  # i from 20 on: one of two blocks
+    rows = np.concatenate([HIDDEN, BESIDE])
+    touched = blocks.copy()
+    touched[5] |= blocks[6]
+
+    entered = pockets.entered(rows, touched, near)
+
+    i = GRID.indices(rows)[:, 0]
+    assert set(rows[entered]) == set(HIDDEN) & set(rows[i >= 20])
+    assert entered.any()
+    assert not pockets.entered(rows, np.zeros_like(blocks), near).any()

@@ -54,6 +54,9 @@ def test_the_robot_obeys_what_the_cameras_see_after_the_latency():
     """Hull, speed and path of each tick bear its stamp; a run again is the same, bit by bit."""
     scenario = scenario_of("S2", 1, 2.2)  # the person comes in after 1.8 s
     (found, trace), (again, other) = (played(scenario) for _ in range(2))
+    both = scores_of([samples_of(trace), samples_of(other)])
+    assert both["true_voxels"] == 2.0 * found["true_voxels"]
+    assert both["distance_p1_m"] == pytest.approx(found["distance_p1_m"])
     hulls = trace.of(words.WORKSPACE.name, words.HULL)
     speeds = trace.of(words.ROBOT.name, words.SPEED)
     done = trace.of(words.ROBOT.name, words.EXECUTION)
