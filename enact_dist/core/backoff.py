@@ -51,7 +51,8 @@ class Backoff:
 class SignsOfLife:
     """Whom a session sends its next signs of life: shards in reach each time, others rarely.
 
-    Those that are away are asked together, and all of them at once when another one goes.
+    Those that are away are asked together, the first time a pause after the last of them went: no
+    sign of life reaches a shard that has just left.
 
     Args:
         draw: Returns numbers in [0, 1).
@@ -80,7 +81,8 @@ class SignsOfLife:
         shards = list(shards)
         gone = frozenset(shard for shard in shards if away(shard))
         if gone - self.gone:
-            self._backoff, self._at_ns = Backoff(AWAY_NS_MIN, AWAY_NS_MAX, self._draw), now_ns
+            self._backoff = Backoff(AWAY_NS_MIN, AWAY_NS_MAX, self._draw)
+            self._at_ns = now_ns + self._backoff.pause_ns()
         self.gone = gone
         asks = now_ns >= self._at_ns
         if gone and asks:
