@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import signal
 import sys
 import time
 from dataclasses import dataclass
@@ -70,11 +71,14 @@ def run_demo(options: Options) -> int:
 
     console = Console(highlight=False, stderr=options.quiet)
     begun_s = time.monotonic()
+    before = signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     try:
         outcome = _run(options, console)
     except (DemoError, CameraError) as error:
         print(f"enact demo: {error}", file=sys.stderr)
         return 1
+    finally:
+        signal.signal(signal.SIGTERM, before)
     if options.quiet:
         sys.stdout.write(report_bytes(outcome.report).decode())
     console.print(f"pictures in {options.out}; {time.monotonic() - begun_s:.0f} s in all")
