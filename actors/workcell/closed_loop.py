@@ -262,6 +262,7 @@ class ClosedLoop:
 
     def _know(self, cell: Cell, tick: int) -> None:
         """Let the robot know the truth in place of what cameras see."""
+        self._put(cell, words.SYSTEM, words.CAMERA_STATES, {}, self._clock.wall_ns())
         at_s = tick * words.PERIOD_S
         if self.sight is Sight.ORACLE:
             hull = self._truth.hull_at(at_s, self._motion.q_rad)

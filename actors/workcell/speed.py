@@ -38,6 +38,8 @@ if TYPE_CHECKING:
 
 MISFITS_MAX = 2
 """More cameras than this whose background no longer fits are a fault."""
+STATES_S = 0.5
+"""Older states of the cameras tell nothing: their misfits would stay what they were."""
 AHEAD_S = 0.15
 """How far along the path the share of the nominal speed is worked out."""
 
@@ -67,6 +69,7 @@ def judged(
     nominal_m_s: float,
     separation: Separation,
     latest_s: float,
+    states_age_s: float,
     misfits: int = 0,
     without_path: str = "",
 ) -> Verdict:
@@ -79,6 +82,7 @@ def judged(
         nominal_m_s: Speed of the fastest point on the path without a limit.
         separation: The quantities of the protective distance.
         latest_s: Oldest exposure, and oldest sample of the joints, on which the robot may move.
+        states_age_s: Age of the cameras' states at the exposure; infinite if there are none.
         misfits: Cameras whose background no longer fits.
         without_path: Why there is no path; empty if there is one.
     """
@@ -88,6 +92,12 @@ def judged(
     if age_s < -FUTURE_NS / 1e9:
         cause = "the cameras' clock is ahead"
         text = f"the newest set is {-1e3 * age_s:.0f} ms ahead of this host's clock"
+        return Verdict("fault", 0.0, cause, text)
+    if states_age_s > STATES_S:
+        cause = "the camera watch is silent"
+        text = "CameraWatch has not written the state of the cameras"
+        if states_age_s < math.inf:
+            text += f" in the {1e3 * states_age_s:.0f} ms before the exposure"
         return Verdict("fault", 0.0, cause, text)
     if joints_age_s > latest_s:
         cause = "the robot does not tell where it is"
@@ -183,6 +193,11 @@ class SpeedControl(Actor):
             nominal_m_s=nominal_m_s,
             separation=separation,
             latest_s=self.latest_s,
+            states_age_s=(
+                math.inf
+                if lock.is_null(self.cameras)
+                else max(0.0, (captured_ns - lock.stamp_ns(self.cameras)) / 1e9)
+            ),
             misfits=sum(state.trouble == "background no longer fits" for state in states.values()),
             without_path=_missing(path),
         )

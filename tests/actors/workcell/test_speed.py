@@ -39,6 +39,7 @@ SOUND = {
     "nearest_m": math.inf,
     "age_s": 0.06,
     "joints_age_s": 0.0,
+    "states_age_s": 0.05,
     "nominal_m_s": 1.0,
     "separation": SEPARATION,
     "latest_s": 0.25,
@@ -58,6 +59,9 @@ SOUND = {
         ({"age_s": -0.03}, "fault", "30 ms ahead of this host's clock"),
         ({"age_s": -0.01}, "run", ""),
         ({"joints_age_s": 0.3}, "fault", "300 ms before the exposure"),
+        ({"states_age_s": 0.5}, "run", ""),
+        ({"states_age_s": 0.6}, "fault", "in the 600 ms before the exposure"),
+        ({"states_age_s": math.inf}, "fault", "CameraWatch has not written"),
         ({"misfits": 2}, "run", ""),
         ({"misfits": 3}, "fault", "the background no longer fits in 3 cameras"),
     ],
@@ -92,6 +96,7 @@ class Cell:
     def __init__(self, cell):
         self.cell, self.online, self.actor = cell, cell.world("online"), SpeedControl()
         self.online.init(ROBOT, MODEL, ARM)
+        self.put(SYSTEM, CAMERA_STATES, {}, time.time_ns())
 
     def put(self, entity, aspect, value, stamp_ns=0):
         request = Write(self.online, entity, aspect)
@@ -199,6 +204,25 @@ def test_silent_robot_and_missing_path_are_said(cell):
     )
 
 
+@pytest.mark.parametrize("age_ms", [700, None])
+def test_a_silent_camera_watch_is_a_fault(cell, age_ms):
+    """Without the watch no camera would ever be known to misfit again."""
+    cell.joints(time.time_ns())
+    cell.path(HOME_RAD, AWAY)
+    sound = cell.judge(2.0)
+    if age_ms is None:
+        with Lock(request := Write(cell.online, SYSTEM, CAMERA_STATES)) as lock:
+            del lock[request]
+    else:
+        cell.put(SYSTEM, CAMERA_STATES, {}, time.time_ns() - age_ms * MS)
+
+    fault = cell.judge(2.0)
+
+    assert sound.limit_m_s > 0.0 == fault.limit_m_s
+    state = cell.get(SYSTEM, SAFETY)
+    assert (state.state, state.reason) == ("fault", "the camera watch is silent")
+
+
 def test_cameras_are_named(cell):
     """A camera for which another stands in is named; three that do not fit are a fault."""
     cell.joints(time.time_ns())
@@ -206,10 +230,11 @@ def test_cameras_are_named(cell):
     states = {
         f"camera/{n}": CameraState(n != 3, 0, 0, "silent" if n == 3 else "") for n in range(8)
     }
-    cell.put(SYSTEM, CAMERA_STATES, states)
+    cell.put(SYSTEM, CAMERA_STATES, states, time.time_ns())
     without = cell.judge(2.0)
     misfit = CameraState(alive=True, last_ns=0, sets_missed=0, trouble="background no longer fits")
-    cell.put(SYSTEM, CAMERA_STATES, {**states, **{f"camera/{n}": misfit for n in range(3)}})
+    misfits = {**states, **{f"camera/{n}": misfit for n in range(3)}}
+    cell.put(SYSTEM, CAMERA_STATES, misfits, time.time_ns())
 
     fault = cell.judge(2.0)
 
