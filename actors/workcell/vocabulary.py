@@ -393,7 +393,7 @@ _FLOW: Final = Durability.VOLATILE
 
 CALIBRATION: Final = Aspect("calibration", Calibration, Durability.DURABLE)
 """Where a camera stands (camera/*)."""
-IMAGE: Final = Aspect("image", np.ndarray, _FLOW, retention=Retention(versions=4))
+IMAGE: Final = Aspect("image", np.ndarray, _FLOW, retention=Retention(versions=16))
 """(H, W, 3) uint8, BGR, as captured (camera/*)."""
 BACKGROUND: Final = Aspect("background", Background, Durability.OS)
 """The empty cell (camera/*)."""
