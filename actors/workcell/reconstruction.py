@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections import deque
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -21,6 +22,7 @@ from actors.workcell.vocabulary import (
     CAMERAS,
     GRID,
     HULL,
+    IMAGES_COMPARED,
     JOINTS,
     MODEL,
     OBSTACLES,
@@ -64,14 +66,15 @@ _SILHOUETTES: Final = Together(
 class Reconstruction(Actor):
     """Intersect the silhouettes of all cameras, and take out what is known.
 
-    A camera that gives no silhouette, a stand-in, or the image of the last set once more, vetoes
+    A camera that gives no silhouette, a stand-in, or the image of one of the last four sets, vetoes
     nothing: its rays count as occupied, the hull can only grow.  `Hull.cameras` names those that
     did.  Without joints that tell where the robot was at the exposure nothing is taken for the
     robot, and everything is at distance 0.
 
     Attributes:
         robot: There is one; False for a cell of cameras only: everything is infinitely far from it.
-        stuck: An image that equals the last one counts as none; False for pictures without noise.
+        stuck: An image that equals one of the last four counts as none; False for pictures without
+            noise.
     """
 
     online = _ONLINE
@@ -98,7 +101,7 @@ class Reconstruction(Actor):
         self._made_of: object = None
         self._made: tuple[Refinement, VoxelBlocks] | None = None
         self._last_ns = self._written_ns = 0
-        self._checksums: dict[str, int] = {}
+        self._checksums: dict[str, deque[int]] = {}
 
     def start(self) -> None:
         """Let OpenCV work in the actor's own thread."""
@@ -192,8 +195,9 @@ class Reconstruction(Actor):
             if silhouette is None or silhouette.stand_in:
                 continue
             checksum = silhouette.image_checksum
-            again = self.stuck and checksum and checksum == self._checksums.get(name)
-            self._checksums[name] = checksum
+            before = self._checksums.setdefault(name, deque(maxlen=IMAGES_COMPARED))
+            again = self.stuck and checksum and checksum in before
+            before.append(checksum)
             if not again:
                 given[name] = silhouette.packed
         return given

@@ -46,6 +46,8 @@ CAMERA_COUNT: Final = 8
 """Cameras of the cell in its delivered configuration."""
 PERIOD_S: Final = 0.1
 """Period of the capture and of all that follows from it."""
+IMAGES_COMPARED: Final = 4
+"""An image that equals one of so many before it is stuck: a driver may alternate its buffers."""
 JOINT_COUNT: Final = 7
 """Joints of the arm."""
 JOINTS_KEPT: Final = 30
@@ -96,8 +98,8 @@ class Silhouette:
         packed: (H, W / 8) uint8, `numpy.packbits` along the rows; a set bit is foreground.
         foreground_px: Number of set bits.
         stand_in: The camera gave no image: all bits are set, so that it vetoes nothing.
-        image_checksum: CRC-32 of the image; the same in two sets means that the image is stuck.
-            0 of a stand-in and of a mask that came as a mask.
+        image_checksum: CRC-32 of the image; that of one of the last sets means that the image is
+            stuck.  0 of a stand-in and of a mask that came as a mask.
     """
 
     packed: npt.NDArray[np.uint8]

@@ -19,6 +19,7 @@ from actors.workcell.vocabulary import (
     CAMERA_COUNT,
     CAMERA_STATES,
     CAMERAS,
+    IMAGES_COMPARED,
     PERIOD_S,
     SILHOUETTE,
     SYSTEM,
@@ -41,14 +42,14 @@ class Seen(NamedTuple):
 
     Attributes:
         last_ns: Stamp of the newest.
-        checksum: Of its image.
-        alike: How many before it, in a row, were of the same image.
+        checksums: Of its image and of those before it, the newest first, `IMAGES_COMPARED` in all.
+        alike: How many in a row, up to it, were an image of those before.
         foreground: Share of the image that is foreground.
         missed: Sets without it, since its first.
     """
 
     last_ns: int = 0
-    checksum: int = 0
+    checksums: tuple[int, ...] = ()
     alike: int = 0
     foreground: float = 0.0
     missed: int = 0
@@ -57,11 +58,12 @@ class Seen(NamedTuple):
         """Return what is known when another silhouette has come."""
         if silhouette.stand_in or captured_ns <= self.last_ns:
             return self
-        same = silhouette.image_checksum != 0 and silhouette.image_checksum == self.checksum
+        checksum = silhouette.image_checksum
+        same = checksum != 0 and checksum in self.checksums
         share = silhouette.foreground_px / (8 * silhouette.packed.size)
         return Seen(
             captured_ns,
-            silhouette.image_checksum,
+            (checksum, *self.checksums)[:IMAGES_COMPARED],
             self.alike + 1 if same else 0,
             share,
             self.missed,
@@ -72,9 +74,9 @@ class CameraWatch(Actor):
     """Tell how each calibrated camera does, at every tick.
 
     A camera is silent if it gave no silhouette for the tick before: it is dead, frozen, or its
-    stamps stand still.  It is stuck if its images are the same bit by bit, and its background no
-    longer fits if too much of the image is foreground.  `absent_ns` asks for a stand-in for each
-    silent camera, as long as one camera lives.
+    stamps stand still.  It is stuck if its images are, bit by bit, among its last four.  Its
+    background no longer fits if too much of the image is foreground.  `absent_ns` asks for a
+    stand-in for each silent camera, as long as one camera lives.
     """
 
     online = World("online")
@@ -94,7 +96,7 @@ class CameraWatch(Actor):
     late_s: float = 0.15
     """Longest time between a tick and the stamp of the newest silhouette."""
     alike_max: int = 1
-    """Silhouettes of one image in a row, after the first, that are no trouble yet."""
+    """Silhouettes in a row of an image that came before, that are no trouble yet."""
     foreground_max: float = 0.3
     """Greatest share of foreground that a background still fits."""
 

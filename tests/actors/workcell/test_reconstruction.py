@@ -221,6 +221,17 @@ def test_a_stand_in_and_a_stuck_image_veto_nothing_and_are_not_named(cell):
     assert before <= voxels_of(hull)
 
 
+def test_a_camera_whose_buffers_alternate_vetoes_nothing(cell):
+    """The image of the set before the last one is stuck, too."""
+    actor = Reconstruction()
+    for number, checksum in enumerate((7, 8, 7)):
+        for camera, bits in enumerate(masks()):
+            mine = checksum if camera == 5 else 10 + number
+            give(cell, camera, bits, FIRST_NS + number * PERIOD_NS, image_checksum=mine)
+        testing.run_once(actor, cell)
+    assert seen(cell)[0].cameras == tuple(f"camera/{n}" for n in range(8) if n != 5)
+
+
 def test_pictures_without_noise_may_be_equal(cell):
     """With `stuck` off, equal images count."""
     actor = Reconstruction(stuck=False)

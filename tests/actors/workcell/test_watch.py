@@ -149,6 +149,17 @@ def test_image_that_repeats_is_stuck(cell):
     assert cell.states()["camera/2"].trouble == ""
 
 
+def test_buffers_that_alternate_are_stuck(cell):
+    """A driver that gives its old buffers in turn repeats no image at once."""
+    cell.tick(0, 1, 2)
+    for checksum in (70, 71, 72, 73) * 2:
+        cell.tick(0, 1)
+        cell.give(2, checksum=checksum)
+    cell.tick(0, 1, 2)
+
+    assert cell.troubles() == ["", "", "stuck"]
+
+
 def test_masks_without_images_are_never_stuck(cell):
     """A checksum of 0 says that there was no image to compare."""
     for _ in range(5):
