@@ -22,7 +22,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Final
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Self
 
 from enact_dist.errors import MisuseError
 from enact_dist.outcome import Outcome, outcome_of
@@ -145,6 +145,20 @@ class Actor:
         """
         super().__init_subclass__(**options)
         cls.declaration = Declaration.of(cls)
+
+    @classmethod
+    def of_options(cls, options: Mapping[str, object]) -> type[Self]:  # noqa: ARG003
+        """Return the class whose declaration follows from options; an actor is made of that one.
+
+        A class overrides it where an option decides what it declares, such as the number of views.
+
+        Args:
+            options: As of `__init__`, as `cell.toml` or a command line gives them, converted.
+
+        Raises:
+            ValueError: There is no such class for these options.
+        """
+        return cls
 
     def update(self, lock: Lock) -> None:
         """Do what this actor is for, once; the only method that must be overridden.

@@ -35,6 +35,7 @@ pattern says.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from enact_dist.actor_flows import streams, unstamped_sets
@@ -54,6 +55,7 @@ from enact_dist.user_code import raised
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
+    from enact_dist.actor import Actor
     from enact_dist.actor_uses import Use
     from enact_dist.config_types import CellConfig
 
@@ -134,10 +136,12 @@ def declarations_of(config: CellConfig) -> tuple[list[ActorDeclaration], list[Fi
         try:
             actor_class = load_class(actor.class_path)
             only = Entity(actor.entity) if actor.entity else actor_class.only_entity
-            actors.append(
-                ActorDeclaration(actor.name, actor_class, actor.worlds or None, only, actor.every_s)
+            declared = ActorDeclaration(
+                actor.name, actor_class, actor.worlds or None, only, actor.every_s
             )
-            read_options(actor_class, actor.options)
+            actors.append(declared)
+            chosen = _of_options(actor_class, read_options(actor_class, actor.options))
+            actors[-1] = replace(declared, actor_class=chosen)
             if actor.every_s is not None:
                 check_every_s(actor_class, actor.every_s)
         except MisuseError as error:
@@ -148,6 +152,18 @@ def declarations_of(config: CellConfig) -> tuple[list[ActorDeclaration], list[Fi
             text = f"actor {actor.name} ({actor.class_path}): {raised(error.__cause__ or error)}"
             findings.append(Finding("error", "broken module", (actor.name,), text))
     return actors, findings
+
+
+def _of_options(actor_class: type[Actor], options: Mapping[str, object]) -> type[Actor]:
+    """Return the class that options make of one.
+
+    Raises:
+        ConfigError: It refuses them.
+    """
+    try:
+        return actor_class.of_options(options)
+    except ValueError as error:
+        raise ConfigError(f"{actor_class.__name__} refuses its options: {error}") from error
 
 
 def _sets(

@@ -169,7 +169,8 @@ def make_actor(actor_class: type[Actor], options: Mapping[str, object]) -> Actor
     changeable = attributes_of(actor_class)
     at_start = inspect.signature(actor_class).parameters
     try:
-        actor = actor_class(**{key: arguments[key] for key in arguments if key in at_start})
+        chosen = actor_class.of_options(arguments)
+        actor = chosen(**{key: arguments[key] for key in arguments if key in at_start})
         for key in arguments.keys() & changeable.keys() - at_start.keys():
             setattr(actor, key, arguments[key])
     except ValueError as error:

@@ -39,7 +39,7 @@ import numpy as np
 
 from actors.geometry.capsules import distance_to_points, fill, outlines
 from actors.geometry.pockets import Pockets
-from actors.geometry.silhouettes import packed
+from actors.geometry.silhouettes import packed, unpacked
 from actors.geometry.visibility import seen_by, static_voxels
 
 if TYPE_CHECKING:
@@ -49,6 +49,7 @@ if TYPE_CHECKING:
 
     from actors.geometry.visibility import Calibrated
     from actors.geometry.visual_hull import VisualHull
+    from actors.geometry.voxels import VoxelBlocks
 
     Bits = npt.NDArray[np.uint8]
     Flags = npt.NDArray[np.bool_]
@@ -85,6 +86,8 @@ BLIND_SHARE: Final = 0.15
 """R5: a camera that alone denies more than this share of what the others leave is half blind."""
 ENTERED_BLOCKS: Final = 8
 """So deep in a pocket are the unseen parts of who stands in its opening: an arm and a trunk."""
+NEAREST_M: Final = 0.5
+"""Nobody is nearer to a camera."""
 NEIGHBOURS_MIN: Final = 14
 """A voxel of the tight set has at least so many of its 26 neighbours in it."""
 
@@ -144,6 +147,28 @@ class _Beside:
         )
 
 
+def moved_px(grid: VoxelBlocks, camera: Calibrated, moved_m: float) -> int:
+    """Return by how many pixels something in the grid moves at most in an image.
+
+    Args:
+        grid: The voxels; what is nearer to the camera than `NEAREST_M` is left out.
+        camera: Its calibration.
+        moved_m: How far it moves.
+    """
+    if not moved_m:
+        return 0
+    rotation, shift = camera.camera_from_cell[:3, :3], camera.camera_from_cell[:3, 3]
+    eye_m = -rotation.T @ shift
+    high_m = grid.origin_m + grid.voxel_m * np.array(grid.shape)
+    away_m = float(np.linalg.norm(eye_m - eye_m.clip(grid.origin_m, high_m)))
+    matrix = camera.camera_matrix
+    corners_px = np.array([(x, y) for x in (0, camera.width) for y in (0, camera.height)])
+    slopes = (corners_px - matrix[:2, 2]) / matrix[[0, 1], [0, 1]]
+    oblique = 1.0 + float((slopes**2).sum(1).max())
+    focal_px = float(max(matrix[0, 0], matrix[1, 1]))
+    return int(np.ceil(focal_px * moved_m * oblique / max(away_m, NEAREST_M)))
+
+
 class Refinement:
     """Turns sets of silhouettes into what is occupied, set by set.
 
@@ -151,11 +176,19 @@ class Refinement:
         hull: The visual hull of the cell's cameras.
         calibrations: Of the same cameras, in the same order.
         boxes: Static obstacles, (n, 15) each: centre, half sizes, rotation; cell frame.
+        moved_m: How far people move between the exposures of a set.  Silhouettes grow by it, but
+            not from the robot's outlines, so that each camera leaves who was there at the first.
     """
 
     def __init__(
-        self, hull: VisualHull, calibrations: Sequence[Calibrated], boxes: Sequence[Numbers]
+        self,
+        hull: VisualHull,
+        calibrations: Sequence[Calibrated],
+        boxes: Sequence[Numbers],
+        *,
+        moved_m: float = 0.0,
     ) -> None:
+        self._moved_px = [moved_px(hull.grid, camera, moved_m) for camera in calibrations]
         self._hull, self._grid = hull, hull.grid
         self._cameras = [(c.camera_matrix, c.distortion, c.camera_from_cell) for c in calibrations]
         self._sizes = [(c.height, c.width) for c in calibrations]
@@ -186,12 +219,12 @@ class Refinement:
             ValueError: Silhouettes of another number or size than the calibrations.
         """
         self._note_live(tuple(n for n, bits in enumerate(silhouettes) if bits is not None))
-        self._hull.load(self._with_robot(silhouettes, robot))
+        outline = self._explaining(robot)
+        self._hull.load(self._with_robot(self._moved(silhouettes, outline), robot))
         raw = self._hull.carve(self._all_blocks)
         counts = {"raw": len(raw)}
         rows = raw[~self._static[raw]]
         counts["static"] = len(raw) - len(rows)
-        outline = self._explaining(robot)
         kept = self._possible(rows, elapsed_s, robot, outline)
         counts["unreachable"] = len(rows) - len(kept)
         counts["robot"] = counts["explained"] = 0
@@ -219,6 +252,25 @@ class Refinement:
             drawn = packed(mask)
             fits = bits is not None and bits.shape == drawn.shape
             result.append(bits | drawn if bits is not None and fits else bits)
+        return result
+
+    def _moved(
+        self, silhouettes: Sequence[Bits | None], outline: list[npt.NDArray[np.uint8]]
+    ) -> list[Bits | None]:
+        """Return silhouettes grown by how far people move between the exposures."""
+        import cv2
+
+        result = list(silhouettes)
+        for number, (bits, size) in enumerate(zip(silhouettes, self._sizes, strict=True)):
+            px = self._moved_px[number]
+            if px and bits is not None and bits.shape == (size[0], -(-size[1] // 8)):
+                seen = unpacked(bits, size[1])
+                if outline:
+                    seen[outline[number] > 0] = 0
+                edge = 2 * px + 1
+                result[number] = bits | packed(
+                    np.asarray(cv2.dilate(seen, np.ones((edge, edge), np.uint8)), np.uint8)
+                )
         return result
 
     def _drawn(self, robot: Numbers) -> list[npt.NDArray[np.uint8]]:

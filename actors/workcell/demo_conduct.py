@@ -69,6 +69,7 @@ class Notes:
 
     Attributes:
         start_ns: Stamp of second 0.
+        cameras: How many the cell has.
         stop: Where the first stop came from; None without one.
         nearest_m: Nearest estimated distance.
         nearest_ns: Exposure of it.
@@ -79,6 +80,7 @@ class Notes:
     """
 
     start_ns: int = 0
+    cameras: int = words.CAMERA_COUNT
     stop: CauseTree | None = None
     nearest_m: float = math.inf
     nearest_ns: int = 0
@@ -122,7 +124,8 @@ class Conductor:
             lambda: [] if self._online.view(grid).get(grid) is not None else ["setup"], "missing"
         )
         self._write(ONLINE, words.WORKSPACE, words.EMPTY, time.time_ns())
-        cameras = {words.camera_entity(number).name for number in range(words.CAMERA_COUNT)}
+        cameras = self._with("calibration")
+        self.notes.cameras = len(cameras)
         self._wait(lambda: cameras - self._with("background"), "cameras without a background")
         self._tell("the operator confirmed the empty cell; backgrounds are learned")
         period_ns = round(words.PERIOD_S * 1e9)
@@ -246,14 +249,14 @@ class Conductor:
 
     def _keep_stop(self) -> None:
         tree = self._tree()
-        if tree is not None and len(masks_of(tree)) == words.CAMERA_COUNT:
+        if tree is not None and len(masks_of(tree)) == self.notes.cameras:
             self._label("first-stop", tree)
             self.notes.stop = tree
 
     def _keep(self) -> None:
         """Keep the newest set and what was made of it, if it is the nearest one of all masks."""
         tree = self._tree()
-        if tree is None or len(masks_of(tree)) < words.CAMERA_COUNT:
+        if tree is None or len(masks_of(tree)) < self.notes.cameras:
             return
         then = self._online.at(stamp_ns=tree.stamp_ns)
         request = View(then, words.ROBOT, words.SPEED)

@@ -60,13 +60,13 @@ def stop_checks(notes: Notes) -> dict[str, bool]:
     tree = notes.stop
     masks = masks_of(tree) if tree is not None else []
     stamps = {mask.stamp_ns for mask in masks}
-    whole = len(masks) == words.CAMERA_COUNT and len(stamps) == 1
+    whole = len(masks) == notes.cameras and len(stamps) == 1
     images = {
         cause.entity
         for cause in (tree.walk() if tree is not None else ())
         if str(cause.aspect) == words.IMAGE.name and cause.stamp_ns in stamps
     }
     return {
-        f"the first stop leads to {words.CAMERA_COUNT} masks of one stamp": whole,
+        f"the first stop leads to {notes.cameras} masks of one stamp": whole,
         "and to their images": whole and images == {mask.entity for mask in masks},
     }

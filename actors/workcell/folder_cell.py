@@ -29,7 +29,7 @@ from actors.workcell.vocabulary import (
     Silhouette,
     camera_entity,
 )
-from enact_dist import Lock, Together, View, Write, local
+from enact_dist import Lock, View, Write, local
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -72,7 +72,9 @@ def hull_by_actors(shots: Sequence[Shot], grid: VoxelBlocks) -> npt.NDArray[np.i
         online.init(WORKSPACE, GRID, Grid(scale * grid.origin_m, scale * grid.voxel_m, grid.shape))
         for number, shot in enumerate(shots):
             online.init(camera_entity(number), CALIBRATION, _calibration(shot.camera, scale))
-        actors = [BackgroundSubtraction(), _reconstruction(len(shots))]
+        count = len(shots)
+        found_by = Reconstruction.of(count, least=count)(robot=False, stuck=False)
+        actors = [BackgroundSubtraction(), found_by]
         with (
             online.watch(str(WORKSPACE), HULL) as watch,
             running(actors, cell) as failures,
@@ -90,16 +92,6 @@ def _calibration(camera: SetCamera, scale: float) -> Calibration:
     pose = camera.camera_from_cell.copy()
     pose[:3, 3] *= scale
     return Calibration(camera.camera_matrix, camera.distortion, pose, camera.width, camera.height)
-
-
-def _reconstruction(count: int) -> Reconstruction:
-    """Return the reconstruction of a cell with so many cameras."""
-    every = Together(
-        [View(Reconstruction.online, camera_entity(number), SILHOUETTE) for number in range(count)]
-    )
-    kind = type("Reconstruction", (Reconstruction,), {"silhouettes": every, "triggers": (every,)})
-    found: Reconstruction = kind(robot=False, stuck=False)
-    return found
 
 
 def _write(online: WorldContext, shots: Sequence[Shot]) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Self
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from actors.workcell.vocabulary import (
     JOINTS,
     MODEL,
     OBSTACLES,
+    PERIOD_S,
     RAW_HULL,
     ROBOT,
     SILHOUETTE,
@@ -41,6 +42,8 @@ from actors.workcell.vocabulary import (
 from enact_dist import Actor, Together, View, ViewEach, World, Write
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     import numpy.typing as npt
 
     from actors.geometry.visibility import CameraTable
@@ -54,13 +57,20 @@ AHEAD_NS_MAX: Final = 100_000_000
 VOXELS_MAX: Final = 150_000
 """A hull of more voxels, ten times those of a person, keeps the nearest to the robot: all cameras
 in the dark fill the grid, and 100 versions of that would take 3 GB of the shard."""
+HUMAN_M_S: Final = 1.6
+"""Speed of a person, ISO/TS 15066, as in speed control."""
 GAP_S: Final = 0.5
 """After so long without a hull a late one is better than none: it says why the robot stands."""
 
 _ONLINE: Final = World("online")
-_SILHOUETTES: Final = Together(
-    [View(_ONLINE, camera_entity(number), SILHOUETTE) for number in range(CAMERA_COUNT)], least=1
-)
+
+
+def _sets(cameras: int, within_s: float, least: int) -> Together[Silhouette]:
+    views = [View(_ONLINE, camera_entity(number), SILHOUETTE) for number in range(cameras)]
+    return Together(views, least=least, within_s=within_s)
+
+
+_SILHOUETTES: Final = _sets(CAMERA_COUNT, 0.0, 1)
 
 
 class Reconstruction(Actor):
@@ -73,6 +83,9 @@ class Reconstruction(Actor):
 
     Attributes:
         robot: There is one; False for a cell of cameras only: everything is infinitely far from it.
+        within_s: How far the exposures of one set may lie apart; above 0 for cameras without a
+            common trigger.  What is occupied, and the uncertainty of its distance, grow by what a
+            person walks in that time: the hull holds who was there at the oldest exposure.
         stuck: An image that equals one of the last four counts as none; False for pictures without
             noise.
     """
@@ -96,12 +109,60 @@ class Reconstruction(Actor):
     """A set this old is passed over while hulls come: no robot may move on it, and the next sets
     would be late, too.  After `GAP_S` without a hull it is taken all the same."""
 
-    def __init__(self, *, robot: bool = True, stuck: bool = True) -> None:
-        self.robot, self.stuck = robot, stuck
+    def __init__(
+        self,
+        *,
+        robot: bool = True,
+        stuck: bool = True,
+        cameras: int | None = None,
+        within_s: float | None = None,
+    ) -> None:
+        every = self.silhouettes
+        if cameras not in (None, len(every.requests)) or within_s not in (None, every.within_s):
+            raise ValueError(
+                f"asked for {cameras} cameras within {within_s} s; this class is for"
+                f" {len(every.requests)} within {every.within_s:g} s; Reconstruction.of(cameras,"
+                " within_s) returns another"
+            )
+        self.robot, self.stuck, self.within_s = robot, stuck, every.within_s
         self._made_of: object = None
         self._made: tuple[Refinement, VoxelBlocks] | None = None
         self._last_ns = self._written_ns = 0
         self._checksums: dict[str, deque[int]] = {}
+
+    @classmethod
+    def of(
+        cls, cameras: int = CAMERA_COUNT, within_s: float = 0.0, *, least: int = 1
+    ) -> type[Self]:
+        """Return the reconstruction of a cell.
+
+        Args:
+            cameras: How many it has, 2 or more.
+            within_s: See the class; less than half the period.
+            least: With how many silhouettes a set is used, at least.
+
+        Raises:
+            ValueError: One of them is out of range.
+        """
+        if not within_s < PERIOD_S / 2:
+            raise ValueError(
+                f"within_s is {within_s:g}; with half the period, {PERIOD_S / 2:g} s, or more it"
+                " cannot be told which image belongs to which set"
+            )
+        every = _sets(cameras, within_s, least)
+        if every == cls.silhouettes:
+            return cls
+        names = {"silhouettes": every, "triggers": (every,), "__module__": cls.__module__}
+        return type(cls.__name__, (cls,), names)
+
+    @classmethod
+    def of_options(cls, options: Mapping[str, object]) -> type[Self]:
+        """Return the reconstruction of a cell by the options `cameras` and `within_s`."""
+        cameras, within_s = options.get("cameras"), options.get("within_s")
+        return cls.of(
+            cameras if isinstance(cameras, int) else len(cls.silhouettes.requests),
+            within_s if isinstance(within_s, float) else cls.silhouettes.within_s,
+        )
 
     def start(self) -> None:
         """Let OpenCV work in the actor's own thread."""
@@ -126,15 +187,15 @@ class Reconstruction(Actor):
         self._last_ns, self._written_ns = stamp_ns, now_ns
         if self.robot and len(found.rows) > VOXELS_MAX:
             found = found.limited(VOXELS_MAX)
-        nearest = found.nearest
+        nearest, clearance_m = found.nearest, found.clearance_m - np.float32(self._moved_m)
         lock[self.hull] = Hull(
             voxels=blocks.indices(found.rows),
-            clearance_m=found.clearance_m,
+            clearance_m=clearance_m,
             tight=found.tight,
             component=found.component,
             counts=found.counts,
             cameras=tuple(name for name in self._names if name in given),
-            nearest_m=float(found.clearance_m[nearest]) if nearest >= 0 else math.inf,
+            nearest_m=float(clearance_m[nearest]) if nearest >= 0 else math.inf,
             nearest_voxel=nearest,
         )
         if lock.get(self.wanted, 0) > 0:
@@ -175,9 +236,15 @@ class Reconstruction(Actor):
         grid = lock[self.grid]
         blocks = VoxelBlocks(grid.origin_m, grid.voxel_m, grid.shape)
         tables = self.tables(blocks, calibrations, boxes)
-        self._made = Refinement(VisualHull(blocks, tables), calibrations, boxes), blocks
+        hull = VisualHull(blocks, tables)
+        self._made = Refinement(hull, calibrations, boxes, moved_m=self._moved_m), blocks
         self._made_of, self._last_ns = made_of, 0
         return self._made
+
+    @property
+    def _moved_m(self) -> float:
+        """How far a person walks between two exposures of one set."""
+        return HUMAN_M_S * self.within_s
 
     @property
     def _names(self) -> list[str]:

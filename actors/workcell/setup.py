@@ -18,6 +18,7 @@ from actors.workcell.simulation.room import boxes_of, cameras
 from actors.workcell.vocabulary import (
     BOXES,
     CALIBRATION,
+    CAMERA_COUNT,
     CAMERAS,
     EMPTY,
     GRID,
@@ -86,6 +87,7 @@ class Setup(Actor):
         voxel_m: Edge of a voxel.
         confirm: The cell is confirmed empty at once and the scenario begins when this many
             seconds have passed; 0: the operator does both.
+        cameras: How many of the room's eight cameras the cell has, the first ones.
     """
 
     online, truth = World("online"), World("truth")
@@ -105,14 +107,18 @@ class Setup(Actor):
         seconds: float = SECONDS,
         voxel_m: float = 0.025,
         confirm: float = 0.0,
+        cameras: int = CAMERA_COUNT,
     ) -> None:
         scenario_of(scenario, seed, seconds)  # refuses what does not exist
         self.scenario, self.seed, self.seconds = scenario, seed, seconds
         self.voxel_m, self.confirm = voxel_m, confirm
+        if not 2 <= cameras <= CAMERA_COUNT:
+            raise ValueError(f"cameras is {cameras}; the room has 2 to {CAMERA_COUNT}")
+        self.cameras = cameras
 
     def update(self, lock: Lock) -> None:
         """Write it."""
-        for number, calibration in enumerate(cameras()):
+        for number, calibration in enumerate(cameras()[: self.cameras]):
             lock[self.calibrations][camera_entity(number)] = calibration
         scenario = scenario_of(self.scenario, self.seed, self.seconds)
         for number, box in enumerate(boxes_of(scenario)):

@@ -9,7 +9,7 @@ writing: `CameraWatch` only looks; `StandIn` locks the silhouette of one dead ca
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, ClassVar, Final, NamedTuple, Self
 
 import numpy as np
 
@@ -30,6 +30,8 @@ from actors.workcell.vocabulary import (
 from enact_dist import Actor, View, ViewEach, World, Write, WriteEach
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from enact_dist import Entity, Lock
 
 SILENT: Final = "silent"
@@ -93,6 +95,8 @@ class CameraWatch(Actor):
     absent = WriteEach(online, CAMERAS, ABSENT)
     every_s = PERIOD_S
 
+    _count: ClassVar[int] = CAMERA_COUNT
+
     late_s: float = 0.15
     """Longest time between a tick and the stamp of the newest silhouette."""
     alike_max: int = 1
@@ -100,19 +104,48 @@ class CameraWatch(Actor):
     foreground_max: float = 0.3
     """Greatest share of foreground that a background still fits."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, cameras: int | None = None) -> None:
+        if cameras not in (None, self._count):
+            raise ValueError(
+                f"asked for {cameras} cameras; this class is for {self._count};"
+                " CameraWatch.of(cameras) returns another"
+            )
         self._seen: dict[Entity, Seen] = {}
+
+    @classmethod
+    def of(cls, cameras: int = CAMERA_COUNT) -> type[Self]:
+        """Return the watch of a cell with so many cameras, 1 or more.
+
+        Raises:
+            ValueError: There are none.
+        """
+        if cameras < 1:
+            raise ValueError(f"cameras is {cameras}; there is nothing to watch")
+        if cameras == cls._count:
+            return cls
+        names: dict[str, object] = dict.fromkeys(map(_attribute, range(cls._count)))
+        for number in range(cameras):
+            names[_attribute(number)] = View(cls.online, camera_entity(number), SILHOUETTE)
+        return type(
+            cls.__name__, (cls,), {**names, "_count": cameras, "__module__": cls.__module__}
+        )
+
+    @classmethod
+    def of_options(cls, options: Mapping[str, object]) -> type[Self]:
+        """Return the watch of a cell by the option `cameras`."""
+        cameras = options.get("cameras")
+        return cls.of(cameras if isinstance(cameras, int) else cls._count)
 
     def update(self, lock: Lock) -> None:
         """Look at the newest silhouettes."""
         calibrated = lock[self.calibrations].keys()
         states: dict[str, CameraState] = {}
         silent = []
-        for number in range(CAMERA_COUNT):
+        for number in range(self._count):
             camera = camera_entity(number)
             if camera not in calibrated:
                 continue
-            view: View[Silhouette] = getattr(self, f"silhouette_{number}")
+            view: View[Silhouette] = getattr(self, _attribute(number))
             seen = self._seen.get(camera, Seen())
             newest = lock.get(view)
             if newest is not None:
@@ -136,6 +169,11 @@ class CameraWatch(Actor):
         if seen.alike > self.alike_max:
             return STUCK
         return MISFIT if seen.foreground > self.foreground_max else ""
+
+
+def _attribute(number: int) -> str:
+    """Return under which name the watch declares the silhouette of a camera."""
+    return f"silhouette_{number}"
 
 
 class StandIn(Actor):

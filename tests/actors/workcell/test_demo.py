@@ -31,15 +31,13 @@ from actors.workcell.trace import ASPECTS, trace_of
 from actors.workcell.truth_of_run import truth_of
 from actors.workcell.unshared import PlainEach, PlainLock, Version
 from enact_dist import Entity, Lock, View, Write, local, testing
+from enact_dist.actor_check import check_cell, declarations_of
 from enact_dist.config import load_config
 from enact_dist.errors import ConfigError
 
 
 def test_shipped_cell_fits_together():
     """No two actors write one slot, every trigger is written, every option can be read."""
-    from enact_dist.actor_check import check_cell
-    from enact_dist.config import load_config
-
     assert [f.text for f in check_cell(load_config(TEMPLATE)) if f.level == "error"] == []
 
 
@@ -283,3 +281,30 @@ def test_the_cell_goes_on_after_a_camera_the_speed_control_and_the_shard_were_ki
     assert any(len(hull.voxels) for _, hull in after)  # what plays has outlived the shard
     assert outcome.report["checks"]["the robot goes on by itself"]
     assert sum("kill" in line for line in outcome.report["events"]) == len(faults)
+
+
+def test_the_cell_of_four_cameras_is_sound(tmp_path):
+    """Tables of four cameras and the option of three actors make it; nothing waits for others."""
+    config = tomllib.loads(TEMPLATE.read_text())
+    actors = config["actors"]
+    for name in list(actors):
+        if name.rpartition("-")[2] in {"4", "5", "6", "7"}:
+            del actors[name]
+    for name in ("setup", "watch", "reconstruction"):
+        actors[name].setdefault("args", {})["cameras"] = 4
+    path = tmp_path / "cell.toml"
+    path.write_text(toml_of(config))
+
+    found = load_config(path)
+
+    declared, wrong = declarations_of(found)
+    assert wrong == []
+    silhouettes = {
+        str(request.entity)
+        for actor in declared
+        if actor.name in {"watch", "reconstruction"}
+        for request in actor.actor_class.declaration.requests.values()
+        if request.aspect.name == "silhouette"
+    }
+    assert silhouettes == {f"camera/{number}" for number in range(4)}
+    assert [one for one in check_cell(found) if one.level == "error"] == []

@@ -37,6 +37,8 @@ from actors.workcell.vocabulary import (
     obstacle_entity,
 )
 from enact_dist import Lock, View, Write, testing
+from enact_dist.actor_load import make_actor
+from enact_dist.errors import ConfigError
 
 pytest.importorskip("cv2", exc_type=ImportError)
 
@@ -290,6 +292,67 @@ def test_joints_are_interpolated_and_carried_on_for_a_while():
     assert joints_at(joints, FIRST_NS - 300_000_000) is None
     none = Joints(np.empty((0, 7)), np.empty((0, 7)), np.empty(0, np.int64))
     assert joints_at(none, FIRST_NS) is None
+
+
+def exposed_apart(cell, actor):
+    """Give a set whose cameras look up to 33 ms apart at a body that walks; return the updates."""
+    late_ms = [0, 33, 5, 28, 12, 20, 31, 8]
+    for number, ms in enumerate(late_ms):
+        walked = np.array([1.6 * ms / 1e3, 0.0, 0.0])
+        there = BODY + np.r_[walked, walked, 0.0]
+        lines = outlines(
+            np.concatenate([there, ARM_AT_HOME]),
+            [(FINE[number].camera_matrix, FINE[number].distortion, FINE[number].camera_from_cell)],
+            sides=32,
+        )
+        bits = packed(fill(lines, FINE[number].height, FINE[number].width)[0])
+        give(cell, number, bits, FIRST_NS + ms * 1_000_000)
+    return testing.run_once(actor, cell)
+
+
+def test_cameras_without_a_common_trigger_make_one_set(fine_cell):
+    """Their set has the stamp of its oldest image, and holds whoever was there at that moment."""
+    options = {"cameras": 8, "within_s": 0.035}
+    actor = make_actor(Reconstruction, options)
+
+    assert exposed_apart(fine_cell, actor) == 1
+
+    hull, stamp_ns = seen(fine_cell)
+    assert stamp_ns == FIRST_NS
+    assert len(hull.cameras) == 8
+    assert body_voxels(AROUND_ARM) <= voxels_of(hull)
+    true_m = distance_between(BODY, ARM_AT_HOME)
+    assert 0.1 < hull.nearest_m <= true_m - 1.6 * 0.035
+
+
+def test_an_empty_cell_of_cameras_without_a_trigger_is_infinitely_far(fine_cell):
+    """The robot's own outlines do not grow."""
+    give_all(fine_cell, FIRST_NS, masks(body=False, views=FINE))
+    testing.run_once(Reconstruction.of(within_s=0.035)(), fine_cell)
+    assert seen(fine_cell)[0].nearest_m == math.inf
+
+
+def test_a_cell_of_four_cameras(cell):
+    """The number is an option; the masks of other cameras are no part of its sets."""
+    actor = make_actor(Reconstruction, {"cameras": 4, "late_s": 0.3})
+    for number, bits in enumerate(masks()[:4]):
+        give(cell, number, bits, FIRST_NS)
+
+    assert testing.run_once(actor, cell) == 1
+    hull, _ = seen(cell)
+    assert hull.cameras == tuple(f"camera/{number}" for number in range(4))
+    assert actor.late_s == 0.3
+    assert body_voxels() <= voxels_of(hull)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [({"cameras": 1}, "two or more"), ({"within_s": 0.05}, "within_s is 0.05; with half")],
+)
+def test_what_cannot_be_a_set_is_refused(options, words):
+    """One camera alone, and images that could belong to two sets."""
+    with pytest.raises(ConfigError, match=words):
+        make_actor(Reconstruction, options)
 
 
 def test_the_raw_hull_is_written_while_somebody_looks(cell):

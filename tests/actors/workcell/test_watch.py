@@ -14,6 +14,7 @@ from actors.workcell.vocabulary import (
 )
 from actors.workcell.watch import CameraWatch, StandIn
 from enact_dist import Lock, View, Write, testing
+from enact_dist.actor_load import make_actor
 
 PERIOD_NS = 100_000_000
 WIDTH, HEIGHT = 36, 20
@@ -147,6 +148,17 @@ def test_image_that_repeats_is_stuck(cell):
 
     assert (stuck.alive, stuck.trouble, stuck.sets_missed) == (False, "stuck", 1)
     assert cell.states()["camera/2"].trouble == ""
+
+
+@pytest.mark.parametrize("cameras", [2, 4, 12])
+def test_watch_of_another_number_of_cameras(cell, cameras):
+    """The number is an option; those above it are not looked at."""
+    cell.watch = make_actor(CameraWatch, {"cameras": cameras, "late_s": 0.15})
+    cell.tick(0, 1, 2)
+    views = [one for one in type(cell.watch).declaration.requests if "silhouette" in one]
+
+    assert len(views) == cameras
+    assert list(cell.tick()) == [f"camera/{number}" for number in range(min(cameras, COUNT))]
 
 
 def test_buffers_that_alternate_are_stuck(cell):
