@@ -20,6 +20,8 @@ R4    unreachable  a block goes that is beyond reach at 3 m/s from    people do 
                    that takes the volume of a person away
 R5    forgiven     where something was, and 5 cameras or more have a  camouflage, or a camera that
       (kept)       say, one of them may say "free"                    is half blind
+R6    shadow       what a camera sees before a surface that is in     a camera that sees a person
+                   shadow, and no camera as something dark elsewhere  before a lit place keeps them
 ====  ===========  =================================================  ===========================
 
 A voxel that no camera can see is neither free nor an obstacle.  It counts as occupied while
@@ -40,7 +42,7 @@ import numpy as np
 from actors.geometry.capsules import distance_to_points, fill, outlines
 from actors.geometry.pockets import Pockets
 from actors.geometry.silhouettes import packed, unpacked
-from actors.geometry.visibility import seen_by, static_voxels
+from actors.geometry.visibility import floor_seen, seen_by, static_voxels, surface_voxels
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -193,6 +195,8 @@ class Refinement:
         self._cameras = [(c.camera_matrix, c.distortion, c.camera_from_cell) for c in calibrations]
         self._sizes = [(c.height, c.width) for c in calibrations]
         self._static = static_voxels(self._grid, boxes)
+        self._surface = surface_voxels(self._grid, boxes)
+        self._floor = floor_seen(self._grid, calibrations, boxes)
         self._all_blocks = np.arange(self._grid.blocks)
         self._before: Flags | None = None
         self._since_s = np.full(self._grid.block_shape, np.inf, np.float32)
@@ -206,6 +210,7 @@ class Refinement:
         silhouettes: Sequence[Bits | None],
         robot: Numbers | None,
         elapsed_s: float,
+        shades: Sequence[Bits | None] = (),
     ) -> Refined:
         """Return what is occupied at an exposure.
 
@@ -214,27 +219,36 @@ class Refinement:
             robot: (n, 7) capsules at the exposure, metres, cell; None if the pose is not known:
                 then nothing is taken for the robot, and everything is at distance 0.
             elapsed_s: Time since the set of the last call; beyond `GAP_MAX_S` the state is reset.
+            shades: As `silhouettes`, what looks like a shadow and is no foreground; () if nothing.
 
         Raises:
             ValueError: Silhouettes of another number or size than the calibrations.
         """
         self._note_live(tuple(n for n, bits in enumerate(silhouettes) if bits is not None))
         outline = self._explaining(robot)
-        self._hull.load(self._with_robot(self._moved(silhouettes, outline), robot))
+        seen = self._with_robot(self._moved(silhouettes, outline), robot)
+        self._hull.load(seen, self._moved(shades, outline) if shades else ())
         raw = self._hull.carve(self._all_blocks)
         counts = {"raw": len(raw)}
         rows = raw[~self._static[raw]]
         counts["static"] = len(raw) - len(rows)
+        dark = self._hull.in_shadow(rows[self._surface[rows]], self._floor)
+        shadow = self._hull.shaded(rows, dark)
+        rows = rows[~shadow]
+        counts["shadow"] = int(shadow.sum())
         kept = self._possible(rows, elapsed_s, robot, outline)
         counts["unreachable"] = len(rows) - len(kept)
         counts["robot"] = counts["explained"] = 0
         away = self._beside_robot(kept, robot, outline, counts)
         forgiven = self._forgiven(away.rows, len(kept))
+        forgiven = forgiven[~self._hull.shaded(forgiven, dark)]
         counts["forgiven"] = len(forgiven)
         more = self._beside_robot(forgiven, robot, outline, counts)
         tight = np.zeros(len(away.rows) + len(more.rows), bool)
         tight[: len(away.rows)] = self._hull.tight(away.rows) & (self._says[away.rows] > 0)
-        return self._components(away.with_more(more), tight, counts, raw)
+        solid = tight.copy()
+        solid[: len(away.rows)] |= self._hull.dark(away.rows) & (self._says[away.rows] > 0)
+        return self._components(away.with_more(more), (tight, solid), counts, raw)
 
     def _with_robot(
         self, silhouettes: Sequence[Bits | None], robot: Numbers | None
@@ -386,12 +400,13 @@ class Refinement:
         return _Beside(rows[stays], near_m[stays] - half_m, explained[stays])
 
     def _components(
-        self, beside: _Beside, tight: Flags, counts: dict[str, int], raw: Rows
+        self, beside: _Beside, sure: tuple[Flags, Flags], counts: dict[str, int], raw: Rows
     ) -> Refined:
         """Join blocks to components, drop the small ones (R2) and what is unseen and untouched."""
         from scipy import ndimage
 
         rows, clearance = beside.rows, beside.clearance_m
+        tight, dark = sure
         shape = self._grid.block_shape
         voxel_m3 = self._grid.voxel_m**3
         visible = self._says[rows] > 0
@@ -408,7 +423,7 @@ class Refinement:
         label = np.where(stays, labels.ravel()[rows >> 6], 0)
         counted = visible & ~beside.explained
         volume = np.bincount(label[counted], minlength=found + 1) * voxel_m3
-        solid = np.bincount(label[tight], minlength=found + 1) > 0
+        solid = np.bincount(label[dark], minlength=found + 1) > 0
         good = (volume >= VISIBLE_M3_MIN) & (solid | (volume >= RIM_M3_MAX))
         good[label[held]] = True
         good[0] = False

@@ -1,9 +1,10 @@
 """Silhouettes: which pixels of an image differ from the empty cell, shadows aside.
 
 An image is smoothed, compared with the mean of the empty cell, rid of shadows and of single pixels.
-A shadow is darker than the background by a bounded factor and of the same colour.  Where more of an
-image looks like shadow than any shadow covers, the light has changed, and all of it stays
-foreground.
+A shadow is darker than the background by a bounded factor and of the same colour.  So is a person
+in grey before a grey wall: `Subtraction.split` keeps what looks like shadow apart from background,
+and `visual_hull.VisualHull.shaded` finds which of it is shadow.  Where more of an image looks like
+shadow than any shadow covers, the light has changed, and all of it stays foreground.
 
 Rules a change must keep: masks are (H, W) uint8, 0 or 255; what is in doubt is foreground; the
 background never changes while something is looked for, so that who stands still does not fade.
@@ -138,13 +139,17 @@ class Subtraction:
         self._clearly = _beyond(mean, EDGE_FACTOR * _limits(spread))
 
     def __call__(self, image: Image) -> Mask:
-        """Return the foreground of an image.
+        """Return the foreground of an image, as `split` does."""
+        return self.split(image)[0]
+
+    def split(self, image: Image) -> tuple[Mask, Mask]:
+        """Return the foreground of an image, and what looks like a shadow in it.
 
         Args:
             image: (H, W, 3) uint8, as captured.
 
         Returns:
-            (H, W) uint8, 255 where foreground.
+            (H, W) uint8 each, 255 where foreground, and where shadow; no pixel is both.
 
         Raises:
             ValueError: An image of another size than the background.
@@ -154,13 +159,16 @@ class Subtraction:
         check_image(image, self._shape)
         smooth = smoothed(image)
         mask = self._differs(smooth)
+        shade = np.zeros_like(mask)
         if self._shaded is not None:
-            shaded = cv2.bitwise_and(self._shaded(smooth), mask)
-            if cv2.countNonZero(shaded) <= SHADOW_SHARE_MAX * shaded.size:
+            shaded = np.asarray(cv2.bitwise_and(self._shaded(smooth), mask), np.uint8)
+            if 0 < cv2.countNonZero(shaded) <= SHADOW_SHARE_MAX * shaded.size:
                 mask = np.asarray(cv2.bitwise_xor(mask, shaded), np.uint8)
+                shade = _majority(shaded)
         closed = cv2.morphologyEx(_majority(mask), cv2.MORPH_CLOSE, NEIGHBOURS)
         clear = cv2.bitwise_and(closed, self._clearly(image))
-        return np.asarray(cv2.bitwise_or(cv2.erode(closed, NEIGHBOURS), clear), np.uint8)
+        found = np.asarray(cv2.bitwise_or(cv2.erode(closed, NEIGHBOURS), clear), np.uint8)
+        return found, np.asarray(cv2.subtract(shade, found), np.uint8)
 
 
 def check_image(image: object, shape: tuple[int, ...], *, name: str = "image") -> None:

@@ -49,6 +49,10 @@ POOL_PX: Final = 8
 """Pixels along the edge of a cell of the pooled masks."""
 POOLS: Final = (1, 2, 3, 4, 6, 9, 13)
 """By how many cells the pooled masks are grown; a block that looks larger gets no say as one."""
+AROUND_M: Final = 2.0
+"""So far beyond the sides of the grid the floor is known."""
+FLOOR_STEP_M: Final = 0.04
+"""Between places on the floor that are looked at."""
 INSIDE_M: Final = 0.005
 """How deep within an obstacle's box a line of sight must pass to be cut off."""
 
@@ -305,13 +309,66 @@ def static_voxels(grid: VoxelBlocks, boxes: Sequence[Numbers]) -> npt.NDArray[np
         grid: The voxels.
         boxes: (n, 15) each.
     """
+    return np.asarray(grid.block_major(_near(grid, boxes, grid.voxel_m / 4.0)), bool)
+
+
+def surface_voxels(grid: VoxelBlocks, boxes: Sequence[Numbers]) -> npt.NDArray[np.bool_]:
+    """Return which voxels (rows) lie on an obstacle, not in it.
+
+    Args:
+        grid: The voxels.
+        boxes: (n, 15) each.
+    """
+    near = grid.block_major(_near(grid, boxes, 1.5 * grid.voxel_m))
+    return np.asarray(near, bool) & ~static_voxels(grid, boxes)
+
+
+def floor_seen(
+    grid: VoxelBlocks, calibrations: Sequence[Calibrated], boxes: Sequence[Numbers]
+) -> Index:
+    """Return where cameras see places on the floor, z = 0, under a grid and around it.
+
+    Args:
+        grid: The voxels; shadows of what is near its sides lie beyond them.
+        calibrations: The cameras.
+        boxes: Static obstacles, (n, 15) each.
+
+    Returns:
+        (cameras, places) int32, as `CameraTable.pixel`, in the mask that is grown least.
+    """
+    x, y, _ = grid.lattice()
+    ends = (float(x[0, 0, 0]), float(x[-1, 0, 0])), (float(y[0, 0, 0]), float(y[0, -1, 0]))
+    along, across = (np.arange(a - AROUND_M, b + AROUND_M, FLOOR_STEP_M) for a, b in ends)
+    x, y = along.astype(np.float32)[:, None, None], across.astype(np.float32)[None, :, None]
+    axes = x, y, np.zeros((1, 1, 1), np.float32)
+    covered = np.zeros((len(along), len(across), 1), bool)
+    for box in (row for of_obstacle in boxes for row in of_obstacle):
+        covered |= inside(box, axes, 0.0)
+    result = []
+    for one in calibrations:
+        u, v, depth = _projected(one, *axes)
+        eye = inverse(one.camera_from_cell)[:3, 3]
+        with np.errstate(invalid="ignore"):
+            seen = (depth > NEAREST_M) & (u >= 0) & (v >= 0) & ~covered
+            seen &= (u < one.width - 1) & (v < one.height - 1)
+        for box in (row for of_obstacle in boxes for row in of_obstacle):
+            seen &= ~hidden_by(box, eye, axes)
+        column, row = (np.rint(np.where(seen, part, 0)).astype(np.int32) for part in (u, v))
+        mask_px = one.width * one.height
+        pixel = np.where(seen, mask_px + row * one.width + column, mask_px * (1 + len(GROWN_PX)))
+        result.append(pixel.ravel().astype(np.int32))
+    return np.stack(result)[:, ~covered.ravel()]
+
+
+def _near(grid: VoxelBlocks, boxes: Sequence[Numbers], margin_m: float) -> Flags:
+    """Return which voxels (i, j, k) have their centre within a margin of an obstacle."""
     half = np.float32(grid.voxel_m / 2.0)
     x, y, z = (axis.astype(np.float32) for axis in grid.lattice())
     axes = (x[:-1] + half, y[:, :-1] + half, z[:, :, :-1] + half)
     result = np.zeros(grid.shape, bool)
     for box in (row for of_obstacle in boxes for row in of_obstacle):
-        result |= inside(box, axes, grid.voxel_m / 4.0)
-    return np.asarray(grid.block_major(result), bool)
+        result |= inside(box, axes, margin_m)
+    return result
 
 
 def seen_by(tables: Sequence[CameraTable]) -> npt.NDArray[np.uint8]:

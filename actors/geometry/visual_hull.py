@@ -3,13 +3,20 @@
 Two levels: blocks of 4 x 4 x 4 voxels are looked up in pooled masks, the rest voxel by voxel,
 each camera only on what the last one left.  More levels of an octree do not pay.
 
+What looks like a shadow is no veto: a person in grey before a grey wall looks like one, too.
+`shaded` finds the voxels that are before a real shadow.  A shadow lies on a surface, and each
+camera that sees the place sees it dark: where a known surface is dark to all cameras, and looks
+like shadow to two of them, it is in shadow.  Whatever has a lit place behind it is a thing.  Height
+above the surface would not tell the two apart: cameras that look down upon a shadow leave a pyramid
+over it, half as high as it is wide.
+
 Rules a change must keep: numpy only; a camera without a silhouette vetoes nothing; the result is
 the same in whatever order the cameras are asked.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -26,6 +33,15 @@ if TYPE_CHECKING:
 
     Bits = npt.NDArray[np.uint8]
     Rows = npt.NDArray[np.integer]
+
+
+FOREGROUND: Final = 255
+SHADE: Final = 1
+"""Value of a pixel near which is shadow and no foreground; background is 0."""
+SURFACE_NEAR: Final = np.ones((11, 11), np.uint8)
+"""Places on a surface lie so many pixels apart in an image, and shadows have soft edges."""
+SHADE_SAYS_MIN: Final = 2
+"""So many cameras must see a place on a surface as shadow."""
 
 
 class Masks:
@@ -45,13 +61,15 @@ class Masks:
         self.cells[-1] = 255
         self._pools = self.cells[:-1].reshape(len(POOLS), *table.pool_shape)
         self._dirty = (slice(0, 0), slice(0, 0))
+        self.shades = False
 
-    def load(self, bits: Bits, name: str) -> None:
+    def load(self, bits: Bits, name: str, shade: Bits | None = None) -> None:
         """Take the silhouette of a set.
 
         Args:
             bits: (H, W / 8) uint8, as `silhouettes.packed` makes them.
             name: What an error calls it.
+            shade: As `bits`, what looks like a shadow; None or empty if nothing does.
 
         Raises:
             ValueError: The silhouette is not of the size of the calibration.
@@ -65,9 +83,18 @@ class Masks:
                 f"{name}: asked for {table.width} x {table.height} pixels as in the"
                 f" calibration (uint8 of shape {asked}), found {bits.dtype} of shape {bits.shape}"
             )
-        self._load_pools(bits)
-        rows = np.flatnonzero(bits.any(1))
-        columns = np.flatnonzero(bits.any(0))
+        self.shades = shade is not None and shade.size > 0
+        dark = bits
+        if shade is not None and self.shades:
+            if shade.shape != bits.shape or shade.dtype != np.uint8:
+                raise ValueError(
+                    f"{name}: asked for shade as uint8 of shape {asked}, found {shade.dtype} of"
+                    f" shape {shade.shape}"
+                )
+            dark = bits | shade
+        self._load_pools(dark)
+        rows = np.flatnonzero(dark.any(1))
+        columns = np.flatnonzero(dark.any(0))
         self._levels[:, *self._dirty] = 0
         if not len(rows):
             self._dirty = (slice(0, 0), slice(0, 0))
@@ -79,6 +106,8 @@ class Masks:
         region = self._dirty = (slice(top, bottom), slice(left, right))
         levels = self._levels[:, *region]
         levels[0] = unpacked(bits, table.width)[region]
+        if shade is not None and self.shades:
+            np.maximum(levels[0], unpacked(shade, table.width)[region] & SHADE, out=levels[0])
         before = 0
         for place, grown in enumerate(GROWN_PX, 1):
             kernel = np.ones((2 * (grown - before) + 1,) * 2, np.uint8)
@@ -115,11 +144,12 @@ class VisualHull:
         self._masks = tuple(Masks(table) for table in self.tables)
         self._given: tuple[int, ...] = ()
 
-    def load(self, silhouettes: Sequence[Bits | None]) -> None:
+    def load(self, silhouettes: Sequence[Bits | None], shades: Sequence[Bits | None] = ()) -> None:
         """Take a set of silhouettes, one per camera in the order of the tables.
 
         Args:
             silhouettes: (H, W / 8) uint8 each; None where a camera has none and vetoes nothing.
+            shades: Of the same cameras, what looks like a shadow; () if nothing does.
 
         Raises:
             ValueError: Another number of silhouettes than of cameras, or one of another size.
@@ -130,9 +160,10 @@ class VisualHull:
                 f" found {len(silhouettes)}"
             )
         given = []
-        for number, bits in enumerate(silhouettes):
+        shades = shades or (None,) * len(silhouettes)
+        for number, (bits, shade) in enumerate(zip(silhouettes, shades, strict=True)):
             if bits is not None:
-                self._masks[number].load(bits, f"silhouette {number}")
+                self._masks[number].load(bits, f"silhouette {number}", shade)
                 given.append(number)
         self._given = tuple(given)
 
@@ -150,6 +181,65 @@ class VisualHull:
             pixels, table = self._masks[number].pixels, self.tables[number]
             rows = rows[pixels[table.pixel[rows]] > 0]
         return rows
+
+    def in_shadow(
+        self, surface: Rows, floor: npt.NDArray[np.int32]
+    ) -> list[npt.NDArray[np.uint8] | None]:
+        """Return where cameras see known surfaces that are in shadow.
+
+        Args:
+            surface: Voxels on obstacles that no camera says to be free.
+            floor: As `visibility.floor_seen` returns it.
+
+        Returns:
+            (H, W) uint8 per camera, not 0 where it does; None of a camera that sees no shadow.
+        """
+        import cv2
+
+        result: list[npt.NDArray[np.uint8] | None] = [None] * len(self.tables)
+        shady = [number for number in self._given if self._masks[number].shades]
+        if not shady:
+            return result
+        places = np.arange(floor.shape[1])
+        for number in self._given:
+            places = places[self._masks[number].pixels[floor[number, places]] > 0]
+        looked = {
+            number: np.concatenate([self.tables[number].pixel[surface], floor[number, places]])
+            for number in shady
+        }
+        says = np.zeros(len(surface) + len(places), np.uint8)
+        for number in shady:
+            says += self._masks[number].pixels[looked[number]] == SHADE
+        for number in shady:
+            table = self.tables[number]
+            index = looked[number][says >= SHADE_SAYS_MIN]
+            index = index[index != table.sentinel]
+            mask = np.zeros((table.height, table.width), np.uint8)
+            mask.ravel()[index % table.mask_px] = 255
+            result[number] = np.asarray(cv2.dilate(mask, SURFACE_NEAR), np.uint8)
+        return result
+
+    def shaded(
+        self, rows: Rows, in_shadow: Sequence[npt.NDArray[np.uint8] | None]
+    ) -> npt.NDArray[np.bool_]:
+        """Return which voxels a camera sees before a shadow, and none as something dark.
+
+        Args:
+            rows: Any voxels.
+            in_shadow: As the method of that name returns it.
+        """
+        free = np.zeros(len(rows), bool)
+        doubtful = np.zeros(len(rows), bool)
+        for number, mask in enumerate(in_shadow):
+            if mask is None:
+                continue
+            table = self.tables[number]
+            index = table.pixel[rows]
+            at = np.flatnonzero(self._masks[number].pixels[index] == SHADE)
+            behind = mask.ravel()[index[at] % table.mask_px] > 0
+            free[at[behind]] = True
+            doubtful[at[~behind]] = True
+        return free & ~doubtful
 
     def with_one_veto(self, blocks: Rows) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int8]]:
         """Return all voxels of some blocks that exactly one camera says to be free.
@@ -181,12 +271,19 @@ class VisualHull:
         Args:
             rows: Any voxels.
         """
+        return self._centres(rows, FOREGROUND)
+
+    def dark(self, rows: Rows) -> npt.NDArray[np.bool_]:
+        """Return which voxels have their centre in every silhouette or what looks like shadow."""
+        return self._centres(rows, SHADE)
+
+    def _centres(self, rows: Rows, least: int) -> npt.NDArray[np.bool_]:
         result = np.ones(len(rows), bool)
         for number in self._given:
             table = self.tables[number]
             index = table.pixel[rows]
             silent = index == table.sentinel
-            result &= silent | (self._masks[number].pixels[index % table.mask_px] > 0)
+            result &= silent | (self._masks[number].pixels[index % table.mask_px] >= least)
         return result
 
     def on_masks(self, rows: Rows, masks: Sequence[npt.NDArray[np.uint8]]) -> npt.NDArray[np.bool_]:

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
 IMAGES: Final = 20
 """How many images make a background, unless an actor says otherwise."""
+NO_SHADE: Final = np.empty((0, 0), np.uint8)
 CHECKED_ROWS: Final = 8
 """Every eighth row goes into the checksum: noise changes each of them."""
 
@@ -90,7 +91,7 @@ class Segmenting:
 
     Args:
         subtractor: "gaussian", "mog2" or "knn".
-        shadows: Shadows count as background.
+        shadows: What looks like a shadow is no foreground.
     """
 
     def __init__(self, subtractor: str, *, shadows: bool) -> None:
@@ -117,11 +118,12 @@ class Segmenting:
                 found.mean, found.spread, subtractor=self._subtractor, shadows=self._shadows
             )
             self._made_of = which
-        mask = self._subtraction(image)
+        mask, shade = self._subtraction.split(image)
         return Silhouette(
             packed=packed(mask),
             foreground_px=int(np.count_nonzero(mask)),
             image_checksum=checksum(image),
+            shade=packed(shade) if shade.any() else NO_SHADE,
         )
 
 
@@ -168,7 +170,7 @@ class BackgroundSubtraction(Actor):
 
     Attributes:
         subtractor: "gaussian", "mog2" or "knn".
-        shadows: Shadows count as background.
+        shadows: What looks like a shadow is no foreground.
     """
 
     online = World("online")

@@ -248,11 +248,11 @@ class ClosedLoop:
                 continue
             source.look(self._playing, joints, stuck=bool(faults))
             image = source.frame(stamp_ns)
-            mask = subtract(image)
+            mask, shade = subtract.split(image)
             bits = packed(mask)
             silhouettes.append(bits)
             found = words.Silhouette(
-                bits, int(np.count_nonzero(mask)), image_checksum=checksum(image)
+                bits, int(np.count_nonzero(mask)), False, checksum(image), packed(shade)
             )
             self._put(cell, words.camera_entity(number), words.SILHOUETTE, found, stamp_ns)
         if self.masks is not None:

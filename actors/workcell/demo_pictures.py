@@ -127,7 +127,12 @@ def _unrefined(trace: Trace, masks: dict[str, words.Silhouette], arm: F64) -> np
     tables = [camera_table(blocks, calibration, boxes) for calibration in calibrations]
     refinement = Refinement(VisualHull(blocks, tables), calibrations, boxes)
     seen = [masks[name] if name in masks and not masks[name].stand_in else None for name in names]
-    found = refinement.step([one.packed if one else None for one in seen], arm, math.inf)
+    found = refinement.step(
+        [one.packed if one else None for one in seen],
+        arm,
+        math.inf,
+        [one.shade if one else None for one in seen],
+    )
     return blocks.indices(found.raw)
 
 

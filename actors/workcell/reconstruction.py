@@ -49,7 +49,6 @@ if TYPE_CHECKING:
     from actors.geometry.visibility import CameraTable
     from enact_dist import Lock
 
-    Bits = npt.NDArray[np.uint8]
     F64 = npt.NDArray[np.float64]
 
 AHEAD_NS_MAX: Final = 100_000_000
@@ -181,8 +180,12 @@ class Reconstruction(Actor):
         refinement, blocks = self._prepared(lock)
         given = self._given(lock[self.silhouettes])
         elapsed_s = (stamp_ns - self._last_ns) / 1e9 if self._last_ns else math.inf
+        seen = [given.get(name) for name in self._names]
         found = refinement.step(
-            [given.get(name) for name in self._names], self._arm(lock, stamp_ns), elapsed_s
+            [one.packed if one else None for one in seen],
+            self._arm(lock, stamp_ns),
+            elapsed_s,
+            [one.shade if one else None for one in seen],
         )
         self._last_ns, self._written_ns = stamp_ns, now_ns
         if self.robot and len(found.rows) > VOXELS_MAX:
@@ -251,7 +254,7 @@ class Reconstruction(Actor):
         """The names of the cameras, in the order of their silhouettes."""
         return [str(view.entity) for view in self.silhouettes.requests]
 
-    def _given(self, found: tuple[Silhouette | None, ...]) -> dict[str, Bits]:
+    def _given(self, found: tuple[Silhouette | None, ...]) -> dict[str, Silhouette]:
         """Return the silhouettes that come of a new image, by name of the camera.
 
         Raises:
@@ -266,7 +269,7 @@ class Reconstruction(Actor):
             again = self.stuck and checksum and checksum in before
             before.append(checksum)
             if not again:
-                given[name] = silhouette.packed
+                given[name] = silhouette
         return given
 
     def _arm(self, lock: Lock, stamp_ns: int) -> F64 | None:

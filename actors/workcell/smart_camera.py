@@ -34,7 +34,7 @@ class SmartCamera(Camera):
     Args:
         source: Address of its images, see `sources`.
         subtractor: "gaussian", "mog2" or "knn".
-        shadows: Shadows count as background.
+        shadows: What looks like a shadow is no foreground.
         images: How many images make a background.
     """
 

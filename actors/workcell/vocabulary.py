@@ -25,7 +25,7 @@ so that each of them says on which images it rests.
 
 # The wire reads these annotations: they stay real types, without `from __future__`.
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -100,12 +100,15 @@ class Silhouette:
         stand_in: The camera gave no image: all bits are set, so that it vetoes nothing.
         image_checksum: CRC-32 of the image; that of one of the last sets means that the image is
             stuck.  0 of a stand-in and of a mask that came as a mask.
+        shade: As `packed`; a set bit is no foreground, but looks like a shadow: the camera says
+            neither that something is there nor that it is free.  (0, 0) if there is none.
     """
 
     packed: npt.NDArray[np.uint8]
     foreground_px: int
     stand_in: bool = False
     image_checksum: int = 0
+    shade: npt.NDArray[np.uint8] = field(default_factory=lambda: np.empty((0, 0), np.uint8))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -9,7 +9,7 @@ import pytest
 
 from actors.geometry.capsules import distance_between, distance_to_points
 from actors.geometry.refinement import Refinement, grown
-from actors.geometry.silhouettes import packed
+from actors.geometry.silhouettes import Subtraction, packed
 
 from .hull_parts import BODY, bits_of, box_row, hull_of, masks_of, ring, small_grid
 
@@ -331,3 +331,69 @@ def test_growing_blocks_is_a_cube_that_ends_at_the_sides():
     corner = np.zeros((6, 5, 4), bool)
     corner[0, 0, 0] = True
     assert grown(corner, 1).sum() == 8
+
+
+def shaded_step(made, dark, shaded, elapsed_s=5.0):
+    """Return what is occupied where some capsules are foreground, and others look like shadow."""
+    bits, shades = bits_of(dark, made.cameras), bits_of(shaded, made.cameras)
+    return made.refinement.step(
+        bits, NO_ARM, elapsed_s, [shade & ~one for one, shade in zip(bits, shades, strict=True)]
+    )
+
+
+ON_FLOOR = np.array(
+    [[x, -0.1, 0.0, x + 0.05, 0.5, 0.0, 0.01] for x in np.arange(-0.55, -0.2, 0.012)]
+)
+"""A patch of the floor, 0.6 m long and 0.35 m wide: where a shadow lies."""
+
+
+@pytest.mark.parametrize("level", [70, 100, 140])
+def test_a_person_in_grey_before_a_grey_wall_stays(level):
+    """Evenly darker than an even background of 150 in all images, and yet no voxel is lost."""
+    pytest.importorskip("cv2", exc_type=ImportError)
+    made = Cell()
+    empty = np.full((*masks_of(BODY, made.cameras[:1])[0].shape, 3), 150, np.uint8)
+    subtraction = Subtraction(empty, np.ones_like(empty))
+    images = [empty.copy() for _ in made.cameras]
+    for image, mask in zip(images, masks_of(BODY, made.cameras), strict=True):
+        image[mask > 0] = level
+    bits, shades = zip(*map(subtraction.split, images), strict=True)
+    found = made.refinement.step(
+        [packed(mask) for mask in bits], NO_ARM, 5.0, [packed(mask) for mask in shades]
+    )
+    assert not np.any(bits)
+    assert set(made.rows_in(BODY).tolist()) <= set(found.rows.tolist())
+
+
+def test_a_shadow_on_the_floor_is_no_obstacle(cell):
+    """Neither on the floor nor in the pyramid over it; as foreground it would be one."""
+    found = shaded_step(cell, NOBODY, ON_FLOOR)
+    assert found.counts["shadow"] > 100
+    assert len(found.rows) == 0
+    assert len(shaded_step(Cell(), ON_FLOOR, NOBODY).rows) > 100
+
+
+def test_a_shadow_on_a_table_is_no_obstacle():
+    """What lies on a box lies on a known surface, too."""
+    table = box_row((-0.4, 0.2, 0.2), (0.35, 0.5, 0.2))
+    made = Cell(boxes=[table])
+    made.step(NOBODY)
+    shadow = ON_FLOOR.copy()
+    shadow[:, [2, 5]] = 0.4
+    found = shaded_step(made, NOBODY, shadow)
+    assert found.counts["shadow"] > 50
+    assert len(found.rows) == 0
+
+
+def test_a_person_beside_a_shadow_is_as_without_it(cell):
+    """The shadow of a person makes their hull hardly larger, and none of them goes."""
+    alone = entered(Cell())
+    found = shaded_step(cell, BODY, ON_FLOOR)
+    assert set(alone.rows.tolist()) <= set(found.rows.tolist())
+    assert len(found.rows) < 1.1 * len(alone.rows)
+
+
+def test_a_person_in_grey_beside_their_shadow_stays(cell):
+    """Cameras that see them before their own shadow take them for it; the others do not."""
+    found = shaded_step(cell, NOBODY, np.concatenate([BODY, ON_FLOOR]))
+    assert set(cell.rows_in(BODY).tolist()) <= set(found.rows.tolist())

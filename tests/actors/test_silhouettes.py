@@ -111,6 +111,17 @@ def test_a_shadow_is_no_foreground(light, background, cell, random):
     assert share(with_test, PERSON) > 0.99
 
 
+@pytest.mark.parametrize("light", [0.5, 0.75, 0.9])
+def test_what_looks_like_a_shadow_is_no_background(light, background, cell, random):
+    """`split` names it: it may be a person in grey.  The rest of the image is neither."""
+    image = cell.copy()
+    image[SHADOW] *= light
+    mask, shade = Subtraction(background.mean, background.spread).split(taken(image, random))
+    assert share(shade | mask, SHADOW) > 0.98
+    assert not (shade & mask).any()
+    assert not shade[around(SHADOW, 3)].any()
+
+
 @pytest.mark.parametrize("factor", [0.25, 1.2])
 def test_what_is_too_dark_or_lighter_is_no_shadow(factor, background, cell, random):
     """A black thing of the floor's hue, and one lighter than the floor, are foreground.
