@@ -29,7 +29,7 @@ from actors.workcell import vocabulary as words
 from actors.workcell.reaction import reaction_of
 from actors.workcell.trace import T, trace_of
 from actors.workcell.true_hull import TrueVoxels
-from actors.workcell.truth_of_run import Truth, safety_of, truth_of
+from actors.workcell.truth_of_run import PERIOD_NS, Truth, safety_of, truth_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -263,17 +263,22 @@ def _rates(trace: Trace, truth: Truth) -> dict[str, float]:
 
 
 def _latencies(trace: Trace, truth: Truth) -> dict[str, float]:
-    """Return the times from the exposure to the commits of each stage, and to the robot's loop."""
+    """Return the times from the exposure to the commits of each stage, and to the robot's loop.
+
+    A set of which no command was made counts until the robot had the next one, or the run ended.
+    """
     last: dict[int, int] = {}
     for camera in trace.entities(words.SILHOUETTE):
         for mask in _during(trace.of(camera, words.SILHOUETTE), truth):
             last[mask.stamp_ns] = max(last.get(mask.stamp_ns, 0), mask.committed_ns)
+    sets = set(last)
     found = _quantiles("masks", [(done - stamp) / 1e6 for stamp, done in last.items()], "ms")
     for name, entity, aspect in (
         ("hull", words.WORKSPACE, words.HULL),
         ("speed", words.ROBOT, words.SPEED),
     ):
         those = _during(trace.of(entity.name, aspect), truth)
+        sets |= {one.stamp_ns for one in those}
         ages = [(one.committed_ns - one.stamp_ns) / 1e6 for one in those]
         found |= _quantiles(name, ages, "ms")
     arrived: dict[int, int] = {}
@@ -281,7 +286,11 @@ def _latencies(trace: Trace, truth: Truth) -> dict[str, float]:
         command = done.datum
         if truth.covers(command.captured_ns):
             arrived.setdefault(command.captured_ns, command.received_ns)
-    ages = [(received - captured) / 1e6 for captured, received in arrived.items()]
+    received_ns = truth.start_ns + truth.ticks * PERIOD_NS
+    ages = []
+    for captured_ns in sorted(sets | arrived.keys(), reverse=True) if arrived else ():
+        received_ns = arrived.get(captured_ns, received_ns)
+        ages.append((received_ns - captured_ns) / 1e6)
     return found | _quantiles("robot", ages, "ms")
 
 

@@ -7,10 +7,11 @@ import pytest
 
 from actors.geometry.kinematics import capsules_at
 from actors.workcell import vocabulary as words
-from actors.workcell.evaluation import GOALS, along, missed, score
+from actors.workcell.evaluation import GOALS, _latencies, along, missed, score
 from actors.workcell.simulation.arm import ARM
 from actors.workcell.simulation.human import Person
 from actors.workcell.trace import ONLINE, Kept
+from actors.workcell.truth_of_run import truth_of
 from enact_dist.errors import ConfigError
 
 from .runs import GRID, PERIOD_NS, START_NS, Run
@@ -47,6 +48,21 @@ def test_the_truth_scores_perfectly(perfect: dict[str, float]) -> None:
 def test_latencies_are_from_the_exposure(perfect: dict[str, float]) -> None:
     assert perfect["hull_p50_ms"] == pytest.approx(40.0)
     assert perfect["robot_p99_ms"] == pytest.approx(55.0)
+
+
+def test_a_set_that_never_reached_the_robot_waits_for_the_next_one() -> None:
+    """Of every second hull there is no command: the robot goes on with the one before."""
+    run = Run("S1", 2.0)
+    for tick in run.ticks:
+        run.hull(tick)
+        if tick % 2:
+            arrived(run, tick)
+    trace = run.trace()
+
+    found = _latencies(trace, truth_of(trace))
+
+    assert found["robot_p50_ms"] == pytest.approx(105.0)
+    assert found["robot_p99_ms"] == pytest.approx(155.0)
 
 
 def test_lost_voxels_and_missed_sets_are_counted() -> None:

@@ -12,6 +12,7 @@ from actors.workcell.planning import PathPlanning, PlanningWithSpeed
 from actors.workcell.simulation.arm import ARM
 from actors.workcell.vocabulary import (
     BOXES,
+    CAMERA_STATES,
     GRID,
     HULL,
     JOINTS,
@@ -268,6 +269,7 @@ def test_both_in_one_actor(worlds):
     """As in the paper's Figure 4: path and speed by one actor, from one set."""
     cell = Cell(worlds, PlanningWithSpeed())
     cell.now_ns -= 10 * PERIOD_NS
+    cell.put(SYSTEM, CAMERA_STATES, {}, cell.now_ns + PERIOD_NS)
     cell.see(START)
 
     path = cell.see(START)
