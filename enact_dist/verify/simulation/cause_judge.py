@@ -69,12 +69,15 @@ class CauseJudge:
             content = host.shard.state.slots[slot]
             if not content.version:
                 continue
-            before = self._known.get((slot, content.version, content.stamp_ns))
             writer = picture.now(slot).writer
-            if before is None and isinstance(writer, LockId):
-                # It was with the disk when the shard died.
+            if not isinstance(writer, LockId):
+                continue
+            before = self._known.get((slot, content.version, content.stamp_ns))
+            if before is None or before.lock != writer:
+                # It was with the disk when the shard died; or the power failed and the clock was
+                # set back, and it has the version and stamp of one that was lost.
                 versions = content.cause.writes if content.cause is not None else ()
                 self._check(slot, content, writer, versions)
-            elif before is not None and content.cause != before:
+            elif content.cause != before:
                 self._world.violation("a cause survives as its version does", slot, content, before)
             self._world.tally["causes over a restart"] += 1
