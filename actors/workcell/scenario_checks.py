@@ -42,19 +42,22 @@ HAND_M = 0.42
 """Nearest true distance that a reaching hand may come to a moving arm."""
 
 
-def checks_of(trace: Trace, scores: Mapping[str, float]) -> dict[str, bool]:
+def checks_of(
+    trace: Trace, scores: Mapping[str, float], played_s: float | None = None
+) -> dict[str, bool]:
     """Return what the scenario of a run must hold, in words, and whether it did.
 
     Args:
         trace: The run.
         scores: Its scores.
+        played_s: How much of the scenario was to be played; None: all of it.
     """
     truth = truth_of(trace)
     name = _playing(trace).name
     found = {
         "no moment faster than ISO/TS 15066 allows": scores.get("violations", 1.0) == 0.0,
         "every figure was measured": scores.keys() >= NEEDED
-        and scores["moments"] >= MOMENTS_S * truth.seconds,
+        and scores["moments"] >= MOMENTS_S * (truth.seconds if played_s is None else played_s),
     }
     found |= _CHECKS.get(name, _nothing)(trace, truth, scores)
     return {text: bool(held) for text, held in found.items()}  # numpy's are no JSON

@@ -64,7 +64,7 @@ def play(cell: Stepped, part: Part) -> dict[str, bool]:
     """Play the part of a scenario and return what held."""
     cell.until(part.end_s, before=lambda: cell.break_as_planned(RESTART_S))
     trace = cell.trace()
-    return checks_of(trace, score(trace, every=5))
+    return checks_of(trace, score(trace, every=5), part.end_s - part.begin_s)
 
 
 @pytest.mark.parametrize("name", PARTS)
