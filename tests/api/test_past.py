@@ -166,7 +166,7 @@ def test_what_has_left_its_retention_names_the_oldest_known_moment(online, loose
     positions += [put(online, ARM, number, FLEETING) for number in range(4, 6)]
 
     with pytest.raises(
-        ForgottenError, match=r"older than its retention, .*; all .* is known from"
+        ForgottenError, match=r"older than its retention, .*; everything requested is known from"
     ) as error:
         value_of(online.at(positions[0]), ARM, FLEETING)
 

@@ -193,7 +193,7 @@ def test_transfer_ends_once_its_lock_is_lost():
         (lambda f: Slice(f.slot, 1, b"", 0, 5000, f.offset, Datum(b"", bytes(9), 9)),
          ProtocolError, "a slice of 9 bytes"),
         (lambda f: Slice(f.slot, 1, b"", 0, 5000, 0, Datum(b"", bytes(1000), 1000)),
-         ProtocolError, "at 0 came, 1000 at 2000"),
+         ProtocolError, "at 0 instead of 1000 at 2000"),
     ],
 )  # fmt: skip
 def test_answer_that_does_not_fit_ends_the_transfer_by_name(answer, error, match):
