@@ -8,6 +8,7 @@ The kernel reports who connects and when that process ends: its session then end
 
 from __future__ import annotations
 
+import itertools
 import logging
 import os
 import select
@@ -42,6 +43,10 @@ PROCESS_CONNECTIONS_MAX: Final = 128
 KEPT_FREE: Final = 512
 """Connections reserved for processes that have fewer than that."""
 BACKLOG: Final = 256
+BURST: Final = 16
+BURST_PAUSE_S: Final = 0.005
+"""After so many connections the next has to wait so long, so that a client that opens hundreds
+leaves the interpreter to the others: each starts a thread."""
 DRAIN_ROUNDS: Final = 20
 DRAIN_STEP_S: Final = 0.001
 """How often and how long a tick waits for arrived requests to be submitted."""
@@ -83,7 +88,9 @@ class SocketService:
     # ---------------------------------------------------------------- connections
 
     def _accept(self) -> None:
-        while True:
+        for number in itertools.count(1):
+            if number % BURST == 0:
+                self._closing.wait(BURST_PAUSE_S)
             try:
                 connected, _ = self._listener.accept()
             except OSError as error:
