@@ -13,8 +13,8 @@ CALLED_NS_MAX: Final = 20_000_000_000
 
 The session's own signs of life find it sooner, once for all who wait, and wake them.
 """
-AWAY_NS_MIN: Final = 2_000_000_000
-AWAY_NS_MAX: Final = 5_000_000_000
+AWAY_NS_MIN: Final = 4_000_000_000
+AWAY_NS_MAX: Final = 10_000_000_000
 """Pause between two signs of life to a shard that is out of reach; doubles up to the second figure.
 
 The carrier tells when it comes back, so these only repair what the carrier has missed.
