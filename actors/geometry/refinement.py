@@ -89,7 +89,7 @@ BLIND_SHARE: Final = 0.15
 ENTERED_BLOCKS: Final = 8
 """So deep in a pocket are the unseen parts of who stands in its opening: an arm and a trunk."""
 NEAREST_M: Final = 0.5
-"""Nobody is nearer to a camera."""
+"""People keep at least this far from each camera."""
 NEIGHBOURS_MIN: Final = 14
 """A voxel of the tight set has at least so many of its 26 neighbours in it."""
 

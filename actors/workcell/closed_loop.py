@@ -76,7 +76,7 @@ class Sight(enum.Enum):
     ORACLE = "oracle"
     """The true distance and the true bodies, without delay but that of the robot's commands."""
     ZONE = "zone"
-    """A fixed zone: full speed while nobody is in it, and rest while somebody is."""
+    """A fixed zone: full speed while it is empty, rest while a person is in it."""
 
 
 class _Reconstruction(Reconstruction):

@@ -95,7 +95,7 @@ def _empty(trace: Trace, truth: Truth, scores: Mapping[str, float]) -> dict[str,
 def _past(trace: Trace, truth: Truth, _: Mapping[str, float]) -> dict[str, bool]:
     """S2: full speed again a second after everybody has left the workspace."""
     speeds, after = _speeds(trace, truth), []
-    empty_since = -math.inf  # nobody has been there yet
+    empty_since = -math.inf  # no person has been there yet
     for kept in speeds:
         inside = any(
             bool((np.abs(body[:, :2]) < truth.half_m).all(1).any())

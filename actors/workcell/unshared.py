@@ -52,7 +52,7 @@ class Version(NamedTuple):
 
 
 class PlainLock:
-    """What an update sees in place of a lock: a dictionary that nobody else uses.
+    """What an update sees in place of a lock: a dictionary of its own.
 
     Args:
         slots: Data by names of world context, entity and aspect.
