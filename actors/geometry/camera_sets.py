@@ -43,6 +43,8 @@ PLACES: Final = (".", "calib", "projections", "cameras")
 COLMAP_PLACES: Final = (".", "sparse", "sparse/0", "colmap")
 ROTATION_TOLERANCE: Final = 1e-2
 """How far from orthonormal R may be as written; files have four digits and more."""
+CONDITION_MAX: Final = 1e12
+"""The left part of a projection that is worse has no inverse, whatever its scale."""
 _REMEDY: Final = "enact demo workcell --help names the formats"
 _COLMAP: Final = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
@@ -166,9 +168,13 @@ def decomposed(projection: Numbers) -> tuple[Numbers, Numbers, Numbers]:
         ValueError: It is no projection of a pinhole camera with its centre at finite distance.
     """
     matrix = np.asarray(projection, np.float64)
-    left = matrix[:, :3]
-    if matrix.shape != (3, 4) or not np.isfinite(matrix).all() or abs(np.linalg.det(left)) < 1e-12:
+    if (
+        matrix.shape != (3, 4)
+        or not np.isfinite(matrix).all()
+        or np.linalg.cond(matrix[:, :3]) > CONDITION_MAX
+    ):
         raise ValueError("asked for a finite 3 x 4 projection whose left part has an inverse")
+    left = matrix[:, :3]
     if np.linalg.det(left) < 0.0:
         matrix, left = -matrix, -left
     flip = np.eye(3)[::-1]
@@ -243,7 +249,7 @@ def _json_file(folder: Path, scale_m: float) -> tuple[Path, list[SetCamera]] | N
     if not isinstance(listed, list) or not all(isinstance(one, dict) for one in listed):
         raise _wrong(file, 'an object with a list "cameras" of objects', type(content).__name__)
     unit = content.get("unit")
-    if unit is not None and unit not in UNITS:
+    if unit is not None and str(unit) not in UNITS:
         raise _wrong(file, f'"unit" as one of {", ".join(UNITS)}', repr(unit))
     scale_m = scale_m if unit is None else UNITS[unit]
     return file, [_json_camera(file, one, number, scale_m) for number, one in enumerate(listed)]

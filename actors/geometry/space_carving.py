@@ -218,8 +218,8 @@ def grid_of(low_m: Numbers, high_m: Numbers, count: int) -> VoxelBlocks:
     size = np.asarray(high_m, np.float64) - np.asarray(low_m, np.float64)
     if not np.isfinite(size).all() or (size <= 0.0).any():
         raise ValueError(
-            f"asked for a box with its low corner below its high one, found {list(low_m)} to"
-            f" {list(high_m)}"
+            f"asked for a box with its low corner below its high one, found"
+            f" {np.asarray(low_m).tolist()} to {np.asarray(high_m).tolist()}"
         )
     voxel_m = float(size.max()) / count
     step = EDGE * EDGE  # whole blocks of whole blocks, see `Carver.carve`

@@ -6,8 +6,8 @@
     images/<camera>.png              masks/<camera>.png              background/<camera>/*.png
     <camera>.png                     (a flat list: one shot per camera)
 
-Masks come from `masks`, non-zero is foreground; else from the difference to `background`; else from
-a key colour.  Every error is one line.
+Masks come from `masks`, non-zero is foreground (in a JPEG: half of white or more); else from the
+difference to `background`; else from a key colour.  Every error is one line.
 """
 
 from __future__ import annotations
@@ -37,6 +37,9 @@ COLOURS: Final = {
     "red": (200, 30, 30),
 }  # fmt: skip
 """Key colours by name, red green blue."""
+JPEG: Final = (".jpg", ".jpeg")
+JPEG_LEAST: Final = 128
+"""Least value of foreground in a JPEG mask: its compression leaves grey dots beside edges."""
 KEY_DISTANCE: Final = 48.0
 """A pixel that is this far from the key colour, in levels of Lab, is foreground."""
 FOREGROUND_MOST: Final = 0.98
@@ -188,7 +191,8 @@ def _shot(
     source, picture, key = how
     background = None
     if source == "masks":
-        mask = np.asarray(_read(file, camera, colour=False) > 0)
+        least = JPEG_LEAST if file.suffix.lower() in JPEG else 1
+        mask = np.asarray(_read(file, camera, colour=False) >= least)
         image = None if picture is None else _read(picture, camera, colour=True)
     else:
         image = _read(file, camera, colour=True)
@@ -224,7 +228,8 @@ def _read(file: Path, camera: SetCamera, *, colour: bool) -> Image:
         )
     image = np.asarray(found, np.uint8) if found.dtype == np.uint8 else _eight_bit(found)
     if not colour and image.ndim == 3:
-        image = image[..., 3] if image.shape[2] == 4 and image[..., 3].min() < 255 else image.max(2)
+        seen_through = image.shape[2] == 4 and image[..., 3].min() < 255
+        image = image[..., 3] if seen_through else image[..., :3].max(2)
     size = (camera.width or image.shape[1], camera.height or image.shape[0])
     if (image.shape[1], image.shape[0]) != size:
         raise InputFileError(

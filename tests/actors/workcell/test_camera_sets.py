@@ -52,7 +52,7 @@ def test_each_format_is_read_into_the_same_cameras(tmp_path, name):
 @given(
     st.tuples(*[st.floats(-3.0, 3.0)] * 3),
     st.tuples(*[st.floats(-2.0, 2.0)] * 3),
-    st.floats(0.1, 10.0),
+    st.floats(-8.0, 3.0).map(lambda power: 10.0**power),
     st.booleans(),
 )
 @settings(max_examples=50)
@@ -116,6 +116,9 @@ WRONG = {
     "a size": (partial(changed, width=3.5), "whole numbers of pixels"),
     "a model": (partial(colmap_with, model="FISHEYE"), "FISHEYE with 8 parameters"),
     "no P": (partial(changed, P=[[1, 2], [3, 4]]), "a projection 3 x 4 of camera 1"),
+    "a row as P": (partial(changed, P=[1, 2, 3]), "a projection 3 x 4 of camera 1"),
+    "a flat P": (partial(changed, P=[[0] * 4] * 3), "a projection 3 x 4 of camera 1"),
+    "units": (lambda folder: turntable.write_json(folder, RING, unit=["m"]), "found ['m']"),
 }  # fmt: skip
 
 

@@ -174,7 +174,10 @@ def test_surface_of_the_hull_lies_on_the_thing(carver, box):
 # ---------------------------------------------------------------- whole folders
 
 
-@pytest.mark.parametrize("kind", ["masks", "frames", "flat", "background", "key", "parameters"])
+WAYS = ["masks", "frames", "flat", "background", "key", "parameters", "opaque", "jpeg"]
+
+
+@pytest.mark.parametrize("kind", WAYS)
 def test_each_way_to_lay_out_a_folder_gives_the_same_hull(tmp_path, capsys, kind):
     """Masks, frames, a flat list, backgrounds or a key colour; outlines agree with the masks."""
     place = tmp_path / "set"
@@ -194,6 +197,12 @@ def test_each_way_to_lay_out_a_folder_gives_the_same_hull(tmp_path, capsys, kind
         turntable.write_json(place, RING, size=kind != "flat")
     if kind in ("masks", "flat"):
         write(place, "masks/{}.png" if kind == "masks" else "masks/{}.pgm")
+    if kind == "opaque":  # red, green, blue and an alpha that hides nothing
+        write(
+            place, "masks/{}.png", lambda m: np.dstack([*[m * 255] * 3, m * 0 + 255]).astype("u1")
+        )
+    if kind == "jpeg":
+        write(place, "masks/{}.jpg")
     if kind == "frames":
         for frame in ("a", "b"):
             write(place, f"masks/{{}}/{frame}.png")
@@ -286,7 +295,8 @@ WRONG = {
     ),
     "wrong bounds": (replaced("bounds.json", b'{"low": [1, 1, 1]}'), {}, "bounds.json: asked for"),
     "no box": (
-        replaced("bounds.json", b'{"low": [1, 1, 1], "high": [0, 2, 2]}'), {}, "low below high",
+        replaced("bounds.json", b'{"low": [1, 1, 1], "high": [0, 2, 2]}'), {},
+        "low corner below its high one, found [1.0, 1.0, 1.0] to [0.0, 2.0, 2.0]",
     ),
 }  # fmt: skip
 
