@@ -52,6 +52,7 @@ if TYPE_CHECKING:
 
     from actors.workcell.demo_conduct import Notes
     from actors.workcell.demo_options import Options
+    from actors.workcell.demo_what_if import WhatIf
     from enact_dist import Cell
 
 HULLS_SCORED = 120
@@ -121,11 +122,13 @@ def _run(options: Options, console: Console) -> Outcome:
         how = "in this process" if options.embedded else "a shard and processes are up"
         console.print(f"{how}; log in {running.log}")
         notes = _conducted(cell, running, options, console)
-        outcome = _reported(cell, running, options, notes, console)
+        what_if = _shown(cell, options, notes, console)
         if options.keep_running:
+            outcome = _reported(running.config, options, notes, what_if, console)
             console.print(f"the cell stays up: enact world tree online --cell {running.config}")
             _until_interrupted(running)
-    return outcome
+            return outcome
+    return _reported(running.config, options, notes, what_if, console)
 
 
 def _cell_of(options: Options) -> DemoCell:
@@ -191,19 +194,27 @@ def _conducted(cell: Cell, running: DemoCell, options: Options, console: Console
     return conductor.notes
 
 
-def _reported(
-    cell: Cell, running: DemoCell, options: Options, notes: Notes, console: Console
-) -> Outcome:
-    """Score, print and draw; return what came of it."""
-    path = options.out / "run.mcap"
+def _shown(cell: Cell, options: Options, notes: Notes, console: Console) -> WhatIf | None:
+    """Show what only a running cell can tell: its past, why it stopped, another planner."""
     if notes.nearest_ns:
         show_past(cell, notes, console)
     if notes.stop is not None:
         show_lineage(notes.stop, console)
-    what_if = show_what_if(cell, path, notes, console) if notes.forked_ns else None
-    trace = trace_of(path)
-    every = max(1, math.ceil(options.seconds * 10.0 / HULLS_SCORED))
-    scores = score(trace, every=every)
+    if not notes.forked_ns:
+        return None
+    return show_what_if(cell, options.out / "run.mcap", notes, console)
+
+
+def _reported(
+    config: Path, options: Options, notes: Notes, what_if: WhatIf | None, console: Console
+) -> Outcome:
+    """Score, print and draw a run that is over; return what came of it."""
+    with console.status("reading the recording") as status:
+        trace = trace_of(options.out / "run.mcap")
+        every = max(1, math.ceil(options.seconds * 10.0 / HULLS_SCORED))
+        scores = score(trace, every=every, tell=status.update)
+        status.update("drawing the pictures")
+        contents = {options.out / name: png for name, png in pictures_of(trace, notes).items()}
     checks = checks_of(trace, scores)
     if options.scenario == "S9":
         checks |= {"the fork was tried": what_if is not None}
@@ -230,11 +241,8 @@ def _reported(
         "cores": notes.cores,
     }
     report = report_of(scores, facts, checks)
-    contents = {
-        options.out / "report.json": report_bytes(report),
-        options.out / "figure4.svg": figure4(running.config),
-    }
-    contents |= {options.out / name: png for name, png in pictures_of(trace, notes).items()}
+    contents[options.out / "report.json"] = report_bytes(report)
+    contents[options.out / "figure4.svg"] = figure4(config)
     write_whole(contents)
     return Outcome(scores, notes.cores, report)
 

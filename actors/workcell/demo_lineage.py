@@ -30,7 +30,7 @@ def show_lineage(tree: CauseTree, console: Console) -> None:
     console.print(f"\nwhy the robot stopped: {command}; of it the hull", style="bold")
     for cause in tree.children:
         if str(cause.aspect) == words.HULL.name:
-            print_tree(drawn(cause))
+            print_tree(drawn(cause), console.file)
     console.print(f"{len(masks_of(tree))} masks; kept under the label first-stop")
 
 

@@ -25,12 +25,13 @@ from enact_dist.actor_graph_svg import svg_of
 from enact_dist.config import load_config
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
 
     import numpy.typing as npt
 
     from actors.workcell.demo_conduct import Notes
-    from actors.workcell.trace import Trace
+    from actors.workcell.trace import Kept, Trace
     from actors.workcell.truth_of_run import Truth
     from enact_dist import Aspect
 
@@ -60,7 +61,7 @@ def pictures_of(trace: Trace, notes: Notes) -> dict[str, bytes]:
         PNG by name of the file; pictures for which the run has no data are left out.
     """
     truth = truth_of(trace)
-    hulls = {kept.stamp_ns: kept.datum for kept in trace.of(words.WORKSPACE.name, words.HULL)}
+    hulls = {kept.stamp_ns: kept for kept in trace.of(words.WORKSPACE.name, words.HULL)}
     found = {"timeline.png": _timeline(trace, truth)}
     seen = [
         {kept.stamp_ns for kept in trace.of(camera, words.SILHOUETTE)}
@@ -69,8 +70,9 @@ def pictures_of(trace: Trace, notes: Notes) -> dict[str, bytes]:
     whole = set.intersection(*seen) if seen else set()
     during = sorted(stamp for stamp in hulls if truth.covers(stamp) and stamp in whole)
     if during:
-        nearest = min(during, key=lambda stamp: hulls[stamp].nearest_m)
-        stamp_ns = notes.nearest_ns if notes.nearest_ns in during else nearest
+        stamp_ns = notes.nearest_ns
+        if stamp_ns not in during:
+            stamp_ns = min(during, key=lambda stamp: hulls[stamp].datum.nearest_m)
         found |= _moment(trace, truth, hulls, stamp_ns)
     return {name: png_bytes(picture) for name, picture in found.items()}
 
@@ -91,13 +93,14 @@ def _masks(trace: Trace, stamp_ns: int) -> dict[str, words.Silhouette]:
 
 
 def _moment(
-    trace: Trace, truth: Truth, hulls: dict[int, words.Hull], stamp_ns: int
+    trace: Trace, truth: Truth, hulls: Mapping[int, Kept[words.Hull]], stamp_ns: int
 ) -> dict[str, Picture]:
     """Draw what was at one exposure."""
     grid = trace.newest(words.WORKSPACE.name, words.GRID)
     parts = [trace.newest(name, words.BOXES) for name in trace.entities(words.BOXES)]
     boxes = np.concatenate([np.empty((0, 15)), *parts])
-    hull, before = hulls[stamp_ns], hulls.get(stamp_ns - PERIOD_NS)
+    hull, last = hulls[stamp_ns].datum, hulls.get(stamp_ns - PERIOD_NS)
+    before = last.datum if last is not None else None
     arm = capsules_at(truth.arm, trace.joints().at(stamp_ns))[0]
     humans = trace.entities(words.TRACK)
     limbs = [_datum(trace, human, words.LIMBS, stamp_ns) for human in humans]

@@ -119,19 +119,24 @@ GOALS: Final[Mapping[str, Goal]] = {
 """Every score with its goal, in the order of the table."""
 
 
-def score(trace: Trace, *, every: int = 1) -> dict[str, float]:
+def score(
+    trace: Trace, *, every: int = 1, tell: Callable[[str], None] = lambda _: None
+) -> dict[str, float]:
     """Return all scores of a run that can be made of what it has, by their names in `GOALS`.
 
     Args:
         trace: The versions of the run, with what was played.
         every: Only each so-many-th hull is compared voxel by voxel.
+        tell: Called with what is being done: ten minutes of a run take minutes.
 
     Raises:
         ConfigError: The run has no truth, no arm or no grid.
     """
     truth = truth_of(trace)
+    tell("comparing the run with its truth")
     samples = samples_of(trace, every=every)
     if len(samples["share"]):
+        tell(f"playing {truth.seconds:.0f} s with an oracle and with a fixed stop zone")
         samples |= beside(truth.scenario)
     of_run = _rates(trace, truth) | _latencies(trace, truth) | reaction_of(trace, truth)
     return in_order(of_run | scores_of([samples]))
@@ -398,11 +403,12 @@ def _planning(trace: Trace, truth: Truth) -> dict[str, list[float]]:
         for kept in trace.of(words.ROBOT.name, words.PATH)
         if truth.covers(kept.stamp_ns) and len(kept.datum.waypoints)
     ]
-    hulls = {kept.stamp_ns: kept.datum for kept in trace.of(words.WORKSPACE.name, words.HULL)}
+    hulls = {kept.stamp_ns: kept for kept in trace.of(words.WORKSPACE.name, words.HULL)}
     voxels = voxels_of(trace)
     touching: list[float] = []
     for kept in paths:
-        hull = hulls.get(kept.stamp_ns)
+        planned_on = hulls.get(kept.stamp_ns)
+        hull = planned_on.datum if planned_on is not None else None
         if hull is None or not len(hull.voxels):
             touching.append(0.0)
             continue

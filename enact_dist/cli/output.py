@@ -13,6 +13,7 @@ from enact_dist.wire.texts import shown, shown_json
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
+    from typing import IO
 
 COLOURS = ("36", "33", "35", "32", "34", "31", "96", "93", "95", "92")
 """ANSI colours of log prefixes, in turn."""
@@ -25,9 +26,10 @@ TOLD_EVERY_S: Final = 0.2
 """How often a line of progress is written over."""
 
 
-def on_terminal() -> bool:
-    """Say whether standard output is a terminal that shows colours."""
-    return sys.stdout.isatty() and "NO_COLOR" not in os.environ and os.environ.get("TERM") != "dumb"
+def on_terminal(out: IO[str] | None = None) -> bool:
+    """Say whether a stream (None: standard output) is a terminal that shows colours."""
+    out = out if out is not None else sys.stdout
+    return out.isatty() and "NO_COLOR" not in os.environ and os.environ.get("TERM") != "dumb"
 
 
 def print_json(value: object) -> None:
@@ -101,21 +103,27 @@ class Branch(Protocol):
         """The parts below."""
 
 
-def print_tree(root: Branch) -> None:
-    """Print a tree with its root as the first line."""
-    if on_terminal():
-        _rich_tree(root)
+def print_tree(root: Branch, out: IO[str] | None = None) -> None:
+    """Print a tree with its root as the first line.
+
+    Args:
+        root: Of the tree.
+        out: Where to; None: standard output.
+    """
+    out = out if out is not None else sys.stdout
+    if on_terminal(out):
+        _rich_tree(root, out)
     else:
-        _plain_tree(root, 0)
+        _plain_tree(root, 0, out)
 
 
-def _plain_tree(branch: Branch, depth: int) -> None:
-    print(f"{'  ' * depth}{shown(branch.label)}")
+def _plain_tree(branch: Branch, depth: int, out: IO[str]) -> None:
+    print(f"{'  ' * depth}{shown(branch.label)}", file=out)
     for child in branch.children.values():
-        _plain_tree(child, depth + 1)
+        _plain_tree(child, depth + 1, out)
 
 
-def _rich_tree(root: Branch) -> None:
+def _rich_tree(root: Branch, out: IO[str]) -> None:
     from rich.console import Console
     from rich.text import Text
     from rich.tree import Tree
@@ -126,7 +134,7 @@ def _rich_tree(root: Branch) -> None:
 
     tree = Tree(Text(shown(root.label), style="bold"))
     grow(tree, root)
-    Console().print(tree)
+    Console(file=out).print(tree)
 
 
 # ---------------------------------------------------------------- units for people

@@ -7,10 +7,12 @@ import pickle
 import re
 import threading
 import tomllib
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 pytest.importorskip("cv2", exc_type=ImportError)
 pytest.importorskip("mcap", exc_type=ImportError)
@@ -21,6 +23,7 @@ from actors.workcell import vocabulary as words
 from actors.workcell.demo import run_quietly
 from actors.workcell.demo_cell import TEMPLATE, configured
 from actors.workcell.demo_conduct import recording, told
+from actors.workcell.demo_lineage import show_lineage
 from actors.workcell.demo_options import Options
 from actors.workcell.demo_pictures import figure4
 from actors.workcell.demo_report import markdown_of, report_of, value_text
@@ -129,6 +132,49 @@ def test_a_recording_gives_back_what_was_committed(tmp_path):
     assert [one.datum.scale for one in kept] == [0.0, 0.5, 1.0]
     assert [one.stamp_ns for one in kept] == [1000, 1001, 1002]
     assert [one.committed_ns for one in kept] == sorted(one.committed_ns for one in kept)
+
+
+def test_a_trace_takes_a_small_part_of_what_was_recorded(tmp_path):
+    """Ten minutes hold 48,000 masks and 6,000 hulls: neither they nor their chunks stay whole."""
+    packed = np.zeros((480, 80), np.uint8)
+    packed[100:200, 20:40] = 255
+    with local(worlds=["online", "truth"]) as cell:
+        mask = Write(cell.world("online"), Entity("camera/0"), words.SILHOUETTE)
+        speed = Write(cell.world("online"), words.ROBOT, words.SPEED)
+        with recording(cell, tmp_path / "run.mcap"):
+            for number in range(100):
+                with Lock(mask, speed) as lock:
+                    lock.put(mask, words.Silhouette(packed, 16_000, False))
+                    lock.put(speed, words.Speed(1.0, 1.0, 2.0, "", 250.0, number, number))
+
+    tracemalloc.start()
+    trace = trace_of(tmp_path / "run.mcap")
+    taken, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+
+    masks = trace.of("camera/0", words.SILHOUETTE)
+    assert len(masks) == 100
+    assert taken < 100 * packed.nbytes / 8
+    np.testing.assert_array_equal(masks[0].datum.packed, packed)
+
+
+def test_why_it_stopped_goes_to_where_the_progress_goes(capsys):
+    """With --json, standard output holds the report alone."""
+    with local(worlds=["online", "truth"]) as cell:
+        hull = Write(cell.world("online"), words.WORKSPACE, words.HULL)
+        speed = Write(cell.world("online"), words.ROBOT, words.SPEED)
+        with Lock(hull) as lock:
+            empty = np.empty((0, 3), np.int16), np.empty(0, np.float32)
+            flags = np.empty(0, np.bool_), np.empty(0, np.int16)
+            lock.put(hull, words.Hull(*empty, *flags, {}, (), np.inf, -1))
+        with Lock(View(cell.world("online"), words.WORKSPACE, words.HULL), speed) as lock:
+            lock.put(speed, words.Speed(0.0, 0.0, 0.1, "someone is too near", 250.0, 1, 1))
+        tree = cell.why("online", words.ROBOT, words.SPEED, depth=3)
+    console = Console(stderr=True)
+    show_lineage(tree, console)
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert "workspace/hull v1" in told.err
 
 
 def test_who_looks_on_gives_way_to_the_cell():
