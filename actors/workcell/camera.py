@@ -6,13 +6,20 @@ lock nor its shutdown, and what can be made ready before a tick is ready by then
 
 from __future__ import annotations
 
+import logging
 import queue
 import threading
 import time
 from concurrent.futures import Future
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
-from actors.workcell.sources import PERIOD_NS, CameraEndedError, CameraError, source_of
+from actors.workcell.sources import (
+    FRAME_S,
+    PERIOD_NS,
+    CameraEndedError,
+    CameraError,
+    source_of,
+)
 from actors.workcell.vocabulary import CALIBRATION, CAMERAS, IMAGE, PERIOD_S
 from enact_dist import Actor, Lock, View, World, Write
 
@@ -29,12 +36,12 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
+log = logging.getLogger("enact.actor")
+
 OPEN_S: Final = 60.0
 """How long a source may take to open; a simulated one draws its room and compiles its loops."""
 PREPARE_AFTER_NS: Final = 65_000_000
 """So long after a tick its images have become a hull, and the next ones are prepared."""
-FRAME_S: Final = 1.0
-"""A source that gives no image for so long hangs."""
 
 
 class Capture:
@@ -63,8 +70,12 @@ class Capture:
         """
         self._result(self._ask(lambda: self._source.open(calibration)), OPEN_S)
 
-    def frame(self, stamp_ns: int, wait_s: float = FRAME_S) -> tuple[Image, int]:
+    def frame(self, stamp_ns: int, wait_s: float | None = None) -> tuple[Image, int]:
         """Return the image of a tick, and when it was exposed, ns since 1970.
+
+        Args:
+            stamp_ns: The tick.
+            wait_s: How long to wait; None: as long as the source may take.
 
         Raises:
             CameraError: No image came, or none in time.
@@ -74,6 +85,8 @@ class Capture:
             image = self._source.frame(stamp_ns)
             return image, self._source.exposed_ns or stamp_ns
 
+        if wait_s is None:
+            wait_s = getattr(self._source, "frame_s", FRAME_S)
         return self._result(self._ask(take), wait_s)
 
     def prepare(self, stamp_ns: int) -> None:
@@ -133,6 +146,7 @@ class Capture:
 class Camera(Actor):
     """Publishes what one camera sees, ten times per second, all cameras at the same ticks.
 
+    Without a calibration it waits, and says so once.
     A camera that fails writes nothing: its error is reported, the tick stays without its image,
     and at the next tick its source is opened again.
 
@@ -149,6 +163,7 @@ class Camera(Actor):
         self.source = source
         self._capture: Capture | None = None
         self._opened: Calibration | None = None
+        self._waits = False
 
     def start(self) -> None:
         """Look at the address, before anything is locked.
@@ -179,10 +194,9 @@ class Camera(Actor):
         assert self._capture is not None
         calibration = lock.get(self.calibration)
         if calibration is None:
-            raise CameraError(
-                f"{self.only_entity_name()}: asked for its calibration; found none in the context;"
-                " write it first (the actor Setup does, or `lock.put` from a program of your own)"
-            )
+            self._wait_for_calibration()
+            return
+        self._waits = False
         self.look(lock)
         if self._opened is None or not _same(self._opened, calibration):
             self._capture.open(calibration)
@@ -197,6 +211,16 @@ class Camera(Actor):
         lock.put(self.image, image, stamp_ns=exposed_ns)
         self.taken(lock, image, exposed_ns)
         self._capture.prepare(lock.tick_ns + PERIOD_NS)
+
+    def _wait_for_calibration(self) -> None:
+        """Say once that no image can be taken yet: cameras start before what calibrates them."""
+        if not self._waits:
+            log.info(
+                "%s waits for its calibration: the context has none yet; the actor Setup writes"
+                " it, or `lock.put` from a program of your own",
+                self.only_entity_name(),
+            )
+        self._waits = True
 
     def taken(self, lock: Lock, image: Image, exposed_ns: int) -> None:
         """Do with an image what belongs to its update; a camera that only publishes does nothing.

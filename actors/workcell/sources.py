@@ -44,6 +44,8 @@ if TYPE_CHECKING:
 ENDINGS: Final = (".png", ".jpg", ".jpeg", ".ppm", ".pgm")
 """Files of a folder that are images."""
 PERIOD_NS: Final = round(PERIOD_S * 1e9)
+FRAME_S: Final = 1.0
+"""A source that gives no image for so long hangs, unless it says by `frame_s` that it may."""
 _VIDEO: Final = "actors.workcell.video"
 _SIMULATED: Final = "actors.workcell.simulation.sources"
 

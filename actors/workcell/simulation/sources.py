@@ -20,7 +20,7 @@ from actors.workcell.simulation.arm import ARM, HOME_RAD, shown_at
 from actors.workcell.simulation.recording import Tape, check_truth
 from actors.workcell.simulation.render import View, robot_colours
 from actors.workcell.simulation.stage import Stage
-from actors.workcell.sources import PERIOD_NS, CameraError, check_options
+from actors.workcell.sources import FRAME_S, PERIOD_NS, CameraError, check_options
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 
     Image = npt.NDArray[np.uint8]
 
+FOLLOW_S: Final = 60.0
+"""How long another scenario may take to be drawn and compared with its recording."""
 EARLY_S: Final = -1.0
 """A time before any person appears, in every scenario."""
 
@@ -109,13 +111,13 @@ class LiveSource:
         assert self._view is not None, "open first"
         playing = self._seen[0]
         if playing != self._playing:
-            self._stage = None if playing is None else self.stage_of(playing)
-            self._playing = playing
-            for boxes in () if self._stage is None else self._stage.rooms:
+            stage = None if playing is None else self.stage_of(playing)
+            for boxes in () if stage is None or stage is self._stage else stage.rooms:
                 self._view.backdrop(boxes)  # half a second each: now, not while a person walks
+            self._stage, self._playing = stage, playing
 
     def stage_of(self, playing: Playing) -> Stage:
-        """Return what a scenario puts where.
+        """Return what a scenario puts where; one that only begins at another time stays as it is.
 
         Raises:
             CameraError: It begins between two ticks, so that no image is of its second 0.
@@ -125,7 +127,27 @@ class LiveSource:
                 f"camera/{self._number}: asked for a scenario that begins at a tick, a multiple of"
                 f" {PERIOD_NS} ns; found the begin {playing.start_ns}"
             )
+        if self._stage is not None and self._plays(playing):
+            return self._stage
         return Stage(scenario_of(playing.scenario, playing.seed, playing.seconds))
+
+    def _plays(self, playing: Playing) -> bool:
+        """Whether this is the scenario that plays, whenever it begins."""
+        now = self._playing
+        return now is not None and (playing.scenario, playing.seed, playing.seconds) == (
+            now.scenario,
+            now.seed,
+            now.seconds,
+        )
+
+    @property
+    def frame_s(self) -> float:
+        """How long the next image may take: another scenario has rooms to draw.
+
+        As `look`, it may be called by any thread.
+        """
+        playing = self._seen[0]
+        return FRAME_S if playing is None or self._plays(playing) else FOLLOW_S
 
     def prepare(self, stamp_ns: int) -> None:
         """Get the people of a tick ready.
@@ -226,7 +248,8 @@ class PlaybackSource(LiveSource):
                 f" {info.seconds:g} s; record it, or play what was recorded"
             )
         stage = super().stage_of(playing)
-        check_truth(self._folder, stage)
+        if stage is not self._stage:
+            check_truth(self._folder, stage)
         return stage
 
     def people(self, at_s: float) -> Rendered:
