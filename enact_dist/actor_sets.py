@@ -11,6 +11,8 @@ PURE, as `actor_triggers`.  Rules that a change must keep:
    data runs without the others: that is counted, too (`partial`).
 4. What can be in no set is counted too: a datum without a stamp, one whose set is over (`late`), a
    second one for the same set (`skipped`), a complete set that newer ones pushed out (`skipped`).
+   With `newest_only` that is each set that waits when a newer one may run, or is older than the
+   last one that ran.
 5. What was incomplete before the actor started is not its business: at the start only the newest
    complete set runs.
 """
@@ -77,6 +79,7 @@ class PendingSets:
         within_ns: How far the stamps of one set may lie apart.
         least: With how many of its data a set may run; None: with all.
         least_after_ns: How long after its first datum it then runs.
+        newest_only: Of the sets that may run, only the newest does.
 
     Attributes:
         incomplete: Number of incomplete sets that are over.
@@ -90,7 +93,8 @@ class PendingSets:
 
     __slots__ = (
         "_due_ns", "_entity", "_floor_ns", "_known", "_least", "_least_after_ns", "_names",
-        "_newest", "_open", "_open_max", "_over", "_ready", "_unstamped", "_within_ns",
+        "_newest", "_newest_only", "_open", "_open_max", "_over", "_ready", "_taken_ns",
+        "_unstamped", "_within_ns",
         "incomplete", "last_partial", "late", "partial", "skipped", "told", "unstamped",
     )  # fmt: skip
 
@@ -103,6 +107,7 @@ class PendingSets:
         within_ns: int = 0,
         least: int | None = None,
         least_after_ns: int = 0,
+        newest_only: bool = False,
     ) -> None:
         self._names = tuple(names)
         self._entity = entity
@@ -110,6 +115,7 @@ class PendingSets:
         self._within_ns = within_ns
         self._least = len(self._names) if least is None else least
         self._least_after_ns = least_after_ns
+        self._newest_only = newest_only
         self._known: dict[int, tuple[int, int]] = {}
         self._newest = [0] * len(self._names)
         self._unstamped = [0] * len(self._names)
@@ -117,7 +123,7 @@ class PendingSets:
         self._over: list[_Set] = []
         self._floor_ns = 0
         self._ready: deque[Trigger] = deque()
-        self._due_ns = 0
+        self._due_ns = self._taken_ns = 0
         self.incomplete = self.partial = self.skipped = self.late = self.unstamped = 0
         self.last_partial = ""
         self.told: deque[IncompleteSet] = deque(maxlen=TOLD_MAX)
@@ -193,9 +199,6 @@ class PendingSets:
         while len(self._open) > self._open_max:
             self._end(self._open[0])
         self._order()
-        while len(self._ready) > self._open_max:
-            self._ready.popleft()
-            self.skipped += 1
         return self.due_ns() is not None
 
     def _age(self, now_ns: int) -> None:
@@ -207,8 +210,12 @@ class PendingSets:
         return one.since_ns + self._least_after_ns if one.count >= self._least else float("inf")
 
     def _order(self) -> None:
+        """Sort the sets that wait for their run, and skip the oldest of too many."""
         if len(self._ready) > 1:
             self._ready = deque(sorted(self._ready, key=lambda ready: ready.captured_ns))
+        while len(self._ready) > (1 if self._newest_only else self._open_max):
+            self._ready.popleft()
+            self.skipped += 1
 
     def gone(self, stamp_ns: int, missing: Sequence[int]) -> None:
         """Count a complete set whose data were outside retention before its update could run."""
@@ -266,6 +273,9 @@ class PendingSets:
 
     def _run(self, one: _Set) -> None:
         self._close(one)
+        if self._newest_only and one.low_ns < self._taken_ns:
+            self.skipped += 1
+            return
         if missing := one.missing():
             self.partial += 1
             self.last_partial = str(self._incomplete(one.low_ns, missing))
@@ -301,12 +311,15 @@ class PendingSets:
         if not self._ready or now_ns < self._due_ns:
             return None
         self._due_ns = 0
-        return self._ready.popleft()
+        trigger = self._ready.popleft()
+        self._taken_ns = trigger.captured_ns
+        return trigger
 
     def postpone(self, trigger: Trigger, due_ns: int) -> None:
-        """Put a set back that was refused; it stays the next one."""
+        """Put a set back that was refused; it stays the next one, save where a newer one waits."""
         trigger.refused += 1
         self._ready.appendleft(trigger)
+        self._order()
         self._due_ns = due_ns
 
     def due_ns(self) -> int | None:

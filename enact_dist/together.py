@@ -13,6 +13,7 @@
 
     Together(views, within_s=0.02)         # cameras without a common clock: stamps that are near
     Together(views, least=6)               # runs without up to two of eight, 0.1 s after the first
+    Together(views, newest_only=True)      # an actor that falls behind goes on with the newest set
 
 A comprehension in the body of a class sees no name of that body but in its first ``in …``: with
 ``online = World("online")`` inside `Fusion`, the list above raises `NameError`.  So roles and sets
@@ -73,7 +74,9 @@ class Together(Generic[T_co]):
             1 to 256, a `least` outside 1 to their number, a negative or infinite time.
     """
 
-    __slots__ = ("by", "least", "least_after_s", "open_max", "requests", "within_s")
+    __slots__ = (
+        "by", "least", "least_after_s", "newest_only", "open_max", "requests", "within_s",
+    )  # fmt: skip
 
     def __init__(
         self,
@@ -84,6 +87,7 @@ class Together(Generic[T_co]):
         least: int | None = None,
         least_after_s: float = LEAST_AFTER_S,
         open_max: int = OPEN_MAX,
+        newest_only: bool = False,
     ) -> None:
         self.requests: Final = tuple(requests)
         self.by: Final = by
@@ -91,6 +95,7 @@ class Together(Generic[T_co]):
         self.least: Final = len(self.requests) if least is None else least
         self.least_after_s: Final = least_after_s
         self.open_max: Final = open_max
+        self.newest_only: Final = newest_only
         for request in self.requests:
             if not isinstance(request, View) or not isinstance(request.entity, Entity):
                 raise TypeError(
@@ -123,10 +128,11 @@ class Together(Generic[T_co]):
     def __repr__(self) -> str:
         more = f", within_s={self.within_s:g}" if self.within_s else ""
         more += f", least={self.least}" if self.least < len(self.requests) else ""
+        more += ", newest_only=True" if self.newest_only else ""
         return f"Together({', '.join(map(repr, self.requests))}, by={self.by!r}{more})"
 
-    def _how(self) -> tuple[float, int, float]:
-        return self.within_s, self.least, self.least_after_s
+    def _how(self) -> tuple[float, int, float, bool]:
+        return self.within_s, self.least, self.least_after_s, self.newest_only
 
     def pending(self, names: Sequence[str]) -> PendingSets:
         """Return an empty account of its sets.
@@ -145,6 +151,7 @@ class Together(Generic[T_co]):
             within_ns=round(self.within_s * 1e9),
             least=self.least,
             least_after_ns=round(self.least_after_s * 1e9),
+            newest_only=self.newest_only,
         )
 
     def stamps(self, members: Sequence[int]) -> dict[View[Any], int]:

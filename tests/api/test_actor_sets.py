@@ -95,6 +95,41 @@ def test_complete_sets_that_nobody_takes_are_skipped_and_counted():
     assert (feed.sets.skipped, feed.runs()) == (2, [30, 40])
 
 
+def test_only_the_newest_set_runs_where_older_ones_are_of_no_use():
+    """An actor that was held up goes on with what is, and never goes back; all is counted."""
+    feed = Feed(newest_only=True, least=2, least_after_ns=10**9)
+    for stamp_ns in (10, 20, 30):
+        feed.come(stamp_ns)
+    assert (feed.sets.skipped, feed.runs()) == (2, [30])
+
+    feed.come(40, LEFT, MIDDLE)
+    feed.come(50)
+    assert feed.runs() == [50]  # 40 has enough, and its last member has moved on
+    assert feed.sets.skipped == 3
+
+    trigger = feed.sets.take(0)
+    assert trigger is None
+    feed.come(60)
+    trigger = feed.sets.take(0)
+    feed.sets.postpone(trigger, 100)
+    feed.come(70)
+    assert feed.sets.take(99) is None
+    assert feed.sets.take(100).captured_ns == 70
+    assert feed.sets.skipped == 4
+
+
+def test_set_older_than_one_that_ran_is_skipped():
+    """It became old enough to run without a member only after the newer one was complete."""
+    feed = Feed(newest_only=True, least=2, least_after_ns=100, within_ns=4)
+    feed.come(20, LEFT, now_ns=0)
+    feed.come(30, now_ns=0)
+    assert feed.runs() == [30]
+    feed.sets.captured(MIDDLE, [feed.next(MIDDLE, 20)], 0)
+
+    assert feed.members(now_ns=200) == []
+    assert feed.sets.skipped + feed.sets.late + feed.sets.incomplete >= 1
+
+
 def test_data_that_fit_no_set_are_counted_by_kind():
     """Without a stamp, for a set that is over, a second time for one that is open."""
     feed = Feed()
