@@ -193,6 +193,24 @@ def test_recording_of_what_its_scenario_was_before_is_refused_and_made_anew(tmp_
         np.testing.assert_array_equal(file[changed], now)
 
 
+def test_a_scenario_that_begins_anew_is_not_compared_again(recording, monkeypatch):
+    """Ten minutes of a recording take three seconds to compare: no image came meanwhile."""
+    compared = []
+    monkeypatch.setattr(
+        "actors.workcell.simulation.sources.check_truth", lambda *_: compared.append(1)
+    )
+    source = opened(f"playback:{recording[1]}", playing())
+    first = source.frame(BEGIN_NS + 30 * PERIOD_NS)
+    source.look(dataclasses.replace(playing(), start_ns=BEGIN_NS + 50 * PERIOD_NS), None)
+    again = source.frame(BEGIN_NS + 80 * PERIOD_NS)
+
+    assert compared == [1]
+    assert np.abs(cv2.blur(first, (5, 5)).astype(int) - cv2.blur(again, (5, 5))).max() < 8
+    with pytest.raises(CameraError, match="begins at a tick"):
+        source.look(dataclasses.replace(playing(), start_ns=BEGIN_NS + 1), None)
+        source.frame(BEGIN_NS)
+
+
 def test_recording_with_the_arm_plays_as_it_was(tmp_path):
     scenario = scenario_of("S1", 1, 0.3)
 
