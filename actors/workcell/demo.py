@@ -174,7 +174,8 @@ def record_views(options: Options, folder: Path, renderer: str) -> int:
     except CameraError as error:
         print(f"enact demo: {error}", file=sys.stderr)
         return 1
-    print(f"recorded in {folder}; play it with --play {folder}")
+    chosen = f"--scenario {scenario.name} --seed {scenario.seed} --seconds {scenario.seconds:g}"
+    print(f"recorded in {folder}; play it with --play {folder} {chosen}")
     return 0
 
 

@@ -65,10 +65,7 @@ class Options:
             raise ConfigError(f"--out {self.out} is a file; name a folder, it need not exist")
         kind, _, folder = self.source.partition(":")
         if kind in PLAYED and folder:
-            try:
-                read_info(Path(folder))
-            except CameraError as error:
-                raise ConfigError(str(error)) from error
+            self._check_recording(Path(folder))
         scenario = scenario_of(self.scenario, self.seed, self.seconds)
         if self.embedded and scenario.faults:
             raise ConfigError(
@@ -80,4 +77,19 @@ class Options:
                 f"{self.cell}: scenario {self.scenario} kills and freezes processes, and those of"
                 " this cell run elsewhere; name another scenario in the args of its actor setup",
                 path=str(self.cell),
+            )
+
+    def _check_recording(self, folder: Path) -> None:
+        """Refuse to play a recording of something else: its cameras would refuse it much later."""
+        try:
+            info = read_info(folder)
+        except CameraError as error:
+            raise ConfigError(str(error)) from error
+        recorded = (info.scenario, info.seed, info.seconds)
+        if recorded != (self.scenario, self.seed, self.seconds):
+            scenario, seed, seconds = recorded
+            raise ConfigError(
+                f"{folder}: asked for a recording of {self.scenario}, seed {self.seed},"
+                f" {self.seconds:g} s; found one of {scenario}, seed {seed}, {seconds:g} s; play it"
+                f" with --scenario {scenario} --seed {seed} --seconds {seconds:g}"
             )

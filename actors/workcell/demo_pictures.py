@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -37,6 +37,12 @@ if TYPE_CHECKING:
 
     F64 = npt.NDArray[np.float64]
     Picture = npt.NDArray[np.uint8]
+
+
+LEFT_NS: Final = 4 * PERIOD_NS
+"""Of whom nothing newer is known, that person has left."""
+WAY_NS: Final = 100 * PERIOD_NS
+"""A plan shows the ways of people as long as this."""
 
 
 def figure4(config: Path) -> bytes:
@@ -77,10 +83,19 @@ def pictures_of(trace: Trace, notes: Notes) -> dict[str, bytes]:
     return {name: png_bytes(picture) for name, picture in found.items()}
 
 
-def _datum(trace: Trace, entity: str, aspect: Aspect[Any], stamp_ns: int) -> Any:
-    """Return the datum of a slot that was the newest at a stamp, or None."""
-    before = [kept for kept in trace.of(entity, aspect) if kept.stamp_ns <= stamp_ns]
+def _datum(trace: Trace, entity: str, aspect: Aspect[Any], stamp_ns: int, since_ns: int = 0) -> Any:
+    """Return the newest datum of a slot from one stamp to another, or None."""
+    before = [kept for kept in trace.of(entity, aspect) if since_ns <= kept.stamp_ns <= stamp_ns]
     return before[-1].datum if before else None
+
+
+def _of_people(trace: Trace, aspect: Aspect[Any], stamp_ns: int) -> dict[str, Any]:
+    """Return what was known at a stamp of people who had not left by then, by name."""
+    found = {
+        human: _datum(trace, human, aspect, stamp_ns, stamp_ns - LEFT_NS)
+        for human in trace.entities(aspect)
+    }
+    return {human: datum for human, datum in found.items() if datum is not None}
 
 
 def _masks(trace: Trace, stamp_ns: int) -> dict[str, words.Silhouette]:
@@ -102,9 +117,8 @@ def _moment(
     hull, last = hulls[stamp_ns].datum, hulls.get(stamp_ns - PERIOD_NS)
     before = last.datum if last is not None else None
     arm = capsules_at(truth.arm, trace.joints().at(stamp_ns))[0]
-    humans = trace.entities(words.TRACK)
-    limbs = [_datum(trace, human, words.LIMBS, stamp_ns) for human in humans]
-    shown = np.concatenate([np.empty((0, 7)), *[each for each in limbs if each is not None]])
+    limbs = _of_people(trace, words.LIMBS, stamp_ns).values()
+    shown = np.concatenate([np.empty((0, 7)), *limbs])
     second = truth.at_s(stamp_ns)
     found = {
         "plan.png": _plan(trace, truth, (grid, boxes, hull, arm), stamp_ns),
@@ -151,12 +165,9 @@ def _properties(trace: Trace, stamp_ns: int, second: float) -> list[str]:
         lines.append(f"safety: {safety.state}")
     if path is not None:
         lines.append(f"path {path.number}: {len(path.waypoints)} points to goal {path.to_goal}")
-    for human in trace.entities(words.TRACK):
-        track = _datum(trace, human, words.TRACK, stamp_ns)
-        x, y = track.position_m[:2] if track is not None else (math.nan, math.nan)
-        if track is not None:
-            fast = float(np.linalg.norm(track.velocity_m_s))
-            lines.append(f"{human}: at {x:.1f}, {y:.1f} m, {fast:.1f} m/s, {track.height_m:.2f} m")
+    for human, track in _of_people(trace, words.TRACK, stamp_ns).items():
+        (x, y), fast = track.position_m[:2], float(np.linalg.norm(track.velocity_m_s))
+        lines.append(f"{human}: at {x:.1f}, {y:.1f} m, {fast:.1f} m/s, {track.height_m:.2f} m")
     return lines
 
 
@@ -168,21 +179,17 @@ def _plan(
     tool = np.empty((0, 3))
     if path is not None and len(path.waypoints):
         tool = tool_poses(truth.arm, along(path.waypoints))[:, :3, 3]
-    ways, tracks, predictions = [], [], []
-    for human in trace.entities(words.TRACK):
-        past = [
-            kept
-            for kept in trace.of(human, words.TRACK)
-            if 0 <= stamp_ns - kept.stamp_ns < 100 * PERIOD_NS
-        ]
-        if past and stamp_ns - past[-1].stamp_ns < 5 * PERIOD_NS:
-            ways.append(np.array([kept.datum.position_m[:2] for kept in past]))
-            tracks.append(past[-1].datum)
-            prediction = _datum(trace, human, words.PREDICTION, stamp_ns)
-            predictions += [prediction] if prediction is not None else []
+    tracks = _of_people(trace, words.TRACK, stamp_ns)
+    predictions = _of_people(trace, words.PREDICTION, stamp_ns)
+    ways = [
+        np.array([kept.datum.position_m[:2] for kept in trace.of(human, words.TRACK)
+                  if 0 <= stamp_ns - kept.stamp_ns < WAY_NS])
+        for human in tracks
+    ]  # fmt: skip
     shown = plots.Plan(
-        grid, boxes, hull, arm, tool, ways, tracks, predictions, truth.bodies_at(stamp_ns)
-    )
+        grid, boxes, hull, arm, tool, ways, [*tracks.values()], [*predictions.values()],
+        truth.bodies_at(stamp_ns),
+    )  # fmt: skip
     return plots.plan_figure(shown, f"second {truth.at_s(stamp_ns):.1f}")
 
 

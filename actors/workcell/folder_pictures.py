@@ -86,7 +86,7 @@ class Shots:
 
 
 def colour_of(text: str) -> tuple[int, int, int]:
-    """Read a colour, a name of `COLOURS` or ``#rrggbb``: red, green, blue.
+    """Read a colour, a name of `COLOURS`, ``#rrggbb`` or ``R,G,B``: red, green, blue.
 
     Raises:
         ValueError: It is invalid.
@@ -96,7 +96,10 @@ def colour_of(text: str) -> tuple[int, int, int]:
     digits = text.removeprefix("#")
     if len(digits) == 6 and all(digit in "0123456789abcdefABCDEF" for digit in digits):
         return int(digits[:2], 16), int(digits[2:4], 16), int(digits[4:], 16)
-    raise ValueError(f"asked for a colour, {', '.join(COLOURS)} or #rrggbb; found {text!r}")
+    parts = [int(part) for part in text.split(",") if part.isdecimal() and int(part) < 256]
+    if len(parts) == text.count(",") + 1 == 3:
+        return parts[0], parts[1], parts[2]
+    raise ValueError(f"asked for a colour, {', '.join(COLOURS)}, #rrggbb or R,G,B; found {text!r}")
 
 
 def read_shots(

@@ -39,7 +39,7 @@ def add_to(verbs: argparse._SubParsersAction[Verb]) -> None:
     demo.add_argument("--play", type=Path, metavar="DIR", help="play views recorded there")
     demo.add_argument("--record", type=Path, metavar="DIR", help="draw the views there, and end")
     demo.add_argument(
-        "--renderer", choices=("composite", "mujoco"), default="composite", help="of --record"
+        "--renderer", choices=("composite", "mujoco"), help="of --record (default composite)"
     )
     demo.add_argument("--embedded", action="store_true", help="all in one process")
     demo.add_argument(
@@ -62,17 +62,8 @@ def add_to(verbs: argparse._SubParsersAction[Verb]) -> None:
     real.add_argument("--grid", type=whole, metavar="N", help="voxels along the longest edge")
     real.add_argument("--unit", metavar="U", help="of a calibration that does not say its own: m")
     real.add_argument("--frame", metavar="NAME", help="which moment (default: the first)")
-    real.add_argument("--key", type=colour, metavar="R,G,B", help="colour of the backdrop")
+    real.add_argument("--key", metavar="COLOUR", help="of the backdrop: green, #00b140 or 0,177,64")
     real.add_argument("--distortion", choices=("pixel",), help="k1, k2, k3 act on radii in pixels")
-
-
-def colour(text: str) -> tuple[int, int, int]:
-    """Read a colour; an `argparse` type."""
-    parts = text.split(",")
-    if len(parts) != 3 or not all(part.isdecimal() and int(part) < 256 for part in parts):
-        raise argparse.ArgumentTypeError(f"{text!r} is no colour such as 0,160,60")
-    red, green, blue = map(int, parts)
-    return red, green, blue
 
 
 def run_workcell(arguments: argparse.Namespace) -> int:
@@ -121,19 +112,25 @@ def _run(arguments: argparse.Namespace) -> int:
         **given,
     )
     if arguments.record:
-        return record_views(options, arguments.record, arguments.renderer)
+        return record_views(options, arguments.record, arguments.renderer or "composite")
     out.mkdir(parents=True, exist_ok=True)
     return run_demo(options)
 
 
 def _run_folder(arguments: argparse.Namespace, out: Path) -> int:
+    from actors.workcell.folder_pictures import colour_of
     from actors.workcell.folders import FolderOptions, run_folder
 
     given: dict[str, Any] = {
         name: getattr(arguments, name)
-        for name in ("grid", "unit", "frame", "key")
+        for name in ("grid", "unit", "frame")
         if getattr(arguments, name) is not None
     }
+    if arguments.key is not None:
+        try:
+            given["key"] = colour_of(arguments.key)
+        except ValueError as error:
+            raise ConfigError(f"--key: {error}") from None
     options = FolderOptions(
         **given, pixel_distortion=arguments.distortion == "pixel", quiet=arguments.json
     )
@@ -141,6 +138,8 @@ def _run_folder(arguments: argparse.Namespace, out: Path) -> int:
 
 
 def _refuse_mixture(arguments: argparse.Namespace) -> None:
+    if arguments.renderer and not arguments.record:
+        raise ConfigError("--renderer belongs to --record DIR; leave it out, or record views first")
     simulated = (
         "scenario",
         "seed",

@@ -46,6 +46,8 @@ _TURN_RAD_S: Final = 2.5
 """How fast a person turns."""
 _REACH_S: Final = 0.7
 """How long a hand needs to its target, and back, before the rounding."""
+_STEP_S: Final = 0.05
+"""A velocity is that from so much earlier to so much later."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -254,6 +256,21 @@ class Person:
         radius = capsules[:, 6]
         weight = radius**2 * (np.linalg.norm(length, axis=1) + radius * 4.0 / 3.0)
         return np.asarray(weight @ middle / (2.0 * weight.sum()))
+
+    def velocity_at(self, at_s: float) -> F64 | None:
+        """Return the velocity of that middle, (2,), m/s; None while absent.
+
+        Only places of one round count: at its end a person who repeats the way starts it again.
+        """
+        if not self.begin_s <= at_s < self.end_s:
+            return None
+        begin_s = at_s - (at_s - self.begin_s) % self._every_s
+        first_s = max(at_s - _STEP_S, begin_s)
+        last_s = min(at_s + _STEP_S, begin_s + self._every_s - 1e-6)
+        before, after = self.centre_at(first_s), self.centre_at(last_s)
+        assert before is not None
+        assert after is not None
+        return np.asarray((after - before) / max(last_s - first_s, 1e-6))
 
 
 def _samples(walk: Walk) -> dict[str, F64]:

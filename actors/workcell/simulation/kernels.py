@@ -42,7 +42,8 @@ def _first_cut(
     h = b * b - a * c
     if h < 0.0:
         return -1.0, 0.0
-    t = (-b - math.sqrt(h)) / a if a > 1e-9 else 1e9
+    # A ray along the axis that meets the capsule at all entered its endless cylinder long before.
+    t = (-b - math.sqrt(h)) / a if a > 1e-9 else -1e9
     y = bo + t * be
     if 0.0 < y < bb:
         return t, y

@@ -16,7 +16,9 @@ disagree with the truth of the run.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import fcntl
 import json
 import math
 import os
@@ -39,7 +41,7 @@ from actors.workcell.sources import PERIOD_NS, CameraError
 from actors.workcell.vocabulary import PERIOD_S
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     import numpy.typing as npt
 
@@ -121,13 +123,24 @@ def kept_recording(
         f"-{wanted.width}x{wanted.height}x{len(chosen)}"
     )
     folder = root / name
-    try:
-        if read_info(folder) == wanted:
-            check_truth(folder, Stage(scenario))
-            return folder
-    except CameraError:
-        pass  # none exists, or an older version made it: make it again
-    return record(folder, scenario, renderer=renderer, calibrations=chosen, progress=progress)
+    with _alone_in(root):
+        try:
+            if read_info(folder) == wanted:
+                check_truth(folder, Stage(scenario))
+                return folder
+        except CameraError:
+            pass  # none exists, or an older version made it: make it again
+        return record(folder, scenario, renderer=renderer, calibrations=chosen, progress=progress)
+
+
+@contextlib.contextmanager
+def _alone_in(root: Path) -> Iterator[None]:
+    """Let one program at a time add to a folder of recordings: others may be playing its result."""
+    root.mkdir(parents=True, exist_ok=True)
+    with (root / ".lock").open("w") as file:
+        with contextlib.suppress(OSError):  # a file system without locks
+            fcntl.flock(file, fcntl.LOCK_EX)
+        yield
 
 
 def record(
@@ -357,7 +370,7 @@ def _record_camera(
     own = folder / f"camera_{number}"
     own.mkdir()
     still = draw(dataclasses.replace(stage.scene_at(-1.0), boxes=stage.boxes))
-    cv2.imwrite(str(own / "still.png"), still)
+    _write(own / "still.png", still)
     windows = np.zeros((info.frames, 4), np.int32)
     for frame in range(info.frames):
         image = draw(_scene(stage, frame, motion))
@@ -366,14 +379,21 @@ def _record_camera(
         if len(rows):
             left, top, right, bottom = columns[0], rows[0], columns[-1] + 1, rows[-1] + 1
             windows[frame] = left, top, right, bottom
-            part = image[top:bottom, left:right]
-            options = [cv2.IMWRITE_JPEG_QUALITY, QUALITY]
-            if not cv2.imwrite(str(own / f"{frame:06d}.jpg"), part, options):
-                raise OSError(
-                    f"{own / f'{frame:06d}.jpg'}: could not be written; is the disk full?"
-                )
+            _write(own / f"{frame:06d}.jpg", image[top:bottom, left:right])
         tell()
     np.save(own / "windows.npy", windows)
+
+
+def _write(path: Path, image: Image) -> None:
+    """Write an image.
+
+    Raises:
+        OSError: It could not be written.
+    """
+    import cv2
+
+    if not cv2.imwrite(str(path), image, [cv2.IMWRITE_JPEG_QUALITY, QUALITY]):
+        raise OSError(f"{path}: could not be written; is the disk full?")
 
 
 def _truth(

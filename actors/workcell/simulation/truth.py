@@ -5,7 +5,7 @@ Only simulated cameras and the evaluation read it.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -27,8 +27,6 @@ from enact_dist import Actor, Lock, View, World, Write, WriteEach
 if TYPE_CHECKING:
     from actors.workcell.simulation.human import Person
     from actors.workcell.vocabulary import Playing
-
-_STEP_S: Final = 0.05
 
 
 class TruthHuman(Actor):
@@ -80,11 +78,7 @@ class TruthRobot(Actor):
 def body_of(person: Person, at_s: float) -> Body | None:
     """Return the true body of a person at a time of the scenario; None while absent."""
     capsules, centre = person.capsules_at(at_s), person.centre_at(at_s)
-    if capsules is None or centre is None:
+    velocity = person.velocity_at(at_s)
+    if capsules is None or centre is None or velocity is None:
         return None
-    before, after = person.centre_at(at_s - _STEP_S), person.centre_at(at_s + _STEP_S)
-    if before is None or after is None:
-        velocity = np.zeros(2)
-    else:
-        velocity = (after - before) / (2.0 * _STEP_S)
     return Body(capsules.astype(np.float32), centre, velocity)

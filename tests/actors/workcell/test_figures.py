@@ -2,9 +2,13 @@
 
 import numpy as np
 
-from actors.workcell import plots
+from actors.workcell import demo_pictures, plots
+from actors.workcell.demo_conduct import Notes
+from actors.workcell.demo_pictures import pictures_of
 from actors.workcell.figures import CHANGED, SAME, masks_figure, scene_picture, voxel_points
-from actors.workcell.vocabulary import Grid, Silhouette
+from actors.workcell.vocabulary import LIMBS, SILHOUETTE, TRACK, Grid, Silhouette, Track
+
+from .runs import Run
 
 GRID = Grid(np.zeros(3), 0.1, (8, 8, 8))
 
@@ -36,6 +40,30 @@ def test_nothing_occupied_is_drawn_as_nothing() -> None:
     nothing = voxel_points(GRID, np.empty((0, 3), np.int16), np.array(SAME))
     floor = voxel_points(GRID, np.array([[0, 0, 0]]), np.array(SAME))
     assert scene_picture([floor, nothing], size_px=(64, 48)).shape == (48, 64, 3)
+
+
+def test_who_has_left_is_in_no_picture_of_later(monkeypatch):
+    """Neither limbs nor properties: a recording has no word that a person went."""
+    run, shown = Run("S1", 4.0), []
+    run.rest()
+    run.hull(30)
+    run.add("camera/0", SILHOUETTE, Silhouette(np.zeros((480, 80), np.uint8), 0), 30)
+    for person, tick in (("human/0", 3), ("human/1", 30)):
+        track = Track(np.array([1.0, 1.0, 1.7]), np.zeros(3), np.eye(6), 1.7, 0.07, 0, hidden=False)
+        run.add(person, TRACK, track, tick)
+        run.add(person, LIMBS, np.ones((1, 7), np.float32), tick)
+    monkeypatch.setattr(
+        demo_pictures,
+        "world_figure",
+        lambda *given: shown.append(given) or np.zeros((4, 4, 3), "u1"),
+    )
+
+    pictures = pictures_of(run.trace(), Notes())
+
+    assert len(pictures) == 5
+    *_, limbs, lines = shown[0]
+    assert len(limbs) == 1
+    assert [line[:8] for line in lines if line.startswith("human")] == ["human/1:"]
 
 
 def test_a_value_that_is_not_known_is_a_gap() -> None:

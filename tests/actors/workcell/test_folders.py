@@ -19,6 +19,7 @@ from actors.geometry.space_carving import (
 from actors.geometry.voxel_surface import surface_of, voxel_surface
 from actors.workcell.folder_pictures import colour_of
 from actors.workcell.folders import FolderOptions, run_folder
+from enact_dist.cli.main import main
 
 from . import turntable
 
@@ -340,12 +341,29 @@ def test_report_is_printed_as_json(folder, capsys):
     assert printed == json.loads((folder.parent / "out" / "report.json").read_text())
 
 
-@pytest.mark.parametrize("text", ["teal", "#12345", "#gg0000"])
+@pytest.mark.parametrize("text", ["teal", "#12345", "#gg0000", "1,2", "0,0,256", "1,2,3,4"])
 def test_colour_that_is_none_is_refused(text):
     """With those that there are."""
-    with pytest.raises(ValueError, match="black, white, green, blue, red or #rrggbb"):
+    with pytest.raises(ValueError, match="black, white, green, blue, red, #rrggbb or R,G,B"):
         colour_of(text)
-    assert colour_of("#0a0b0c") == (10, 11, 12)
+    assert colour_of("#0a0b0c") == colour_of("10,11,12") == (10, 11, 12)
+
+
+def test_key_colour_of_the_command_line_is_a_name_or_numbers(folder, capsys):
+    """All that the code reads can be typed; what it cannot read is one line."""
+    out = folder.parent / "out"
+    words = ["demo", "workcell", "--cameras", str(folder), "--out", str(out), "--key"]
+    (folder / "masks").rename(folder / "images")
+    assert main([*words, "teal"]) == 2
+    assert "--key: asked for a colour, black, white" in capsys.readouterr().err
+    assert main([*words, "black", "--grid", "32", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["masks_from"] == "key colour"
+
+
+def test_renderer_without_a_recording_is_refused(capsys):
+    """It would be played as if nobody had asked for it."""
+    assert main(["demo", "workcell", "--renderer", "mujoco"]) == 2
+    assert "--renderer belongs to --record DIR" in capsys.readouterr().err
 
 
 def test_two_masks_without_anything_agree():

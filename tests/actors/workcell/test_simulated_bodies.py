@@ -12,6 +12,7 @@ from actors.workcell.scenarios import SCENARIOS, Pause, Walk, scenario_of
 from actors.workcell.simulation.arm import ARM, BASE_HEIGHT_M, HOME_RAD
 from actors.workcell.simulation.human import CAPSULES, HEAD, RIGHT_HAND, Person, Posture, body
 from actors.workcell.simulation.stage import Stage
+from actors.workcell.simulation.truth import body_of
 
 TRUNK = slice(6, 11)
 
@@ -111,6 +112,17 @@ def test_person_stands_turns_and_reaches_where_the_walk_says():
     capsules = person.capsules_at(arrived_s + 5.0)
     assert np.linalg.norm(capsules[RIGHT_HAND, 3:6] - [0.75, -0.25, 1.0]) < 0.02
     assert person.capsules_at(person.end_s + 0.01) is None
+
+
+@pytest.mark.parametrize("repeats", [False, True])
+def test_true_velocity_is_that_of_walking_from_the_first_moment_to_the_last(repeats):
+    """Also where who walks a way again starts anew, far from its end: that is no step of theirs."""
+    person = Person(Walk(((0.0, 0.0), (6.0, 0.0)), begin_s=1.0, speed_m_s=1.2, repeats=repeats))
+    for at_s in (1.0, 1.02, 3.0, 5.96, *((6.0, 6.02) if repeats else ())):
+        found = body_of(person, at_s)
+        assert found is not None
+        assert found.velocity_m_s[0] == pytest.approx(1.2, abs=0.8)
+        assert abs(found.velocity_m_s[1]) < 0.1
 
 
 @pytest.mark.parametrize("name", SCENARIOS)

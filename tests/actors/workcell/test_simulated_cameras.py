@@ -4,12 +4,14 @@ import dataclasses
 import importlib.util
 import json
 import sys
+import threading
 
 import cv2
 import numpy as np
 import pytest
 
 from actors.geometry.kinematics import capsules_at
+from actors.workcell.demo_options import Options
 from actors.workcell.scenarios import scenario_of
 from actors.workcell.simulation import sources
 from actors.workcell.simulation.arm import ARM, HOME_RAD, shown_at
@@ -37,6 +39,7 @@ from actors.workcell.vocabulary import (
     human_entity,
 )
 from enact_dist import View, ViewEach, testing
+from enact_dist.errors import ConfigError
 
 BEGIN_NS = 1_000_000 * PERIOD_NS
 VIEWS = cameras(0.25)[:2]
@@ -164,7 +167,43 @@ def test_recording_is_made_once_and_again_if_it_is_of_something_else(recording):
     scenario = scenario_of("visit", 3, SECONDS)
     assert kept_recording(root, scenario, calibrations=VIEWS) == folder
     assert (folder / "recording.json").stat().st_mtime_ns == made_ns
-    assert [path.name for path in root.iterdir()] == [folder.name]
+    assert [path.name for path in root.iterdir() if path.is_dir()] == [folder.name]
+
+
+def test_programs_that_want_a_recording_at_once_make_one(tmp_path):
+    """The second one waits for the first and plays what it made; nobody's images are replaced."""
+    scenario, start, drawn, made = scenario_of("S1", 1, 0.5), threading.Barrier(2), [], []
+
+    def want():
+        start.wait()
+        folder = kept_recording(
+            tmp_path, scenario, calibrations=VIEWS[:1], progress=lambda *_: drawn.append(1)
+        )
+        made.append((folder / "recording.json").stat().st_ino)
+
+    programs = [threading.Thread(target=want) for _ in range(2)]
+    for program in programs:
+        program.start()
+    for program in programs:
+        program.join()
+
+    assert (len(made), len(set(made)), len(drawn)) == (2, 1, 5)
+
+
+def test_recording_that_a_full_disk_cuts_short_is_none(tmp_path, monkeypatch):
+    """Neither the empty room nor a frame is left out in silence."""
+    monkeypatch.setattr("cv2.imwrite", lambda path, *_: not path.endswith("still.png"))
+    with pytest.raises(OSError, match=r"still\.png: could not be written; is the disk full"):
+        record(tmp_path / "views", scenario_of("S1", 1, 0.2), calibrations=VIEWS[:1])
+    assert not (tmp_path / "views").exists()
+
+
+def test_options_refuse_a_recording_of_something_else(recording, tmp_path):
+    """At once, with the options that play it; its cameras would refuse it minutes later."""
+    source = f"playback+robot:{recording[1]}"
+    with pytest.raises(ConfigError, match=r"play it with --scenario visit --seed 3 --seconds 4$"):
+        Options(tmp_path, source=source)
+    assert Options(tmp_path, seed=3, seconds=SECONDS, source=source).seed == 3
 
 
 def test_recording_knows_its_truth(recording):

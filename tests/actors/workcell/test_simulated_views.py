@@ -73,6 +73,19 @@ def test_outline_and_depth_of_a_sphere_are_exact(number):
     np.testing.assert_allclose(drawn.depth_m[inside], along[inside] - half, atol=2e-4)
 
 
+@pytest.mark.parametrize("ends", [(2.0, 3.0), (3.0, 2.0)])
+def test_a_capsule_seen_along_its_axis_shows_its_nearer_end(ends):
+    """In whichever order its ends are given."""
+    from actors.workcell.simulation.kernels import draw
+
+    depth_m = np.full((1, 1), np.inf, np.float32)
+    capsule = np.array([[ends[0], 0.0, 0.0, ends[1], 0.0, 0.0, 0.1]])
+    ray, window = np.array([[[1.0, 0.0, 0.0, 1.0]]], np.float32), np.array([[0, 0, 1, 1]], np.int32)
+    image, names = np.empty((0, 0, 3), np.uint8), np.empty((0, 0), np.int16)
+    draw(image, depth_m, names, np.zeros(3), ray, window, capsule, grey(1), np.zeros(3), 0)
+    assert depth_m[0, 0] == pytest.approx(1.9)
+
+
 def test_capsules_of_arm_and_person_fill_their_outlines():
     scene = Stage(scenario_of("visit", 1)).scene_at(6.0, capsules_at(ARM, np.array(HOME_RAD))[0])
     camera = view(3).calibration
