@@ -66,7 +66,7 @@ _ONLINE: Final = World("online")
 
 def _sets(cameras: int, within_s: float, least: int) -> Together[Silhouette]:
     views = [View(_ONLINE, camera_entity(number), SILHOUETTE) for number in range(cameras)]
-    return Together(views, least=least, within_s=within_s)
+    return Together(views, least=least, within_s=within_s, newest_only=True)
 
 
 _SILHOUETTES: Final = _sets(CAMERA_COUNT, 0.0, 1)

@@ -177,6 +177,18 @@ def test_each_complete_set_runs_once_and_in_order(cell):
     assert testing.run_once(actor, cell) == 0
 
 
+def test_sets_that_came_meanwhile_are_passed_over_for_the_newest(cell):
+    """An update that was held up does not make the next ones late, too."""
+    actor = Reconstruction()
+    give_all(cell, FIRST_NS)
+    testing.run_once(actor, cell)
+    for number in range(1, 5):
+        give_all(cell, FIRST_NS + number * PERIOD_NS)
+
+    assert testing.run_once(actor, cell) == 1
+    assert seen(cell)[1] == FIRST_NS + 4 * PERIOD_NS
+
+
 def test_a_late_set_is_passed_over_while_hulls_come(cell, monkeypatch):
     """It would only make the next ones late, too; after a gap a late hull is better than none."""
     now_ns = [FIRST_NS + 10_000_000_000]
