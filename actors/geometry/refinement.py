@@ -64,6 +64,8 @@ SHELL_M: Final = 0.10
 """R3: how far from the robot a voxel may be explained by it."""
 EXPLAINED_GROWN_M: Final = 0.06
 """R3: by how much the robot's outlines are grown; its shadows and blurred edges."""
+FINE_M: Final = 0.025
+"""R3: that shell and that margin are for voxels of this edge; larger ones reach farther out."""
 LOOKED_M: Final = 0.5
 """R2: what the robot explains within this distance makes no component visible."""
 VISIBLE_M3_MIN: Final = 0.0005
@@ -194,6 +196,7 @@ class Refinement:
         self._hull, self._grid = hull, hull.grid
         self._cameras = [(c.camera_matrix, c.distortion, c.camera_from_cell) for c in calibrations]
         self._sizes = [(c.height, c.width) for c in calibrations]
+        self._coarse_m = max(0.0, (self._grid.voxel_m - FINE_M) * np.sqrt(3.0) / 2.0)
         self._static = static_voxels(self._grid, boxes)
         self._surface = surface_voxels(self._grid, boxes)
         self._floor = floor_seen(self._grid, calibrations, boxes)
@@ -373,7 +376,7 @@ class Refinement:
         if robot is None or not len(robot):
             return []
         larger = np.array(robot, np.float64)
-        larger[:, 6] += EXPLAINED_GROWN_M
+        larger[:, 6] += EXPLAINED_GROWN_M + self._coarse_m
         return self._drawn(larger)
 
     def _beside_robot(
@@ -393,7 +396,7 @@ class Refinement:
         candidates = np.flatnonzero((near_m < LOOKED_M) & ~touches & (self._says[rows] > 0))
         if len(candidates) and outline:
             explained[candidates] = self._hull.on_masks(rows[candidates], outline)
-        gone = explained & (near_m < SHELL_M)
+        gone = explained & (near_m < SHELL_M + self._coarse_m)
         counts["robot"] += int(touches.sum())
         counts["explained"] += int(gone.sum())
         stays = ~(touches | gone)

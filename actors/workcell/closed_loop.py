@@ -310,6 +310,7 @@ class ClosedLoop:
             doing.path_number,
             doing.goals_reached,
             motion.refused,
+            refusal or doing.reason,
         )
         self._keep(words.ROBOT, words.EXECUTION, done)
 

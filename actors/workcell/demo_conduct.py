@@ -229,10 +229,12 @@ class Conductor:
             self._aside(self._keep)
         if found is not None and found.state == "stop" and not self.notes.stop and now_s > 0.0:
             self._aside(self._keep_stop)
-        if found is None or found.state == before:
+        if found is None:
             return before
-        self._say(now_s, told(found))
-        return found.state
+        state, line = told(found, newest, time.time_ns())
+        if state != before:
+            self._say(now_s, line)
+        return state
 
     def _aside(self, act: Callable[[], None]) -> None:
         """Ask the shard at length in a thread, unless one does: the run must not wait for it."""
@@ -320,10 +322,19 @@ class Conductor:
         return self._running.shard_pid(name)
 
 
-def told(safety: words.Safety) -> str:
-    """Return the state of the cell in a line."""
+def told(safety: words.Safety, speed: words.Speed | None, now_ns: int) -> tuple[str, str]:
+    """Return the state of the cell in a word and in a line.
+
+    Args:
+        safety: What speed control says, who is silent while no hull comes.
+        speed: The newest command; None: there was none yet.
+        now_ns: The time.
+    """
+    age_s = 0.0 if speed is None else (now_ns - speed.captured_ns) / 1e9
+    if age_s > FRESH_S:
+        return "silent", f"silent: the robot rests; its newest command is {age_s:.1f} s old"
     reason = safety.reason.removeprefix("; ")
-    return f"{safety.state}: {reason}" if reason else safety.state
+    return safety.state, f"{safety.state}: {reason}" if reason else safety.state
 
 
 def masks_of(tree: CauseTree) -> list[CauseTree]:

@@ -145,7 +145,7 @@ class RobotJoints(Actor):
 class Robot(Actor):
     """Hand the newest path and speed to the arm's loop, as they come (ENACT 4.1).
 
-    A command whose stamps are too old is refused; `execution` says so.
+    A command whose stamps are too old is refused; `execution` says so, and how old they are.
 
     Args:
         driver: Address of the arm, as of `RobotJoints`, which has to run in the same process.
@@ -182,6 +182,7 @@ class Robot(Actor):
             path_number=doing.path_number,
             goals_reached=doing.goals_reached,
             refused=motion.refused,
+            reason=refusal or doing.reason,
         )
 
     def _arm(self) -> RunningArm:

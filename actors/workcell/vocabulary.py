@@ -308,7 +308,7 @@ class Execution:
 
     Attributes:
         state: "moving", "dwelling", "waiting" (for a path), "stopped" (scale 0) or "refused" (the
-            command is too old).
+            stamps of the command are too old, or cannot be).
         scale: Share of the nominal speed at which it moves now, 0 to 1.
         speed_m_s: Of the quickest point of the arm now.
         captured_ns: Exposure on which the command rests.
@@ -316,6 +316,8 @@ class Execution:
         path_number: Number of the path that it follows.
         goals_reached: How many goals it has reached since its start.
         refused: How many commands it has refused since its start because they were too old.
+        reason: Why the command was refused, or why the arm brakes or rests; empty if nothing
+            keeps it from moving.
     """
 
     state: str
@@ -326,6 +328,7 @@ class Execution:
     path_number: int
     goals_reached: int
     refused: int
+    reason: str = ""
 
 
 @dataclass(frozen=True, slots=True)

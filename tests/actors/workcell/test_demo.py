@@ -262,9 +262,22 @@ def test_figure_4_is_drawn_from_the_declarations():
 
 
 def test_a_state_without_a_reason_is_one_word():
-    assert told(words.Safety("run", "", 0)) == "run"
-    assert told(words.Safety("run", "; without camera/3", 0)) == "run: without camera/3"
-    assert told(words.Safety("stop", "someone is too near", 0)) == "stop: someone is too near"
+    assert told(words.Safety("run", "", 0), None, 0) == ("run", "run")
+    without = words.Safety("run", "; without camera/3", 0)
+    assert told(without, None, 0) == ("run", "run: without camera/3")
+    near = words.Safety("stop", "someone is too near", 0)
+    assert told(near, None, 0) == ("stop", "stop: someone is too near")
+
+
+def test_a_cell_without_commands_is_not_said_to_run():
+    """Speed control, which says how the cell does, says so once per hull."""
+    run, begun_ns = words.Safety("run", "", 0), 1_000_000_000
+    speed = words.Speed(1.0, 1.5, np.inf, "nobody is there", 250.0, begun_ns, begun_ns)
+
+    assert told(run, speed, begun_ns + 400_000_000) == ("run", "run")
+    state, line = told(run, speed, begun_ns + 1_200_000_000)
+    assert state != "run"
+    assert "its newest command is 1.2 s old" in line
 
 
 @pytest.mark.timing

@@ -137,6 +137,7 @@ def test_command_with_old_stamps_is_refused(running):
     running.arm.until(lambda: len(running.arm.sent) >= many)
 
     assert (said.state, said.refused) == ("refused", 1)
+    assert said.reason.endswith("ms old, 250 are allowed")
     assert not running.arm.moves
     np.testing.assert_array_equal(running.arm.sent[-1][0], HOME_RAD)
 

@@ -19,6 +19,7 @@ from actors.workcell.planning import PathPlanning
 from actors.workcell.scenario_checks import checks_of
 from enact_dist import Lock, View, Write, testing
 
+from . import stepped as stepping
 from .stepped import stepped
 
 if TYPE_CHECKING:
@@ -79,6 +80,26 @@ def test_a_scenario_holds_what_it_must(name: str, monkeypatch: pytest.MonkeyPatc
 
     assert len(held) > 1
     assert [what for what, right in held.items() if not right] == []
+
+
+def test_a_coarse_grid_does_not_hold_the_robot_after_a_restart(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A reconstruction that knows nothing of before takes no rim of the arm for a person.
+
+    The arm rests while it is away, so a rim would stay where it is, and the arm with it.
+    """
+    monkeypatch.setattr(stepping, "VOXEL_M", 0.05)
+    monkeypatch.setattr(stepping, "_tables", {})
+    with stepped(monkeypatch, "S1", seed=SEED, seconds=3.0) as cell:
+        cell.until(0.5)
+        cell.kill("reconstruction")
+        cell.until(1.8)
+        cell.start("reconstruction")
+        cell.until(2.1)
+
+        assert len(cell.newest(words.WORKSPACE, words.HULL).voxels) == 0
+        assert cell.newest(words.ROBOT, words.SPEED).scale == 1.0
 
 
 def test_online_never_sees_what_the_planner_of_a_fork_does(monkeypatch: pytest.MonkeyPatch) -> None:
