@@ -1,4 +1,4 @@
-"""Finish pictures: regions over depth images, labels, tiles, PNG.
+"""Finish pictures: depth images in grey, labels, tiles, bars, PNG.
 
 Pictures are RGB, uint8, (H, W, 3).  The font is OpenCV's, drawn large and averaged: no font file is
 needed.
@@ -10,11 +10,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from actors.geometry.files import write_whole
-
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from pathlib import Path
 
     import numpy.typing as npt
 
@@ -46,33 +43,6 @@ def depth_picture(depth_mm: npt.NDArray[np.uint16]) -> Picture:
     hatch = ((rows + columns) // 2 % 5 == 0) & ~known
     picture[hatch] = 205
     return picture
-
-
-def with_region(
-    picture: Picture,
-    region: npt.NDArray[np.bool_],
-    *,
-    colour: tuple[int, int, int] = ALARM,
-    strength: float = 0.55,
-) -> Picture:
-    """Tint a region of a picture and draw its outline.
-
-    Args:
-        picture: (H, W, 3).
-        region: (H, W), true inside.
-        colour: RGB of tint and outline.
-        strength: Share of the tint inside, 0 … 1.
-    """
-    import cv2
-
-    tinted = picture.astype(np.float32)
-    tinted[region] = (1.0 - strength) * tinted[region] + strength * np.array(colour, np.float32)
-    result = np.ascontiguousarray(np.rint(tinted).astype(np.uint8))
-    outlines, _ = cv2.findContours(
-        region.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE
-    )
-    cv2.drawContours(result, outlines, -1, colour, 1, cv2.LINE_AA)
-    return result
 
 
 def with_label(
@@ -180,15 +150,6 @@ def png_bytes(picture: Picture) -> bytes:
     if not done:
         raise ValueError(f"a picture of shape {picture.shape} and {picture.dtype} is no PNG")
     return bytes(content)
-
-
-def save_png(path: Path, picture: Picture) -> None:
-    """Write a picture so that the file is whole or absent; directories are made.
-
-    Raises:
-        OSError: The disk refuses; an older file of this name is untouched.
-    """
-    write_whole({path: png_bytes(picture)})
 
 
 def _lettering(text: str, height_px: int) -> tuple[npt.NDArray[np.uint8], Any]:

@@ -36,8 +36,6 @@ WHOLE_MAX: Final = 1 << 15
 """A grid of more voxels is first looked at block by block."""
 BEYOND: Final = 0.1
 """Share of its size that is left around what was found."""
-NEAREST: Final = 1e-3
-"""A voxel nearer to the camera's plane than this share of its distance has no pixel."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -34,10 +34,10 @@ from actors.workcell.demo_cell import EmbeddedCell, RunningCell
 from actors.workcell.demo_conduct import Conductor, recording
 from actors.workcell.demo_lineage import show_lineage, show_past, stop_checks
 from actors.workcell.demo_options import PLAYED
-from actors.workcell.demo_pictures import figure4, pictures_of
 from actors.workcell.demo_report import report_bytes, report_of, table_of
 from actors.workcell.demo_what_if import show_what_if
 from actors.workcell.evaluation import score
+from actors.workcell.figures import figure4, pictures_of
 from actors.workcell.scenario_checks import checks_of
 from actors.workcell.scenarios import scenario_of
 from actors.workcell.simulation.recording import cache_folder, kept_recording, record
@@ -215,7 +215,9 @@ def _reported(
         every = max(1, math.ceil(options.seconds * 10.0 / HULLS_SCORED))
         scores = score(trace, every=every, tell=status.update)
         status.update("drawing the pictures")
-        contents = {options.out / name: png for name, png in pictures_of(trace, notes).items()}
+        contents = {
+            options.out / name: png for name, png in pictures_of(trace, notes.nearest_ns).items()
+        }
     checks = checks_of(trace, scores)
     if options.scenario == "S9":
         checks |= {"the fork was tried": what_if is not None}

@@ -1,6 +1,6 @@
-"""Pictures of a run: masks and hulls as in ENACT's Figure 3, Figure 1's panels, plan and timeline.
+"""Pictures of a run: masks and hulls as in ENACT's Figure 3, Figure 1's panels; Figure 4.
 
-All are RGB, uint8, (H, W, 3), drawn from data of one stamp; nothing here asks a world context.
+All are drawn from the versions of its recording; but for Figure 4 they are RGB, uint8, (H, W, 3).
 """
 
 from __future__ import annotations
@@ -11,14 +11,29 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from actors.geometry.cloud_picture import draw_points
+from actors.geometry.kinematics import capsules_at
 from actors.geometry.mesh_picture import viewpoint
-from actors.geometry.picture import tiles, with_label
+from actors.geometry.picture import png_bytes, tiles, with_label
+from actors.geometry.refinement import Refinement
+from actors.geometry.visibility import camera_table
+from actors.geometry.visual_hull import VisualHull
+from actors.geometry.voxels import VoxelBlocks
+from actors.workcell import vocabulary as words
+from actors.workcell.plots import ARM, plan_figure, timeline_figure
+from actors.workcell.truth_of_run import PERIOD_NS, truth_of
+from enact_dist.actor_check import declarations_of
+from enact_dist.actor_graph import graph_of
+from enact_dist.actor_graph_svg import svg_of
+from enact_dist.config import load_config
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
+    from pathlib import Path
 
     import numpy.typing as npt
 
+    from actors.workcell.trace import Trace
+    from actors.workcell.truth_of_run import Truth
     from actors.workcell.vocabulary import Grid, Hull, Silhouette
 
     F64 = npt.NDArray[np.float64]
@@ -32,11 +47,115 @@ CHANGED: Final = (226, 92, 40)
 GONE: Final = (214, 178, 84)
 """What the refinement removed."""
 STEEL: Final = (196, 202, 210)
-ARM: Final = (240, 146, 58)
 SKIN: Final = (92, 130, 196)
 LIGHT: Final = np.array([0.45, -0.35, 0.82])
 VIEW_PX: Final = (900, 660)
 CORNERS: Final = np.array([[x, y, z] for x in (-1.5, 1.7) for y in (-1.6, 1.6) for z in (0.0, 1.7)])
+
+
+def figure4(config: Path) -> bytes:
+    """Draw the actors of a cell and the data that they declare to read and write, as SVG.
+
+    Args:
+        config: Its `cell.toml`.
+    """
+    parsed = load_config(config)
+    actors, _ = declarations_of(parsed)
+    return svg_of(graph_of(actors), f"cell {parsed.name}").encode()
+
+
+def pictures_of(trace: Trace, nearest_ns: int) -> dict[str, bytes]:
+    """Draw a run: its nearest approach, and its whole course.
+
+    Args:
+        trace: What was recorded.
+        nearest_ns: Stamp of the nearest approach; one that was not recorded whole is looked for.
+
+    Returns:
+        PNG by name of the file; pictures for which the run has no data are left out.
+    """
+    truth = truth_of(trace)
+    found = {"timeline.png": timeline_figure(trace, truth)}
+    seen = [
+        {kept.stamp_ns for kept in trace.of(camera, words.SILHOUETTE)}
+        for camera in trace.entities(words.SILHOUETTE)
+    ]
+    whole = set.intersection(*seen) if seen else set()
+    during = {
+        kept.stamp_ns: kept
+        for kept in trace.of(words.WORKSPACE.name, words.HULL)
+        if truth.covers(kept.stamp_ns) and kept.stamp_ns in whole
+    }
+    if during:
+        stamp_ns = nearest_ns
+        if stamp_ns not in during:
+            stamp_ns = min(during, key=lambda stamp: during[stamp].datum.nearest_m)
+        found |= _moment(trace, truth, during[stamp_ns].datum, stamp_ns)
+    return {name: png_bytes(picture) for name, picture in found.items()}
+
+
+def _moment(trace: Trace, truth: Truth, hull: Hull, stamp_ns: int) -> dict[str, Picture]:
+    """Draw what was at one exposure."""
+    grid, boxes = trace.newest(words.WORKSPACE.name, words.GRID), trace.boxes()
+    arm = capsules_at(truth.arm, trace.joints().at(stamp_ns))[0]
+    limbs = [np.empty((0, 7)), *trace.people_at(words.LIMBS, stamp_ns).values()]
+    lines = _properties(trace, stamp_ns, truth.at_s(stamp_ns))
+    masks, old_masks = (_masks(trace, stamp) for stamp in (stamp_ns, stamp_ns - PERIOD_NS))
+    hulls = trace.of(words.WORKSPACE.name, words.HULL)
+    old = [kept.datum for kept in hulls if kept.stamp_ns == stamp_ns - PERIOD_NS]
+    raw = _unrefined(trace, grid, masks, arm)
+    return {
+        "plan.png": plan_figure(trace, truth, hull, stamp_ns),
+        "figure1.png": world_figure(grid, boxes, arm, hull, np.concatenate(limbs), lines),
+        "figure3_bottom.png": hull_figure(grid, boxes, arm, (raw, hull), old[0] if old else None),
+        "figure3_top.png": masks_figure(masks, old_masks),
+    }
+
+
+def _masks(trace: Trace, stamp_ns: int) -> dict[str, Silhouette]:
+    return {
+        camera: kept.datum
+        for camera in trace.entities(words.SILHOUETTE)
+        for kept in trace.of(camera, words.SILHOUETTE)
+        if kept.stamp_ns == stamp_ns
+    }
+
+
+def _unrefined(
+    trace: Trace, grid: Grid, masks: dict[str, Silhouette], arm: F64
+) -> npt.NDArray[np.int16]:
+    """Return the voxels (n, 3) of a set before the refinement, carved once more."""
+    boxes, names = [trace.boxes()], trace.entities(words.CALIBRATION)
+    calibrations = [trace.newest(name, words.CALIBRATION) for name in names]
+    blocks = VoxelBlocks(grid.origin_m, grid.voxel_m, grid.shape)
+    tables = [camera_table(blocks, calibration, boxes) for calibration in calibrations]
+    refinement = Refinement(VisualHull(blocks, tables), calibrations, boxes)
+    seen = [masks[name] if name in masks and not masks[name].stand_in else None for name in names]
+    found = refinement.step(
+        [one.packed if one else None for one in seen],
+        arm,
+        math.inf,
+        [one.shade if one else None for one in seen],
+    )
+    return blocks.indices(found.raw)
+
+
+def _properties(trace: Trace, stamp_ns: int, second: float) -> list[str]:
+    """Return the high-level properties of a moment, a line each."""
+    lines = [f"second {second:.1f}"]
+    speed = trace.at(words.ROBOT.name, words.SPEED, stamp_ns)
+    safety = trace.at(words.SYSTEM.name, words.SAFETY, stamp_ns)
+    path = trace.at(words.ROBOT.name, words.PATH, stamp_ns)
+    if speed is not None:
+        lines += [f"speed: {speed.scale:.0%} of nominal", f"nearest: {speed.nearest_m:.2f} m"]
+    if safety is not None:
+        lines.append(f"safety: {safety.state}")
+    if path is not None:
+        lines.append(f"path {path.number}: {len(path.waypoints)} points to goal {path.to_goal}")
+    for human, track in trace.people_at(words.TRACK, stamp_ns).items():
+        (x, y), fast = track.position_m[:2], float(np.linalg.norm(track.velocity_m_s))
+        lines.append(f"{human}: at {x:.1f}, {y:.1f} m, {fast:.1f} m/s, {track.height_m:.2f} m")
+    return lines
 
 
 def unpacked(mask: Silhouette) -> npt.NDArray[np.bool_]:

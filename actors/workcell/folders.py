@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
     import numpy.typing as npt
 
-    from actors.geometry.camera_sets import CameraSet, SetCamera
+    from actors.geometry.camera_sets import CameraSet
     from actors.geometry.voxels import VoxelBlocks
     from actors.workcell.folder_pictures import Shot, Shots
 
@@ -299,10 +299,15 @@ def _judged(
         mean = float(np.mean(carver.agreement(*found)))
         if mean >= AGREES:
             return found
+    mirrored = Carver(carver.cameras, [mask[:, ::-1] for mask in carver.masks])
     others = {
-        "with all poses inverted (cell from camera)": _other(carver, box, "turned_round"),
-        "with y up and z back (computer graphics)": _other(carver, box, "flipped"),
-        "with the pictures mirrored left to right": _other(carver, box, "mirrored"),
+        "with all poses inverted (cell from camera)": _mean_iou(
+            Carver([one.turned_round() for one in carver.cameras], carver.masks), None
+        ),
+        "with y up and z back (computer graphics)": _mean_iou(
+            Carver([one.flipped() for one in carver.cameras], carver.masks), None
+        ),
+        "with the pictures mirrored left to right": _mean_iou(mirrored, box),
     }
     best = max(others, key=others.__getitem__)
     what = "an empty hull" if found is None else f"a mean IoU of {mean:.2f}"
@@ -316,27 +321,14 @@ def _judged(
     )
 
 
-def _other(carver: Carver, box: tuple[Numbers, Numbers] | None, way: str) -> float:
-    """Return the mean IoU if the calibration is read another way."""
-    if way == "mirrored":
-        other = Carver(carver.cameras, [mask[:, ::-1] for mask in carver.masks])
-    else:
-        turned = {"turned_round": _turned_round, "flipped": _flipped}[way]
-        other, box = Carver([turned(one) for one in carver.cameras], carver.masks), None
-    box = box or found_bounds(other)
+def _mean_iou(carver: Carver, box: tuple[Numbers, Numbers] | None) -> float:
+    """Return the mean IoU of a coarse hull and the masks."""
+    box = box or found_bounds(carver)
     if box is None:
         return 0.0
     grid = grid_of(*box, COARSE)
-    rows = other.carve(grid).tight_rows
-    return float(np.mean(other.agreement(grid, rows))) if len(rows) else 0.0
-
-
-def _turned_round(camera: SetCamera) -> SetCamera:
-    return camera.turned_round()
-
-
-def _flipped(camera: SetCamera) -> SetCamera:
-    return camera.flipped()
+    rows = carver.carve(grid).tight_rows
+    return float(np.mean(carver.agreement(grid, rows))) if len(rows) else 0.0
 
 
 # ---------------------------------------------------------------- what comes of it

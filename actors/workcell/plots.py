@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from actors.geometry.kinematics import capsules_at, end_velocities, tool_poses
 from actors.geometry.picture import INK, with_label
+from actors.geometry.separation import Separation
+from actors.workcell import vocabulary as words
+from actors.workcell.evaluation import along
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     import numpy.typing as npt
 
-    from actors.workcell.vocabulary import Grid, Hull, Prediction, Track
+    from actors.workcell.trace import Trace
+    from actors.workcell.truth_of_run import Truth
+    from actors.workcell.vocabulary import Hull
 
     F64 = npt.NDArray[np.float64]
     Picture = npt.NDArray[np.uint8]
@@ -30,6 +37,12 @@ TRACK: Final = (40, 90, 190)
 AHEAD: Final = (120, 160, 220)
 TRUE: Final = (20, 140, 90)
 PATH: Final = (150, 60, 160)
+LEGEND: Final = (
+    ("hull", OCCUPIED), ("arm", ARM), ("track, 0.5 s", TRACK), ("prediction", AHEAD),
+    ("truth", TRUE), ("path", PATH),
+)  # fmt: skip
+WAY_NS: Final = 10_000_000_000
+"""The plan shows the ways of people as long as this."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,85 +62,54 @@ class Line:
     colour: tuple[int, int, int]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Plan:
-    """What a plan shows, all of one stamp.
-
-    Attributes:
-        grid: The grid.
-        boxes: (n, 15), static obstacles.
-        hull: Occupied voxels.
-        arm: (k, 7), the arm.
-        tool_path: (n, 3), the tool along the path.
-        ways: (n, 2) each, positions of people so far.
-        tracks: Present positions of people.
-        predictions: Predicted positions of people.
-        bodies: The true bodies, each (n, 7).
-    """
-
-    grid: Grid
-    boxes: F64
-    hull: Hull
-    arm: F64
-    tool_path: F64
-    ways: Sequence[F64]
-    tracks: Sequence[Track]
-    predictions: Sequence[Prediction]
-    bodies: Sequence[F64]
-
-
-def plan_figure(plan: Plan, caption: str) -> Picture:
+def plan_figure(trace: Trace, truth: Truth, hull: Hull, stamp_ns: int) -> Picture:
     """Show the cell from above: hull, arm, tracks, predictions, path, and the truth as outlines.
 
     Args:
-        plan: What to show.
-        caption: A line over it.
+        trace: What was recorded.
+        truth: What really was.
+        hull: The hull of the moment.
+        stamp_ns: The moment.
     """
     import cv2
 
     sheet = np.full((PLAN_PX, PLAN_PX, 3), 252, np.uint8)
-    half = np.array(plan.grid.shape[:2]) * plan.grid.voxel_m / 2.0
-    middle = plan.grid.origin_m[:2] + half
-    corners = [tuple(_px(middle + sign * half).tolist()) for sign in (-1.0, 1.0)]
-    cv2.rectangle(sheet, corners[0], corners[1], GREY, 2)
-    for box in plan.boxes:
+    grid = trace.newest(words.WORKSPACE.name, words.GRID)
+    low = grid.origin_m[:2]
+    size = np.array(grid.shape[:2]) * grid.voxel_m
+    cv2.rectangle(sheet, _at(low), _at(low + size), GREY, 2)
+    for box in trace.boxes():
         turn = box[6:].reshape(3, 3)[:2, :2]
         rim = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * box[3:5]
         cv2.fillConvexPoly(sheet, _px(box[:2] + rim @ turn.T), GREY, cv2.LINE_AA)
-    if len(plan.hull.voxels):
-        columns = np.unique(plan.hull.voxels[:, :2], axis=0)
-        for low in plan.grid.origin_m[:2] + columns * plan.grid.voxel_m:
-            one, other = _px(low), _px(low + plan.grid.voxel_m)
-            cv2.rectangle(sheet, tuple(one.tolist()), tuple(other.tolist()), OCCUPIED, cv2.FILLED)
-    for capsule in plan.arm:
-        _stroke(sheet, capsule, ARM)
-    for body in plan.bodies:
-        for capsule in body:
-            cv2.circle(
-                sheet, tuple(_px(capsule[:2]).tolist()), _length(capsule[6]), TRUE, 1, cv2.LINE_AA
-            )
-    for way in plan.ways:
-        cv2.polylines(sheet, [_px(way)], False, TRACK, 2, cv2.LINE_AA)
-    for prediction in plan.predictions:
+    for corner in low + np.unique(hull.voxels[:, :2], axis=0) * grid.voxel_m:
+        cv2.rectangle(sheet, _at(corner), _at(corner + grid.voxel_m), OCCUPIED, cv2.FILLED)
+    for capsule in capsules_at(truth.arm, trace.joints().at(stamp_ns))[0]:
+        ends, thick = (_at(capsule[:3]), _at(capsule[3:6])), 2 * _length(capsule[6])
+        cv2.line(sheet, *ends, ARM, thick, cv2.LINE_AA)
+    for capsule in (capsule for body in truth.bodies_at(stamp_ns) for capsule in body):
+        cv2.circle(sheet, _at(capsule[:2]), _length(capsule[6]), TRUE, 1, cv2.LINE_AA)
+    tracks = trace.people_at(words.TRACK, stamp_ns)
+    for human in tracks:
+        past = [
+            kept.datum.position_m[:2]
+            for kept in trace.of(human, words.TRACK)
+            if 0 <= stamp_ns - kept.stamp_ns < WAY_NS
+        ]
+        cv2.polylines(sheet, [_px(np.array(past))], False, TRACK, 2, cv2.LINE_AA)
+    for prediction in trace.people_at(words.PREDICTION, stamp_ns).values():
         for centre, radius in zip(prediction.centre_m, prediction.radius_m, strict=True):
-            cv2.circle(sheet, tuple(_px(centre).tolist()), _length(radius), AHEAD, 1, cv2.LINE_AA)
-    for track in plan.tracks:
-        here = _px(track.position_m[:2])
-        ahead = _px(track.position_m[:2] + 0.5 * track.velocity_m_s[:2])
-        cv2.circle(sheet, tuple(here.tolist()), 7, TRACK, cv2.FILLED, cv2.LINE_AA)
-        cv2.arrowedLine(sheet, tuple(here.tolist()), tuple(ahead.tolist()), TRACK, 2, cv2.LINE_AA)
-    if len(plan.tool_path) > 1:
-        cv2.polylines(sheet, [_px(plan.tool_path[:, :2])], False, PATH, 3, cv2.LINE_AA)
-    sheet = with_label(sheet, caption, (12, 10), height_px=20)
-    legend = [
-        ("hull", OCCUPIED),
-        ("arm", ARM),
-        ("track, 0.5 s", TRACK),
-        ("prediction", AHEAD),
-        ("truth", TRUE),
-        ("path", PATH),
-    ]
-    return _legend(sheet, legend)
+            cv2.circle(sheet, _at(centre), _length(radius), AHEAD, 1, cv2.LINE_AA)
+    for track in tracks.values():
+        here, ahead = track.position_m[:2], track.velocity_m_s[:2] * 0.5
+        cv2.circle(sheet, _at(here), 7, TRACK, cv2.FILLED, cv2.LINE_AA)
+        cv2.arrowedLine(sheet, _at(here), _at(here + ahead), TRACK, 2, cv2.LINE_AA)
+    path = trace.at(words.ROBOT.name, words.PATH, stamp_ns)
+    if path is not None and len(path.waypoints):
+        tool = tool_poses(truth.arm, along(path.waypoints))[:, :2, 3]
+        cv2.polylines(sheet, [_px(tool)], False, PATH, 3, cv2.LINE_AA)
+    sheet = with_label(sheet, f"second {truth.at_s(stamp_ns):.1f}", (12, 10), height_px=20)
+    return _legend(sheet, LEGEND)
 
 
 def _px(points_m: F64) -> npt.NDArray[np.int32]:
@@ -137,15 +119,13 @@ def _px(points_m: F64) -> npt.NDArray[np.int32]:
     return np.asarray(np.rint(place), np.int32)
 
 
+def _at(point_m: F64) -> tuple[int, int]:
+    x, y = _px(point_m).tolist()
+    return x, y
+
+
 def _length(metres: float) -> int:
     return max(1, round(float(metres) / (2.0 * PLAN_M) * PLAN_PX))
-
-
-def _stroke(sheet: Picture, capsule: F64, colour: tuple[int, int, int]) -> None:
-    import cv2
-
-    one, other = (tuple(_px(end).tolist()) for end in (capsule[:3], capsule[3:6]))
-    cv2.line(sheet, one, other, colour, 2 * _length(capsule[6]), cv2.LINE_AA)
 
 
 def _legend(sheet: Picture, entries: Sequence[tuple[str, tuple[int, int, int]]]) -> Picture:
@@ -158,6 +138,42 @@ def _legend(sheet: Picture, entries: Sequence[tuple[str, tuple[int, int, int]]])
         sheet = with_label(sheet, name, (left + 18, top - 2), height_px=16, paper=None)
         left += 40 + 10 * len(name)
     return sheet
+
+
+def timeline_figure(trace: Trace, truth: Truth) -> Picture:
+    """Draw distance and speed over the whole run."""
+    motion = trace.joints()
+    chosen = np.array([truth.covers(int(stamp)) for stamp in motion.stamp_ns], np.bool_)
+    stamps, q, dq = motion.stamp_ns[chosen][::5], motion.q[chosen][::5], motion.dq[chosen][::5]
+    at_s = (stamps - truth.start_ns) / 1e9
+    true_m = np.array([truth.distance_m(int(s), one) for s, one in zip(stamps, q, strict=True)])
+    fast = np.empty(0)
+    if len(q):
+        fast = np.linalg.norm(end_velocities(truth.arm, q, dq), axis=-1).max((1, 2))
+    spent = Separation(reaction_s=0.0)
+    limit = np.array([spent.speed_max_m_s(float(one)) for one in true_m])
+    speeds = [
+        kept for kept in trace.of(words.ROBOT.name, words.SPEED) if truth.covers(kept.stamp_ns)
+    ]
+    seen_s = np.array([truth.at_s(kept.stamp_ns) for kept in speeds])
+    seen_m = np.array([kept.datum.nearest_m for kept in speeds])
+    told = np.array([kept.datum.limit_m_s for kept in speeds])
+    distances = [
+        Line("true", at_s, np.where(true_m < 3.0, true_m, np.nan), TRUE),
+        Line("estimated", seen_s, seen_m, ARM),
+    ]
+    moved = [
+        Line("allowed for the true distance", at_s, limit, TRUE),
+        Line("commanded limit", seen_s, told, ARM),
+        Line("actual", at_s, fast, TRACK),
+    ]
+    top = math.ceil(12.0 * float(fast.max(initial=0.5))) / 10.0
+    return timeline(
+        [
+            ("distance of the nearest to the arm, m", 3.0, distances),
+            ("speed of the quickest point, m/s", top, moved),
+        ]
+    )
 
 
 def timeline(

@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import zlib
 from collections import defaultdict
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
 import numpy as np
@@ -20,14 +20,12 @@ from enact_dist.recording.reading import Recording
 from enact_dist.wire.payload import decode_datum
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Mapping
     from pathlib import Path
 
     import numpy.typing as npt
 
     from enact_dist.core.datum import Datum
-    from enact_dist.recording.exact import Recorded
-
 T = TypeVar("T")
 
 ONLINE: Final = "online"
@@ -38,6 +36,8 @@ ASPECTS: Final[Mapping[str, Aspect[Any]]] = {
 """The aspects of the workcell by name."""
 RECORDED: Final = tuple(sorted(ASPECTS.keys() - {"image", "raw_hull", "background", "wanted"}))
 """What a run records: all but the images and what is only made for pictures."""
+LEFT_NS: Final = 400_000_000
+"""A person of whom no datum is as new as this has left: null versions are not kept here."""
 PACKED_BYTES_MIN: Final = 4096
 """From here on a datum is kept compressed: a mask of 38 kB takes 2 kB, ten minutes hold 48,000."""
 
@@ -118,6 +118,24 @@ class Trace:
             if (context, name) == (world, aspect.name)
         )
 
+    def at(self, entity: str, aspect: Aspect[T], stamp_ns: int, *, since_ns: int = 0) -> T | None:
+        """Return the newest datum of a slot from `since_ns` to a stamp, or None."""
+        found = [kept for kept in self.of(entity, aspect) if since_ns <= kept.stamp_ns <= stamp_ns]
+        return found[-1].datum if found else None
+
+    def people_at(self, aspect: Aspect[T], stamp_ns: int) -> dict[str, T]:
+        """Return what was known at a stamp of people who had not left by then, by name."""
+        found = {
+            human: self.at(human, aspect, stamp_ns, since_ns=stamp_ns - LEFT_NS)
+            for human in self.entities(aspect)
+        }
+        return {human: datum for human, datum in found.items() if datum is not None}
+
+    def boxes(self) -> npt.NDArray[np.float64]:
+        """Return the boxes of all static obstacles, (n, 15), as the aspect `boxes` has them."""
+        parts = [self.newest(name, words.BOXES) for name in self.entities(words.BOXES)]
+        return np.concatenate([np.empty((0, 15)), *parts])
+
     def joints(self) -> Motion:
         """Return all samples of the arm, each once, in the order of time."""
         data = [kept.datum for kept in self.of(words.ROBOT.name, words.JOINTS)]
@@ -149,24 +167,6 @@ class Motion:
         return np.array([np.interp(stamp_ns, self.stamp_ns, joint) for joint in self.q.T])
 
 
-@dataclass(slots=True)
-class Gatherer:
-    """Collects versions of a recording while it is read."""
-
-    versions: dict[tuple[str, str, str], list[Kept[Any]]] = field(
-        default_factory=lambda: defaultdict(list)
-    )
-
-    def take(self, recorded: Recorded) -> None:
-        """Keep one version, unless it is null or its aspect is not the workcell's."""
-        aspect = ASPECTS.get(recorded.slot.aspect)
-        if recorded.datum is None or aspect is None:
-            return
-        slot = (recorded.slot.context, recorded.slot.entity, recorded.slot.aspect)
-        held = _held(recorded.datum, aspect.datum_type)
-        self.versions[slot].append(Kept(recorded.captured_ns, recorded.stamp_ns, held))
-
-
 def _held(datum: Datum, datum_type: type[T]) -> T | Packed[T]:
     """Return a value or its packed datum; neither keeps the chunk that it was read from."""
     if datum.size < PACKED_BYTES_MIN:
@@ -185,12 +185,12 @@ def trace_of(path: Path) -> Trace:
     Raises:
         ConfigError: The file is no recording, or cannot be read.
     """
-    recording, gatherer = Recording(path), Gatherer()
-    for recorded in _versions(recording):
-        gatherer.take(recorded)
-    return Trace(dict(gatherer.versions), int(recording.end.get("missing", "0")))
-
-
-def _versions(recording: Recording) -> Iterator[Recorded]:
-    for commit in recording.commits():
-        yield from commit.versions
+    recording = Recording(path)
+    versions: dict[tuple[str, str, str], list[Kept[Any]]] = defaultdict(list)
+    for recorded in (version for commit in recording.commits() for version in commit.versions):
+        aspect = ASPECTS.get(recorded.slot.aspect)
+        if recorded.datum is not None and aspect is not None:
+            slot = (recorded.slot.context, recorded.slot.entity, recorded.slot.aspect)
+            held = _held(recorded.datum, aspect.datum_type)
+            versions[slot].append(Kept(recorded.captured_ns, recorded.stamp_ns, held))
+    return Trace(dict(versions), int(recording.end.get("missing", "0")))

@@ -25,8 +25,8 @@ from actors.workcell.demo_cell import TEMPLATE, configured
 from actors.workcell.demo_conduct import recording, told
 from actors.workcell.demo_lineage import show_lineage
 from actors.workcell.demo_options import Options
-from actors.workcell.demo_pictures import figure4
 from actors.workcell.demo_report import markdown_of, report_of, value_text
+from actors.workcell.figures import figure4
 from actors.workcell.scenarios import Fault, scenario_of
 from actors.workcell.setup import Setup, grid_of
 from actors.workcell.simulation.truth import TruthHuman

@@ -2,9 +2,7 @@
 
 import numpy as np
 
-from actors.workcell import demo_pictures, plots
-from actors.workcell.demo_conduct import Notes
-from actors.workcell.demo_pictures import pictures_of
+from actors.workcell import figures, plots
 from actors.workcell.figures import CHANGED, SAME, masks_figure, scene_picture, voxel_points
 from actors.workcell.vocabulary import LIMBS, SILHOUETTE, TRACK, Grid, Silhouette, Track
 
@@ -53,12 +51,12 @@ def test_who_has_left_is_in_no_picture_of_later(monkeypatch):
         run.add(person, TRACK, track, tick)
         run.add(person, LIMBS, np.ones((1, 7), np.float32), tick)
     monkeypatch.setattr(
-        demo_pictures,
+        figures,
         "world_figure",
         lambda *given: shown.append(given) or np.zeros((4, 4, 3), "u1"),
     )
 
-    pictures = pictures_of(run.trace(), Notes())
+    pictures = figures.pictures_of(run.trace(), 0)
 
     assert len(pictures) == 5
     *_, limbs, lines = shown[0]
