@@ -14,6 +14,7 @@ lower limit is obeyed with full deceleration.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Final, Protocol
 
 import numpy as np
@@ -43,6 +44,14 @@ KEPT: Final = 0.97
 """Aim below a limit of speed: while the reach grows, the follower is a cycle behind."""
 ARRIVED_RAD: Final = 2e-4
 """So near to its end a path is over."""
+NEAR_RAD: Final = 0.02
+"""Distance of the places among which the nearest one is sought first."""
+GAP_RAD: Final = 1e-6
+"""A path leads into another one if they lie no farther apart."""
+BEND_LEAST: Final = 1e-3
+"""Less curvature is none, rad/rad²."""
+FAST_SHARE: Final = 1.02
+"""How far a follower may be above a limit that lies ahead: while it brakes it is a cycle behind."""
 
 
 class Arm(Chain, Protocol):
@@ -64,7 +73,67 @@ class Arm(Chain, Protocol):
         ...
 
 
-class JointPath:
+class Line(ABC):
+    """A curve of the joints by its parameter, 0 to `length_rad`.
+
+    Attributes:
+        length_rad: The greatest `s`.
+    """
+
+    length_rad: float
+
+    @abstractmethod
+    def at(self, s_rad: F64 | float) -> tuple[F64, F64, F64]:
+        """Return q, q' and q'' at places along the path.
+
+        Args:
+            s_rad: (m,), or one; beyond the ends, the ends.
+
+        Returns:
+            Three (m, n): rad, rad/rad, rad/rad².
+        """
+
+    @abstractmethod
+    def straight_rad(self, s_rad: float) -> float:
+        """Return the first place from `s` on where the path is straight."""
+
+    @property
+    @abstractmethod
+    def pieces(self) -> tuple[tuple[JointPath, float, float], ...]:
+        """The paths that it is made of: each with where it begins on that path, and its length."""
+
+    def nearest_rad(self, q_rad: F64, from_rad: float = 0.0) -> float:
+        """Return the place that is nearest to a state of the joints, (n,), from a place on."""
+        from_rad = float(np.clip(from_rad, 0.0, self.length_rad))
+        count = int(np.ceil((self.length_rad - from_rad) / NEAR_RAD)) + 1
+        places = np.linspace(from_rad, self.length_rad, count + 1)
+        off = np.linalg.norm(self.at(places)[0] - q_rad, axis=1)
+        place, least = float(places[np.argmin(off)]), float(off.min())
+        for _ in range(6):
+            q, dq, _ = self.at(place)
+            along = float((q_rad - q[0]) @ dq[0] / max(float(dq[0] @ dq[0]), 1e-9))
+            there = place + float(np.clip(along, -NEAR_RAD, NEAR_RAD))
+            there = float(np.clip(there, from_rad, self.length_rad))
+            now = float(np.linalg.norm(self.at(there)[0][0] - q_rad))
+            if now >= least:
+                break
+            place, least = there, now
+        return place
+
+    def states(self, from_rad: float, to_rad: float, step_rad: float) -> F64:
+        """Return states along a stretch of the path, both of its ends included, (m, n)."""
+        count = max(2, int(np.ceil((to_rad - from_rad) / step_rad)) + 1)
+        return self.at(np.linspace(from_rad, to_rad, count))[0]
+
+    def leads_into(self, at_rad: float, other: Line) -> bool:
+        """Say whether another path begins at a place of this one, straight on."""
+        q, dq, ddq = self.at(at_rad)
+        begins, heading, _ = other.at(0.0)
+        gap = max(float(np.abs(q - begins).max()), float(np.abs(dq - heading).max()))
+        return gap <= GAP_RAD and float(np.abs(ddq).max()) <= BEND_LEAST
+
+
+class JointPath(Line):
     """A polyline with rounded corners, see the module.
 
     Args:
@@ -89,7 +158,9 @@ class JointPath:
         self._at_rad = np.r_[0.0, np.cumsum(lengths)]
         self.length_rad = float(self._at_rad[-1])
         corner = np.zeros(len(points))
-        corner[1:-1] = np.minimum(CORNER_RAD, 0.5 * np.minimum(lengths[:-1], lengths[1:]))
+        room = 0.5 * lengths
+        room[:1], room[-1:] = lengths[:1], lengths[-1:]  # only one corner shares these
+        corner[1:-1] = np.minimum(CORNER_RAD, np.minimum(room[:-1], room[1:]))
         self.corner_rad = corner
 
     def at(self, s_rad: F64 | float) -> tuple[F64, F64, F64]:
@@ -129,21 +200,66 @@ class JointPath:
         ddq = (3.0 * t * (1.0 - t) / reach[:, None]) * (behind - before)
         return q, before + share * (behind - before), ddq
 
-    def nearest_rad(self, q_rad: F64) -> float:
-        """Return the place along the path that is nearest to a state of the joints, (n,)."""
-        if len(self.waypoints) == 1:
-            return 0.0
-        ahead = ((q_rad - self.waypoints[:-1]) * self._directions).sum(1)
-        s = self._at_rad[:-1] + np.clip(ahead, 0.0, np.diff(self._at_rad))
-        fine = np.clip(s[:, None] + np.linspace(-0.2, 0.2, 81), 0.0, self.length_rad).ravel()
-        s = np.r_[s, fine]
-        off = np.linalg.norm(self.at(s)[0] - q_rad, axis=1)
-        return float(s[int(np.argmin(off))])
+    @property
+    def pieces(self) -> tuple[tuple[JointPath, float, float], ...]:
+        """The path itself, all of it."""
+        return ((self, 0.0, self.length_rad),)
 
-    def states(self, from_rad: float, to_rad: float, step_rad: float) -> F64:
-        """Return states along a stretch of the path, both of its ends included, (m, n)."""
-        count = max(2, int(np.ceil((to_rad - from_rad) / step_rad)) + 1)
-        return self.at(np.linspace(from_rad, to_rad, count))[0]
+    def straight_rad(self, s_rad: float) -> float:
+        """Return the first place from `s` on where the path is straight: `s`, or a corner's end."""
+        inside = np.abs(s_rad - self._at_rad) < self.corner_rad
+        return float((self._at_rad + self.corner_rad)[inside].max(initial=s_rad))
+
+
+class JoinedPath(Line):
+    """A path from a place on, which goes over to another one at a later place.
+
+    Args:
+        first: The path.
+        from_rad: Where on it this one begins.
+        to_rad: Where on it the other one begins; at `from_rad` or behind it.
+        second: The other one; `first` leads straight into it there.
+
+    Raises:
+        ValueError: There would be a gap or a kink.
+    """
+
+    def __init__(self, first: Line, from_rad: float, to_rad: float, second: Line) -> None:
+        if not first.leads_into(to_rad, second):
+            raise ValueError(f"the path does not lead straight into the other one at {to_rad} rad")
+        before, at_rad = [], 0.0
+        for path, begins_rad, length_rad in first.pieces:
+            low, high = max(from_rad, at_rad), min(to_rad, at_rad + length_rad)
+            if high > low:
+                before.append((path, begins_rad + low - at_rad, high - low))
+            at_rad += length_rad
+        self._pieces = (*before, *second.pieces)
+        ends = np.cumsum([length_rad for _, _, length_rad in self._pieces])
+        self._at_rad = np.r_[0.0, ends[:-1]]
+        self.length_rad = float(ends[-1])
+
+    @property
+    def pieces(self) -> tuple[tuple[JointPath, float, float], ...]:
+        """The paths that it is made of: each with where it begins on that path, and its length."""
+        return self._pieces
+
+    def at(self, s_rad: F64 | float) -> tuple[F64, F64, F64]:
+        """Return q, q' and q'', as `Line.at`."""
+        s = np.clip(np.atleast_1d(np.asarray(s_rad, np.float64)), 0.0, self.length_rad)
+        which = np.searchsorted(self._at_rad, s, side="right") - 1
+        found = np.empty((3, len(s), self._pieces[0][0].waypoints.shape[1]))
+        for number, (path, begins_rad, _) in enumerate(self._pieces):
+            here = which == number
+            if here.any():
+                found[:, here] = path.at(s[here] - self._at_rad[number] + begins_rad)
+        return found[0], found[1], found[2]
+
+    def straight_rad(self, s_rad: float) -> float:
+        """Return the first place from `s` on where the path is straight."""
+        number = max(0, int(np.searchsorted(self._at_rad, s_rad, side="right")) - 1)
+        path, begins_rad, length_rad = self._pieces[number]
+        there = path.straight_rad(s_rad - self._at_rad[number] + begins_rad) - begins_rad
+        return float(self._at_rad[number] + min(there, length_rad))
 
 
 class PathSpeeds:
@@ -166,7 +282,7 @@ class PathSpeeds:
         nominal_rad_s: (m,), greatest `ds/dt`.
     """
 
-    def __init__(self, arm: Arm, path: JointPath, *, nominal_m_s: float) -> None:
+    def __init__(self, arm: Arm, path: Line, *, nominal_m_s: float) -> None:
         self.path = path
         count = int(np.ceil(path.length_rad / GRID_RAD)) + 2
         self.places_rad = np.linspace(0.0, path.length_rad, count)
@@ -195,6 +311,17 @@ class PathSpeeds:
         step = self.places_rad[1] - self.places_rad[0] if len(self.places_rad) > 1 else 1.0
         came_s = np.cumsum(step / self.nominal_rad_s[first:])
         return slice(first, first + 1 + int(np.searchsorted(came_s, seconds)))
+
+    def reached_rad(self, s_rad: float, speed_rad_s: float, seconds: float) -> float:
+        """Return how far the arm can come within a time, from `s` on, at most."""
+        left_s = seconds
+        while left_s > 0.0 and s_rad < self.path.length_rad:
+            step_s = min(0.01, left_s)
+            quickest = speed_rad_s + self.starting_rad_s2 * step_s
+            least = speed_rad_s - self.braking_rad_s2 * step_s
+            speed_rad_s = max(least, min(quickest, float(self.nominal_rad_s[self.place(s_rad)])))
+            s_rad, left_s = s_rad + speed_rad_s * step_s, left_s - step_s
+        return min(s_rad, self.path.length_rad)
 
     def nominal_m_s(self, s_rad: float, ahead_s: float) -> float:
         """Return the quickest speed of a capsule's end from `s` on, nothing limiting, m/s."""
@@ -230,7 +357,7 @@ class PathFollower:
         import ruckig
 
         self.speeds = speeds
-        self._braking_m_s2 = braking_m_s2
+        self._cycle_s, self._braking_m_s2 = cycle_s, braking_m_s2
         self._end_rad = speeds.path.length_rad
         self._allowed: tuple[float, F64] = (np.inf, speeds.nominal_rad_s)
         self._ruckig = ruckig.Ruckig(1, cycle_s)
@@ -276,6 +403,24 @@ class PathFollower:
             self.speed_rad_s**2 / (1.6 * self.speeds.braking_rad_s2)
             + self.speed_rad_s * 2.0 * LAG_S
         )
+
+    def over_to(self, speeds: PathSpeeds, s_rad: float, limit_m_s: float) -> PathFollower | None:
+        """Return a follower that goes on from here on another path, as fast as this one.
+
+        Args:
+            speeds: The other path, which goes through where the arm is, in the same direction.
+            s_rad: Where on it the arm is.
+            limit_m_s: As for `step`.
+
+        Returns:
+            None while the arm is too fast for what comes on the other path.
+        """
+        other = PathFollower(speeds, cycle_s=self._cycle_s, braking_m_s2=self._braking_m_s2)
+        other._place(s_rad, self.speed_rad_s, self.acceleration_rad_s2)
+        # A path on which the arm brakes as well as here has nothing to do with a lower limit.
+        weaker = speeds.braking_rad_s2 < self.speeds.braking_rad_s2
+        most_rad_s = other._target(limit_m_s if weaker else np.inf)
+        return other if self.speed_rad_s <= FAST_SHARE * most_rad_s else None
 
     def step(self, limit_m_s: float) -> None:
         """Move on by one cycle.

@@ -36,6 +36,8 @@ QUESTIONS_MAX: Final = 4000
 """Edges and states after which the search ends, however much time is left."""
 CANDIDATES: Final = 8
 """Shortcuts that are tried together."""
+TURNS_RAD: Final = (0.4, 0.2, 0.1, 0.05)
+"""How far a path that has to begin straight on may do so before it turns."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,6 +64,7 @@ def plan(
     q_max_rad: F64,
     seed: int,
     limit_s: float,
+    heading: F64 | None = None,
 ) -> Plan:
     """Return a path from one state to another.
 
@@ -77,6 +80,8 @@ def plan(
         q_max_rad: (n,), limits of the joints, symmetric.
         seed: Of the search, >= 1.
         limit_s: Longest time that search and shortcuts take, each half of it.
+        heading: (n,), the direction of length 1 in which the path begins, so that an arm that moves
+            can go over to it; None: any.
 
     Raises:
         ValueError: `seed` is less than 1.
@@ -88,7 +93,13 @@ def plan(
     if not ends.all():
         return Plan(none, f"the {'goal' if ends[0] else 'arm'} is where something is in the way", 1)
     began_s = time.monotonic()
-    found, questions = np.stack([start_rad, goal_rad]), 2
+    before, questions = none, 2
+    if heading is not None:
+        turn_rad, asked = _turn(start_rad, goal_rad, heading, free)
+        if turn_rad is None:
+            return Plan(none, "the arm cannot turn before what is in the way", questions + asked)
+        before, start_rad, questions = start_rad[None], turn_rad, questions + asked
+    found = np.stack([start_rad, goal_rad])
     if not free(_states(found)).all():
         solved, asked = _rrt_connect(start_rad, goal_rad, free, q_max_rad, seed, limit_s / 2.0)
         questions += asked
@@ -96,10 +107,33 @@ def plan(
             return Plan(none, "no path was found", questions)
         left_s = limit_s - (time.monotonic() - began_s)
         found = shortened(solved, free, seed=seed, limit_s=left_s)
-    rounded = _with_free_corners(found, passable)
+    rounded = _with_free_corners(np.concatenate([before, found]), passable)
     if rounded is None:
         return Plan(none, "no path was found whose corners are free", questions)
     return Plan(rounded, "", questions)
+
+
+def _turn(start_rad: F64, goal_rad: F64, heading: F64, free: Free) -> tuple[F64 | None, int]:
+    """Return where a path that begins straight on can turn, if anywhere, and what was asked.
+
+    The farther it is, the rounder is the corner; one from which the goal lies straight ahead is
+    best.
+    """
+    most_rad = float(np.linalg.norm(goal_rad - start_rad)) / 2.0
+    best, asked = None, 0
+    for lead_rad in TURNS_RAD:
+        if lead_rad > most_rad:
+            continue
+        turn_rad = start_rad + lead_rad * heading
+        straight = free(_states(np.stack([start_rad, turn_rad]))).all()
+        asked += 1
+        if not straight:
+            continue
+        best = turn_rad if best is None else best
+        asked += 1
+        if free(_states(np.stack([turn_rad, goal_rad]))).all():
+            return turn_rad, asked
+    return best, asked
 
 
 def shortened(waypoints: F64, free: Free, *, seed: int, limit_s: float) -> F64:

@@ -193,7 +193,7 @@ class ClosedLoop:
                 else:
                     self._know(cell, tick)
                 self._decide(cell)
-                self._move()
+                self._move(cell)
                 self._clock.advance(words.PERIOD_S)
         return Trace(self.versions)
 
@@ -279,18 +279,18 @@ class ClosedLoop:
                 testing.run_once(self._actors[name], cell)
         self._keep_newest(cell)
 
-    def _move(self) -> None:
+    def _move(self, cell: Cell) -> None:
         """Let the robot's loop run for one period; what was decided arrives on the way."""
         stamp_ns = self._clock.wall_ns()
         cycle_ns = round(CYCLE_S * 1e9)
         arrives_ns = stamp_ns + round(LATENCY_S * 1e9)
         for now_ns in range(stamp_ns, stamp_ns + PERIOD_NS, cycle_ns):
             if now_ns - cycle_ns < arrives_ns <= now_ns:
-                self._command(now_ns)
+                self._command(cell, now_ns)
             self._motion.cycle(now_ns)
             self._motion.measured(self._motion.q_rad, self._motion.dq_rad_s, now_ns)
 
-    def _command(self, now_ns: int) -> None:
+    def _command(self, cell: Cell, now_ns: int) -> None:
         """Give the robot the newest speed and path, and keep what it makes of them."""
         motion, refusal = self._motion, ""
         speeds = self.versions.get((ONLINE, words.ROBOT.name, words.SPEED.name))
@@ -300,19 +300,8 @@ class ClosedLoop:
         paths = self.versions.get((ONLINE, words.ROBOT.name, words.PATH.name))
         if paths:
             motion.follow(paths[-1].datum)
-        doing = motion.doing
-        done = words.Execution(
-            "refused" if refusal else doing.state,
-            doing.scale,
-            doing.speed_m_s,
-            self._clock.wall_ns(),
-            now_ns,
-            doing.path_number,
-            doing.goals_reached,
-            motion.refused,
-            refusal or doing.reason,
-        )
-        self._keep(words.ROBOT, words.EXECUTION, done)
+        done = motion.execution(self._clock.wall_ns(), now_ns, refusal)
+        self._put(cell, words.ROBOT, words.EXECUTION, done)
 
     # ------------------------------------------------------------ data
 

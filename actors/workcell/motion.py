@@ -10,7 +10,9 @@ Rules a change must keep:
 2. A command is refused on arrival if its stamps are too old or in the future, or if it is based on
    an earlier exposure than the last one.  Ages are by the host's clock: when it is set, the newest
    command is forgotten.
-3. The arm leaves a path only at rest, at a place on the path.
+3. The arm leaves a path at rest, or where it leads straight into the next one: there the arm goes
+   over within all limits of both.  A path that the arm cannot come to any more is refused, and the
+   arm brakes on the old one.
 4. An arm that is not where it was commanded to be gets no more commands.
 """
 
@@ -25,11 +27,12 @@ import numpy as np
 from actors.geometry.joint_paths import (
     BRAKING_RAMP_S,
     STARTING_SHARE,
+    JoinedPath,
     JointPath,
     PathFollower,
     PathSpeeds,
 )
-from actors.workcell.vocabulary import JOINTS_KEPT, Joints
+from actors.workcell.vocabulary import JOINTS_KEPT, NO_PATH, Execution, Joints
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -153,6 +156,47 @@ class Doing:
     goals_reached: int = 0
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Seam:
+    """Where an arm goes over from its path to another one, without a stop.
+
+    Attributes:
+        leaves: Follower of the path that the arm is on.
+        from_rad: Where on that path `speeds` begins.
+        at_rad: Where on it the other one begins.
+        speeds: Along both.
+    """
+
+    leaves: PathFollower
+    from_rad: float
+    at_rad: float
+    speeds: PathSpeeds
+
+    def lies_ahead(self, follower: PathFollower | None) -> bool:
+        """Say whether the arm still comes to it."""
+        return follower is self.leaves and follower.s_rad <= self.at_rad
+
+    def crossed(self, limit_m_s: float) -> PathFollower | None:
+        """Return a follower of both paths; None while the arm is too fast for them."""
+        here_rad = self.leaves.s_rad - self.from_rad
+        return self.leaves.over_to(self.speeds, here_rad, limit_m_s)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Asked:
+    """A path that the arm shall follow.
+
+    Attributes:
+        path: The path.
+        speeds: Along it, from its beginning.
+        seam: Where the arm goes over to it without a stop; None: nowhere.
+    """
+
+    path: Path
+    speeds: PathSpeeds
+    seam: _Seam | None
+
+
 class Motion:
     """The loop, one cycle at a time, see the module.
 
@@ -164,6 +208,8 @@ class Motion:
     Attributes:
         doing: What it does now.
         refused: Commands that it has refused.
+        refused_path: Identity of the last path that it has refused.
+        path_refusal: Why; empty if it has refused none.
     """
 
     def __init__(self, model: ArmModel, q_rad: F64, now_ns: int) -> None:
@@ -171,13 +217,15 @@ class Motion:
         self.q_rad, self.dq_rad_s = np.array(q_rad, np.float64), np.zeros(len(q_rad))
         self._recent: tuple[tuple[int, F64, F64], ...] = ((now_ns, self.q_rad, self.dq_rad_s),)
         self._speed: Speed | None = None
-        self._asked: tuple[Path, PathSpeeds] | None = None
+        self._asked: _Asked | None = None
+        self._path_captured_ns = 0
         self._followed: Path | None = None
         self._follower: PathFollower | None = None
         self._cut_for: Path | None = None
         self._reached = False
         self._silence = "no speed has been commanded"
         self.doing, self.refused = Doing(), 0
+        self.refused_path, self.path_refusal = NO_PATH, ""
 
     def obey(self, speed: Speed, now_ns: int) -> str:
         """Take a command.
@@ -199,17 +247,38 @@ class Motion:
         return why
 
     def follow(self, path: Path) -> None:
-        """Take a path; one without waypoints ends the motion where it can stop."""
+        """Take a path; one without waypoints ends the motion where it can stop.
+
+        A path on an earlier exposure than the last one is refused, see `path_refusal`.
+        """
         asked = self._asked
-        if asked is not None and asked[0].identity == path.identity:
+        if path.identity in (self.refused_path, asked.path.identity if asked else None):
+            return
+        if path.captured_ns < self._path_captured_ns:
+            self._refuse(path, "it rests on an earlier exposure than the last path")
             return
         waypoints = path.waypoints if len(path.waypoints) else self.q_rad[None]
         line = JointPath(waypoints)
-        self._asked = path, PathSpeeds(self._model, line, nominal_m_s=NOMINAL_M_S)
+        speeds = PathSpeeds(self._model, line, nominal_m_s=NOMINAL_M_S)
+        self._path_captured_ns = path.captured_ns
+        self._asked = _Asked(path, speeds, self._seam(speeds))
+
+    def _seam(self, speeds: PathSpeeds) -> _Seam | None:
+        """Return where the path of the arm leads straight into another one, if it does."""
+        follower = self._follower
+        if follower is None or speeds.path.length_rad == 0.0:
+            return None
+        from_rad, line = follower.s_rad, follower.speeds.path
+        at_rad = line.nearest_rad(speeds.path.at(0.0)[0][0], from_rad)
+        if not line.leads_into(at_rad, speeds.path):
+            return None
+        both = JoinedPath(line, from_rad, at_rad, speeds.path)
+        joined = PathSpeeds(self._model, both, nominal_m_s=NOMINAL_M_S)
+        return _Seam(follower, from_rad, at_rad, joined)
 
     def silence(self, reason: str) -> None:
-        """Forget the newest command: the arm brakes and rests until another one comes."""
-        self._speed, self._silence = None, reason
+        """Forget the newest command and stamp: the arm brakes and rests until another one comes."""
+        self._speed, self._silence, self._path_captured_ns = None, reason, 0
 
     def cycle(self, now_ns: int) -> None:
         """Do what is to be done in one period of the loop."""
@@ -250,6 +319,29 @@ class Motion:
             stamp_ns=np.array(stamps + [stamp for stamp, _, _ in recent], np.int64),
         )
 
+    def execution(self, captured_ns: int, received_ns: int, refusal: str) -> Execution:
+        """Return what came of the newest command.
+
+        Args:
+            captured_ns: Exposure on which it rests.
+            received_ns: When it came.
+            refusal: Why it was refused; empty if it was taken.
+        """
+        doing = self.doing
+        return Execution(
+            state="refused" if refusal else doing.state,
+            scale=doing.scale,
+            speed_m_s=doing.speed_m_s,
+            captured_ns=captured_ns,
+            received_ns=received_ns,
+            path_number=doing.path_number,
+            goals_reached=doing.goals_reached,
+            refused=self.refused,
+            reason=refusal or doing.reason,
+            refused_path=self.refused_path,
+            path_refusal=self.path_refusal,
+        )
+
     def _limit(self, now_ns: int) -> tuple[float, str]:
         """Return the speed allowed now, and the reason if it is zero."""
         speed = self._speed
@@ -264,27 +356,50 @@ class Motion:
 
     def _change_path(self, limit_m_s: float) -> float:
         """Go over to the newest path where that can be; return the limit until then."""
-        if self._asked is None or self._asked[0] is self._followed:
+        asked, follower = self._asked, self._follower
+        if asked is None or asked.path is self._followed:
             return limit_m_s
-        path, speeds = self._asked
-        follower = self._follower
+        path, speeds = asked.path, asked.speeds
         at_rest = follower is None or follower.speed_rad_s == 0.0
-        if not len(path.waypoints):
+        if not len(path.waypoints) or path.identity == self.refused_path:
             if at_rest:
                 self._follow(path, None)
             return 0.0
+        if asked.seam is not None and asked.seam.lies_ahead(follower):
+            crossed = asked.seam.crossed(limit_m_s)
+            if crossed is not None:
+                self._follow(path, crossed)
+            return limit_m_s if crossed is not None else 0.0
         beside_rad = float(np.linalg.norm(path.waypoints[0] - self.q_rad))
         if at_rest and beside_rad <= 1.5 * BESIDE_RAD:
             if beside_rad > 1e-9:
                 line = JointPath(np.vstack([self.q_rad, path.waypoints]))
                 speeds = PathSpeeds(self._model, line, nominal_m_s=NOMINAL_M_S)
-            self._follow(path, speeds)
+            begun = PathFollower(speeds, cycle_s=CYCLE_S, braking_m_s2=BRAKING_M_S2)
+            self._follow(path, begun)
             return limit_m_s
         if follower is not None and self._ends_there(follower, path):
             return limit_m_s
+        self._refuse(path, self._astray(path))
         if at_rest:
             self._follow(path, None)
         return 0.0
+
+    def _astray(self, path: Path) -> str:
+        """Say why the arm cannot come to a path from where it is."""
+        follower, followed = self._follower, self._followed
+        if follower is not None and followed is not None:
+            line, start = follower.speeds.path, path.waypoints[0]
+            place_rad = line.nearest_rad(start)
+            if np.linalg.norm(line.at(place_rad)[0][0] - start) <= BESIDE_RAD:
+                cannot = "cannot stop at" if place_rad > follower.s_rad else "has passed"
+                return f"the arm {cannot} the place where it leaves path {followed.number}"
+        return "it starts elsewhere"
+
+    def _refuse(self, path: Path, why: str) -> None:
+        """Keep which path is refused, and why."""
+        self.refused_path = path.identity
+        self.path_refusal = f"path {path.number} is refused: {why}"
 
     def _ends_there(self, follower: PathFollower, path: Path) -> bool:
         """Let the present path end where the next one begins; False if it does not lead there."""
@@ -297,12 +412,10 @@ class Motion:
             self._cut_for = path
         return True
 
-    def _follow(self, path: Path, speeds: PathSpeeds | None) -> None:
-        """Begin a path, or none."""
+    def _follow(self, path: Path, follower: PathFollower | None) -> None:
+        """Follow a path, or none."""
         self._followed, self._cut_for, self._reached = path, None, False
-        self._follower = None
-        if speeds is not None:
-            self._follower = PathFollower(speeds, cycle_s=CYCLE_S, braking_m_s2=BRAKING_M_S2)
+        self._follower = follower
 
     def _number(self) -> int:
         followed = self._followed
@@ -312,7 +425,9 @@ class Motion:
         follower, reached = self._follower, self.doing.goals_reached
         if follower is None:
             path = self._followed
-            reason = "no path yet" if path is None else path.reason or "the path starts elsewhere"
+            reason = "no path yet" if path is None else path.reason
+            if path is not None and path.identity == self.refused_path:
+                reason = self.path_refusal
             self.doing = Doing("waiting", reason, 0.0, 0.0, -1, reached)
         elif follower.arrived:
             if not self._reached and self._cut_for is None:

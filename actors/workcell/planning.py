@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import time
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from actors.geometry.arm_clearance import ArmSpheres, CellGrid, Clearance, GrownGrid
-from actors.geometry.joint_paths import JointPath, PathSpeeds
+from actors.geometry.joint_paths import JoinedPath, JointPath, PathSpeeds
 from actors.geometry.joint_planning import Plan, load, plan
 from actors.workcell.motion import NOMINAL_M_S
 from actors.workcell.speed import SpeedControl
 from actors.workcell.vocabulary import (
     BOXES,
+    EXECUTION,
     GRID,
     HULL,
     HUMANS,
@@ -28,6 +30,7 @@ from actors.workcell.vocabulary import (
     ArmModel,
     Grid,
     Hull,
+    Joints,
     Path,
     Prediction,
     Task,
@@ -57,6 +60,8 @@ OFF_RAD: Final = 0.05
 """So far from its path the arm is not on it."""
 HERE_RAD: Final = 2e-3
 """So near to a goal the arm is there."""
+BEYOND_RAD: Final = 0.01
+"""So far beyond where the arm can be by then it leaves its path."""
 
 
 class Obstacles:
@@ -99,18 +104,55 @@ class Obstacles:
         return Clearance(self._spheres, self._model, grids, slack_m=0.02)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Branch:
+    """Where an arm leaves the path that it follows, without a stop.
+
+    Attributes:
+        speeds: Along that path.
+        here_rad: Where the arm is on it.
+        at_rad: Where it leaves it; the path is straight there.
+    """
+
+    speeds: PathSpeeds
+    here_rad: float
+    at_rad: float
+
+    @property
+    def q_rad(self) -> F64:
+        """The state in which it leaves, (7,)."""
+        state: F64 = self.speeds.path.at(self.at_rad)[0][0]
+        return state
+
+    @property
+    def heading(self) -> F64:
+        """The direction in which it leaves, (7,), of length 1."""
+        heading: F64 = self.speeds.path.at(self.at_rad)[1][0]
+        return heading
+
+    def onto(self, path: Path, model: ArmModel) -> PathSpeeds:
+        """Return what the arm follows from where it is: the rest of its path, and then another."""
+        line = JointPath(path.waypoints)
+        both = JoinedPath(self.speeds.path, self.here_rad, self.at_rad, line)
+        return PathSpeeds(model, both, nominal_m_s=NOMINAL_M_S)
+
+
 class PathPlanning(Actor):
     """Keep a path to the next goal of the task, at each hull.
 
     The next second of the path is looked at.  If it is blocked in two sets in a row, another path
-    is planned, from where the arm can stop.  Without one, the path has no waypoints and
-    says why.  Predicted positions of people are avoided if another way exists.
+    is planned.  A moving arm goes over to it without a stop, at a place that it reaches only when
+    the path is there; an arm that is past that place refuses the path and brakes, and the next set
+    plans again.  Without a way, the path has no waypoints and says why.  Predicted positions of
+    people are avoided if another way exists.
 
     Attributes:
         predict: Whether predictions count.
         seed: Of the search; with the number of the path it decides what is found.
         limit_s: Longest time of a search.
         ahead_s: How much of the path is looked at.
+        branch_s: How long a path takes to the robot, from the time that planning begins: `limit_s`,
+            and the way.
     """
 
     online = World("online")
@@ -119,6 +161,7 @@ class PathPlanning(Actor):
     predictions = ViewEach(online, HUMANS, PREDICTION)
     boxes = ViewEach(online, OBSTACLES, BOXES)
     joints = View(online, ROBOT, JOINTS)
+    execution = View(online, ROBOT, EXECUTION)
     model = View(online, ROBOT, MODEL)
     task = View(online, ROBOT, TASK)
     path = Write(online, ROBOT, PATH)
@@ -128,12 +171,14 @@ class PathPlanning(Actor):
     seed: int = 1
     limit_s: float = 0.08
     ahead_s: float = 1.0
+    branch_s: float = 0.13
 
     def __init__(self, *, predict: bool = True, seed: int = 1) -> None:
         super().__init__()
         self.predict, self.seed = predict, seed
         self._obstacles: tuple[bytes, Obstacles] | None = None
         self._followed: tuple[object, PathSpeeds] | None = None
+        self._left: PathSpeeds | None = None
         self._blocked = 0
         self._pause = 0
         self._there_since_ns = 0
@@ -169,13 +214,14 @@ class PathPlanning(Actor):
             self._dwell(lock, obstacles, [later, now], task, goal)
             return
         self._there_since_ns = 0
-        speeds = self._speeds_along(lock[self.model], last)
+        refusal = self._refusal(lock, last)
+        speeds = self._speeds_along(lock[self.model], last, refused=bool(refusal))
         line = speeds.path
         s_rad = line.nearest_rad(q)
         off_rad = float(np.linalg.norm(line.at(s_rad)[0][0] - q))
         moved_on = np.linalg.norm(last.waypoints[-1] - task.goals[goal]) > HERE_RAD
-        if at_rest and (off_rad > OFF_RAD or moved_on):
-            why = "the task has changed" if moved_on else "the arm is off its path"
+        if at_rest and (off_rad > OFF_RAD or moved_on or refusal):
+            why = "the task has changed" if moved_on else refusal or "the arm is off its path"
             self._plan(lock, obstacles, [later, now], q, goal, why)
             return
         there = speeds.within(s_rad, self.ahead_s)
@@ -183,13 +229,15 @@ class PathPlanning(Actor):
         blocked = not obstacles.passable(now).free(ahead).all()
         avoid = bool(predictions) and not obstacles.passable(soon).free(ahead).all()
         self._blocked = self._blocked + 1 if blocked or avoid else 0
-        if self._blocked < 2:
+        if self._blocked < 2 and not refusal:
             return
-        start = q if at_rest else self._stopping_place(speeds, s_rad, joints.dq[-1])
-        if blocked:
-            self._plan(lock, obstacles, [later, now], start, goal, "someone is in the way")
+        branch = None if at_rest else self._branch(speeds, s_rad, joints)
+        if refusal or blocked:
+            why = refusal or "someone is in the way"
+            self._plan(lock, obstacles, [later, now], q, goal, why, branch=branch)
         elif self._blocked % 3 == 2:
-            self._plan(lock, obstacles, [later], start, goal, "someone will be in the way")
+            why = "someone will be in the way"
+            self._plan(lock, obstacles, [later], q, goal, why, branch=branch)
 
     def _dwell(
         self, lock: Lock, obstacles: Obstacles, cells: list[CellGrid], task: Task, goal: int
@@ -215,6 +263,7 @@ class PathPlanning(Actor):
         goal: int,
         why: str,
         from_goal: int | None = None,
+        branch: Branch | None = None,
     ) -> None:
         """Write a path from a state to a goal, or the absence of one.
 
@@ -222,10 +271,11 @@ class PathPlanning(Actor):
             lock: Of the update.
             obstacles: What to keep from.
             cells: What people take, the most careful first; the last is what counts.
-            start: Where the path begins, (7,).
+            start: Where the path begins, (7,), if it has no `branch`.
             goal: Where it leads.
             why: Why it replaces the last one.
             from_goal: Goal that it comes from; None: as the last path.
+            branch: Where a moving arm leaves its path.
         """
         last, began_s = lock.get(self.path), time.monotonic()
         number = last.number + 1 if last is not None else 1
@@ -234,13 +284,14 @@ class PathPlanning(Actor):
         for one in cells:
             left_s = self.limit_s - (time.monotonic() - began_s)
             found = plan(
-                start,
+                start if branch is None else branch.q_rad,
                 lock[self.task].goals[goal],
                 obstacles.free(one).free,
                 obstacles.passable(one).free,
                 q_max_rad=lock[self.model].q_max,
                 seed=self.seed + number,
                 limit_s=max(left_s, 0.02),
+                heading=None if branch is None else branch.heading,
             )
             if len(found.waypoints) or one is cells[-1]:
                 break
@@ -252,7 +303,7 @@ class PathPlanning(Actor):
         if from_goal is None:
             from_goal = last.from_goal if last is not None else -1
         length_rad = float(np.linalg.norm(np.diff(found.waypoints, axis=0), axis=1).sum())
-        lock[self.path] = Path(
+        path = Path(
             waypoints=found.waypoints,
             number=number,
             from_goal=from_goal,
@@ -261,15 +312,27 @@ class PathPlanning(Actor):
             length_rad=length_rad,
             reason=found.reason or why,
             took_ms=1e3 * (time.monotonic() - began_s),
+            captured_ns=lock.stamp_ns(self.hull),
         )
+        lock[self.path] = path
+        if branch is not None and len(path.waypoints):
+            self._followed = path.identity, branch.onto(path, lock[self.model])
+            self._left = branch.speeds
 
-    def _stopping_place(self, speeds: PathSpeeds, s_rad: float, dq_rad_s: F64) -> F64:
-        """Return where on its path a moving arm will be able to stop."""
+    def _refusal(self, lock: Lock, last: Path) -> str:
+        """Say why the robot refused the last path; empty if it did not."""
+        done = lock.get(self.execution)
+        if done is None or done.refused_path != last.identity:
+            return ""
+        return done.path_refusal
+
+    def _branch(self, speeds: PathSpeeds, s_rad: float, joints: Joints) -> Branch:
+        """Return where a moving arm will be able to leave its path when another one arrives."""
         along = max(float(np.linalg.norm(speeds.path.at(s_rad)[1][0])), 0.1)
-        speed = float(np.linalg.norm(dq_rad_s)) / along
-        ahead = speed * (self.limit_s + 0.2) + speed**2 / (1.2 * speeds.braking_rad_s2)
-        place: F64 = speeds.path.at(s_rad + ahead + 0.02)[0][0]
-        return place
+        speed_rad_s = float(np.linalg.norm(joints.dq[-1])) / along
+        age_s = max(0.0, (self.now_ns() - int(joints.stamp_ns[-1])) / 1e9)
+        reached_rad = speeds.reached_rad(s_rad, speed_rad_s, age_s + self.branch_s)
+        return Branch(speeds, s_rad, speeds.path.straight_rad(reached_rad + BEYOND_RAD))
 
     def _known(self, lock: Lock) -> Obstacles:
         """Return what is static, worked out once as long as it stays the same."""
@@ -282,11 +345,13 @@ class PathPlanning(Actor):
             self._obstacles = key, Obstacles(model, grid, rows)
         return self._obstacles[1]
 
-    def _speeds_along(self, model: ArmModel, path: Path) -> PathSpeeds:
+    def _speeds_along(self, model: ArmModel, path: Path, *, refused: bool) -> PathSpeeds:
+        """Return along what the arm moves: the last path, with what it followed before."""
         if self._followed is None or self._followed[0] != path.identity:
             line = JointPath(path.waypoints)
             self._followed = path.identity, PathSpeeds(model, line, nominal_m_s=NOMINAL_M_S)
-        return self._followed[1]
+            self._left = None
+        return self._left if refused and self._left is not None else self._followed[1]
 
 
 class PlanningWithSpeed(PathPlanning, SpeedControl):  # type: ignore[misc]  # one writes the path

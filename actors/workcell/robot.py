@@ -21,7 +21,6 @@ from actors.workcell.vocabulary import (
     PERIOD_S,
     ROBOT,
     SPEED,
-    Execution,
 )
 from enact_dist import Actor, View, World, Write
 
@@ -172,18 +171,7 @@ class Robot(Actor):
             self._taken_ns = speed.captured_ns
         if not lock.is_null(self.path):
             motion.follow(lock[self.path])
-        doing = motion.doing
-        lock[self.execution] = Execution(
-            state="refused" if refusal else doing.state,
-            scale=doing.scale,
-            speed_m_s=doing.speed_m_s,
-            captured_ns=self._taken_ns,
-            received_ns=received_ns,
-            path_number=doing.path_number,
-            goals_reached=doing.goals_reached,
-            refused=motion.refused,
-            reason=refusal or doing.reason,
-        )
+        lock[self.execution] = motion.execution(self._taken_ns, received_ns, refusal)
 
     def _arm(self) -> RunningArm:
         arm = _arms.get(self.driver) if _is_open(self.driver).wait(OPENING_S) else None

@@ -52,6 +52,8 @@ JOINT_COUNT: Final = 7
 """Joints of the arm."""
 JOINTS_KEPT: Final = 30
 """Samples in one datum of `JOINTS`: 0.3 s at 100 Hz."""
+NO_PATH: Final = (-1, 0)
+"""Identity of no path."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -262,6 +264,7 @@ class Path:
         length_rad: Sum of the Euclidean lengths of its pieces.
         reason: Why there is no path, or why it replaced the last one.
         took_ms: Duration of planning.
+        captured_ns: Exposure of the hull that it was planned on.
     """
 
     waypoints: npt.NDArray[np.float64]
@@ -272,6 +275,7 @@ class Path:
     length_rad: float
     reason: str = ""
     took_ms: float = 0.0
+    captured_ns: int = 0
 
     @property
     def identity(self) -> tuple[int, int]:
@@ -318,6 +322,9 @@ class Execution:
         refused: How many commands it has refused since its start because they were too old.
         reason: Why the command was refused, or why the arm brakes or rests; empty if nothing
             keeps it from moving.
+        refused_path: Identity of the last path that it has refused: the arm had passed the place
+            where it begins, or it rests on an earlier exposure than the path before.
+        path_refusal: Why, in words; empty if it has refused none.
     """
 
     state: str
@@ -329,6 +336,8 @@ class Execution:
     goals_reached: int
     refused: int
     reason: str = ""
+    refused_path: tuple[int, int] = NO_PATH
+    path_refusal: str = ""
 
 
 @dataclass(frozen=True, slots=True)

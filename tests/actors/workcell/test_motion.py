@@ -216,7 +216,7 @@ def test_path_that_begins_elsewhere_is_not_followed():
     loop.motion.follow(path_of([loop.motion.q_rad, LEFT], 3))
     loop.run(5.0)
 
-    assert (waiting.state, waiting.reason) == ("waiting", "the path starts elsewhere")
+    assert (waiting.state, waiting.reason) == ("waiting", "path 2 is refused: it starts elsewhere")
     assert loop.motion.doing.path_number == 3
     np.testing.assert_allclose(loop.motion.q_rad, LEFT, atol=1e-9)
 

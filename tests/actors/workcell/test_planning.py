@@ -8,11 +8,13 @@ import pytest
 from actors.geometry.capsules import distance_to_points
 from actors.geometry.joint_paths import JointPath
 from actors.geometry.kinematics import capsules_at
+from actors.workcell.motion import CYCLE_S, Motion
 from actors.workcell.planning import PathPlanning, PlanningWithSpeed
 from actors.workcell.simulation.arm import ARM
 from actors.workcell.vocabulary import (
     BOXES,
     CAMERA_STATES,
+    EXECUTION,
     GRID,
     HULL,
     JOINTS,
@@ -25,10 +27,12 @@ from actors.workcell.vocabulary import (
     SYSTEM,
     TASK,
     WORKSPACE,
+    Execution,
     Grid,
     Hull,
     Joints,
     Prediction,
+    Speed,
     Task,
     human_entity,
     obstacle_entity,
@@ -53,6 +57,8 @@ def person(hand=(0.62, -0.15, 1.1), foot=(1.2, -0.75)):
 
 
 NOBODY = np.empty((0, 3))
+REACHING = person(hand=(0.62, 0.2, 1.1), foot=(1.2, 0.75))
+"""Someone in the second half of the way from left to right."""
 
 
 class Cell:
@@ -189,6 +195,108 @@ def test_blocked_path_is_replaced_after_two_sets(worlds):
     np.testing.assert_allclose(start, on_way + along * dq / 0.1, atol=1e-9)
     assert 0.0 < along < 0.4
     assert not touches(new, person())
+
+
+def heading_to(one, other):
+    return (other - one) / np.linalg.norm(other - one)
+
+
+def test_moving_arm_leaves_its_path_straight_on_where_it_will_be(worlds):
+    """Not where it is now: behind the way of the time that planning and hand-over take."""
+    cell = Cell(worlds)
+    cell.see(START)
+    cell.see(LEFT)
+    ahead = heading_to(LEFT, RIGHT)
+    on_way = LEFT + 0.3 * ahead
+    cell.see(on_way, REACHING, ahead)
+
+    new = cell.see(on_way + 0.1 * ahead, REACHING, ahead)
+
+    along = (new.waypoints[0] - on_way) @ ahead - 0.1
+    assert 0.13 < along < 0.4
+    np.testing.assert_allclose(heading_to(*new.waypoints[:2]), ahead, atol=1e-9)
+    assert new.captured_ns == cell.now_ns
+    assert not touches(new, REACHING)
+
+
+def test_refused_path_is_planned_again_from_the_path_that_is_followed(worlds):
+    """The robot was past the place where it should have left its path: there is another one."""
+    cell = Cell(worlds)
+    cell.see(START)
+    old = cell.see(LEFT)
+    ahead = heading_to(LEFT, RIGHT)
+    cell.see(LEFT + 0.3 * ahead, REACHING, ahead)
+    late = cell.see(LEFT + 0.4 * ahead, REACHING, ahead)
+    beyond = late.waypoints[0] + 0.05 * ahead
+    why = f"path {late.number} is refused: the arm has passed the place"
+    done = Execution("moving", 1.0, 1.0, 0, 0, old.number, 0, 0, "", late.identity, why)
+    cell.put(ROBOT, EXECUTION, done)
+
+    new = cell.see(beyond, REACHING, 0.4 * ahead)
+
+    assert (new.number, new.reason) == (late.number + 1, why)
+    assert (new.waypoints[0] - beyond) @ ahead > 0.05
+    np.testing.assert_allclose(heading_to(*new.waypoints[:2]), ahead, atol=1e-9)
+
+
+def test_refused_path_is_planned_again_from_where_the_arm_rests(worlds):
+    """Also if the arm rests so near to the refused path that it seems to be on it."""
+    cell = Cell(worlds)
+    cell.see(START)
+    path = cell.see(LEFT)
+    beside = LEFT + 0.3 * heading_to(LEFT, RIGHT) + 0.01
+    done = Execution("waiting", 0.0, 0.0, 0, 0, -1, 0, 0, "", path.identity, "path 2 is refused")
+    cell.put(ROBOT, EXECUTION, done)
+
+    new = cell.see(beside)
+
+    np.testing.assert_array_equal(new.waypoints[[0, -1]], [beside, RIGHT])
+    assert new.reason == "path 2 is refused"
+
+
+def run_past(cell, voxels, seconds=8.0):
+    """Let an arm go from left to right while something appears in its way; return states and refusals."""
+    motion = Motion(ARM, START, cell.now_ns)
+    period, cycle = round(PERIOD_NS / 1e6), round(CYCLE_S * 1e3)
+    states, refusals, coming = [], set(), []
+    for at_ms in range(0, round(seconds * 1e3), cycle):
+        if at_ms % period == 0:
+            there = voxels if motion.q_rad[0] > -0.7 else NOBODY
+            path = cell.see(motion.q_rad, there, motion.dq_rad_s)
+            coming.append((at_ms + 120, path))
+        while coming and at_ms >= coming[0][0]:
+            motion.follow(coming.pop(0)[1])
+        now_ns = cell.now_ns + at_ms % period * 1_000_000
+        motion.obey(Speed(1.0, np.inf, np.inf, "", 250.0, now_ns, now_ns), now_ns)
+        motion.cycle(now_ns)
+        states.append((motion.q_rad, float(np.linalg.norm(motion.dq_rad_s))))
+        refusals.add(motion.path_refusal)
+        if at_ms % period == 0:
+            cell.put(ROBOT, EXECUTION, motion.execution(now_ns, now_ns, ""))
+        if motion.doing.goals_reached == 2:
+            break
+    return states, refusals - {""}
+
+
+def test_arm_goes_around_what_appears_while_it_moves(worlds):
+    """Planner and robot together: no stop, no touch, and the goal is reached."""
+    cell = Cell(worlds, goals=(LEFT, RIGHT), cyclic=False)
+    cell.actor.now_ns = lambda: cell.now_ns + 50_000_000
+
+    states, refusals = run_past(cell, REACHING)
+
+    path = cell.get(ROBOT, PATH)
+    under_way = [speed for q, speed in states if -0.9 < q[0] < 0.8]
+    points = ORIGIN_M + (REACHING + 0.5) * VOXEL_M
+    off_m = [
+        distance_to_points(capsules[1:], points).min()
+        for capsules in capsules_at(ARM, np.array([q for q, _ in states])[::2])
+    ]
+    assert path.reason == "someone is in the way"
+    assert refusals == set()
+    np.testing.assert_allclose(states[-1][0], RIGHT, atol=1e-9)
+    assert min(under_way) > 0.05
+    assert min(off_m) > 0.0
 
 
 def test_without_a_path_it_waits_and_says_why(worlds):
