@@ -179,9 +179,10 @@ class SpeedControl(Actor):
         reaction = self._measured(age_s)
         joints_ns = int(joints.stamp_ns[-1]) if joints is not None else 0
         nominal_m_s = self._nominal_m_s(lock.get(self.model), path, joints)
+        human_m_s, by_whom = self.people_m_s(lock)
         separation = Separation(
             reaction_s=reaction.reaction_s,
-            human_m_s=self.human_m_s,
+            human_m_s=human_m_s,
             braking_m_s2=self.braking_m_s2,
             intrusion_m=self.intrusion_m,
             uncertainty_m=self.uncertainty_m,
@@ -203,19 +204,25 @@ class SpeedControl(Actor):
         )
         blind = [name for name, state in sorted(states.items()) if not state.alive]
         without = f"; without {', '.join(blind)}" if blind else ""
+        people = f"; {by_whom}" if by_whom else ""
         lock[self.speed] = Speed(
             scale=min(1.0, verdict.limit_m_s / nominal_m_s) if verdict.limit_m_s else 0.0,
             limit_m_s=verdict.limit_m_s,
             nearest_m=hull.nearest_m,
-            reason=verdict.reason + without,
+            reason=verdict.reason + people + without,
             valid_ms=1e3 * reaction.valid_s,
             captured_ns=captured_ns,
             joints_ns=joints_ns,
+            human_m_s=human_m_s,
         )
         last = lock.get(self.safety)
         said = verdict.state, verdict.cause + without
         if last is None or (last.state, last.reason) != said:
             lock[self.safety] = Safety(*said, since_ns=captured_ns)
+
+    def people_m_s(self, lock: Lock) -> tuple[float, str]:
+        """Return how fast people count, and why; nothing where it is assumed."""
+        return self.human_m_s, ""
 
     def _measured(self, age_s: float) -> Reaction:
         """Return the reaction time that was measured, this set included."""

@@ -111,7 +111,7 @@ class HumanTracking(Actor):
             if name in seen:
                 self._hidden_since_ns.pop(name, None)
                 state = corrected(*expected[name], seen[name].centre_m)
-                self._write(lock, name, state, seen[name], known[name])
+                self._write(lock, name, state, seen[name], known[name], now_ns)
             else:
                 self._lose(lock, name, expected[name], known[name], grid, now_ns)
         taken = {column for _, column in pairs}
@@ -139,12 +139,14 @@ class HumanTracking(Actor):
         state: tuple[F64, F64],
         body: Body,
         before: Track | None,
-        now_ns: int = 0,
+        now_ns: int,
     ) -> None:
         """Write what is known of a person who is seen."""
         height_m = body.top_m if before is None else 0.8 * before.height_m + 0.2 * body.top_m
         first_ns = now_ns if before is None else before.first_ns
-        lock[self.tracks][name] = _track(state, body.top_m, height_m, body.volume_m3, first_ns)
+        lock[self.tracks][name] = _track(
+            state, body.top_m, height_m, body.volume_m3, first_ns, now_ns
+        )
         if before is None or before.hidden or self._sets % self.limbs_every == 0:
             lock[self.limbs][name] = limbs(body.points_m)
         radius_m = float(np.clip(body.radius_m, *RADIUS_M))
@@ -180,6 +182,7 @@ class HumanTracking(Actor):
             before.height_m,
             before.volume_m3,
             before.first_ns,
+            before.seen_ns,
             hidden=True,
         )
         lock[self.limbs].pop(name, None)
@@ -206,6 +209,7 @@ def _track(
     height_m: float,
     volume_m3: float,
     first_ns: int,
+    seen_ns: int,
     *,
     hidden: bool = False,
 ) -> Track:
@@ -221,6 +225,7 @@ def _track(
         volume_m3=volume_m3,
         first_ns=first_ns,
         hidden=hidden,
+        seen_ns=seen_ns,
     )
 
 

@@ -170,6 +170,7 @@ class Track:
         volume_m3: Volume of the tight hull of the person.
         first_ns: Stamp of the set in which the track began.
         hidden: No camera sees the person now; they are where none can look.
+        seen_ns: Stamp of the set in which they were last seen.
     """
 
     position_m: npt.NDArray[np.float64]
@@ -179,6 +180,7 @@ class Track:
     volume_m3: float
     first_ns: int
     hidden: bool
+    seen_ns: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -295,6 +297,7 @@ class Speed:
         valid_ms: How long after `captured_ns` it may be moved on.
         captured_ns: Exposure of the set that it rests on.
         joints_ns: Stamp of the newest joint sample that it rests on.
+        human_m_s: Speed of people (v_h) that it was made with.
     """
 
     scale: float
@@ -304,6 +307,7 @@ class Speed:
     valid_ms: float
     captured_ns: int
     joints_ns: int
+    human_m_s: float = 1.6
 
 
 @dataclass(frozen=True, slots=True)
