@@ -194,10 +194,12 @@ class Recorder:
                     self.summary.seconds = time.monotonic() - begun_s
                     if seconds is not None and self.summary.seconds >= seconds:
                         break
-                    self._listen(watch, 0.0 if self._settled() else POLL_S)
+                    more = self._listen(watch, 0.0)
                     self._record_settled()
                     self._look_at(file)
                     tell(self.summary)
+                    if not (more or self._settled()):
+                        stop.wait(POLL_S)  # each commit would wake this thread otherwise
                 self._finish(watch)
             finally:
                 self.summary.seconds = time.monotonic() - begun_s
@@ -262,14 +264,15 @@ class Recorder:
             over = time.monotonic() >= ends_s
             self._listen(watch, POLL_S)
 
-    def _listen(self, watch: Watch, wait_s: float) -> None:
-        """Take what the watch tells, and wait so long for the first of it."""
+    def _listen(self, watch: Watch, wait_s: float) -> bool:
+        """Take what the watch tells; return whether there is more.  Wait so long for the first."""
         for _ in range(HEARD_MAX):
             change = watch.next(wait_s)
             wait_s = 0.0
             if change is None:
-                break
+                return False
             self._note(change)
+        return True
 
     def _note(self, change: Change) -> None:
         stamp_ns, shard = change.position
