@@ -29,7 +29,7 @@ from actors.workcell import vocabulary as words
 from actors.workcell.reaction import reaction_of
 from actors.workcell.trace import T, trace_of
 from actors.workcell.true_hull import TrueVoxels
-from actors.workcell.truth_of_run import PERIOD_NS, Truth, safety_of, truth_of
+from actors.workcell.truth_of_run import PERIOD_NS, Truth, share_of, too_fast_of, truth_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -163,7 +163,8 @@ def samples_of(trace: Trace, *, every: int = 1) -> Samples:
         **_distances(trace, truth),
         "track": _tracks(trace, truth),
         **_planning(trace, truth),
-        **safety_of(trace, truth),
+        "too_fast": too_fast_of(trace, truth),
+        "share": share_of(trace, truth),
     }
     return {name: np.asarray(values, np.float64) for name, values in found.items()}
 
@@ -176,7 +177,7 @@ def beside(scenario: Scenario) -> Samples:
     found = {}
     for name, sight in (("oracle_share", Sight.ORACLE), ("zone_share", Sight.ZONE)):
         trace = ClosedLoop(scenario, sight=sight).run()
-        found[name] = safety_of(trace, truth_of(trace))["share"]
+        found[name] = share_of(trace, truth_of(trace))
     return found
 
 

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from actors.geometry.kinematics import capsules_at, end_velocities, tool_poses
+from actors.geometry.kinematics import capsules_at, tool_poses
 from actors.geometry.picture import INK, with_label
-from actors.geometry.separation import Separation
 from actors.workcell import vocabulary as words
 from actors.workcell.evaluation import along
+from actors.workcell.truth_of_run import allowed_m_s, course_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -88,7 +88,8 @@ def plan_figure(trace: Trace, truth: Truth, hull: Hull, stamp_ns: int) -> Pictur
         ends, thick = (_at(capsule[:3]), _at(capsule[3:6])), 2 * _length(capsule[6])
         cv2.line(sheet, *ends, ARM, thick, cv2.LINE_AA)
     for capsule in (capsule for body in truth.bodies_at(stamp_ns) for capsule in body):
-        cv2.circle(sheet, _at(capsule[:2]), _length(capsule[6]), TRUE, 1, cv2.LINE_AA)
+        for end in (capsule[:2], capsule[3:5]):
+            cv2.circle(sheet, _at(end), _length(capsule[6]), TRUE, 1, cv2.LINE_AA)
     tracks = trace.people_at(words.TRACK, stamp_ns)
     for human in tracks:
         past = [
@@ -142,16 +143,9 @@ def _legend(sheet: Picture, entries: Sequence[tuple[str, tuple[int, int, int]]])
 
 def timeline_figure(trace: Trace, truth: Truth) -> Picture:
     """Draw distance and speed over the whole run."""
-    motion = trace.joints()
-    chosen = np.array([truth.covers(int(stamp)) for stamp in motion.stamp_ns], np.bool_)
-    stamps, q, dq = motion.stamp_ns[chosen][::5], motion.q[chosen][::5], motion.dq[chosen][::5]
-    at_s = (stamps - truth.start_ns) / 1e9
-    true_m = np.array([truth.distance_m(int(s), one) for s, one in zip(stamps, q, strict=True)])
-    fast = np.empty(0)
-    if len(q):
-        fast = np.linalg.norm(end_velocities(truth.arm, q, dq), axis=-1).max((1, 2))
-    spent = Separation(reaction_s=0.0)
-    limit = np.array([spent.speed_max_m_s(float(one)) for one in true_m])
+    course = course_of(trace, truth, every=5)
+    at_s = (course.stamp_ns - truth.start_ns) / 1e9
+    true_m, fast = course.distance_m, course.fastest_m_s
     speeds = [
         kept for kept in trace.of(words.ROBOT.name, words.SPEED) if truth.covers(kept.stamp_ns)
     ]
@@ -163,7 +157,7 @@ def timeline_figure(trace: Trace, truth: Truth) -> Picture:
         Line("estimated", seen_s, seen_m, ARM),
     ]
     moved = [
-        Line("allowed for the true distance", at_s, limit, TRUE),
+        Line("allowed for the true distance", at_s, allowed_m_s(course), TRUE),
         Line("commanded limit", seen_s, told, ARM),
         Line("actual", at_s, fast, TRACK),
     ]

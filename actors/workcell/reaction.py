@@ -10,11 +10,10 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from actors.geometry.kinematics import end_velocities
 from actors.geometry.separation import Separation
 from actors.workcell import vocabulary as words
 from actors.workcell.motion import CYCLE_S, NOMINAL_M_S
-from actors.workcell.truth_of_run import RESTING_M_S
+from actors.workcell.truth_of_run import RESTING_M_S, course_of
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -36,27 +35,23 @@ def reaction_of(trace: Trace, truth: Truth) -> dict[str, float]:
     distance of the full speed, to the commit of the first command that is lower than the full
     speed; the second one from the protective distance at rest, to the arm at rest.
     """
-    motion = trace.joints()
-    chosen = np.array([truth.covers(int(stamp)) for stamp in motion.stamp_ns], np.bool_)
-    if chosen.sum() < 3:
+    course, law = course_of(trace, truth), Separation()
+    stamps, distance_m = course.stamp_ns, course.distance_m
+    if len(stamps) < 3:
         return {}
-    stamps, q, dq = motion.stamp_ns[chosen], motion.q[chosen], motion.dq[chosen]
-    distance_m = np.array(
-        [truth.distance_m(int(stamp), joints) for stamp, joints in zip(stamps, q, strict=True)]
-    )
-    law = Separation()
     speeds = trace.of(words.ROBOT.name, words.SPEED)
     commands = np.array([kept.committed_ns for kept in speeds], np.int64)
     lower = np.array([kept.datum.limit_m_s < NOMINAL_M_S for kept in speeds], np.bool_)
-    moving_m_s = np.linalg.norm(end_velocities(truth.arm, q, dq), axis=-1).max((1, 2))
     found = {}
     full = after_ms(stamps, distance_m < law.protective_m(NOMINAL_M_S), commands, lower)
     if full:
         found = {"reaction_p50_ms": float(np.median(full)), "reaction_max_ms": max(full)}
-    rest = after_ms(stamps, distance_m < law.protective_m(0.0), stamps, moving_m_s < RESTING_M_S)
+    rest = after_ms(
+        stamps, distance_m < law.protective_m(0.0), stamps, course.fastest_m_s < RESTING_M_S
+    )
     if rest:
         found["rest_max_ms"] = max(rest)
-    return found | _jerk(stamps, dq)
+    return found | _jerk(stamps, course.dq)
 
 
 def after_ms(stamps: Stamps, cause: Flags, told: Stamps, effect: Flags) -> list[float]:

@@ -97,10 +97,7 @@ def _past(trace: Trace, truth: Truth, _: Mapping[str, float]) -> dict[str, bool]
     speeds, after = _speeds(trace, truth), []
     empty_since = -math.inf  # no person has been there yet
     for kept in speeds:
-        inside = any(
-            bool((np.abs(body[:, :2]) < truth.half_m).all(1).any())
-            for body in truth.bodies_at(kept.stamp_ns)
-        )
+        inside = any(bool(truth.over(body[:, :2]).any()) for body in truth.bodies_at(kept.stamp_ns))
         empty_since = 0 if inside else empty_since + 1
         if empty_since > round(1.0 / words.PERIOD_S):
             after.append(kept.datum.scale)
@@ -138,7 +135,7 @@ def _hidden(trace: Trace, truth: Truth, scores: Mapping[str, float]) -> dict[str
     held = []
     for kept in _hulls(trace, truth):
         middles = [middle for middle, *_ in truth.centres_at(kept.stamp_ns)]
-        if middles and np.abs(middles[0]).max() < float(truth.half_m[0]) - 0.3:
+        if middles and truth.over(middles[0], -0.3).all():
             places = grid.origin_m[:2] + (kept.datum.voxels[:, :2] + 0.5) * grid.voxel_m
             off_m = np.linalg.norm(places - middles[0], axis=1)
             held.append(bool(off_m.min(initial=math.inf) < PLACE_M))
@@ -249,7 +246,7 @@ def _two(trace: Trace, truth: Truth, _: Mapping[str, float]) -> dict[str, bool]:
     both = []
     for hull in _hulls(trace, truth):
         middles = [middle for middle, *_ in truth.centres_at(hull.stamp_ns)]
-        if len(middles) > 1 and np.abs(middles).max() < float(truth.half_m[0]) - 0.3:
+        if len(middles) > 1 and truth.over(np.array(middles), -0.3).all():
             there = tracks.get(hull.stamp_ns, [])
             near = [[float(np.linalg.norm(m - one)) < PLACE_M for one in there] for m in middles]
             own = {row.index(True) for row in near if any(row)}

@@ -43,7 +43,8 @@ class Truth:
         things: Boxes that are left.
         start_ns: Stamp of second 0.
         seconds: How long it lasts.
-        half_m: Half of the workspace along x and y.
+        low_m: x and y from which on the workspace reaches.
+        high_m: x and y up to which it does.
     """
 
     scenario: Scenario
@@ -52,7 +53,8 @@ class Truth:
     things: tuple[Thing, ...]
     start_ns: int
     seconds: float
-    half_m: F64
+    low_m: F64
+    high_m: F64
 
     @property
     def ticks(self) -> int:
@@ -72,6 +74,11 @@ class Truth:
         bodies = (person.capsules_at(self.at_s(stamp_ns)) for person in self.people)
         return [body for body in bodies if body is not None]
 
+    def over(self, points_m: F64, beyond_m: F64 | float = 0.0) -> npt.NDArray[np.bool_]:
+        """Say which points (..., 2) lie over the workspace, grown by `beyond_m` on each side."""
+        low_m, high_m = self.low_m - beyond_m, self.high_m + beyond_m
+        return np.asarray(((points_m > low_m) & (points_m < high_m)).all(-1))
+
     def inside(self, body: F64) -> bool:
         """Say whether all of a body lies over the workspace."""
         return bool(self._over(body).all())
@@ -79,7 +86,7 @@ class Truth:
     def _over(self, body: F64) -> npt.NDArray[np.bool_]:
         """Say of both ends of each capsule, (n, 2), whether all of it lies over the workspace."""
         ends = body[:, :6].reshape(-1, 2, 3)[..., :2]
-        return np.asarray((np.abs(ends) + body[:, None, 6:] < self.half_m).all(-1))
+        return self.over(ends, -body[:, None, 6:])
 
     def centres_at(self, stamp_ns: int) -> list[Moving]:
         """Return middle, velocity and middle half a second later of who is there."""
@@ -138,7 +145,8 @@ def truth_of(trace: Trace) -> Truth:
         things=scenario.things,
         start_ns=playing.start_ns,
         seconds=playing.seconds,
-        half_m=np.array(grid.shape[:2]) * grid.voxel_m / 2.0,
+        low_m=grid.origin_m[:2],
+        high_m=grid.origin_m[:2] + np.array(grid.shape[:2]) * grid.voxel_m,
     )
 
 
@@ -151,30 +159,54 @@ def _surface(thing: Thing, step_m: float = 0.03) -> F64:
     return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
 
 
-def safety_of(trace: Trace, truth: Truth) -> dict[str, F64]:
-    """Return what safety and productivity are scored on.
+@dataclass(frozen=True, slots=True, eq=False)
+class Course:
+    """The arm at its samples in the scenario, and how far it truly was from people and objects.
 
-    `too_fast` is, at each sample of the arm, 100 times per second, whether the arm was faster than
-    ISO/TS 15066 allows for the *true* distance of that moment, without any reaction time: T_r is
-    used up.  `share` is the share of the nominal speed at each command while the arm was not at a
-    goal.
+    Attributes:
+        stamp_ns: (n,) int64, increasing.
+        dq: (n, 7) rad/s.
+        fastest_m_s: (n,), speed of its quickest point.
+        distance_m: (n,), infinity where nothing is there.
     """
+
+    stamp_ns: npt.NDArray[np.int64]
+    dq: F64
+    fastest_m_s: F64
+    distance_m: F64
+
+
+def course_of(trace: Trace, truth: Truth, *, every: int = 1) -> Course:
+    """Return the course of the arm over the scenario, at each so-many-th sample."""
+    motion = trace.joints()
+    covered = [truth.covers(int(stamp)) for stamp in motion.stamp_ns]
+    chosen = np.flatnonzero(covered)[::every]
+    stamps, q, dq = motion.stamp_ns[chosen], motion.q[chosen], motion.dq[chosen]
+    fastest = np.empty(0)
+    if len(q):
+        fastest = np.linalg.norm(end_velocities(truth.arm, q, dq), axis=-1).max((1, 2))
+    distances = [truth.distance_m(int(at), joints) for at, joints in zip(stamps, q, strict=True)]
+    return Course(stamps, dq, fastest, np.array(distances))
+
+
+def allowed_m_s(course: Course) -> F64:
+    """Return the speed that ISO/TS 15066 allows at each true distance; T_r is used up."""
+    spent = Separation(reaction_s=0.0)
+    return np.array([spent.speed_max_m_s(float(distance)) for distance in course.distance_m])
+
+
+def share_of(trace: Trace, truth: Truth) -> F64:
+    """Return the share of the nominal speed at each command while the arm was not at a goal."""
     done = [
         kept.datum
         for kept in trace.of(words.ROBOT.name, words.EXECUTION)
         if truth.covers(kept.datum.captured_ns) and kept.datum.state != "dwelling"
     ]
-    share = np.array([one.scale for one in done], np.float64)
-    motion = trace.joints()
-    chosen = np.array([truth.covers(int(stamp)) for stamp in motion.stamp_ns], np.bool_)
-    if not chosen.any():
-        return {"too_fast": np.empty(0), "share": share}
-    stamps, q, dq = motion.stamp_ns[chosen], motion.q[chosen], motion.dq[chosen]
-    fastest = np.linalg.norm(end_velocities(truth.arm, q, dq), axis=-1).max((1, 2))
-    distances = [
-        truth.distance_m(int(stamp), joints) for stamp, joints in zip(stamps, q, strict=True)
-    ]
-    spent = Separation(reaction_s=0.0)
-    allowed = np.array([spent.speed_max_m_s(distance) for distance in distances])
-    too_fast = (fastest > allowed) & (fastest > RESTING_M_S)
-    return {"too_fast": too_fast.astype(np.float64), "share": share}
+    return np.array([one.scale for one in done], np.float64)
+
+
+def too_fast_of(trace: Trace, truth: Truth) -> F64:
+    """Return 1 for each sample at which the arm was faster than `allowed_m_s`, 0 for others."""
+    course = course_of(trace, truth)
+    fast = course.fastest_m_s > np.maximum(allowed_m_s(course), RESTING_M_S)
+    return fast.astype(np.float64)

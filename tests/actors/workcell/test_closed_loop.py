@@ -14,7 +14,7 @@ from actors.workcell.scenarios import Pause, Walk, scenario_of
 from actors.workcell.simulation.backdrop import backdrop_of
 from actors.workcell.simulation.room import BOXES, Box, cameras
 from actors.workcell.true_hull import capsules_in
-from actors.workcell.truth_of_run import safety_of, truth_of
+from actors.workcell.truth_of_run import share_of, truth_of
 
 pytest.importorskip("cv2", exc_type=ImportError)
 pytest.importorskip("ompl", exc_type=ImportError)
@@ -23,7 +23,7 @@ pytest.importorskip("ompl", exc_type=ImportError)
 def kept_by(scenario, sight):
     """Return the mean share of the nominal speed."""
     trace = ClosedLoop(scenario, sight=sight, voxel_m=0.05).run()
-    return float(safety_of(trace, truth_of(trace))["share"].mean())
+    return float(share_of(trace, truth_of(trace)).mean())
 
 
 def played(scenario):

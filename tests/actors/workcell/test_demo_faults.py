@@ -25,7 +25,7 @@ from actors.workcell.demo_conduct import Conductor, recording
 from actors.workcell.demo_options import Options
 from actors.workcell.scenario_checks import checks_of
 from actors.workcell.trace import trace_of
-from actors.workcell.truth_of_run import safety_of, truth_of
+from actors.workcell.truth_of_run import too_fast_of, truth_of
 from actors.workcell.watch import SILENT
 from enact_dist import Aspect, Entity, Lock, Write
 from enact_dist.errors import EnactError
@@ -286,7 +286,7 @@ def test_nothing_of_it_made_the_robot_too_fast(trial: Trial) -> None:
     trial.recorded.close()
     trace = trace_of(trial.path)
     truth = truth_of(trace)
-    too_fast = safety_of(trace, truth)["too_fast"]
+    too_fast = too_fast_of(trace, truth)
 
     assert len(too_fast) > 500
     assert too_fast.sum() == 0.0

@@ -35,6 +35,17 @@ def perfect() -> dict[str, float]:
     return score(run.trace(), every=5)
 
 
+def test_the_workspace_is_where_the_grid_is() -> None:
+    """Also where its middle is not the origin of the cell, and its sides differ."""
+    run, limb = Run("S1", 1.0), np.array([[1.0, 3.0, 1.0, 1.2, 3.0, 1.0, 0.1]])
+    assert not truth_of(run.trace()).inside(limb)
+    run.add(words.WORKSPACE.name, words.GRID, words.Grid(np.zeros(3), 0.1, (20, 40, 20)), 0)
+    truth = truth_of(run.trace())
+    assert truth.inside(limb)
+    assert not truth.inside(limb - [2.0, 0.0, 0.0, 2.0, 0.0, 0.0, 0.0])
+    assert truth.over(np.array([[0.2, 0.2], [1.9, 0.2]]), -0.15).tolist() == [True, False]
+
+
 def test_the_truth_scores_perfectly(perfect: dict[str, float]) -> None:
     assert perfect["lost_near_voxels"] == perfect["lost_share"] == 0.0
     assert perfect["true_voxels"] > 500

@@ -81,7 +81,7 @@ def test_place_of_who_hides_is_where_they_are(shift: int, kept: bool) -> None:
         slot = run.versions["online", words.WORKSPACE.name, "hull"]
         hull = slot[-1].datum
         moved = (hull.voxels + np.array([shift, 0, 0])).astype(np.int16)
-        slot[-1] = dataclasses.replace(slot[-1], datum=dataclasses.replace(hull, voxels=moved))
+        slot[-1] = dataclasses.replace(slot[-1], held=dataclasses.replace(hull, voxels=moved))
 
     assert held(run, "the place of who hides") is kept
 
