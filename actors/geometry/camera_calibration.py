@@ -4,7 +4,7 @@
 2. `linked`: cameras that saw the board at the same moments stand in one frame, directly or by
    others between them.
 3. `calibrated`: all of it at once (`bundle_adjustment`); pictures that contradict all the others
-   are left out and named.
+   are left out and named, and so are single corners that a shadow or the edge of a marker moved.
 """
 
 from __future__ import annotations
@@ -38,6 +38,13 @@ CONTRADICTS: Final = 4.0
 """A picture whose error is so many times that of the others is left out …"""
 CONTRADICTS_PX: Final = 1.0
 """… if it is also larger than this."""
+STRAYS: Final = 6.0
+"""A corner whose error is so many times that of the middle one of all corners is left out: three
+and more standard deviations of an exact one …"""
+STRAYS_PX: Final = 0.1
+"""… if it is also larger than this."""
+CORNERS_KEPT: Final = 6
+"""A picture of which fewer are left is left out."""
 AGREES_PX: Final = 8.0
 """A pose that misses the corners of a picture by less than this agrees with it, before all of it
 is adjusted."""
@@ -75,6 +82,7 @@ class Calibrated:
         sights: Those that were used.
         contradicting: Those that were left out.
         unlinked: Why a camera stands in no frame with the others, by camera.
+        strays: How many single corners were left out.
     """
 
     rig: Rig
@@ -83,6 +91,7 @@ class Calibrated:
     rms_px: dict[str, float] = field(default_factory=dict)
     contradicting: list[Sight] = field(default_factory=list)
     unlinked: dict[str, str] = field(default_factory=dict)
+    strays: int = 0
 
 
 def fitted_lens(sights: Sequence[Sight], width: int, height: int, *, k3: bool = False) -> Lens:
@@ -289,7 +298,10 @@ def calibrated(
         kept_ids = {id(sight) for sight in kept}
         contradicting += [sight for sight in used if id(sight) not in kept_ids]
         used = kept
-    result = Calibrated(rig, origin, used, contradicting=contradicting)
+    used, strays = _without_strays(rig, used, origin)
+    if strays:
+        rig = adjusted(rig, used, origin=origin, free=free, k3=k3)
+    result = Calibrated(rig, origin, used, contradicting=contradicting, strays=strays)
     names = sorted({sight.camera for sight in used})
     for name in names:
         off = np.concatenate([rig.errors_px(sight) for sight in used if sight.camera == name])
@@ -298,6 +310,28 @@ def calibrated(
     rest = {name: rig.cameras[name] for name in names}
     result.rig = replace(rig, cameras=rest, lenses={name: rig.lenses[name] for name in names})
     return result
+
+
+def _without_strays(rig: Rig, sights: list[Sight], origin: str) -> tuple[list[Sight], int]:
+    """Return sights without single corners that are far off, and how many those were.
+
+    Most corners are found within 0.05 px.  A few are off by half a pixel; as errors grow with the
+    square, they would decide.
+    """
+    if not sights:
+        return sights, 0
+    errors = [np.linalg.norm(rig.errors_px(sight), axis=1) for sight in sights]
+    most_px = max(STRAYS_PX, STRAYS * float(np.median(np.concatenate(errors))))
+    near = [error <= most_px for error in errors]
+    strays = sum(int((~one).sum()) for one in near)
+    kept = [
+        replace(sight, points_m=sight.points_m[one], pixels=sight.pixels[one])
+        for sight, one in zip(sights, near, strict=True)
+        if one.sum() >= CORNERS_KEPT
+    ]
+    left = _still_linked(kept, origin)
+    same = {sight.camera for sight in left} == {sight.camera for sight in sights}
+    return (left, strays) if same else (sights, 0)
 
 
 def _still_linked(sights: list[Sight], origin: str) -> list[Sight]:

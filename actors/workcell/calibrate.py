@@ -82,7 +82,7 @@ class CameraReport:
         pictures: How many pictures it has.
         boards: In how many of them the board was found.
         shared: At how many moments another camera of the file saw it, too.
-        rms_px: Root mean square error of the corners.
+        rms_px: Root mean square error of the corners that were used.
         focal_px: Focal length across.
         covered: Share of the picture within the outermost corners, 0 to 1.
         centre_m: Where it stands, metres; empty if that is not known.
@@ -109,7 +109,9 @@ class CalibrateReport:
         origin: The moment whose board gives the frame.
         moments: At how many moments a camera of the file saw the board.
         file: What was written.
-        rms_px: Root mean square error of all corners.
+        rms_px: Root mean square error of the corners that were used.
+        corners: How many were used.
+        strays: How many were left out because they were far off all others.
         cameras: One entry for each.
         contradicting: Pictures that were left out because all others contradict them.
         notes: What may be wrong though nothing failed.
@@ -120,6 +122,8 @@ class CalibrateReport:
     moments: int = 0
     file: str = ""
     rms_px: float | None = None
+    corners: int = 0
+    strays: int = 0
     cameras: list[CameraReport] = field(default_factory=list)
     contradicting: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
@@ -364,8 +368,9 @@ def _report(
                     " it nearer to the edges, too"
                 )
         report.cameras.append(entry)
-    off = [found.rig.errors_px(sight) for sight in found.sights]
-    report.rms_px = round(float(np.sqrt((np.concatenate(off) ** 2).sum(1).mean())), 4)
+    off = np.concatenate([found.rig.errors_px(sight) for sight in found.sights])
+    report.rms_px = round(float(np.sqrt((off**2).sum(1).mean())), 4)
+    report.corners, report.strays = len(off), found.strays
     report.contradicting = sorted(f"{one.camera}/{one.moment}" for one in found.contradicting)
     last = max(seen.last_marker for one in cameras for seen in one.seen.values())
     if last < board.markers - 1:

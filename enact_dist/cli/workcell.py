@@ -211,7 +211,8 @@ def _print_board(board: Board, arguments: argparse.Namespace) -> int:
 def _print(report: CalibrateReport) -> None:
     print(f"board        {report.board}")
     print(f"origin       the board of moment {report.origin}, of {report.moments} moments")
-    print(f"error        {report.rms_px:.3f} px rms\n")
+    strays = f"; {report.strays} stray ones were left out" if report.strays else ""
+    print(f"error        {report.rms_px:.3f} px rms of {report.corners} corners{strays}\n")
     rows = []
     for one in report.cameras:
         known: list[Any] = ["-", "-", "-"]
