@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
@@ -50,6 +51,8 @@ MARGIN_M: Final = 0.05
 """What a planned path keeps from everything."""
 STATIC_MARGIN_M: Final = 0.02
 """The remaining clearance from static obstacles along a path that is still valid."""
+STATIC_CELL_M: Final = 0.025
+"""Edge of the cells that static obstacles take, however coarse the hull is."""
 COARSER: Final = 2
 """Voxels of the hull along an edge of a cell in which is planned: 5 cm."""
 HEIGHT_M: Final = 2.0
@@ -76,7 +79,8 @@ class Obstacles:
     def __init__(self, model: ArmModel, grid: Grid, boxes: F64) -> None:
         self._model, self._grid = model, grid
         self._spheres = ArmSpheres(model)
-        static = CellGrid(grid.origin_m, grid.voxel_m, grid.shape)
+        x, y, z = (math.ceil(size * grid.voxel_m / STATIC_CELL_M - 1e-9) for size in grid.shape)
+        static = CellGrid(grid.origin_m, STATIC_CELL_M, (x, y, z))
         static.mark_boxes(boxes)
         self._static = GrownGrid(self._spheres, static, MARGIN_M)
         self._static_left = GrownGrid(self._spheres, static, STATIC_MARGIN_M)
@@ -339,7 +343,8 @@ class PathPlanning(Actor):
         boxes = [np.reshape(one, (-1, 15)) for _, one in sorted(lock[self.boxes].items())]
         rows = np.concatenate([np.empty((0, 15)), *boxes])
         model, grid = lock[self.model], lock[self.grid]
-        parts = (rows, model.dh, model.base, model.capsules, grid.origin_m, np.array(grid.shape))
+        size = np.array([grid.voxel_m, *grid.shape])
+        parts = (rows, model.dh, model.base, model.capsules, grid.origin_m, size)
         key = b"".join(np.ascontiguousarray(part).tobytes() for part in parts)
         if self._obstacles is None or self._obstacles[0] != key:
             self._obstacles = key, Obstacles(model, grid, rows)

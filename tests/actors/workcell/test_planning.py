@@ -5,12 +5,15 @@ import time
 import numpy as np
 import pytest
 
+from actors.geometry.arm_clearance import CellGrid
 from actors.geometry.capsules import distance_to_points
 from actors.geometry.joint_paths import JointPath
 from actors.geometry.kinematics import capsules_at
 from actors.workcell.motion import CYCLE_S, Motion
-from actors.workcell.planning import PathPlanning, PlanningWithSpeed
+from actors.workcell.planning import Obstacles, PathPlanning, PlanningWithSpeed
+from actors.workcell.setup import GOALS_RAD, grid_of
 from actors.workcell.simulation.arm import ARM
+from actors.workcell.simulation.room import BOXES as ROOM_BOXES
 from actors.workcell.vocabulary import (
     BOXES,
     CAMERA_STATES,
@@ -59,6 +62,17 @@ def person(hand=(0.62, -0.15, 1.1), foot=(1.2, -0.75)):
 NOBODY = np.empty((0, 3))
 REACHING = person(hand=(0.62, 0.2, 1.1), foot=(1.2, 0.75))
 """Someone in the second half of the way from left to right."""
+
+
+@pytest.mark.parametrize("voxel_m", [0.02, 0.04, 0.05, 0.1])
+def test_the_goals_of_the_task_are_free_on_any_grid(voxel_m):
+    """A table does not grow with the voxels of the hull; a robot in an empty cell would stand."""
+    grid, boxes = grid_of(voxel_m), np.stack([box.row() for box in ROOM_BOXES])
+    obstacles = Obstacles(ARM, grid, boxes)
+
+    free = obstacles.free(CellGrid(grid.origin_m, grid.voxel_m, grid.shape)).free
+
+    assert free(np.array(GOALS_RAD)).all()
 
 
 class Cell:
