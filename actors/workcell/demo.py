@@ -200,7 +200,7 @@ def _shown(cell: Cell, options: Options, notes: Notes, console: Console) -> What
     if notes.nearest_ns:
         show_past(cell, notes, console)
     if notes.stop is not None:
-        show_lineage(notes.stop, console)
+        show_lineage(notes.stop, len(notes.images), console)
     if not notes.forked_ns:
         return None
     return show_what_if(cell, options.out / "run.mcap", notes, console)

@@ -28,14 +28,19 @@ from enact_dist.errors import EnactError, ForgottenError, NullDatumError, ShardU
 from enact_dist.recording import Recorder
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
+
+    import numpy as np
+    import numpy.typing as npt
 
     from actors.running_cell import DemoCell
     from actors.workcell.demo_options import Options
     from actors.workcell.scenarios import Fault
-    from enact_dist import Aspect, Cell, Entity
+    from enact_dist import Aspect, Cell, Entity, Version
     from enact_dist.lineage import CauseTree
+
+    Image = npt.NDArray[np.uint8]
 
 T = TypeVar("T")
 
@@ -71,6 +76,7 @@ class Notes:
         start_ns: Stamp of second 0.
         cameras: How many the cell has.
         stop: Where the first stop came from; None without one.
+        images: The images of its masks that smart cameras committed together with them.
         nearest_m: Nearest estimated distance.
         nearest_ns: Exposure of it.
         forked_ns: When the fork was made; 0: it was not.
@@ -82,6 +88,7 @@ class Notes:
     start_ns: int = 0
     cameras: int = words.CAMERA_COUNT
     stop: CauseTree | None = None
+    images: tuple[Version[Image], ...] = ()
     nearest_m: float = math.inf
     nearest_ns: int = 0
     forked_ns: int = 0
@@ -252,8 +259,9 @@ class Conductor:
     def _keep_stop(self) -> None:
         tree = self._tree()
         if tree is not None and len(masks_of(tree)) == self.notes.cameras:
-            self._label("first-stop", tree)
-            self.notes.stop = tree
+            images = self._images_with(masks_of(tree))
+            self._label("first-stop", tree, images)
+            self.notes.images, self.notes.stop = images, tree
 
     def _keep(self) -> None:
         """Keep the newest set and what was made of it, if it is the nearest one of all masks."""
@@ -274,12 +282,22 @@ class Conductor:
         except ForgottenError:
             return None  # an image has left its retention meanwhile; the next set comes soon
 
-    def _label(self, label: str, tree: CauseTree) -> None:
+    def _images_with(self, masks: Sequence[CauseTree]) -> tuple[Version[Image], ...]:
+        """Return the images that were committed in one step with masks: no cause, but the same."""
+        return tuple(
+            image
+            for mask in masks
+            for image in self._online.history(mask.entity, words.IMAGE)
+            if image.position == mask.position
+        )
+
+    def _label(self, label: str, tree: CauseTree, images: Sequence[Version[Image]] = ()) -> None:
         """Keep all versions of a tree under a label, in place of what it kept before."""
         if label in self._cell.kept():
             self._cell.let_go(label)
+        known = [cause for cause in tree.walk() if cause.known]
         with contextlib.suppress(ForgottenError):  # images go first; all else is kept
-            self._cell.keep(label, (cause for cause in tree.walk() if cause.known))
+            self._cell.keep(label, (*known, *images))
 
     def _say(self, now_s: float, text: str) -> None:
         line = f"{now_s:6.1f} s  {text}"

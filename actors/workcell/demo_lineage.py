@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from actors.workcell import vocabulary as words
 from actors.workcell.demo_conduct import DEPTH, masks_of
@@ -15,15 +15,18 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from actors.workcell.demo_conduct import Notes
-    from enact_dist import Cell
+    from enact_dist import Aspect, Cell, Entity
     from enact_dist.lineage import CauseTree
 
+T = TypeVar("T")
 
-def show_lineage(tree: CauseTree, console: Console) -> None:
+
+def show_lineage(tree: CauseTree, images: int, console: Console) -> None:
     """Print where the first stop came from: its hull, the masks of one stamp, their images.
 
     Args:
         tree: The causes of the speed that stopped the robot.
+        images: How many images were committed in one step with the masks.
         console: Where progress and table are printed.
     """
     command = f"enact why online {words.ROBOT}/{words.SPEED}@{tree.version} --depth {DEPTH}"
@@ -31,7 +34,8 @@ def show_lineage(tree: CauseTree, console: Console) -> None:
     for cause in tree.children:
         if str(cause.aspect) == words.HULL.name:
             print_tree(drawn(cause), console.file)
-    console.print(f"{len(masks_of(tree))} masks; kept under the label first-stop")
+    beside = f", {images} of them in one commit with their image" if images else ""
+    console.print(f"{len(masks_of(tree))} masks{beside}; kept under the label first-stop")
 
 
 def show_past(cell: Cell, notes: Notes, console: Console) -> None:
@@ -42,6 +46,11 @@ def show_past(cell: Cell, notes: Notes, console: Console) -> None:
     console.print(f"\nonline at the nearest approach, second {second:.1f} (world.at)", style="bold")
     seen = then.view(hull, speed)
     found, command = seen.get(hull), seen.get(speed)
+    if found is None or command is None:  # what is not kept has left its retention since
+        found, command = (
+            _kept(cell, words.WORKSPACE, words.HULL, notes.nearest_ns),
+            _kept(cell, words.ROBOT, words.SPEED, notes.nearest_ns),
+        )
     if found is not None and command is not None:
         console.print(
             f"{len(found.voxels):,} voxels, the nearest {found.nearest_m:.2f} m from the arm;"
@@ -55,6 +64,12 @@ def show_past(cell: Cell, notes: Notes, console: Console) -> None:
     console.print(f"{len(masks)} masks of that stamp, kept under the label nearest")
 
 
+def _kept(cell: Cell, entity: Entity, aspect: Aspect[T], stamp_ns: int) -> T | None:
+    """Return the datum of a stamp among what is kept; None if it is gone."""
+    history = cell.world(ONLINE).history(entity, aspect)
+    return next((one.datum() for one in history if one.stamp_ns == stamp_ns), None)
+
+
 def stop_checks(notes: Notes) -> dict[str, bool]:
     """Return whether the tree of the first stop ends at all masks of one stamp."""
     tree = notes.stop
@@ -66,6 +81,7 @@ def stop_checks(notes: Notes) -> dict[str, bool]:
         for cause in (tree.walk() if tree is not None else ())
         if str(cause.aspect) == words.IMAGE.name and cause.stamp_ns in stamps
     }
+    images |= {image.entity for image in notes.images if image.stamp_ns in stamps}
     return {
         f"the first stop leads to {notes.cameras} masks of one stamp": whole,
         "and to their images": whole and images == {mask.entity for mask in masks},

@@ -392,7 +392,8 @@ def _write(path: Path, image: Image) -> None:
     """
     import cv2
 
-    if not cv2.imwrite(str(path), image, [cv2.IMWRITE_JPEG_QUALITY, QUALITY]):
+    how = [cv2.IMWRITE_JPEG_QUALITY, QUALITY] if path.suffix == ".jpg" else []
+    if not cv2.imwrite(str(path), image, how):
         raise OSError(f"{path}: could not be written; is the disk full?")
 
 

@@ -17,13 +17,13 @@ from rich.console import Console
 pytest.importorskip("cv2", exc_type=ImportError)
 pytest.importorskip("mcap", exc_type=ImportError)
 
-from actors.running_cell import toml_of
+from actors.running_cell import DemoCell, toml_of
 from actors.workcell import demo_conduct
 from actors.workcell import vocabulary as words
 from actors.workcell.demo import run_quietly
 from actors.workcell.demo_cell import TEMPLATE, configured
-from actors.workcell.demo_conduct import recording, told
-from actors.workcell.demo_lineage import show_lineage
+from actors.workcell.demo_conduct import Conductor, Notes, recording, told
+from actors.workcell.demo_lineage import show_lineage, show_past, stop_checks
 from actors.workcell.demo_options import Options
 from actors.workcell.demo_report import markdown_of, report_of, value_text
 from actors.workcell.figures import figure4
@@ -37,6 +37,25 @@ from enact_dist import Entity, Lock, View, Write, local, testing
 from enact_dist.actor_check import check_cell, declarations_of
 from enact_dist.config import load_config
 from enact_dist.errors import ConfigError
+
+
+def put_hull_and_speed(online, views, stamp_ns):
+    """Commit a hull of one voxel, made of masks, and the speed made of it."""
+    hull = Write(online, words.WORKSPACE, words.HULL)
+    speed = Write(online, words.ROBOT, words.SPEED)
+    with Lock(hull, *views) as lock:
+        for view in views:
+            assert lock[view] is not None
+        flags = np.ones(1, np.bool_), np.zeros(1, np.int16)
+        one = words.Hull(
+            np.ones((1, 3), np.int16), np.full(1, 0.1, np.float32), *flags, {}, (), 0.1, 0
+        )
+        lock.put(hull, one, stamp_ns=stamp_ns)
+    seen = View(online, words.WORKSPACE, words.HULL)
+    with Lock(seen, speed) as lock:
+        assert lock[seen].nearest_m == 0.1
+        near = words.Speed(0.0, 0.0, 0.1, "someone is too near", 250.0, stamp_ns, stamp_ns)
+        lock.put(speed, near, stamp_ns=stamp_ns)
 
 
 def test_shipped_cell_fits_together():
@@ -171,10 +190,54 @@ def test_why_it_stopped_goes_to_where_the_progress_goes(capsys):
             lock.put(speed, words.Speed(0.0, 0.0, 0.1, "someone is too near", 250.0, 1, 1))
         tree = cell.why("online", words.ROBOT, words.SPEED, depth=3)
     console = Console(stderr=True)
-    show_lineage(tree, console)
+    show_lineage(tree, 0, console)
     told = capsys.readouterr()
     assert told.out == ""
     assert "workspace/hull v1" in told.err
+
+
+def test_a_stop_leads_to_the_images_that_were_committed_with_its_masks(tmp_path):
+    """A smart camera writes image and mask in one step, so neither is a cause of the other."""
+    options, told = Options(tmp_path), []
+    running = DemoCell(tmp_path / "cell.toml", log="")
+    with local(worlds=["online", "truth"]) as cell:
+        online = cell.world("online")
+        views = []
+        for number in range(2):
+            camera = words.camera_entity(number)
+            image, mask = (Write(online, camera, one) for one in (words.IMAGE, words.SILHOUETTE))
+            with Lock(image, mask) as lock:
+                lock.put(image, np.zeros((4, 8, 3), np.uint8), stamp_ns=7)
+                lock.put(mask, words.Silhouette(np.zeros((4, 1), np.uint8), 0), stamp_ns=7)
+            views.append(View(online, camera, words.SILHOUETTE))
+        put_hull_and_speed(online, views, 7)
+        conductor = Conductor(cell, running, options, told.append)
+        conductor.notes.cameras = 2
+
+        conductor._keep_stop()
+
+        assert set(stop_checks(conductor.notes).values()) == {True}
+        kept = [str(one.aspect) for one in cell.kept()["first-stop"]]
+        assert kept.count("image") == kept.count("silhouette") == 2
+
+
+def test_the_nearest_approach_is_shown_when_hulls_of_its_time_are_forgotten(capsys):
+    """A plain run of a minute is longer than hulls stay; those that were kept are there."""
+    with local(worlds=["online", "truth"]) as cell:
+        online = cell.world("online")
+        put_hull_and_speed(online, (), 1)
+        put_hull_and_speed(online, (), 2)
+        near = [
+            online.history(entity, aspect, count=1)[0]
+            for entity, aspect in ((words.WORKSPACE, words.HULL), (words.ROBOT, words.SPEED))
+        ]
+        cell.keep("nearest", near)
+        for stamp_ns in range(3, 130):
+            put_hull_and_speed(online, (), stamp_ns)
+
+        show_past(cell, Notes(nearest_ns=2), Console())
+
+    assert "1 voxels, the nearest 0.10 m from the arm" in capsys.readouterr().out
 
 
 def test_who_looks_on_gives_way_to_the_cell():
