@@ -331,8 +331,11 @@ class ClosedLoop:
         """Keep what the actors have written since the last tick, with its stamps."""
         online = cell.world(ONLINE)
         single = [View(online, entity, aspect) for entity, aspect in _OF_ONLINE]
-        tracks = ViewEach(online, words.HUMANS, words.TRACK)
-        with Lock(*single, tracks) as lock:
+        people = [
+            (aspect, ViewEach(online, words.HUMANS, aspect))
+            for aspect in (words.TRACK, words.PREDICTION)
+        ]
+        with Lock(*single, *(view for _, view in people)) as lock:
             for view, (entity, aspect) in zip(single, _OF_ONLINE, strict=True):
                 version = lock.version(view)
                 if lock.is_null(view) or version == self._known.get(aspect.name):
@@ -340,8 +343,9 @@ class ClosedLoop:
                 self._known[aspect.name] = version
                 self._keep(entity, aspect, lock[view], stamp_ns=lock.stamp_ns(view))
                 if aspect is words.HULL:
-                    for human, track in lock[tracks].items():
-                        self._keep(human, words.TRACK, track, stamp_ns=lock.stamp_ns(view))
+                    for kind, those in people:
+                        for human, datum in lock[those].items():
+                            self._keep(human, kind, datum, stamp_ns=lock.stamp_ns(view))
 
     # ------------------------------------------------------------ what breaks
 

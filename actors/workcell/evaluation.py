@@ -28,6 +28,7 @@ from actors.geometry.kinematics import capsules_at
 from actors.workcell import vocabulary as words
 from actors.workcell.reaction import reaction_of
 from actors.workcell.trace import T, trace_of
+from actors.workcell.track_scores import track_samples
 from actors.workcell.true_hull import TrueVoxels
 from actors.workcell.truth_of_run import PERIOD_NS, Truth, share_of, too_fast_of, truth_of
 
@@ -46,8 +47,6 @@ NEAR_M: Final = 0.5
 """Within this distance of the robot no voxel of a person may be lost."""
 PHANTOM_M: Final = 0.15
 """What is farther than this from everything real is a phantom."""
-INSIDE_M: Final = 1.7
-"""Tracks are scored while the person's middle is so near to the robot's axis along x and y."""
 CLOSE_M: Final = 2.0
 """Distances are scored below this true distance."""
 
@@ -103,6 +102,7 @@ GOALS: Final[Mapping[str, Goal]] = {
     "track_position_p50_m": Goal("track, position, p50, m", high=0.04),
     "track_velocity_p50_m_s": Goal("track, velocity, p50, m/s", high=0.1),
     "track_ahead_p50_m": Goal("track, 0.5 s ahead, p50, m", high=0.12),
+    "untracked_share": Goal("people inside without a track, share of moments", high=0.01),
     "violations": Goal("moments faster than ISO/TS 15066 allows", 0, 0),
     "moments": Goal("moments looked at, 100 Hz"),
     "speed_kept": Goal("mean share of the nominal speed"),
@@ -161,7 +161,7 @@ def samples_of(trace: Trace, *, every: int = 1) -> Samples:
     found = {
         **_voxels(trace, truth, every=every),
         **_distances(trace, truth),
-        "track": _tracks(trace, truth),
+        **track_samples(trace, truth),
         **_planning(trace, truth),
         "too_fast": too_fast_of(trace, truth),
         "share": share_of(trace, truth),
@@ -217,11 +217,10 @@ def scores_of(runs: Sequence[Samples]) -> dict[str, float]:
     told("nearest_true_m", "distance_m", np.min)
     if math.isinf(found.get("nearest_true_m", 0.0)):
         del found["nearest_true_m"]
-    if len(every.get("track", ())):
-        position, velocity, ahead = np.median(every["track"], axis=0).tolist()
-        found["track_position_p50_m"] = position
-        found["track_velocity_p50_m_s"] = velocity
-        found["track_ahead_p50_m"] = ahead
+    told("track_position_p50_m", "track_position_m", np.median)
+    told("track_velocity_p50_m_s", "track_velocity_m_s", np.median)
+    told("track_ahead_p50_m", "track_ahead_m", np.median)
+    told("untracked_share", "untracked", np.mean)
     told("violations", "too_fast", np.sum)
     told("moments", "too_fast", len)
     told("speed_kept", "share", np.mean)
@@ -363,38 +362,6 @@ def _distances(trace: Trace, truth: Truth) -> dict[str, list[float]]:
         if true_m < CLOSE_M:
             errors.append(kept.datum.nearest_m - true_m)
     return {"distance_error_m": errors, "distance_m": nearest}
-
-
-def _tracks(trace: Trace, truth: Truth) -> F64:
-    """Compare each track with the person who is nearest to it: (n, 3) errors.
-
-    Of position, m, of velocity, m/s, and of where they are half a second later, m.
-    """
-    errors: list[tuple[float, float, float]] = []
-    for human in trace.entities(words.TRACK):
-        for kept in _during(trace.of(human, words.TRACK), truth):
-            track = kept.datum
-            if track.hidden:
-                continue
-            people = [
-                moving
-                for moving in truth.centres_at(kept.stamp_ns)
-                if np.abs(moving[0]).max() < INSIDE_M
-            ]
-            if not people:
-                continue
-            here, speed, ahead = min(
-                people, key=lambda one: float(np.linalg.norm(one[0] - track.position_m[:2]))
-            )
-            guess = track.position_m[:2] + 0.5 * track.velocity_m_s[:2]
-            errors.append(
-                (
-                    float(np.linalg.norm(track.position_m[:2] - here)),
-                    float(np.linalg.norm(track.velocity_m_s[:2] - speed)),
-                    float(np.linalg.norm(guess - ahead)),
-                )
-            )
-    return np.array(errors).reshape(-1, 3)
 
 
 def _planning(trace: Trace, truth: Truth) -> dict[str, list[float]]:

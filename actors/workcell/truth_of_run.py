@@ -30,6 +30,8 @@ RESTING_M_S: Final = 0.02
 AHEAD_S: Final = 0.5
 """How far ahead a prediction is scored."""
 PERIOD_NS: Final = round(words.PERIOD_S * 1e9)
+SILENT_NS: Final = 250_000_000
+"""After so long without a command the robot brakes, whatever the last one was."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -195,18 +197,30 @@ def allowed_m_s(course: Course) -> F64:
     return np.array([spent.speed_max_m_s(float(distance)) for distance in course.distance_m])
 
 
-def share_of(trace: Trace, truth: Truth) -> F64:
-    """Return the share of the nominal speed at each command while the arm was not at a goal."""
-    done = [
-        kept.datum
-        for kept in trace.of(words.ROBOT.name, words.EXECUTION)
-        if truth.covers(kept.datum.captured_ns) and kept.datum.state != "dwelling"
-    ]
-    return np.array([one.scale for one in done], np.float64)
-
-
 def too_fast_of(trace: Trace, truth: Truth) -> F64:
     """Return 1 for each sample at which the arm was faster than `allowed_m_s`, 0 for others."""
     course = course_of(trace, truth)
     fast = course.fastest_m_s > np.maximum(allowed_m_s(course), RESTING_M_S)
     return fast.astype(np.float64)
+
+
+def share_of(trace: Trace, truth: Truth) -> F64:
+    """Return the share of the nominal speed at the end of each period, but those at a goal; (n,).
+
+    It is 0 while no command reaches the robot.  Empty where the run has no robot.
+    """
+    done = sorted(
+        (kept.datum for kept in trace.of(words.ROBOT.name, words.EXECUTION)),
+        key=lambda one: one.received_ns,
+    )
+    if not done:
+        return np.empty(0)
+    received_ns = np.array([one.received_ns for one in done], np.int64)
+    result: list[float] = []
+    for at_ns in truth.start_ns + PERIOD_NS * np.arange(1, truth.ticks + 1):
+        newest = int(np.searchsorted(received_ns, at_ns, side="right")) - 1
+        if newest < 0 or at_ns - received_ns[newest] > SILENT_NS:
+            result.append(0.0)
+        elif done[newest].state != "dwelling":
+            result.append(done[newest].scale)
+    return np.array(result, np.float64)

@@ -102,6 +102,19 @@ def test_an_arm_that_is_too_fast_near_a_person_is_a_violation() -> None:
     assert violations[1] == 0.0
 
 
+def test_a_robot_without_commands_counts_as_at_rest() -> None:
+    """Commands come for a second, twice of each set, and then none for another one."""
+    run = Run("S1", 2.0)
+    run.rest()
+    for tick in run.ticks:
+        run.hull(tick)
+        if tick < 10:
+            arrived(run, tick)
+            arrived(run, tick)
+
+    assert 0.5 <= score(run.trace(), every=30)["speed_kept"] < 0.65
+
+
 def test_productivity_is_set_beside_an_oracle_and_a_zone() -> None:
     run = Run("S2", 6.0)
     run.rest()
@@ -117,7 +130,7 @@ def test_productivity_is_set_beside_an_oracle_and_a_zone() -> None:
 
 
 def test_tracks_are_compared_with_the_nearest_person() -> None:
-    run = Run("S2", 6.0)
+    run = Run("S3", 5.0)
     run.rest()
     person = Person(run.scenario.walks[0])
     for tick in run.ticks:
@@ -125,22 +138,87 @@ def test_tracks_are_compared_with_the_nearest_person() -> None:
         centre = person.centre_at(tick / 10)
         if centre is None:
             continue
-        track = words.Track(
-            position_m=np.array([centre[0] + 0.03, centre[1], 1.75]),
-            velocity_m_s=velocity_of(person, tick),
-            covariance=np.eye(6),
-            height_m=1.75,
-            volume_m3=0.07,
-            first_ns=START_NS,
-            hidden=False,
-        )
+        track = track_at(centre + np.array([0.03, 0.0]), velocity_of(person, tick))
         run.add("human/0", words.TRACK, track, tick)
+        run.add("human/0", words.PREDICTION, predicted(person, tick), tick)
 
     found = score(run.trace(), every=60)
 
     assert found["track_position_p50_m"] == pytest.approx(0.03, abs=1e-6)
     assert found["track_velocity_p50_m_s"] < 1e-6
-    assert found["track_ahead_p50_m"] < 0.15
+    assert found["track_ahead_p50_m"] < 1e-6
+    assert found["untracked_share"] == 0.0
+
+
+def track_at(at_m: np.ndarray, velocity_m_s: np.ndarray, *, hidden: bool = False) -> words.Track:
+    """Return the track of a person."""
+    return words.Track(
+        position_m=np.array([*at_m, 1.75]),
+        velocity_m_s=velocity_m_s,
+        covariance=np.eye(6),
+        height_m=1.75,
+        volume_m3=0.07,
+        first_ns=START_NS,
+        hidden=hidden,
+    )
+
+
+def predicted(person: Person, tick: int, off_m: float = 0.0) -> words.Prediction:
+    """Return where a person will be in 0.4 s and 0.6 s, so much beside the truth at 0.5 s."""
+    ahead = person.centre_at(tick / 10 + 0.5)
+    step = np.zeros(2) if ahead is None else ahead + np.array([off_m, 0.0])
+    centre = step + np.array([[-0.1, 0.0], [0.1, 0.0]])
+    return words.Prediction(np.array([0.4, 0.6]), centre, np.full(2, 0.3))
+
+
+def test_the_prediction_that_was_published_is_scored() -> None:
+    """A perfect track with a prediction that is off by a metre."""
+    run = Run("S2", 4.0)
+    run.rest()
+    person = Person(run.scenario.walks[0])
+    for tick in run.ticks:
+        run.hull(tick)
+        centre = person.centre_at(tick / 10)
+        if centre is not None:
+            run.add("human/0", words.TRACK, track_at(centre, velocity_of(person, tick)), tick)
+            run.add("human/0", words.PREDICTION, predicted(person, tick, 1.0), tick)
+
+    assert score(run.trace(), every=60)["track_ahead_p50_m"] == pytest.approx(1.0, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("tracks", "state", "share"),
+    [
+        ((), "run", 1.0),
+        ((), "fault", None),
+        (("near",), "run", 0.5),
+        (("near", "near"), "run", 0.5),
+        (("near", "hidden"), "run", 0.0),
+        (("far", "hidden"), "run", 0.5),
+    ],
+)
+def test_a_person_without_a_track_of_their_own_counts(tracks, state, share) -> None:
+    """Two people: whom does each track belong to?  Nobody counts while the cell sees nothing."""
+    run = Run("S11", 4.5)
+    run.rest()
+    run.add(words.SYSTEM.name, words.SAFETY, words.Safety(state, "", START_NS), 0)
+    inside = {tick: [one.centre_at(tick / 10) for one in run.people] for tick in run.ticks}
+    both = [
+        tick
+        for tick, places in inside.items()
+        if all(at is not None and np.abs(at).max() < 1.7 for at in places)
+    ]
+    for tick in both:
+        run.hull(tick)
+        first, second = inside[tick]
+        for number, kind in enumerate(tracks):
+            at_m = second + np.array([0.0, 1.0]) if kind == "hidden" else first
+            at_m = at_m + np.array([0.0, 0.7]) if kind == "far" else at_m
+            track = track_at(at_m, np.zeros(3), hidden=kind == "hidden")
+            run.add(f"human/{number}", words.TRACK, track, tick)
+
+    assert both
+    assert score(run.trace(), every=60).get("untracked_share") == share
 
 
 def velocity_of(person: Person, tick: int) -> np.ndarray:
