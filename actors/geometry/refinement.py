@@ -19,7 +19,8 @@ R4    unreachable  a block goes that is beyond reach at 3 m/s from    people do 
                    from outside; not the third set in a row in which  they have been overlooked
                    that takes the volume of a person away
 R5    forgiven     where something was, and 5 cameras or more have a  camouflage, or a camera that
-      (kept)       say, one of them may say "free"                    is half blind
+      (kept)       say, one that says "free" is overruled if others   is half blind
+                   see what nothing else explains
 R6    shadow       what a camera sees before a surface that is in     a camera that sees a person
                    shadow, and no camera as something dark elsewhere  before a lit place keeps them
 ====  ===========  =================================================  ===========================
@@ -40,6 +41,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from actors.geometry.capsules import distance_to_points, fill, outlines
+from actors.geometry.overruled import grown, overruled
 from actors.geometry.pockets import Pockets
 from actors.geometry.silhouettes import packed, unpacked
 from actors.geometry.visibility import floor_seen, seen_by, static_voxels, surface_voxels
@@ -86,8 +88,8 @@ SAMPLED: Final = 4
 """R4: one of so many voxels is looked at to find that volume; so it takes 0.3 ms."""
 SAYS_MIN: Final = 5
 """R5: so many cameras must have a say for one to be outvoted."""
-BLIND_SHARE: Final = 0.15
-"""R5: a camera that alone denies more than this share of what the others leave is half blind."""
+STEP_BLOCKS: Final = 1
+"""R5: so many blocks people move on from one set to the next."""
 ENTERED_BLOCKS: Final = 8
 """So deep in a pocket are the unseen parts of who stands in its opening: an arm and a trunk."""
 NEAREST_M: Final = 0.5
@@ -200,7 +202,6 @@ class Refinement:
         self._static = static_voxels(self._grid, boxes)
         self._surface = surface_voxels(self._grid, boxes)
         self._floor = floor_seen(self._grid, calibrations, boxes)
-        self._all_blocks = np.arange(self._grid.blocks)
         self._before: Flags | None = None
         self._since_s = np.full(self._grid.block_shape, np.inf, np.float32)
         self._appeared = 0
@@ -231,7 +232,7 @@ class Refinement:
         outline = self._explaining(robot)
         seen = self._with_robot(self._moved(silhouettes, outline), robot)
         self._hull.load(seen, self._moved(shades, outline) if shades else ())
-        raw = self._hull.carve(self._all_blocks)
+        raw, one_veto = self._hull.carve_leniently(self._was_near())
         counts = {"raw": len(raw)}
         rows = raw[~self._static[raw]]
         counts["static"] = len(raw) - len(rows)
@@ -243,7 +244,7 @@ class Refinement:
         counts["unreachable"] = len(rows) - len(kept)
         counts["robot"] = counts["explained"] = 0
         away = self._beside_robot(kept, robot, outline, counts)
-        forgiven = self._forgiven(away.rows, len(kept))
+        forgiven = self._forgiven(one_veto, raw, away.rows)
         forgiven = forgiven[~self._hull.shaded(forgiven, dark)]
         counts["forgiven"] = len(forgiven)
         more = self._beside_robot(forgiven, robot, outline, counts)
@@ -348,28 +349,16 @@ class Refinement:
         result[:, :reach] = result[:, -reach:] = True
         return result
 
-    def _forgiven(self, left: Rows, common: int) -> Rows:
-        """Return the voxels where something was, and that only one camera says to be free (R5).
-
-        They count if they lie between what all cameras leave, so that a limb does not fall apart,
-        or if the camera contradicts the others in so many voxels that it must be half blind.
-
-        Args:
-            left: What all cameras leave, and is not the robot.
-            common: How many voxels all cameras leave.
-        """
+    def _was_near(self) -> Flags:
+        """Return the blocks (i, j, k) where something was, or a step away: R5 is about them."""
         if self._before is None or not self._before.any():
-            return np.empty(0, np.int64)
-        blocks = np.flatnonzero(self._before.ravel())
-        rows, camera = self._hull.with_one_veto(blocks)
-        outvoted = (self._says[rows] >= SAYS_MIN) & ~self._static[rows]
-        rows, camera = rows[outvoted], camera[outvoted]
-        alone = np.bincount(camera, minlength=len(self._sizes))
-        blind = alone > BLIND_SHARE * max(common, 1)
-        blocks_left = np.zeros(self._grid.block_shape, bool)
-        blocks_left.ravel()[left >> 6] = True
-        between = ~grown(~grown(blocks_left, 1), 1)
-        return np.asarray(rows[between.ravel()[rows >> 6] | blind[camera]])
+            return np.zeros(self._grid.block_shape, bool)
+        return grown(self._before, STEP_BLOCKS)
+
+    def _forgiven(self, one_veto: Rows, raw: Rows, left: Rows) -> Rows:
+        """Return the voxels about which the one camera that says "free" is wrong (R5)."""
+        rows = one_veto[self._says[one_veto] >= SAYS_MIN]
+        return overruled(self._hull, rows[~self._static[rows]], raw, left)
 
     def _explaining(self, robot: Numbers | None) -> list[npt.NDArray[np.uint8]]:
         """Return where cameras may see the robot, its shadows and blurred edges."""
@@ -473,17 +462,3 @@ class Refinement:
         result = tight.copy()
         result[tight] = dense[i, j, k] > NEIGHBOURS_MIN
         return result
-
-
-def grown(blocks: Flags, reach: int) -> Flags:
-    """Return blocks (i, j, k) and all within so many blocks of them, along axes and diagonals."""
-    import cv2
-
-    if reach < 1:
-        return blocks.copy()
-    wide, deep, high = blocks.shape
-    edge = 2 * reach + 1
-    image = np.ascontiguousarray(blocks, np.uint8)
-    flat = cv2.dilate(image, np.ones((edge, edge), np.uint8))
-    lines = np.ascontiguousarray(flat).reshape(wide * deep, high)
-    return np.asarray(cv2.dilate(lines, np.ones((1, edge), np.uint8)) > 0).reshape(blocks.shape)

@@ -117,6 +117,15 @@ class CameraTable:
         """Rows and columns of the pooled masks."""
         return -(-self.height // POOL_PX), -(-self.width // POOL_PX)
 
+    def cell_of_pixel(self, pixel: npt.NDArray[np.integer]) -> npt.NDArray[np.int64]:
+        """Return in which cell of the pooled masks pixels lie.
+
+        Args:
+            pixel: Flat indices into one mask.
+        """
+        row, column = np.divmod(pixel, self.width)
+        return np.asarray(row // POOL_PX * self.pool_shape[1] + column // POOL_PX, np.int64)
+
     @property
     def pool_sentinel(self) -> int:
         """Index of the byte behind the pooled masks."""

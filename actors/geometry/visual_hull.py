@@ -22,6 +22,7 @@ import numpy as np
 
 from actors.geometry.silhouettes import unpacked
 from actors.geometry.visibility import GROWN_PX, POOL_PX, POOLS
+from actors.geometry.voxels import PER_BLOCK
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -42,6 +43,11 @@ SURFACE_NEAR: Final = np.ones((11, 11), np.uint8)
 """Places on a surface lie so many pixels apart in an image, and shadows have soft edges."""
 SHADE_SAYS_MIN: Final = 2
 """So many cameras must see a place on a surface as shadow."""
+FILLED_PX_MIN: Final = POOL_PX * POOL_PX // 2
+"""So many pixels of a cell that show something are no edge and no noise."""
+EXPLAINING_STEP: Final = 3
+"""One of so many voxels is projected to find what they explain: several fall into each cell."""
+BITS_SET: Final = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).sum(1, np.uint8)
 
 
 class Masks:
@@ -61,6 +67,7 @@ class Masks:
         self.cells[-1] = 255
         self._pools = self.cells[:-1].reshape(len(POOLS), *table.pool_shape)
         self._dirty = (slice(0, 0), slice(0, 0))
+        self._dark: Bits = np.empty((0, 0), np.uint8)
         self.shades = False
 
     def load(self, bits: Bits, name: str, shade: Bits | None = None) -> None:
@@ -92,6 +99,7 @@ class Masks:
                     f" shape {shade.shape}"
                 )
             dark = bits | shade
+        self._dark = dark
         self._load_pools(dark)
         rows = np.flatnonzero(dark.any(1))
         columns = np.flatnonzero(dark.any(0))
@@ -114,14 +122,27 @@ class Masks:
             cv2.dilate(levels[place - 1], kernel, dst=levels[place])
             before = grown
 
+    def unexplained(self, pixels: Rows) -> npt.NDArray[np.uint8]:
+        """Return which cells show something, and have none of these pixels in or beside them.
+
+        Args:
+            pixels: Flat indices into one mask.
+
+        Returns:
+            `pool_shape` of the table, uint8, 0 or 1.
+        """
+        import cv2
+
+        explained = np.zeros(self._table.pool_shape, np.uint8)
+        explained.ravel()[self._table.cell_of_pixel(pixels)] = 1
+        filled = BITS_SET[_by_cell(self._dark)].sum(1, np.uint8) >= FILLED_PX_MIN
+        return np.asarray(filled > cv2.dilate(explained, np.ones((3, 3), np.uint8)), np.uint8)
+
     def _load_pools(self, bits: Bits) -> None:
         """Pool the bits to cells and grow these."""
         import cv2
 
-        missing = -len(bits) % POOL_PX
-        if missing:
-            bits = np.concatenate([bits, np.zeros((missing, bits.shape[1]), np.uint8)])
-        pooled = np.bitwise_or.reduce(bits.reshape(-1, POOL_PX, bits.shape[1]), axis=1)
+        pooled = np.bitwise_or.reduce(_by_cell(bits), axis=1)
         before, grown = 0, (pooled > 0).astype(np.uint8)
         for place, reach in enumerate(POOLS):
             kernel = np.ones((2 * (reach - before) + 1,) * 2, np.uint8)
@@ -182,6 +203,31 @@ class VisualHull:
             rows = rows[pixels[table.pixel[rows]] > 0]
         return rows
 
+    def carve_leniently(
+        self, near: npt.NDArray[np.bool_]
+    ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+        """Return the rows of all voxels that no camera, and of those that one says to be free.
+
+        Args:
+            near: Blocks (i, j, k) of which those are looked for that one camera says to be free.
+        """
+        start = (~near).ravel().astype(np.uint8)
+        vetoes, blocks = start, np.arange(self.grid.blocks)
+        for number in self._given:
+            free = self._masks[number].cells[self.tables[number].cell[blocks]] == 0
+            vetoes = vetoes + free
+            few = vetoes <= 1
+            blocks, vetoes = blocks[few], vetoes[few]
+        rows = self.grid.rows_in(blocks)
+        vetoes = np.repeat(start[blocks], PER_BLOCK)
+        for number in self._given:
+            free = self._masks[number].pixels[self.tables[number].pixel[rows]] == 0
+            vetoes += free
+            few = vetoes <= 1
+            rows, vetoes = rows[few], vetoes[few]
+        one = vetoes > start[rows >> 6]
+        return rows[~one], rows[one]
+
     def in_shadow(
         self, surface: Rows, floor: npt.NDArray[np.int32]
     ) -> list[npt.NDArray[np.uint8] | None]:
@@ -241,29 +287,25 @@ class VisualHull:
             doubtful[at[~behind]] = True
         return free & ~doubtful
 
-    def with_one_veto(self, blocks: Rows) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int8]]:
-        """Return all voxels of some blocks that exactly one camera says to be free.
+    def contradictions(self, rows: Rows, hull: Rows) -> npt.NDArray[np.uint8]:
+        """Return how many cameras see something where a voxel is, and no voxel of a hull.
 
         Args:
-            blocks: Numbers of blocks, each once.
-
-        Returns:
-            Their rows, (N,), and the number of the camera, (N,).
+            rows: Any voxels.
+            hull: Voxels that explain what cameras see.
         """
-        vetoes = np.zeros(len(blocks), np.uint8)
+        result = np.zeros(len(rows), np.uint8)
+        some = hull[::EXPLAINING_STEP]
         for number in self._given:
-            vetoes += self._masks[number].cells[self.tables[number].cell[blocks]] == 0
-        rows = self.grid.rows_in(blocks[vetoes <= 1])
-        vetoes = np.zeros(len(rows), np.uint8)
-        camera = np.full(len(rows), -1, np.int8)
-        for number in self._given:
-            free = self._masks[number].pixels[self.tables[number].pixel[rows]] == 0
-            vetoes += free
-            camera[free] = number
-            few = vetoes <= 1
-            rows, vetoes, camera = rows[few], vetoes[few], camera[few]
-        one = vetoes == 1
-        return np.asarray(rows[one]), np.asarray(camera[one])
+            table = self.tables[number]
+            index = table.pixel[some]
+            seen = index[index != table.sentinel] % table.mask_px
+            unexplained = self._masks[number].unexplained(seen)
+            if unexplained.any():
+                index = table.pixel[rows]
+                cells = table.cell_of_pixel(index % table.mask_px)
+                result += unexplained.ravel()[cells] & (index != table.sentinel)
+        return result
 
     def tight(self, rows: Rows) -> npt.NDArray[np.bool_]:
         """Return which voxels have their centre in every silhouette, as it came.
@@ -303,3 +345,11 @@ class VisualHull:
         result = np.zeros(len(rows), bool)
         result[left] = True
         return result
+
+
+def _by_cell(bits: Bits) -> Bits:
+    """Return the bytes of each cell of a mask, (rows of cells, `POOL_PX`, columns of cells)."""
+    missing = -len(bits) % POOL_PX
+    if missing:
+        bits = np.concatenate([bits, np.zeros((missing, bits.shape[1]), np.uint8)])
+    return bits.reshape(-1, POOL_PX, bits.shape[1])

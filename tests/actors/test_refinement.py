@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from actors.geometry.capsules import distance_between, distance_to_points
-from actors.geometry.refinement import Refinement, grown
+from actors.geometry.overruled import grown
+from actors.geometry.refinement import Refinement
 from actors.geometry.silhouettes import Subtraction, packed
 
 from .hull_parts import BODY, bits_of, box_row, hull_of, masks_of, ring, small_grid
@@ -205,6 +206,32 @@ def test_one_blind_camera_is_outvoted_where_something_was(cell, share):
     found = cell.step(BODY, bits=blind(bits_of(BODY, cell.cameras), [2], share))
     assert set(cell.rows_in(BODY).tolist()) <= set(found.rows.tolist())
     assert found.counts["forgiven"] > 0
+
+
+def test_a_camera_that_contradicts_nothing_is_believed():
+    """R5: four cameras on one side leave much beside a body; a fifth alone denies it, rightly."""
+    made, around = Cell(), ring(24)
+    made.cameras = [*around[:4], around[7]]
+    made.hull = hull_of(made.grid, made.cameras)
+    made.refinement = Refinement(made.hull, made.cameras, [])
+    bits = bits_of(BODY, made.cameras)
+    larger = made.step(BODY, elapsed_s=5.0, bits=[*bits[:4], None])
+    found = made.step(BODY, bits=bits)
+    alone = made.step(BODY, elapsed_s=5.0, bits=bits)
+    assert len(larger.rows) > 1.3 * len(alone.rows)
+    assert len(found.rows) < 1.05 * len(alone.rows)
+    assert set(made.rows_in(BODY).tolist()) <= set(found.rows.tolist())
+
+
+def test_who_walks_on_before_a_blind_camera_stays_whole():
+    """R5: where a person steps to, nothing was in the set before."""
+    made = Cell(voxel_m=0.025)
+    way = np.array([1, 0, 0, 1, 0, 0, 0])
+    entered(made, BODY - 0.2 * way)
+    for place in (-0.1, 0.0, 0.1):
+        walking = BODY + place * way
+        found = made.step(walking, bits=blind(bits_of(walking, made.cameras), [2]))
+        assert set(made.rows_in(walking).tolist()) <= set(found.rows.tolist())
 
 
 def test_a_limb_that_one_camera_cuts_stays_whole(cell):
