@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from actors.geometry.depth import frame_points, metres, spread_m
+from actors.geometry.depth_reconstruction import reconstruct_view
 from actors.geometry.fusion import fuse_views
 from actors.geometry.poses import inverse, moved
-from actors.geometry.reconstruction import reconstruct_view
 from actors.geometry.shapes import PointCloud, Surface
 
 if TYPE_CHECKING:

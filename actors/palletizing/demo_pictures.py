@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from actors.geometry.depth import mean_known, median_known, metres, points_grid
+from actors.geometry.depth_reconstruction import grid_triangles
 from actors.geometry.mesh_picture import Body, draw_bodies, viewpoint
 from actors.geometry.picture import tiles, with_label
 from actors.geometry.poses import inverse, moved
-from actors.geometry.reconstruction import grid_triangles
 from actors.geometry.segmentation import RISE_MIN_M, rise
 from actors.geometry.shapes import FREE_FORM
 

@@ -37,9 +37,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from actors.geometry.depth_reconstruction import reconstruct_view
 from actors.geometry.deviation import VERDICTS, Finding, Limits, inspect_place
 from actors.geometry.fusion import fuse_views
-from actors.geometry.reconstruction import reconstruct_view
 from actors.geometry.segmentation import product_on_plate
 from actors.palletizing.pallet import tray_of
 from actors.palletizing.simulation.packages import (

@@ -32,9 +32,15 @@ from actors.geometry.files import write_whole
 from actors.running_cell import DemoCell, DemoError
 from actors.workcell.demo_cell import EmbeddedCell, RunningCell
 from actors.workcell.demo_conduct import Conductor, recording
-from actors.workcell.demo_lineage import show_lineage, show_past, stop_checks
 from actors.workcell.demo_options import PLAYED
-from actors.workcell.demo_report import report_bytes, report_of, table_of
+from actors.workcell.demo_report import (
+    report_bytes,
+    report_of,
+    show_lineage,
+    show_past,
+    stop_checks,
+    table_of,
+)
 from actors.workcell.demo_what_if import show_what_if
 from actors.workcell.evaluation import score
 from actors.workcell.figures import figure4, pictures_of

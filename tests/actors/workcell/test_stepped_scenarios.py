@@ -13,7 +13,7 @@ import pytest
 
 from actors.workcell import vocabulary as words
 from actors.workcell.demo_conduct import DEPTH, Notes
-from actors.workcell.demo_lineage import stop_checks
+from actors.workcell.demo_report import stop_checks
 from actors.workcell.evaluation import score
 from actors.workcell.planning import PathPlanning
 from actors.workcell.scenario_checks import checks_of
