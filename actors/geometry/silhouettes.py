@@ -68,42 +68,61 @@ class BackgroundStatistics:
         self.frames = 0
         self._sum = np.empty(0)
         self._squares = np.empty(0)
+        self._count: npt.NDArray[np.float64] = np.empty((0, 0))
 
     def fits(self, image: Image) -> bool:
         """Return whether an image is of the size of those until now."""
         return not self.frames or image.shape == self._sum.shape
 
-    def add(self, image: Image) -> None:
+    def add(self, image: Image, hidden: Mask | None = None) -> None:
         """Take one more image.
 
         Args:
             image: (H, W, 3) uint8.
+            hidden: (H, W), not 0 where something stands before the background; None: nowhere.
 
         Raises:
             ValueError: Not a colour image, or of another size than the first.
         """
+        import cv2
+
         if self.frames:
             check_image(image, self._sum.shape)
         else:
             check_image(image, (*image.shape[:2], 3))
         values = smoothed(image).astype(np.float64)
+        if hidden is not None:  # smoothing carries it one pixel further
+            hidden = np.asarray(cv2.dilate(hidden, NEIGHBOURS), np.uint8)
+            values[hidden > 0] = 0.0
+        free = np.ones(values.shape[:2])
+        if hidden is not None:
+            free[hidden > 0] = 0.0
         if self.frames:
             self._sum += values
             self._squares += values**2
+            self._count += free
         else:
-            self._sum, self._squares = values, values**2
+            self._sum, self._squares, self._count = values, values**2, free
         self.frames += 1
+
+    @property
+    def unknown(self) -> Mask:
+        """(H, W) uint8, 255 where less than half of the images show the background, else 0."""
+        return np.where(2.0 * self._count < self.frames, 255, 0).astype(np.uint8)
+
+    @property
+    def _counted(self) -> npt.NDArray[np.float64]:
+        return np.maximum(self._count, 1.0)[..., None]
 
     @property
     def mean(self) -> Image:
         """(H, W, 3) uint8, levels."""
-        return np.rint(self._sum / max(self.frames, 1)).astype(np.uint8)
+        return np.rint(self._sum / self._counted).astype(np.uint8)
 
     @property
     def spread(self) -> Image:
         """(H, W, 3) uint8, standard deviation, levels, rounded up."""
-        count = max(self.frames, 1)
-        variance = self._squares / count - (self._sum / count) ** 2
+        variance = self._squares / self._counted - (self._sum / self._counted) ** 2
         return np.ceil(np.sqrt(np.maximum(variance, 0.0))).clip(0, 255).astype(np.uint8)
 
 

@@ -7,17 +7,24 @@ in the update of the camera.
 
 from __future__ import annotations
 
+import logging
 import zlib
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from actors.geometry.silhouettes import BackgroundStatistics, Subtraction, packed
+from actors.geometry.capsules import fill, outlines
+from actors.geometry.kinematics import capsules_at
+from actors.geometry.silhouettes import BackgroundStatistics, Subtraction, packed, unpacked
 from actors.workcell.vocabulary import (
     BACKGROUND,
+    CALIBRATION,
     CAMERAS,
     EMPTY,
     IMAGE,
+    JOINTS,
+    MODEL,
+    ROBOT,
     SILHOUETTE,
     WORKSPACE,
     Background,
@@ -32,9 +39,17 @@ if TYPE_CHECKING:
 
     from enact_dist import Lock
 
+log = logging.getLogger("enact.actor")
+
 IMAGES: Final = 20
 """How many images make a background, unless an actor says otherwise."""
 NO_SHADE: Final = np.empty((0, 0), np.uint8)
+ARM_GROWN_M: Final = 0.06
+"""By how much the outline of the arm is grown: its shadow, and blurred edges."""
+RESTING_RAD_S: Final = 1e-3
+"""An arm whose joints were slower for 0.3 s is at rest."""
+RESTED_NS: Final = 500_000_000
+"""Joints that were measured farther from an exposure say nothing of it."""
 CHECKED_ROWS: Final = 8
 """Every eighth row goes into the checksum: noise changes each of them."""
 
@@ -72,18 +87,50 @@ class Learning:
         return wanted and captured_ns > self._newest_ns + self._apart_ns
 
     def learned(
-        self, image: npt.NDArray[np.uint8], empty_ns: int, captured_ns: int
+        self,
+        image: npt.NDArray[np.uint8],
+        empty_ns: int,
+        captured_ns: int,
+        hidden: npt.NDArray[np.uint8] | None = None,
+        before: Background | None = None,
     ) -> Background | None:
-        """Take an image that is wanted; return the background with the last one."""
+        """Take an image that is wanted; return the background with the last one.
+
+        Args:
+            image: (H, W, 3) uint8.
+            empty_ns: When the operator said that the cell is empty.
+            captured_ns: Stamp of the image.
+            hidden: (H, W), not 0 where the arm stands before the background; None: nowhere.
+            before: The last background: what the arm hides now keeps what was learned there.
+        """
         if self._since_ns != empty_ns or not self._statistics.fits(image):
             self._since_ns, self._statistics = empty_ns, BackgroundStatistics()
-        self._statistics.add(image)
+        self._statistics.add(image, hidden)
         self._newest_ns = captured_ns
         learned = self._statistics
         if learned.frames < self._images:
             return None
         self._statistics = BackgroundStatistics()
-        return Background(learned.mean, learned.spread, learned.frames, captured_ns)
+        found = Background(learned.mean, learned.spread, learned.frames, captured_ns)
+        return _completed(found, learned.unknown, before)
+
+
+def _completed(
+    found: Background, unknown: npt.NDArray[np.uint8], before: Background | None
+) -> Background:
+    """Return a background that has what was learned before where the arm hides it now."""
+    if not unknown.any():
+        return found
+    mean, spread = found.mean.copy(), found.spread.copy()
+    if before is not None and before.mean.shape == mean.shape:
+        kept = unknown > 0
+        if before.hidden.size:
+            kept &= unpacked(before.hidden, mean.shape[1]) == 0
+        mean[kept], spread[kept] = before.mean[kept], before.spread[kept]
+        unknown = np.where(kept, 0, unknown).astype(np.uint8)
+    count = int(np.count_nonzero(unknown))
+    hidden = packed(unknown) if count else NO_SHADE
+    return Background(mean, spread, found.frames, found.captured_ns, hidden, count)
 
 
 class Segmenting:
@@ -98,6 +145,7 @@ class Segmenting:
         self._subtractor, self._shadows = subtractor, shadows
         self._made_of: tuple[str, int] | None = None
         self._subtraction: Subtraction | None = None
+        self._hidden: npt.NDArray[np.bool_] | None = None
 
     def silhouette(
         self,
@@ -118,7 +166,11 @@ class Segmenting:
                 found.mean, found.spread, subtractor=self._subtractor, shadows=self._shadows
             )
             self._made_of = which
+            width = found.mean.shape[1]
+            self._hidden = unpacked(found.hidden, width) > 0 if found.hidden_px else None
         mask, shade = self._subtraction.split(image)
+        if self._hidden is not None:
+            mask[self._hidden], shade[self._hidden] = 255, 0
         return Silhouette(
             packed=packed(mask),
             foreground_px=int(np.count_nonzero(mask)),
@@ -133,20 +185,29 @@ class BackgroundLearning(Actor):
     Uses images captured after the operator declared the cell empty, five per second.
     A new declaration starts again; after a restart a newer background is kept.
 
+    With `arm_in_view`, images count while the arm rests, and pixels on its outline, grown by
+    6 cm, are left out.  They keep what was learned before, at another pose of the arm; those that
+    were never free of it are no background: the camera says *free* of nothing there.
+
     Args:
         images: How many images make a background.
+        arm_in_view: The images show the arm.  Those of a simulated empty cell do not.
     """
 
     online = World("online")
     image = View(online, CAMERAS, IMAGE)
     empty = View(online, WORKSPACE, EMPTY)
+    calibration = View(online, CAMERAS, CALIBRATION)
+    model = View(online, ROBOT, MODEL)
+    joints = View(online, ROBOT, JOINTS)
     background = Write(online, CAMERAS, BACKGROUND)
     every_s = 0.2
     in_phase = False
 
-    def __init__(self, images: int = IMAGES) -> None:
-        self.images = images
+    def __init__(self, images: int = IMAGES, *, arm_in_view: bool = False) -> None:
+        self.images, self.arm_in_view = images, arm_in_view
         self._learning = Learning(images)
+        self._waited_for_ns = 0
 
     def start(self) -> None:
         """Let OpenCV work in the actor's own thread."""
@@ -157,10 +218,44 @@ class BackgroundLearning(Actor):
         empty_ns, captured_ns = lock.get(self.empty, 0), lock.stamp_ns(self.image)
         if lock.is_null(self.image):
             return
-        if self._learning.wants(empty_ns, lock.stamp_ns(self.background), captured_ns):
-            found = self._learning.learned(lock[self.image], empty_ns, captured_ns)
-            if found is not None:
-                lock.put(self.background, found, stamp_ns=captured_ns)
+        if not self._learning.wants(empty_ns, lock.stamp_ns(self.background), captured_ns):
+            return
+        hidden = self._arm(lock, captured_ns) if self.arm_in_view else None
+        if self.arm_in_view and hidden is None:
+            if self._waited_for_ns != empty_ns:
+                self._waited_for_ns = empty_ns
+                log.warning(
+                    "%s is learned once the arm rests and its joints are known",
+                    lock.entity.name,
+                )
+            return
+        before = lock.get(self.background)
+        found = self._learning.learned(lock[self.image], empty_ns, captured_ns, hidden, before)
+        if found is None:
+            return
+        lock.put(self.background, found, stamp_ns=captured_ns)
+        if found.hidden_px:
+            log.warning(
+                "%s: %d pixels (%.1f %%) were never free of the arm, and tell nothing; move the"
+                " arm away from there, and say again that the cell is empty",
+                lock.entity.name,
+                found.hidden_px,
+                100.0 * found.hidden_px / found.mean[..., 0].size,
+            )
+
+    def _arm(self, lock: Lock, captured_ns: int) -> npt.NDArray[np.uint8] | None:
+        """Return where the arm at rest is in the image, (H, W); None while it moves."""
+        if any(map(lock.is_null, (self.calibration, self.model, self.joints))):
+            return None
+        camera, joints = lock[self.calibration], lock[self.joints]
+        known = abs(captured_ns - int(joints.stamp_ns[-1])) <= RESTED_NS
+        if not known or np.abs(joints.dq).max() > RESTING_RAD_S:
+            return None
+        arm = capsules_at(lock[self.model], joints.q[-1])[0].copy()
+        arm[:, 6] += ARM_GROWN_M
+        seen_by = [(camera.camera_matrix, camera.distortion, camera.camera_from_cell)]
+        height, width = lock[self.image].shape[:2]
+        return np.asarray(fill(outlines(arm, seen_by), height, width)[0])
 
 
 class BackgroundSubtraction(Actor):

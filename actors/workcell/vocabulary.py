@@ -84,12 +84,17 @@ class Background:
         spread: (H, W, 3) uint8, standard deviation of the filtered images, levels, rounded up.
         frames: Number of images that it was learned from.
         captured_ns: Stamp of the last of them.
+        hidden: (H, W / 8) uint8, as `Silhouette.packed`; a set bit was never free of the arm, so
+            the camera never says *free* there.  (0, 0) if there is none.
+        hidden_px: Number of its set bits.
     """
 
     mean: npt.NDArray[np.uint8]
     spread: npt.NDArray[np.uint8]
     frames: int
     captured_ns: int
+    hidden: npt.NDArray[np.uint8] = field(default_factory=lambda: np.empty((0, 0), np.uint8))
+    hidden_px: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -5,8 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from actors.geometry.capsules import fill, outlines
+from actors.geometry.kinematics import capsules_at
 from actors.geometry.silhouettes import unpacked
 from actors.workcell.background import BackgroundLearning, BackgroundSubtraction, checksum
+from actors.workcell.simulation.arm import ARM
 from actors.workcell.smart_camera import SmartCamera
 from actors.workcell.sources import source_of
 from actors.workcell.vocabulary import (
@@ -14,10 +17,14 @@ from actors.workcell.vocabulary import (
     CALIBRATION,
     EMPTY,
     IMAGE,
+    JOINTS,
+    MODEL,
+    ROBOT,
     SILHOUETTE,
     WORKSPACE,
     Background,
     Calibration,
+    Joints,
     camera_entity,
 )
 from enact_dist import Lock, View, Write, testing
@@ -94,6 +101,92 @@ def test_a_background_is_learned_after_the_word_and_not_before(cell, random):
     assert found.frames == 5
     assert np.abs(found.mean.astype(int) - 120).max() <= 3
     assert found.spread.min() >= 0
+
+
+ROOM = Calibration(
+    np.array([[60.0, 0, 31.5], [0, 60.0, 23.5], [0, 0, 1]]), np.zeros(5),
+    np.array([[0, 1.0, 0, 0], [0, 0, -1.0, 0.9], [-1.0, 0, 0, 3.0], [0, 0, 0, 1.0]]),
+    SHAPE[1], SHAPE[0],
+)  # fmt: skip
+"""Three metres before the arm, at the height of its middle."""
+LEANS = np.array([[0, turn, 0, 0, 0, 0, 0] for turn in (-1.2, 1.2)]) + np.eye(7)[0] * np.pi / 2
+
+
+def rest(cell, q, at_ns, dq=0.0):
+    """Publish joints of an arm that rests, or turns."""
+    stamps = at_ns - 10_000_000 * np.arange(29, -1, -1)
+    put(cell, ROBOT, JOINTS, Joints(np.tile(q, (30, 1)), np.full((30, 7), dq), stamps), at_ns)
+
+
+def shown(random, q):
+    """Return an image of the grey cell with the arm, bright; and where it is."""
+    arm = capsules_at(ARM, q)[0]
+    seen_by = [(ROOM.camera_matrix, ROOM.distortion, ROOM.camera_from_cell)]
+    there = fill(outlines(arm, seen_by), *SHAPE[:2])[0] > 0
+    image = image_of(random)
+    image[there] = 230
+    return image, there
+
+
+def teach(cell, learning, random, first, q, count=4):
+    """Say that the cell is empty, and let images with the arm come; return the background."""
+    put(cell, WORKSPACE, EMPTY, first * PERIOD_NS)
+    for number in range(first + 1, first + 1 + count):
+        rest(cell, q, number * PERIOD_NS)
+        put(cell, CAMERA, IMAGE, shown(random, q)[0], number * PERIOD_NS)
+        testing.run_once(learning, cell)
+    return seen(cell, CAMERA, BACKGROUND)[0]
+
+
+@pytest.fixture
+def with_arm(cell):
+    """Learning of a camera that sees the arm."""
+    put(cell, CAMERA, CALIBRATION, ROOM)
+    put(cell, ROBOT, MODEL, ARM)
+    return actor_of(BackgroundLearning, images=4, arm_in_view=True)
+
+
+def test_the_arm_is_no_background_and_what_it_hides_tells_nothing(cell, random, with_arm, caplog):
+    """Such pixels are foreground whatever they show, are counted, and are named in the log."""
+    found = teach(cell, with_arm, random, 1, LEANS[0])
+    _, there = shown(random, LEANS[0])
+    hidden = unpacked(found.hidden, SHAPE[1]) > 0
+
+    assert hidden[there].all()
+    assert found.hidden_px == hidden.sum() < 0.6 * hidden.size
+    assert np.abs(found.mean[~hidden].astype(int) - 120).max() <= 4
+    assert f"camera/2: {found.hidden_px} pixels" in caplog.text
+    assert "say again that the cell is empty" in caplog.text
+    subtraction = actor_of(BackgroundSubtraction)
+    put(cell, CAMERA, IMAGE, image_of(random), 9 * PERIOD_NS)
+    testing.run_once(subtraction, cell)
+    mask = unpacked(seen(cell, CAMERA, SILHOUETTE)[0].packed, SHAPE[1]) > 0
+    np.testing.assert_array_equal(mask, hidden)
+
+
+def test_what_the_arm_hid_is_learned_when_it_is_elsewhere(cell, random, with_arm):
+    """Said empty again at another pose: only what both poses hide is left."""
+    first = unpacked(teach(cell, with_arm, random, 1, LEANS[0]).hidden, SHAPE[1]) > 0
+
+    found = teach(cell, with_arm, random, 20, LEANS[1])
+
+    hidden = unpacked(found.hidden, SHAPE[1]) > 0
+    assert found.hidden_px == hidden.sum() > 0
+    assert (first & ~hidden).sum() > 50
+    assert not (hidden & ~first).any()
+    assert np.abs(found.mean[~hidden].astype(int) - 120).max() <= 4
+
+
+def test_nothing_is_learned_while_the_arm_moves(cell, random, with_arm, caplog):
+    """Where it was at the exposure is not known well enough; the log says what is waited for."""
+    put(cell, WORKSPACE, EMPTY, PERIOD_NS)
+    for number in range(2, 10):
+        rest(cell, LEANS[0], number * PERIOD_NS, dq=0.1)
+        put(cell, CAMERA, IMAGE, shown(random, LEANS[0])[0], number * PERIOD_NS)
+        testing.run_once(with_arm, cell)
+
+    assert seen(cell, CAMERA, BACKGROUND) is None
+    assert caplog.text.count("camera/2 is learned once the arm rests") == 1
 
 
 def test_the_same_image_twice_is_one_image(cell, random):
