@@ -204,23 +204,25 @@ class Conductor:
         faults = list(scenario_of(options.scenario, options.seed, options.seconds).faults)
         fork_at_s = min(0.3 * options.seconds, max(0.0, options.seconds - WHAT_IF_S))
         state, undo = "", []
-        while (now_s := (time.time_ns() - notes.start_ns) / 1e9) < options.seconds + 0.5:
-            self._running.check()
-            while faults and now_s >= faults[0].at_s:
-                undo += self._break(faults.pop(0), now_s)
-            for due_s, act in [each for each in undo if now_s >= each[0]]:
-                undo.remove((due_s, act))
+        try:
+            while (now_s := (time.time_ns() - notes.start_ns) / 1e9) < options.seconds + 0.5:
+                self._running.check()
+                while faults and now_s >= faults[0].at_s:
+                    undo += self._break(faults.pop(0), now_s)
+                for due_s, act in [each for each in undo if now_s >= each[0]]:
+                    undo.remove((due_s, act))
+                    act()
+                try:
+                    if not notes.forked_ns and now_s >= fork_at_s:
+                        self._online.fork(WHAT_IF)
+                        notes.forked_ns = time.time_ns()
+                    state = self._look(now_s, state)
+                except EnactError as error:
+                    self._say(now_s, f"cannot look: {str(error).splitlines()[0]}")
+                time.sleep(LOOK_S)
+        finally:  # a process that stays frozen could not end with the cell
+            for _, act in undo:
                 act()
-            try:
-                if not notes.forked_ns and now_s >= fork_at_s:
-                    self._online.fork(WHAT_IF)
-                    notes.forked_ns = time.time_ns()
-                state = self._look(now_s, state)
-            except EnactError as error:
-                self._say(now_s, f"cannot look: {str(error).splitlines()[0]}")
-            time.sleep(LOOK_S)
-        for _, act in undo:
-            act()
         if self._asking is not None:
             self._asking.join(timeout=ASKED_S)
 
@@ -317,7 +319,7 @@ class Conductor:
             os.kill(pid, signal.SIGKILL)
             return []
         os.kill(pid, signal.SIGSTOP)
-        return [(end_s, lambda: os.kill(pid, signal.SIGCONT))]
+        return [(end_s, lambda: go_on(pid))]
 
     def _set(self, actor: str, value: str) -> None:
         """Change an attribute of a running actor, as an operator would, without waiting for it."""
@@ -338,6 +340,12 @@ class Conductor:
             if name in info.names():
                 return info.pid
         return self._running.shard_pid(name)
+
+
+def go_on(pid: int) -> None:
+    """Let a frozen process go on, if it is still there."""
+    with contextlib.suppress(ProcessLookupError):
+        os.kill(pid, signal.SIGCONT)
 
 
 def told(safety: words.Safety, speed: words.Speed | None, now_ns: int) -> tuple[str, str]:

@@ -5,9 +5,12 @@ import json
 import os
 import pickle
 import re
+import subprocess
 import threading
+import time
 import tomllib
 import tracemalloc
+import types
 from pathlib import Path
 
 import numpy as np
@@ -224,6 +227,28 @@ def test_a_stop_leads_to_the_images_that_were_committed_with_its_masks(tmp_path)
         assert set(stop_checks(conductor.notes).values()) == {True}
         kept = [str(one.aspect) for one in cell.kept()["first-stop"]]
         assert kept.count("image") == kept.count("silhouette") == 2
+
+
+def test_a_frozen_process_goes_on_when_the_run_fails(tmp_path, monkeypatch):
+    """It could not end with its cell, and would stay."""
+    freeze = dataclasses.replace(scenario_of("S1", 1), faults=(Fault(0.0, "freeze", "one", 60.0),))
+    monkeypatch.setattr(demo_conduct, "scenario_of", lambda *_: freeze)
+    rounds = iter([None])
+    with local(worlds=["online", "truth"]) as cell, subprocess.Popen(["sleep", "60"]) as process:
+        running = types.SimpleNamespace(
+            check=lambda: next(rounds), shard_pid=lambda _: process.pid, config=tmp_path
+        )
+        conductor = Conductor(cell, running, Options(tmp_path), lambda _: None)
+        conductor.notes.start_ns = time.time_ns()
+
+        with pytest.raises(StopIteration):
+            conductor.follow()
+
+        state = Path(f"/proc/{process.pid}/stat").read_text().rpartition(")")[2].split()[0]
+        process.kill()
+    assert conductor.notes.faults == ["freeze one"]
+    assert state != "T"
+    demo_conduct.go_on(process.pid)  # of a process that has ended: nothing
 
 
 def test_the_nearest_approach_is_shown_when_hulls_of_its_time_are_forgotten(capsys):
