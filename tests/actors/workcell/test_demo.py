@@ -39,7 +39,6 @@ from actors.workcell.scenarios import Fault, scenario_of
 from actors.workcell.setup import Setup, grid_of
 from actors.workcell.simulation.truth import TruthHuman
 from actors.workcell.trace import ASPECTS, trace_of
-from actors.workcell.truth_of_run import truth_of
 from actors.workcell.unshared import PlainEach, PlainLock, Version
 from enact_dist import Entity, Lock, View, Write, local, testing
 from enact_dist.actor_check import check_cell, declarations_of
@@ -397,41 +396,6 @@ def test_the_robot_rests_while_its_reconstruction_is_dead_and_goes_on(tmp_path, 
     assert max(seconds) > killed_s + 0.5  # and somebody does again
     for name in ("report.json", "timeline.png", "cell.toml", "run.mcap"):
         assert (tmp_path / name).stat().st_size > 1000
-
-
-@pytest.mark.timing
-def test_the_cell_goes_on_after_a_camera_the_speed_control_and_the_shard_were_killed(
-    tmp_path, monkeypatch
-):
-    """Real processes: no moment is too fast, each comes back by itself, and the person stays."""
-    faults = (
-        Fault(1.0, "kill", "camera-3"),
-        Fault(6.0, "kill", "speed"),
-        Fault(11.0, "kill", "cell"),
-    )
-
-    def with_faults(name, seed, seconds):
-        return dataclasses.replace(scenario_of(name, seed, seconds), faults=faults)
-
-    monkeypatch.setattr(demo_conduct, "scenario_of", with_faults)
-    options = Options(tmp_path, scenario="S8", seconds=22.0, source="live", voxel_m=0.05)
-
-    outcome = run_quietly(options)
-
-    assert outcome.scores["violations"] == 0.0
-    trace = trace_of(tmp_path / "run.mcap")
-    truth = truth_of(trace)
-    hulls = [
-        (truth.at_s(kept.stamp_ns), kept.datum)
-        for kept in trace.of(words.WORKSPACE.name, words.HULL)
-        if truth.covers(kept.stamp_ns)
-    ]
-    assert any("camera/3" not in hull.cameras for at_s, hull in hulls if at_s > 1.0)
-    after = [(at_s, hull) for at_s, hull in hulls if at_s > 13.0]
-    assert any("camera/3" in hull.cameras for _, hull in after)
-    assert any(len(hull.voxels) for _, hull in after)  # what plays has outlived the shard
-    assert outcome.report["checks"]["the robot goes on by itself"]
-    assert sum("kill" in line for line in outcome.report["events"]) == len(faults)
 
 
 def test_the_cell_of_four_cameras_is_sound(tmp_path):
