@@ -210,7 +210,7 @@ def read_info(folder: Path) -> RecordingInfo:
     """Return what a recording is of.
 
     Raises:
-        CameraError: There is no recording, or one of another format.
+        CameraError: There is no recording, or one of another format, or a camera's is missing.
     """
     path = folder / "recording.json"
     asked = "asked for a recording of the simulated cameras"
@@ -225,6 +225,12 @@ def read_info(folder: Path) -> RecordingInfo:
         raise CameraError(
             f"{path}: {asked} in format {FORMAT}; found format {info.format}; record it again"
         )
+    for number in range(info.cameras):
+        for name in ("still.png", "windows.npy"):
+            if not (folder / f"camera_{number}" / name).is_file():
+                raise CameraError(
+                    f"{folder}: {asked}; found no camera_{number}/{name}; record it again"
+                )
     return info
 
 

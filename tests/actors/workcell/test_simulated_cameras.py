@@ -3,6 +3,7 @@
 import dataclasses
 import importlib.util
 import json
+import shutil
 import sys
 import threading
 
@@ -204,6 +205,15 @@ def test_options_refuse_a_recording_of_something_else(recording, tmp_path):
     with pytest.raises(ConfigError, match=r"play it with --scenario visit --seed 3 --seconds 4$"):
         Options(tmp_path, source=source)
     assert Options(tmp_path, seed=3, seconds=SECONDS, source=source).seed == 3
+
+
+def test_options_refuse_a_recording_that_lacks_a_camera(recording, tmp_path):
+    """A folder that was copied in part is named before a cell is started for it."""
+    shutil.copytree(recording[1], tmp_path / "part")
+    (tmp_path / "part" / "camera_1" / "windows.npy").unlink()
+
+    with pytest.raises(ConfigError, match=r"found no camera_1/windows.npy; record it again"):
+        Options(tmp_path, source=f"playback:{tmp_path / 'part'}")
 
 
 def test_recording_knows_its_truth(recording):
