@@ -40,7 +40,7 @@ log = logging.getLogger("enact.actor")
 
 OPEN_S: Final = 60.0
 """How long a source may take to open; a simulated one draws its room and compiles its loops."""
-PREPARE_AFTER_NS: Final = 65_000_000
+PREPARE_AFTER_NS: Final = 78_000_000
 """So long after a tick its images have become a hull, and the next ones are prepared."""
 
 
