@@ -299,7 +299,7 @@ class ClosedLoop:
             self._taken_ns = speeds[-1].datum.captured_ns
         paths = self.versions.get((ONLINE, words.ROBOT.name, words.PATH.name))
         if paths:
-            motion.follow(paths[-1].datum)
+            motion.follow(paths[-1].datum, now_ns)
         done = motion.execution(self._clock.wall_ns(), now_ns, refusal)
         self._put(cell, words.ROBOT, words.EXECUTION, done)
 

@@ -246,13 +246,19 @@ class Motion:
         self.refused += 1
         return why
 
-    def follow(self, path: Path) -> None:
+    def follow(self, path: Path, now_ns: int) -> None:
         """Take a path; one without waypoints ends the motion where it can stop.
 
-        A path on an earlier exposure than the last one is refused, see `path_refusal`.
+        A path on an earlier exposure than the last one, or on one that is still to come, is
+        refused, see `path_refusal`.
         """
         asked = self._asked
         if path.identity in (self.refused_path, asked.path.identity if asked else None):
+            return
+        ahead_ns = path.captured_ns - now_ns
+        if ahead_ns > FUTURE_NS:
+            why = f"it rests on images {ahead_ns / 1e6:.0f} ms ahead of this host's clock"
+            self._refuse(path, why)
             return
         if path.captured_ns < self._path_captured_ns:
             self._refuse(path, "it rests on an earlier exposure than the last path")

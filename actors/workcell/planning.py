@@ -65,6 +65,9 @@ HERE_RAD: Final = 2e-3
 """So near to a goal the arm is there."""
 BEYOND_RAD: Final = 0.01
 """So far beyond where the arm can be by then it leaves its path."""
+LOOKED_RAD: Final = 0.03
+"""Distance of the states that are looked at along a path."""
+CUT_OFF: Final = "someone is in the way before the arm can leave its path"
 
 
 class Obstacles:
@@ -129,6 +132,11 @@ class Branch:
         return state
 
     @property
+    def before_rad(self) -> F64:
+        """The states of the arm from here to there, (m, 7)."""
+        return self.speeds.path.states(self.here_rad, self.at_rad, LOOKED_RAD)
+
+    @property
     def heading(self) -> F64:
         """The direction in which it leaves, (7,), of length 1."""
         heading: F64 = self.speeds.path.at(self.at_rad)[1][0]
@@ -147,8 +155,8 @@ class PathPlanning(Actor):
     The next second of the path is looked at.  If it is blocked in two sets in a row, another path
     is planned.  A moving arm goes over to it without a stop, at a place that it reaches only when
     the path is there; an arm that is past that place refuses the path and brakes, and the next set
-    plans again.  Without a way, the path has no waypoints and says why.  Predicted positions of
-    people are avoided if another way exists.
+    plans again.  Without a way, the path has no waypoints and says why; so it is if someone is in
+    the way to that place.  Predicted positions of people are avoided if another way exists.
 
     Attributes:
         predict: Whether predictions count.
@@ -229,8 +237,9 @@ class PathPlanning(Actor):
             self._plan(lock, obstacles, [later, now], q, goal, why)
             return
         there = speeds.within(s_rad, self.ahead_s)
-        ahead = line.states(s_rad, float(speeds.places_rad[there][-1]), 0.03)
-        blocked = not obstacles.passable(now).free(ahead).all()
+        ahead = line.states(s_rad, float(speeds.places_rad[there][-1]), LOOKED_RAD)
+        passable = obstacles.passable(now)
+        blocked = not passable.free(ahead).all()
         avoid = bool(predictions) and not obstacles.passable(soon).free(ahead).all()
         self._blocked = self._blocked + 1 if blocked or avoid else 0
         if self._blocked < 2 and not refusal:
@@ -238,7 +247,9 @@ class PathPlanning(Actor):
         branch = None if at_rest else self._branch(speeds, s_rad, joints)
         if refusal or blocked:
             why = refusal or "someone is in the way"
-            self._plan(lock, obstacles, [later, now], q, goal, why, branch=branch)
+            reached = branch is None or passable.free(branch.before_rad).all()
+            cells = [later, now] if reached else []
+            self._plan(lock, obstacles, cells, q, goal, why, branch=branch)
         elif self._blocked % 3 == 2:
             why = "someone will be in the way"
             self._plan(lock, obstacles, [later], q, goal, why, branch=branch)
@@ -274,7 +285,8 @@ class PathPlanning(Actor):
         Args:
             lock: Of the update.
             obstacles: What to keep from.
-            cells: What people take, the most careful first; the last is what counts.
+            cells: What people take, the most careful first; the last is what counts.  Empty if
+                someone is in the way to the `branch`.
             start: Where the path begins, (7,), if it has no `branch`.
             goal: Where it leads.
             why: Why it replaces the last one.
@@ -284,7 +296,7 @@ class PathPlanning(Actor):
         last, began_s = lock.get(self.path), time.monotonic()
         number = last.number + 1 if last is not None else 1
         only_wish = last is not None and why == "someone will be in the way"
-        found = Plan(np.empty((0, len(start))), "", 0)
+        found = Plan(np.empty((0, len(start))), CUT_OFF, 0)
         for one in cells:
             left_s = self.limit_s - (time.monotonic() - began_s)
             found = plan(

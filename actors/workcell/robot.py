@@ -170,7 +170,7 @@ class Robot(Actor):
             refusal = motion.obey(speed, received_ns)
             self._taken_ns = speed.captured_ns
         if not lock.is_null(self.path):
-            motion.follow(lock[self.path])
+            motion.follow(lock[self.path], received_ns)
         lock[self.execution] = motion.execution(self._taken_ns, received_ns, refusal)
 
     def _arm(self) -> RunningArm:

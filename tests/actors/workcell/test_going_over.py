@@ -50,7 +50,8 @@ class Loop:
         self.numbers += 1
         rows = np.asarray(waypoints, float).reshape(-1, 7)
         self.motion.follow(
-            Path(rows, self.numbers, 0, 1, START_NS, 0.0, "", 0.0, captured_ns or self.now_ns)
+            Path(rows, self.numbers, 0, 1, START_NS, 0.0, "", 0.0, captured_ns or self.now_ns),
+            self.now_ns,
         )
 
     def run(self, seconds, limit_m_s=math.inf):
@@ -220,6 +221,20 @@ def test_path_on_an_earlier_exposure_is_refused_and_changes_nothing():
     loop.follow(leaving(loop.line, loop.s_rad + 0.3, UP), stamp_ns - 10**9)
     loop.run(0.1)
     assert loop.motion.doing.path_number == 3
+
+
+def test_path_ahead_of_the_clock_is_refused_and_refuses_no_later_one():
+    """Cameras whose clock was ahead for a moment do not keep the arm from all paths after it."""
+    loop = Loop()
+    loop.run(0.8)
+
+    loop.follow(leaving(loop.line, loop.s_rad + 0.3, UP), loop.now_ns + 3600 * 10**9)
+    refusal = loop.motion.path_refusal
+    loop.follow(leaving(loop.line, loop.s_rad + 0.3, UP))
+    loop.run(4.0)
+
+    assert refusal == "path 2 is refused: it rests on images 3600000 ms ahead of this host's clock"
+    np.testing.assert_allclose(loop.motion.q_rad, UP, atol=1e-9)
 
 
 def test_path_that_turns_at_its_beginning_is_gone_over_to_at_rest():

@@ -43,7 +43,7 @@ class Loop:
     def __init__(self, waypoints=(LEFT, RIGHT)):
         self.now_ns = START_NS
         self.motion = Motion(ARM, waypoints[0], self.now_ns)
-        self.motion.follow(path_of(waypoints))
+        self.motion.follow(path_of(waypoints), self.now_ns)
 
     def run(self, seconds, commanded=True, **changes):
         """Run for some time, with a fresh command in each cycle or with none."""
@@ -189,7 +189,7 @@ def test_arm_goes_over_to_a_path_where_it_leaves_the_old_one():
     loop.run(0.4)
     away = LEFT + (RIGHT - LEFT) * 0.6
     aside = away + np.array([0.0, -0.4, 0.0, 0.2, 0.0, 0.0, 0.0])
-    loop.motion.follow(path_of([away, aside], 2))
+    loop.motion.follow(path_of([away, aside], 2), loop.now_ns)
     seen = []
 
     for _ in range(400):
@@ -209,11 +209,11 @@ def test_path_that_begins_elsewhere_is_not_followed():
     """The arm brakes, waits, and says why; a path from where it is goes on."""
     loop = Loop()
     loop.run(0.4)
-    loop.motion.follow(path_of([RIGHT + 0.3, LEFT], 2))
+    loop.motion.follow(path_of([RIGHT + 0.3, LEFT], 2), loop.now_ns)
 
     loop.run(0.6)
     waiting = loop.motion.doing
-    loop.motion.follow(path_of([loop.motion.q_rad, LEFT], 3))
+    loop.motion.follow(path_of([loop.motion.q_rad, LEFT], 3), loop.now_ns)
     loop.run(5.0)
 
     assert (waiting.state, waiting.reason) == ("waiting", "path 2 is refused: it starts elsewhere")
@@ -226,7 +226,7 @@ def test_path_of_another_life_of_the_shard_is_followed_though_its_number_was_use
     loop = Loop()
     loop.run(0.4)
 
-    loop.motion.follow(path_of([], 1, "no path was found", START_NS + 10**9))
+    loop.motion.follow(path_of([], 1, "no path was found", START_NS + 10**9), loop.now_ns)
     loop.run(0.6)
 
     assert not loop.moves
@@ -261,7 +261,7 @@ def test_no_path_ends_the_motion():
     loop = Loop()
     loop.run(0.4)
 
-    loop.motion.follow(path_of([], 2, "no path was found"))
+    loop.motion.follow(path_of([], 2, "no path was found"), loop.now_ns)
     loop.run(0.6)
 
     assert not loop.moves
@@ -323,7 +323,7 @@ def test_robot_never_moves_faster_than_the_true_distance_allows(seed):
         if loop.motion.doing.state == "dwelling":
             number += 1
             ends = [LEFT, RIGHT] if number % 2 else [RIGHT, LEFT]
-            loop.motion.follow(path_of(ends, number))
+            loop.motion.follow(path_of(ends, number), loop.now_ns)
         loop.run(CYCLE_S, commanded=False)
         true_m = float(capsule_distances(capsules_at(ARM, loop.motion.q_rad)[0], person).min())
         ends = end_velocities(ARM, loop.motion.q_rad, loop.motion.dq_rad_s)

@@ -253,6 +253,30 @@ def test_refused_path_is_planned_again_from_the_path_that_is_followed(worlds):
     np.testing.assert_allclose(heading_to(*new.waypoints[:2]), ahead, atol=1e-9)
 
 
+def test_arm_stops_if_it_would_pass_someone_before_it_can_leave_its_path(worlds):
+    """A path that leaves the old one behind them would lead the arm through them."""
+    cell = Cell(worlds)
+    cell.actor.branch_s = 0.5
+    cell.actor.now_ns = lambda: cell.now_ns
+    cell.see(START)
+    cell.see(LEFT)
+    ahead = heading_to(LEFT, RIGHT)
+    on_way = LEFT + 0.4 * ahead
+    between = JointPath(np.array([LEFT, RIGHT])).at(0.7)[0]
+    end_m = capsules_at(ARM, between)[0][-1, 3:5]
+    pole = np.r_[end_m, 0.0] + np.linspace(0.0, 1.0, 120)[:, None] * [0.0, 0.0, 2.0]
+    pole = np.unique(np.floor((pole - ORIGIN_M) / VOXEL_M), axis=0)
+    cell.see(on_way, pole, 1.2 * ahead)
+
+    new = cell.see(on_way, pole, 1.2 * ahead)
+
+    assert not len(new.waypoints)
+    assert new.reason == "someone is in the way before the arm can leave its path"
+    for _ in range(4):
+        rested = cell.see(on_way + 0.1 * ahead)
+    np.testing.assert_allclose(rested.waypoints, [on_way + 0.1 * ahead, RIGHT])
+
+
 def test_refused_path_is_planned_again_from_where_the_arm_rests(worlds):
     """Also if the arm rests so near to the refused path that it seems to be on it."""
     cell = Cell(worlds)
@@ -279,7 +303,7 @@ def run_past(cell, voxels, seconds=8.0):
             path = cell.see(motion.q_rad, there, motion.dq_rad_s)
             coming.append((at_ms + 120, path))
         while coming and at_ms >= coming[0][0]:
-            motion.follow(coming.pop(0)[1])
+            motion.follow(coming.pop(0)[1], cell.now_ns + at_ms % period * 1_000_000)
         now_ns = cell.now_ns + at_ms % period * 1_000_000
         motion.obey(Speed(1.0, np.inf, np.inf, "", 250.0, now_ns, now_ns), now_ns)
         motion.cycle(now_ns)
