@@ -38,6 +38,8 @@ STARTING_RAMP_S: Final = 0.1
 """The same of acceleration."""
 STARTING_SHARE: Final = 0.5
 """Acceleration along the path as a share of the deceleration."""
+RELEASE_SHARE: Final = 0.05
+"""Of the acceleration along the path: more does not follow at once on a deceleration."""
 LAG_S: Final = 0.03
 """How much earlier the follower brakes than full deceleration needs."""
 KEPT: Final = 0.97
@@ -434,6 +436,9 @@ class PathFollower:
         braking = target < self.speed_rad_s or self.acceleration_rad_s2 < 0.0
         state, speeds = self._state, self.speeds
         state.target_velocity = [target]
+        # The jerk that ends a deceleration would else begin an acceleration that ends too late.
+        release = RELEASE_SHARE if self.acceleration_rad_s2 < 0.0 else 1.0
+        state.max_acceleration = [release * speeds.starting_rad_s2]
         state.max_jerk = [
             speeds.braking_rad_s2 / BRAKING_RAMP_S
             if braking

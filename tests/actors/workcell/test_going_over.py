@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from actors.geometry.joint_paths import JoinedPath, JointPath, PathFollower, PathSpeeds
+from actors.geometry.kinematics import end_velocities
 from actors.workcell.motion import BRAKING_M_S2, CYCLE_S, NOMINAL_M_S, Motion
 from actors.workcell.simulation.arm import ARM
 from actors.workcell.vocabulary import NO_PATH, Path, Speed
@@ -163,6 +164,21 @@ def test_arm_brakes_on_the_old_path_before_a_corner_that_is_too_sharp():
     assert 0.0 < max(near) < 0.4
     np.testing.assert_allclose(loop.motion.q_rad, new[-1], atol=1e-9)
     loop.check(old, JointPath(new))
+
+
+@pytest.mark.parametrize("seed", [212, 228, 78])
+def test_arm_that_brakes_when_it_goes_over_keeps_the_limit_behind(seed):
+    """It ends its braking without such an acceleration as would carry it beyond the limit."""
+    draw = np.random.default_rng(seed)
+    loop = Loop(drawn(draw, 2))
+    loop.run(1.0, 0.1)
+
+    loop.follow(leaving(loop.line, loop.s_rad + 0.02, *drawn(draw, 2), lead_rad=0.1))
+    loop.run(0.4, 0.1)
+
+    q, dq = (np.array(part) for part in zip(*loop.states, strict=True))
+    assert loop.motion.doing.path_number == 2
+    assert np.linalg.norm(end_velocities(ARM, q, dq), axis=-1).max() <= 0.1
 
 
 def test_path_that_comes_when_the_arm_has_passed_its_beginning_is_refused():
