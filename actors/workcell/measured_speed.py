@@ -40,7 +40,9 @@ def people_m_s(
     """Return how fast people count, and why.
 
     It is the greatest speed of a track plus twice its standard deviation, if all that is occupied
-    belongs to people with settled tracks; else what is assumed of people in general.
+    belongs to people with settled tracks, and no track is hidden, young or old; else what is
+    assumed of people in general.  Someone without a settled track can stand beside another person
+    and be one component with them.
 
     Args:
         hull: What is occupied.
@@ -51,7 +53,11 @@ def people_m_s(
     """
     if not len(hull.voxels):
         return assumed_m_s, ""
-    known = [one for one in tracks if _settled(one, captured_ns)]
+    known = []
+    for one in tracks:
+        if not _settled(one, captured_ns):
+            return _assumed(assumed_m_s, one.position_m, "has no settled track")
+        known.append(one)
     middles = np.array([_middle(one, captured_ns) for one in known]).reshape(-1, 2)
     places = grid.origin_m[:2] + (hull.voxels[:, :2] + 0.5) * grid.voxel_m
     fastest_m_s = LEAST_M_S
@@ -61,12 +67,16 @@ def people_m_s(
         theirs = off_m.min(0) <= WITHIN_M
         own_m = off_m[:, theirs].min(1, initial=np.inf)
         if own_m.max() > REACH_M:
-            x, y = part[np.argmax(own_m)]
             what = "has no settled track" if not theirs.any() else "is beyond reach of their track"
-            return assumed_m_s, f"{assumed_m_s:g} m/s assumed: what is at ({x:.1f}, {y:.1f}) {what}"
+            return _assumed(assumed_m_s, part[np.argmax(own_m)], what)
         quick = [_fast_m_s(one) for one, own in zip(known, theirs, strict=True) if own]
         fastest_m_s = max(fastest_m_s, *quick)
     return fastest_m_s, f"people at {fastest_m_s:.2f} m/s, measured"
+
+
+def _assumed(assumed_m_s: float, at_m: F64, what: str) -> tuple[float, str]:
+    x, y = at_m[:2]
+    return assumed_m_s, f"{assumed_m_s:g} m/s assumed: what is at ({x:.1f}, {y:.1f}) {what}"
 
 
 def _settled(track: Track, captured_ns: int) -> bool:
@@ -90,8 +100,8 @@ class MeasuredSpeedControl(SpeedControl):
     """Speed control in which people are as fast as their tracks say, plus two deviations.
 
     The standard allows it where the speed of people is monitored.  Nobody counts as slower than
-    0.5 m/s.  As soon as anything occupied belongs to no settled track, `human_m_s` counts.  The
-    reason of each speed says which of the two it was.
+    0.5 m/s.  As soon as anything occupied belongs to no settled track, or anyone's track is not
+    settled, `human_m_s` counts.  The reason of each speed says which of the two it was.
 
     A track knows the body's middle, not a hand.  This is why it is not the default.
     """

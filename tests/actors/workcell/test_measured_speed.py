@@ -100,8 +100,13 @@ def test_people_are_as_fast_as_their_tracks_and_two_deviations(tracks, expected_
         ([track_of(1.0, 0.0, seen_ago_s=-0.1)], [HERE]),
         ([track_of(1.6, 0.0)], [HERE]),
         ([track_of(1.0, 0.0)], [np.concatenate([HERE, column(1.0, 1.2)])]),
+        ([track_of(0.9, 0.0), track_of(1.1, 0.0, hidden=True)], [HERE]),
+        ([track_of(0.9, 0.0), track_of(1.1, 0.0, age_s=0.5)], [HERE]),
     ],
-    ids=["none", "a second", "hidden", "young", "old", "ahead", "beside", "beyond reach"],
+    ids=[
+        "none", "a second", "hidden", "young", "old", "ahead", "beside", "beyond reach",
+        "another hidden", "another young",
+    ],
 )
 def test_what_has_no_settled_track_is_as_fast_as_people_in_general(tracks, parts):
     """The reason says where it is."""
