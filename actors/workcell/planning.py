@@ -155,8 +155,8 @@ class PathPlanning(Actor):
     The next second of the path is looked at.  If it is blocked in two sets in a row, another path
     is planned.  A moving arm goes over to it without a stop, at a place that it reaches only when
     the path is there; an arm that is past that place refuses the path and brakes, and the next set
-    plans again.  Without a way, the path has no waypoints and says why; so it is if someone is in
-    the way to that place.  Predicted positions of people are avoided if another way exists.
+    plans again.  Without a way, or if someone is in the way to that place, the path has no
+    waypoints and says why.  Predicted positions of people are avoided if another way exists.
 
     Attributes:
         predict: Whether predictions count.

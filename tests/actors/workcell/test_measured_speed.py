@@ -104,8 +104,16 @@ def test_people_are_as_fast_as_their_tracks_and_two_deviations(tracks, expected_
         ([track_of(0.9, 0.0), track_of(1.1, 0.0, age_s=0.5)], [HERE]),
     ],
     ids=[
-        "none", "a second", "hidden", "young", "old", "ahead", "beside", "beyond reach",
-        "another hidden", "another young",
+        "none",
+        "a second",
+        "hidden",
+        "young",
+        "old",
+        "ahead",
+        "beside",
+        "beyond reach",
+        "another hidden",
+        "another young",
     ],
 )
 def test_what_has_no_settled_track_is_as_fast_as_people_in_general(tracks, parts):
