@@ -48,8 +48,8 @@ ARM_GROWN_M: Final = 0.06
 """By how much the outline of the arm is grown: its shadow, and blurred edges."""
 RESTING_RAD_S: Final = 1e-3
 """An arm whose joints were slower for 0.3 s is at rest."""
-RESTED_NS: Final = 500_000_000
-"""Joints that were measured farther from an exposure say nothing of it."""
+RESTED_NS: Final = 100_000_000
+"""So long after its last sample an arm at rest has not moved far."""
 CHECKED_ROWS: Final = 8
 """Every eighth row goes into the checksum: noise changes each of them."""
 
@@ -248,7 +248,8 @@ class BackgroundLearning(Actor):
         if any(map(lock.is_null, (self.calibration, self.model, self.joints))):
             return None
         camera, joints = lock[self.calibration], lock[self.joints]
-        known = abs(captured_ns - int(joints.stamp_ns[-1])) <= RESTED_NS
+        first_ns, last_ns = int(joints.stamp_ns[0]), int(joints.stamp_ns[-1])
+        known = first_ns <= captured_ns <= last_ns + RESTED_NS
         if not known or np.abs(joints.dq).max() > RESTING_RAD_S:
             return None
         arm = capsules_at(lock[self.model], joints.q[-1])[0].copy()

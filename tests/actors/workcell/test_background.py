@@ -189,6 +189,20 @@ def test_nothing_is_learned_while_the_arm_moves(cell, random, with_arm, caplog):
     assert caplog.text.count("camera/2 is learned once the arm rests") == 1
 
 
+@pytest.mark.parametrize("later_ms", [-150, 350])
+def test_nothing_is_learned_where_the_arm_is_not_known_at_the_exposure(
+    cell, random, with_arm, later_ms
+):
+    """An arm that rests since the exposure, or rested before it, may have moved at it."""
+    put(cell, WORKSPACE, EMPTY, PERIOD_NS)
+    for number in range(2, 10):
+        rest(cell, LEANS[0], number * PERIOD_NS + later_ms * 1_000_000)
+        put(cell, CAMERA, IMAGE, shown(random, LEANS[0])[0], number * PERIOD_NS)
+        testing.run_once(with_arm, cell)
+
+    assert seen(cell, CAMERA, BACKGROUND) is None
+
+
 def test_the_same_image_twice_is_one_image(cell, random):
     """A tick without a new image teaches nothing."""
     learning = actor_of(BackgroundLearning, images=3)
