@@ -11,8 +11,8 @@ PURE, as `actor_triggers`.  Rules that a change must keep:
    data runs without the others: that is counted, too (`partial`).
 4. What can be in no set is counted too: a datum without a stamp, one whose set is over (`late`), a
    second one for the same set (`skipped`), a complete set that newer ones pushed out (`skipped`).
-   With `newest_only` that is each set that waits when a newer one may run, or is older than the
-   last one that ran.
+   With `newest_only` a set is skipped, too, if a newer one may run before it, or if it is older
+   than the last one that ran.
 5. What was incomplete before the actor started is not its business: at the start only the newest
    complete set runs.
 """

@@ -236,8 +236,8 @@ class BackgroundLearning(Actor):
         lock.put(self.background, found, stamp_ns=captured_ns)
         if found.hidden_px:
             log.warning(
-                "%s: %d pixels (%.1f %%) were never free of the arm, and tell nothing; move the"
-                " arm away from there, and say again that the cell is empty",
+                "%s: %d pixels (%.1f %%) were never free of the arm and count as occupied; move"
+                " the arm away from there, and declare the cell empty again",
                 lock.entity.name,
                 found.hidden_px,
                 100.0 * found.hidden_px / found.mean[..., 0].size,

@@ -21,13 +21,13 @@ if TYPE_CHECKING:
     F64 = npt.NDArray[np.float64]
 
 LEAST_M_S: Final = 0.5
-"""Nobody counts as slower: a hand is quicker than the body, and a person may start to walk."""
+"""The least speed of a person: a hand is quicker than the body, and a person may start to walk."""
 SIGMAS: Final = 2.0
 """Of the speed's standard deviation, on top of the speed."""
 SETTLED_NS: Final = 1_000_000_000
 """A younger track has not settled yet."""
 FRESH_NS: Final = 250_000_000
-"""A track that was last seen earlier says nothing."""
+"""A track counts only if its person was seen within this time before the exposure."""
 WITHIN_M: Final = 0.2
 """A component is a person's if it comes so near to the middle of their body, in x and y."""
 REACH_M: Final = 0.9
@@ -99,9 +99,9 @@ def _fast_m_s(track: Track) -> float:
 class MeasuredSpeedControl(SpeedControl):
     """Speed control in which people are as fast as their tracks say, plus two deviations.
 
-    The standard allows it where the speed of people is monitored.  Nobody counts as slower than
-    0.5 m/s.  As soon as anything occupied belongs to no settled track, or anyone's track is not
-    settled, `human_m_s` counts.  The reason of each speed says which of the two it was.
+    The standard allows it where the speed of people is monitored.  The least is 0.5 m/s.
+    `human_m_s` counts as soon as anything occupied belongs to no settled track, or while any track
+    is not settled.  The reason of each speed says which of the two it was.
 
     A track knows the body's middle, not a hand.  This is why it is not the default.
     """

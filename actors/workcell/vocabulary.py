@@ -332,7 +332,8 @@ class Execution:
         reason: Why the command was refused, or why the arm brakes or rests; empty if nothing
             keeps it from moving.
         refused_path: Identity of the last path that it has refused: the arm had passed the place
-            where it begins, or it rests on an earlier exposure than the path before.
+            where it begins, or its exposure is earlier than that of the path before, or ahead of
+            the robot's clock.
         path_refusal: Why, in words; empty if it has refused none.
     """
 

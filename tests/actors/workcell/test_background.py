@@ -156,7 +156,7 @@ def test_the_arm_is_no_background_and_what_it_hides_tells_nothing(cell, random, 
     assert found.hidden_px == hidden.sum() < 0.6 * hidden.size
     assert np.abs(found.mean[~hidden].astype(int) - 120).max() <= 4
     assert f"camera/2: {found.hidden_px} pixels" in caplog.text
-    assert "say again that the cell is empty" in caplog.text
+    assert "declare the cell empty again" in caplog.text
     subtraction = actor_of(BackgroundSubtraction)
     put(cell, CAMERA, IMAGE, image_of(random), 9 * PERIOD_NS)
     testing.run_once(subtraction, cell)

@@ -207,7 +207,7 @@ def test_path_that_comes_when_the_arm_has_passed_its_beginning_is_refused():
 
 
 def test_refused_path_is_not_followed_at_rest_either():
-    """The planner has been told to plan again; the arm rests, and says why."""
+    """The planner plans again; the arm rests, and its reason names the refused path."""
     loop = Loop()
     loop.run(0.8)
     loop.follow(leaving(loop.line, loop.s_rad - 0.02, UP))
