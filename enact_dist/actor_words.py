@@ -11,6 +11,7 @@ commands of sessions that are gone.  Changed values last until the process ends;
 from __future__ import annotations
 
 import logging
+import secrets
 import threading
 from typing import TYPE_CHECKING, Any, Final
 
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from enact_dist.actor import Actor
     from enact_dist.actor_runner import ActorRun
     from enact_dist.cell import Cell
+    from enact_dist.cell_info import ActorInfo
     from enact_dist.watch import Watch
     from enact_dist.world import WorldContext
 
@@ -52,6 +54,36 @@ def tell(world: WorldContext, word: dict[str, Any], *, session: str, live: Itera
     with Lock(request) as lock:
         kept = {one: words for one, words in lock.get(request, {}).items() if one in {*live}}
         lock[request] = {**kept, session: word}
+
+
+def reports_of(cell: Cell, name: str) -> list[tuple[ActorInfo, dict[str, Any]]]:
+    """Return the reports of the actors of a name, each with its session."""
+    return [
+        (info, row)
+        for info in cell.actors()
+        if not info.silent and isinstance(info.report.get("actors"), (list, tuple))
+        for row in info.report["actors"]
+        if isinstance(row, dict) and row.get("name") == name
+    ]
+
+
+def tell_reported(cell: Cell, info: ActorInfo, row: dict[str, Any], word: dict[str, Any]) -> str:
+    """Give a command to an actor that reports; return the token that its answer begins with.
+
+    Args:
+        cell: Where it runs.
+        info: Its session.
+        row: Its report, which names the world context in which it reads commands.
+        word: The command: `{"set": values}` or `{"restart": True}`.
+
+    Raises:
+        EnactError: The lock was not granted, or its commit failed.
+    """
+    token = secrets.token_hex(4)
+    live = [one.session for one in cell.actors() if not one.silent]
+    world = cell.world(str(row["words_in"]))
+    tell(world, {"token": token, **word}, session=info.session, live=live)
+    return token
 
 
 def with_values(actor: Actor, values: dict[str, str]) -> None:

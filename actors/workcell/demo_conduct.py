@@ -10,8 +10,6 @@ import contextlib
 import math
 import os
 import signal
-import subprocess
-import sys
 import threading
 import time
 from dataclasses import dataclass, field
@@ -23,6 +21,7 @@ from actors.workcell.demo_cell import SETUP
 from actors.workcell.scenarios import scenario_of
 from actors.workcell.trace import ONLINE, RECORDED, TRUTH
 from enact_dist import Lock, View, Write
+from enact_dist.actor_words import reports_of, tell_reported
 from enact_dist.config import load_config
 from enact_dist.errors import EnactError, ForgottenError, NullDatumError, ShardUnreachableError
 from enact_dist.recording import Recorder
@@ -203,26 +202,27 @@ class Conductor:
         options, notes = self._options, self.notes
         faults = list(scenario_of(options.scenario, options.seed, options.seconds).faults)
         fork_at_s = min(0.3 * options.seconds, max(0.0, options.seconds - WHAT_IF_S))
-        state, undo = "", []
+        state, later = "", []
         try:
             while (now_s := (time.time_ns() - notes.start_ns) / 1e9) < options.seconds + 0.5:
                 self._running.check()
                 while faults and now_s >= faults[0].at_s:
-                    undo += self._break(faults.pop(0), now_s)
-                for due_s, act in [each for each in undo if now_s >= each[0]]:
-                    undo.remove((due_s, act))
-                    act()
+                    later += self._break(faults.pop(0), now_s)
                 try:
+                    for due in [each for each in later if now_s >= each[0]]:
+                        due[1]()  # where the shard is away for now, the next round tries again
+                        later.remove(due)
                     if not notes.forked_ns and now_s >= fork_at_s:
                         self._online.fork(WHAT_IF)
                         notes.forked_ns = time.time_ns()
                     state = self._look(now_s, state)
                 except EnactError as error:
-                    self._say(now_s, f"cannot look: {str(error).splitlines()[0]}")
+                    self._say(now_s, f"cannot look or act: {str(error).splitlines()[0]}")
                 time.sleep(LOOK_S)
         finally:  # a process that stays frozen could not end with the cell
-            for _, act in undo:
-                act()
+            for _, act in later:
+                with contextlib.suppress(EnactError, DemoError):
+                    act()
         if self._asking is not None:
             self._asking.join(timeout=ASKED_S)
 
@@ -307,13 +307,15 @@ class Conductor:
         self._tell(line)
 
     def _break(self, fault: Fault, now_s: float) -> list[tuple[float, Callable[[], None]]]:
-        """Do to a process what the scenario says; return what is to be undone, and when."""
+        """Do to a process what the scenario says; return what is left to do, and when."""
         self._say(now_s, f"{fault.kind} {fault.target}")
         self.notes.faults.append(f"{fault.kind} {fault.target}")
         end_s = fault.at_s + fault.seconds
         if fault.kind == "stuck":
-            self._set(fault.target, "stuck=true")
-            return [(end_s, lambda: self._set(fault.target, "stuck=false"))]
+            return [
+                (fault.at_s, lambda: self._set(fault.target, "stuck", "true")),
+                (end_s, lambda: self._set(fault.target, "stuck", "false")),
+            ]
         pid = self._pid(fault.target)
         if fault.kind == "kill":
             os.kill(pid, signal.SIGKILL)
@@ -321,14 +323,18 @@ class Conductor:
         os.kill(pid, signal.SIGSTOP)
         return [(end_s, lambda: go_on(pid))]
 
-    def _set(self, actor: str, value: str) -> None:
-        """Change an attribute of a running actor, as an operator would, without waiting for it."""
-        command = [sys.executable, "-m", "enact_dist.cli.main", "actor", "set", actor, value]
-        subprocess.Popen(
-            [*command, "--cell", str(self._running.config)],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-        )
+    def _set(self, name: str, attribute: str, value: str) -> None:
+        """Change an attribute of a running actor, as an operator would.
+
+        Raises:
+            DemoError: No actor of that name accepts commands.
+            EnactError: The shard did not take the command.
+        """
+        found = [one for one in reports_of(self._cell, name) if one[1].get("words_in")]
+        if not found:
+            raise DemoError(f"actor {name} accepts no commands; see {self._running.log}")
+        for info, row in found:
+            tell_reported(self._cell, info, row, {"set": {attribute: value}})
 
     def _pid(self, name: str) -> int:
         """Return the process of an actor, or else of a shard.

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import secrets
 import sys
 import time
 from typing import TYPE_CHECKING, Any, Final
 
+from enact_dist.actor_words import reports_of, tell_reported
 from enact_dist.cli.verbs import (
     DONE,
     FAILED,
@@ -70,7 +70,7 @@ def set_values(arguments: argparse.Namespace) -> int:
     with open_cell(arguments, observer=False, actor="enact actor set") as cell:
         status = DONE
         for info, row in _found(cell, arguments.name):
-            token = _tell(cell, info, row, {"set": values})
+            token = tell_reported(cell, info, row, {"set": values})
             answer = _answer(cell, info.session, arguments.name, token)
             if answer != "done":
                 where = f"{info.host} pid {info.pid}"
@@ -87,11 +87,11 @@ def restart_actor(arguments: argparse.Namespace) -> int:
     with open_cell(arguments, observer=False, actor="enact actor restart") as cell:
         before = _found(cell, arguments.name)
         for info, row in before:
-            _tell(cell, info, row, {"restart": True})
+            tell_reported(cell, info, row, {"restart": True})
         old = {info.session for info, _ in before}
         end_s = time.monotonic() + RETURN_S
         while time.monotonic() < end_s:
-            rows = _rows(cell, arguments.name)
+            rows = reports_of(cell, arguments.name)
             back = [info for info, row in rows if info.session not in old and _runs(row)]
             if len(back) >= len(before) and not old & {info.session for info, _ in rows}:
                 for info in back:
@@ -104,17 +104,6 @@ def restart_actor(arguments: argparse.Namespace) -> int:
         file=sys.stderr,
     )
     return FAILED
-
-
-def _rows(cell: Cell, name: str) -> list[tuple[ActorInfo, dict[str, Any]]]:
-    """Return the reports of the actors of a name, with their sessions."""
-    return [
-        (info, row)
-        for info in cell.actors()
-        if not info.silent and isinstance(info.report.get("actors"), (list, tuple))
-        for row in info.report["actors"]
-        if isinstance(row, dict) and row.get("name") == name
-    ]
 
 
 def _runs(row: dict[str, Any]) -> bool:
@@ -130,7 +119,7 @@ def _found(cell: Cell, name: str) -> list[tuple[ActorInfo, dict[str, Any]]]:
         MisuseError: There is no such actor, or one accepts no commands.
     """
     end_s = time.monotonic() + REPORTED_S
-    while not (found := _rows(cell, name)) or not all(row.get("words_in") for _, row in found):
+    while not (found := reports_of(cell, name)) or not all(row.get("words_in") for _, row in found):
         if time.monotonic() >= end_s:
             break
         time.sleep(LOOK_S)
@@ -146,21 +135,11 @@ def _found(cell: Cell, name: str) -> list[tuple[ActorInfo, dict[str, Any]]]:
     return found
 
 
-def _tell(cell: Cell, info: ActorInfo, row: dict[str, Any], word: dict[str, Any]) -> str:
-    from enact_dist.actor_words import tell
-
-    token = secrets.token_hex(4)
-    live = [one.session for one in cell.actors() if not one.silent]
-    world = cell.world(str(row["words_in"]))
-    tell(world, {"token": token, **word}, session=info.session, live=live)
-    return token
-
-
 def _answer(cell: Cell, session: str, name: str, token: str) -> str:
     """Return the answer of an actor to a command."""
     end_s = time.monotonic() + ANSWER_S
     while time.monotonic() < end_s:
-        for info, row in _rows(cell, name):
+        for info, row in reports_of(cell, name):
             told, _, answer = str(row.get("word", "")).partition(" ")
             if info.session == session and told == token:
                 return answer
