@@ -91,11 +91,11 @@ def plan_figure(trace: Trace, truth: Truth, hull: Hull, stamp_ns: int) -> Pictur
         for end in (capsule[:2], capsule[3:5]):
             cv2.circle(sheet, _at(end), _length(capsule[6]), TRUE, 1, cv2.LINE_AA)
     tracks = trace.people_at(words.TRACK, stamp_ns)
-    for human in tracks:
-        past = [
+    for human, track in tracks.items():
+        past = [  # another person may have had the name before
             kept.datum.position_m[:2]
             for kept in trace.of(human, words.TRACK)
-            if 0 <= stamp_ns - kept.stamp_ns < WAY_NS
+            if 0 <= stamp_ns - kept.stamp_ns < WAY_NS and kept.datum.first_ns == track.first_ns
         ]
         cv2.polylines(sheet, [_px(np.array(past))], False, TRACK, 2, cv2.LINE_AA)
     for prediction in trace.people_at(words.PREDICTION, stamp_ns).values():
@@ -188,7 +188,7 @@ def timeline(
     sheets = []
     for title, top, lines in panels:
         sheet = np.full((height, width, 3), 255, np.uint8)
-        left, right, up, down = 60, width - 16, 34, height - 40
+        left, right, up, down = 60, width - 16, 34, height - 54
         for share in (0.0, 0.5, 1.0):
             y = round(down + (up - down) * share)
             cv2.line(sheet, (left, y), (right, y), (226, 230, 235), 1)

@@ -3,7 +3,9 @@
 import numpy as np
 
 from actors.workcell import figures, plots
+from actors.workcell import vocabulary as words
 from actors.workcell.figures import CHANGED, SAME, masks_figure, scene_picture, voxel_points
+from actors.workcell.truth_of_run import truth_of
 from actors.workcell.vocabulary import LIMBS, SILHOUETTE, TRACK, Grid, Silhouette, Track
 
 from .runs import Run
@@ -38,6 +40,36 @@ def test_nothing_occupied_is_drawn_as_nothing() -> None:
     nothing = voxel_points(GRID, np.empty((0, 3), np.int16), np.array(SAME))
     floor = voxel_points(GRID, np.array([[0, 0, 0]]), np.array(SAME))
     assert scene_picture([floor, nothing], size_px=(64, 48)).shape == (48, 64, 3)
+
+
+def test_the_way_of_a_person_does_not_begin_with_somebody_elses() -> None:
+    """A name is given again when a track has ended."""
+    run = Run("S1", 4.0)
+    run.rest()
+    run.hull(30)
+    for at_m, first, ticks in ((-2.2, 0, range(3)), (2.2, 20, range(20, 31))):
+        for tick in ticks:
+            there = np.array([at_m, 0.1 * (tick - first), 1.7])
+            track = Track(there, np.zeros(3), np.eye(6), 1.7, 0.07, first, hidden=False)
+            run.add("human/0", TRACK, track, tick)
+    trace, stamp_ns = run.trace(), run.trace().of(words.WORKSPACE.name, words.HULL)[-1].stamp_ns
+    hull = trace.newest(words.WORKSPACE.name, words.HULL)
+
+    picture = plots.plan_figure(trace, truth_of(trace), hull, stamp_ns)
+
+    blue = (picture == plots.TRACK).all(-1)[:-60]
+    assert blue[:, -200:].any()
+    assert not blue[:, : plots.PLAN_PX // 2].any()
+
+
+def test_seconds_do_not_run_into_the_legend() -> None:
+    """Between the figures along the time and the names of the curves is a free row."""
+    line = plots.Line("speed", np.arange(6.0), np.full(6, np.nan), (255, 0, 0))
+    picture = plots.timeline([("speed, m/s", 2.0, [line])])
+    legend = int(np.flatnonzero((picture == (255, 0, 0)).all(-1).any(1))[0])
+    ink = (picture[:, 100:] < 200).all(-1).any(1)  # right of the legend and of the values
+    assert ink[: legend - 5].any()
+    assert not ink[legend - 5 :].any()
 
 
 def test_who_has_left_is_in_no_picture_of_later(monkeypatch):
