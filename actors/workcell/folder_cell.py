@@ -47,6 +47,8 @@ CELL_M: Final = 2.0
 """Longest edge of the box while the actors work on it."""
 TABLES_BYTES_MAX: Final = 1 << 30
 """Cameras and voxels whose tables take more memory are carved without them."""
+HULL_S: Final = 120.0
+"""How long the actors may take; the largest tables take some seconds."""
 LOOK_S: Final = 0.2
 """How often the wait for the hull looks whether an actor has failed."""
 
@@ -64,6 +66,7 @@ def hull_by_actors(shots: Sequence[Shot], grid: VoxelBlocks) -> npt.NDArray[np.i
         grid: The voxels.
 
     Raises:
+        TimeoutError: There is no hull after `HULL_S`.
         Exception: What an actor's update raised.
     """
     scale = CELL_M / (grid.voxel_m * max(grid.shape))
@@ -80,9 +83,16 @@ def hull_by_actors(shots: Sequence[Shot], grid: VoxelBlocks) -> npt.NDArray[np.i
             running(actors, cell) as failures,
         ):
             _write(online, shots)
+            end_s = time.monotonic() + HULL_S
             while (change := watch.next(LOOK_S)) is None or change.null:
                 if failures:
                     raise failures[0]
+                if time.monotonic() > end_s:
+                    raise TimeoutError(
+                        f"the actors made no hull of {len(shots)} pictures and {grid.voxels:,}"
+                        f" voxels within {HULL_S:g} s; choose a coarser --grid, or try again when"
+                        " the machine is less busy"
+                    )
         hull = View(online, WORKSPACE, HULL)
         found = online.view(hull)[hull]
         return grid.rows_of(found.voxels[found.tight])

@@ -316,6 +316,16 @@ def test_what_is_wrong_is_one_line_and_nothing_is_written(folder, capsys, name):
     assert not (folder.parent / "out").exists()
 
 
+def test_actors_that_make_no_hull_are_one_line(folder, capsys, monkeypatch):
+    """Here what the cameras saw never reaches them."""
+    monkeypatch.setattr("actors.workcell.folder_cell._write", lambda *_: None)
+    monkeypatch.setattr("actors.workcell.folder_cell.HULL_S", 0.1)
+    status, report, err = run(folder, capsys)
+    assert (status, report) == (1, None)
+    assert "no hull of 8 pictures" in err
+    assert err.count("\n") == 1
+
+
 def test_missing_picture_is_told_and_the_others_are_used(folder, capsys):
     """A hull of seven cameras is one."""
     (folder / "masks" / "2.png").unlink()
