@@ -162,7 +162,7 @@ def record_views(options: Options, folder: Path, renderer: str) -> int:
 
     Args:
         options: Which scenario.
-        folder: What lies there is replaced.
+        folder: A new one, or that of a recording, which is replaced.
         renderer: "composite" or "mujoco".
     """
     from rich.progress import Progress

@@ -152,7 +152,7 @@ def record(
     motion: Motion | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
-    """Record a scenario; what lies at `folder` is replaced.
+    """Record a scenario; a recording that lies at `folder` is replaced, anything else stays.
 
     Args:
         folder: Where; its parents are made.
@@ -163,9 +163,15 @@ def record(
         progress: Told how many of how many views are done.
 
     Raises:
-        CameraError: The renderer cannot work here.
+        CameraError: The renderer cannot work here, or something else lies at the folder.
         OSError: The folder cannot be written.
     """
+    empty = not folder.exists() or (folder.is_dir() and not any(folder.iterdir()))
+    if not empty and not (folder / "recording.json").is_file():
+        raise CameraError(
+            f"{folder}: asked for a new folder, an empty one, or a recording to replace; found"
+            " something else; name another folder"
+        )
     chosen = tuple(cameras() if calibrations is None else calibrations)
     info = _info(scenario, renderer, chosen, robot=motion is not None)
     stage = Stage(scenario)

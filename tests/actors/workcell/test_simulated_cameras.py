@@ -191,6 +191,17 @@ def test_programs_that_want_a_recording_at_once_make_one(tmp_path):
     assert (len(made), len(set(made)), len(drawn)) == (2, 1, 5)
 
 
+@pytest.mark.parametrize("there", ["a file", "a folder of files"])
+def test_what_is_no_recording_is_not_replaced_by_one(tmp_path, there):
+    """A wrong folder after --record would be gone."""
+    kept = tmp_path / "thesis" if there == "a file" else tmp_path / "thesis" / "text"
+    kept.parent.mkdir(exist_ok=True)
+    kept.write_text("years of work")
+    with pytest.raises(CameraError, match="thesis: asked for a new folder"):
+        record(tmp_path / "thesis", scenario_of("S1", 1, 0.2), calibrations=VIEWS[:1])
+    assert kept.read_text() == "years of work"
+
+
 def test_recording_that_a_full_disk_cuts_short_is_none(tmp_path, monkeypatch):
     """Neither the empty room nor a frame is left out in silence."""
     monkeypatch.setattr("cv2.imwrite", lambda path, *_: not path.endswith("still.png"))
