@@ -73,7 +73,7 @@ class DemoCell:
         """Return the processor time of each process by name, where they are known."""
         return {}
 
-    def joined(self) -> Cell:
+    def joined(self) -> contextlib.AbstractContextManager[Cell]:
         """Join the cell as soon as its shards answer.
 
         Raises:

@@ -129,8 +129,8 @@ class EmbeddedCell(DemoCell):
     def __exit__(self, *_: object) -> None:
         self._open.close()
 
-    def joined(self) -> Cell:
-        """Start the shard and the actors, and return the cell."""
+    def joined(self) -> contextlib.AbstractContextManager[Cell]:
+        """Start the shard and the actors, and return the cell, which is closed after its actors."""
         config = load_config(self.config)
         cell = self._open.enter_context(local(config=config, actor="demo"))
         for actor in config.actors:
@@ -138,4 +138,4 @@ class EmbeddedCell(DemoCell):
                 configured_actor(actor), cell, dict(actor.worlds) or None, name=actor.name
             )
             self._open.enter_context(thread)
-        return cell
+        return contextlib.nullcontext(cell)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeVar
 
 from actors.geometry.joint_paths import JointPath, PathFollower, PathSpeeds
 from actors.workcell import vocabulary as words
@@ -24,7 +23,9 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from actors.workcell.demo_conduct import Notes
-    from enact_dist import Cell
+    from enact_dist import Cell, Version
+
+T = TypeVar("T")
 
 REPLAYED: Final = ("hull", "prediction", "track", "joints")
 """What the planner of a fork reads; all else is as it was when the fork was made."""
@@ -41,7 +42,7 @@ class WhatIf:
         paths_online: How many the planner of the cell planned in the same seconds.
         legs_fork_s: How long each leg of the task takes with its paths, see `legs_s`.
         legs_online_s: The same with the paths of the cell.
-        strangers: Versions of paths in `online` that this process wrote: what a fork must not do.
+        strangers: Paths in `online` that the planner in the fork committed, which must not be.
     """
 
     paths_fork: int
@@ -132,14 +133,21 @@ def _tried(cell: Cell, recording: Path, notes: Notes) -> tuple[WhatIf, int]:
     here = [
         one for one in all_online if 0 <= one.position.stamp_ns - notes.forked_ns <= WHAT_IF_S * 1e9
     ]
-    written = sum(one.cause is not None and one.cause.pid == os.getpid() for one in all_online)
     model = View(online, words.ROBOT, words.MODEL)
     arm = online.view(model)[model]
     legs_fork_s, legs_online_s = (
         legs_s(arm, [(one.stamp_ns, one.datum()) for one in versions]) for versions in (there, here)
     )
-    found = WhatIf(len(there), len(here), legs_fork_s, legs_online_s, written)
+    found = WhatIf(len(there), len(here), legs_fork_s, legs_online_s, in_both(there, all_online))
     return found, summary.versions
+
+
+def in_both(fork: Sequence[Version[T]], online: Sequence[Version[T]]) -> int:
+    """Return how many versions that were committed in a fork are in `online`, too.
+
+    Who wrote them would not tell: in one process both planners have one session.
+    """
+    return len({one.position for one in fork} & {one.position for one in online})
 
 
 def legs_s(arm: words.ArmModel, paths: Sequence[tuple[int, words.Path]]) -> tuple[float, ...]:

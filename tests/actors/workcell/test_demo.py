@@ -20,8 +20,8 @@ from rich.console import Console
 pytest.importorskip("cv2", exc_type=ImportError)
 pytest.importorskip("mcap", exc_type=ImportError)
 
-from actors.running_cell import DemoCell, toml_of
-from actors.workcell import demo_conduct
+from actors.running_cell import DemoCell, DemoError, toml_of
+from actors.workcell import demo_cell, demo_conduct
 from actors.workcell import vocabulary as words
 from actors.workcell.demo import run_quietly
 from actors.workcell.demo_cell import TEMPLATE, configured
@@ -34,16 +34,20 @@ from actors.workcell.demo_report import (
     stop_checks,
     value_text,
 )
+from actors.workcell.demo_what_if import in_both
 from actors.workcell.figures import figure4
 from actors.workcell.scenarios import Fault, scenario_of
 from actors.workcell.setup import Setup, grid_of
 from actors.workcell.simulation.truth import TruthHuman
 from actors.workcell.trace import ASPECTS, trace_of
 from actors.workcell.unshared import PlainEach, PlainLock, Version
-from enact_dist import Entity, Lock, View, Write, local, testing
+from enact_dist import Aspect, Entity, Lock, View, Write, local, testing
 from enact_dist.actor_check import check_cell, declarations_of
+from enact_dist.actor_words import ACTOR, WORDS
 from enact_dist.config import load_config
-from enact_dist.errors import ConfigError
+from enact_dist.errors import ConfigError, MisuseError
+
+NOTE = Aspect("note", str)
 
 
 def put_hull_and_speed(online, views, stamp_ns):
@@ -250,6 +254,45 @@ def test_a_frozen_process_goes_on_when_the_run_fails(tmp_path, monkeypatch):
     demo_conduct.go_on(process.pid)  # of a process that has ended: nothing
 
 
+def test_a_camera_repeats_its_image_until_its_time_is_over(tmp_path, monkeypatch):
+    """The commands are in the cell when their moment is over: no process brings them later."""
+    stuck = dataclasses.replace(scenario_of("S1", 1), faults=(Fault(0.0, "stuck", "one", 0.3),))
+    monkeypatch.setattr(demo_conduct, "scenario_of", lambda *_: stuck)
+    with testing.worlds("online", "truth") as cell:
+        world = cell.world("online")
+        session = world.session.client.core.session
+        row = {"name": "one", "state": "running", "words_in": "online"}
+        info = types.SimpleNamespace(
+            session=session, silent=False, report={"actors": [row]}, names=lambda: {"one"}
+        )
+        monkeypatch.setattr(cell, "actors", lambda: [info])
+        taken = []
+
+        def look_at_commands():
+            seen = View(world, ACTOR, WORDS)
+            taken.append(world.view(seen).get(seen, {}).get(session, {}).get("set"))
+            if taken[-1] == {"stuck": "false"}:
+                raise DemoError
+
+        running = types.SimpleNamespace(check=look_at_commands, config=tmp_path, log="a log")
+        conductor = Conductor(cell, running, Options(tmp_path), lambda _: None)
+        conductor.notes.start_ns = time.time_ns()
+
+        with pytest.raises(DemoError):
+            conductor.follow()
+
+    assert taken[0] is None
+    assert {"stuck": "true"} in taken
+
+
+def test_an_actor_that_reads_no_commands_ends_the_run_in_one_line(tmp_path):
+    with local(worlds=["online", "truth"]) as cell:
+        running = DemoCell(tmp_path / "cell.toml", log="a log")
+        conductor = Conductor(cell, running, Options(tmp_path), lambda _: None)
+        with pytest.raises(DemoError, match="actor camera-3 accepts no commands; see a log"):
+            conductor._set("camera-3", "stuck", "true")
+
+
 def test_the_nearest_approach_is_shown_when_hulls_of_its_time_are_forgotten(capsys):
     """A plain run of a minute is longer than hulls stay; those that were kept are there."""
     with local(worlds=["online", "truth"]) as cell:
@@ -423,3 +466,38 @@ def test_the_cell_of_four_cameras_is_sound(tmp_path):
     }
     assert silhouettes == {f"camera/{number}" for number in range(4)}
     assert [one for one in check_cell(found) if one.level == "error"] == []
+
+
+def test_a_cell_in_one_process_ends_its_actors_before_its_shard(tmp_path, monkeypatch):
+    """Else they find their cell closed, and the run fails at its end."""
+
+    def small(text, options):
+        config = configured(text, options)
+        return config | {"actors": {name: config["actors"][name] for name in ("setup", "watch")}}
+
+    monkeypatch.setattr(demo_cell, "configured", small)
+    running = demo_cell.EmbeddedCell(Options(tmp_path, embedded=True))
+
+    with running, running.joined() as cell:
+        grid = View(cell.world("online"), words.WORKSPACE, words.GRID)
+        with cell.world("online").watch(str(words.WORKSPACE), words.GRID) as watch:
+            assert watch.next(30.0) is not None
+        assert cell.world("online").view(grid)[grid].voxel_m == 0.025
+
+    with pytest.raises(MisuseError, match="closed"):
+        cell.world("online").view(grid)
+
+
+def test_paths_of_a_fork_are_told_from_those_of_its_own_process():
+    """With --embedded both planners write from one session."""
+    with local(worlds=["online"]) as cell:
+        online = cell.world("online")
+        fork = online.fork("what_if")
+        for world in (online, fork, fork, online):
+            request = Write(world, words.ROBOT, NOTE)
+            with Lock(request) as lock:
+                lock[request] = "a path"
+        here, there = (world.history(words.ROBOT, NOTE) for world in (online, fork))
+        assert (len(here), len(there)) == (2, 2)
+        assert in_both(there, here) == 0
+        assert in_both(there, [*here, there[-1]]) == 1
