@@ -301,10 +301,12 @@ def hull_figure(
         scene_picture([room, voxel_points(grid, raw, left)]),
         scene_picture([room, capsule_points(arm, ARM), voxel_points(grid, hull.voxels, right)]),
     ]
-    removed = [f"{count} {rule}" for rule, count in hull.counts.items() if count and rule != "raw"]
+    ruled = [f"{count:,} {rule}" for rule, count in hull.counts.items() if count and rule != "raw"]
+    for row, text in enumerate(ruled):
+        pictures[1] = with_label(pictures[1], text, (10, 10 + 22 * row), height_px=16)
     captions = [
         f"before refinement: {len(raw):,} voxels (yellow: removed)",
-        "; ".join([f"after: {len(hull.voxels):,} (red: new)", *removed]),
+        f"after: {len(hull.voxels):,} (red: new); voxels of each rule below",
     ]
     return tiles(pictures, captions)
 

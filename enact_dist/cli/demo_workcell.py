@@ -16,6 +16,21 @@ _EXTRA: Final = ("cv2", "scipy", "numba", "mujoco", "ompl", "ruckig")
 """Modules of the `workcell` extra, which the core does without."""
 _CHOICES: Final = ("scenario", "seed", "seconds", "voxel_m", "source")
 
+FORMATS: Final = """\
+FOLDER holds, as .png, .jpg, .ppm, .pgm, .bmp or .tif (without MOMENT if there is only one):
+  masks/CAMERA/MOMENT.png      not black is foreground
+  images/CAMERA/MOMENT.png     where there are no masks, with background/CAMERA.png or --key
+and one calibration of all cameras, with x_camera = R X + t:
+  cameras.json                 as enact workcell calibrate writes it: "unit", and "cameras", each
+                               with "name", "K", "R", "t" (or "P"), "distortion", "width", "height"
+  cameras.txt and images.txt   of COLMAP, as text, here or in sparse, sparse/0, colmap
+  NAME.txt                     the number of cameras, and a line for each: name K(9) R(9) t(3)
+  CAMERA.txt                   a 3 x 4 projection, here or in calib, projections, cameras
+  CAMERA.yml, .yaml, .xml      of OpenCV, in the same places: camera_matrix,
+                               distortion_coefficients, and R with t, or projection_matrix
+bounds.json, {"low": [x, y, z], "high": [x, y, z]}, says where to look, if that is known."""
+"""What a folder of pictures holds; `camera_sets` and `folder_pictures` read it."""
+
 
 def add_to(verbs: argparse._SubParsersAction[Verb]) -> None:
     """Add the verb."""
@@ -57,7 +72,9 @@ def add_to(verbs: argparse._SubParsersAction[Verb]) -> None:
         metavar="FILE",
         help="the cell.toml of a workcell that runs already, to be conducted and scored",
     )
-    real = demo.add_argument_group("real pictures of calibrated cameras instead of the simulation")
+    real = demo.add_argument_group(
+        "real pictures of calibrated cameras instead of the simulation", FORMATS
+    )
     real.add_argument("--cameras", type=Path, metavar="FOLDER", help="pictures or masks")
     real.add_argument("--grid", type=whole, metavar="N", help="voxels along the longest edge")
     real.add_argument("--unit", metavar="U", help="of a calibration that does not say its own: m")

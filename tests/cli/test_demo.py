@@ -68,6 +68,15 @@ def test_options_of_the_workcell_that_do_not_fit_are_refused(enact, words, reaso
     assert not (tmp_path / "out").exists()
 
 
+def test_formats_of_pictures_are_in_the_help(enact, capsys):
+    """An error about a folder without a calibration sends its reader there."""
+    with pytest.raises(SystemExit):
+        enact("demo", "workcell", "--help")
+    said = capsys.readouterr().out
+    for name in ("cameras.json", "cameras.txt", "masks/", "images/", "bounds.json", ".yml"):
+        assert name in said
+
+
 def test_missing_extra_of_the_workcell_is_named_with_its_command(enact, monkeypatch):
     """Without OpenCV the error says which extras to install."""
     error = ModuleNotFoundError("No module named 'cv2'", name="cv2")

@@ -42,6 +42,25 @@ def test_nothing_occupied_is_drawn_as_nothing() -> None:
     assert scene_picture([floor, nothing], size_px=(64, 48)).shape == (48, 64, 3)
 
 
+def test_the_part_of_each_rule_is_within_the_picture(monkeypatch) -> None:
+    """A caption with all of them ran out of it."""
+    drawn, draw = [], figures.with_label
+
+    def noting(picture, text, at_px, **given):
+        drawn.append(text)
+        return draw(picture, text, at_px, **given)
+
+    monkeypatch.setattr(figures, "with_label", noting)
+    voxels = np.array([[1, 1, 1]], np.int16)
+    counts = dict.fromkeys(("raw", "static", "unreachable", "robot", "distant"), 2000000)
+    flags = np.ones(1, np.bool_), np.zeros(1, np.int16)
+    hull = words.Hull(voxels, np.full(1, 0.1, np.float32), *flags, counts, (), 0.1, 0)
+
+    figures.hull_figure(GRID, np.empty((0, 15)), np.empty((0, 7)), (voxels, hull), None)
+
+    assert drawn == [f"2,000,000 {rule}" for rule in counts if rule != "raw"]
+
+
 def test_the_way_of_a_person_does_not_begin_with_somebody_elses() -> None:
     """A name is given again when a track has ended."""
     run = Run("S1", 4.0)
