@@ -83,6 +83,8 @@ def show_lineage(tree: CauseTree, images: int, console: Console) -> None:
         images: How many images were committed in one step with the masks.
         console: Where progress and table are printed.
     """
+    if console.quiet:
+        return  # the tree is not printed by the console itself
     command = f"enact why online {words.ROBOT}/{words.SPEED}@{tree.version} --depth {DEPTH}"
     console.print(f"\nwhy the robot stopped: {command}; of it the hull", style="bold")
     for cause in tree.children:

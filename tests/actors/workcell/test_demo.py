@@ -205,6 +205,8 @@ def test_why_it_stopped_goes_to_where_the_progress_goes(capsys):
     told = capsys.readouterr()
     assert told.out == ""
     assert "workspace/hull v1" in told.err
+    show_lineage(tree, 0, Console(quiet=True))  # a bench prints rows only
+    assert capsys.readouterr().out == ""
 
 
 def test_a_stop_leads_to_the_images_that_were_committed_with_its_masks(tmp_path):
