@@ -44,7 +44,7 @@ def test_table_and_tree_are_drawn_on_a_terminal(capsys, monkeypatch):
     """On a terminal the same content is drawn; brackets in data are no markup."""
     from enact_dist.cli.slots import Branch
 
-    monkeypatch.setattr(output, "on_terminal", lambda: True)
+    monkeypatch.setattr(output, "on_terminal", lambda _=None: True)
     root = Branch("online")
     root.at(["tray", "1"]).children[" count"] = Branch("count [bold]v1[/]")
 
@@ -59,7 +59,7 @@ def test_table_and_tree_are_drawn_on_a_terminal(capsys, monkeypatch):
 
 def test_narrow_terminal_breaks_no_word(capsys, monkeypatch):
     """What one copies from a table, such as a position, stays in one piece."""
-    monkeypatch.setattr(output, "on_terminal", lambda: True)
+    monkeypatch.setattr(output, "on_terminal", lambda _=None: True)
     monkeypatch.setenv("COLUMNS", "30")
     position = "1795295489659705547@right"
     output.print_table(
