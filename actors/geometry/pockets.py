@@ -153,8 +153,10 @@ class Pockets:
         open_now = np.unique(pocket[inside & touched.ravel()[block]])
         return np.asarray(inside & near.ravel()[block] & np.isin(pocket, open_now))
 
-    def note(self, rows: Rows, component: Rows, visible: Flags) -> None:
-        """Take what is occupied in a set.
+    def note(self, rows: Rows, component: Rows, visible: Flags) -> bool:
+        """Take what is occupied in a set; return whether a pocket is held from this set on.
+
+        Its voxels belong to this set already: who went in is in no other place.
 
         Args:
             rows: (N,) voxels.
@@ -162,7 +164,7 @@ class Pockets:
             visible: (N,) a camera has a say about it.
         """
         if not self.count:
-            return
+            return False
         voxel_m3 = self._grid.voxel_m**3
         held = self._held.copy()
         volume = np.bincount(component[visible]) * voxel_m3
@@ -185,3 +187,4 @@ class Pockets:
                 self._largest_m3[pocket] = 0.0
         if not np.array_equal(held, self._held):
             self._update_blocks()
+        return bool((self._held & ~held).any())

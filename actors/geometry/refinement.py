@@ -428,7 +428,8 @@ class Refinement:
         self._before = np.zeros(shape, bool)
         self._before.ravel()[rows >> 6] = True
         self._since_s[self._before] = 0.0
-        self._pockets.note(rows, label, visible)
+        if self._pockets.note(rows, label, visible):
+            return self._components(beside, sure, counts, raw)  # once: what is held stays held
         return Refined(
             rows=rows,
             clearance_m=clearance[kept],

@@ -31,11 +31,11 @@ def pockets_of(rows):
 
 
 def note(pockets, visible, unseen=()):
-    """Tell of one component with visible voxels, and unseen ones that belong to it."""
+    """Note one component with visible voxels, and unseen ones; return what `note` returns."""
     unseen = np.array(unseen, np.int64)
     rows = np.concatenate([visible, unseen]).astype(np.int64)
     seen = np.arange(len(rows)) < len(visible)
-    pockets.note(rows, np.ones(len(rows), np.int64), seen)
+    return pockets.note(rows, np.ones(len(rows), np.int64), seen)
 
 
 NOTHING = np.empty(0, np.int64)
@@ -58,6 +58,14 @@ def test_who_goes_in_holds_the_pocket_and_who_comes_out_frees_it():
     note(pockets, BESIDE)
     assert not pockets.held.any()
     assert not pockets.held_blocks.any()
+
+
+def test_a_pocket_that_is_held_from_now_on_is_named_once():
+    """The set in which the last visible part vanishes has to hold it already."""
+    pockets = pockets_of(HIDDEN)
+    assert not note(pockets, BESIDE, HIDDEN)
+    assert note(pockets, NOTHING)
+    assert not note(pockets, NOTHING)
 
 
 def test_who_only_walks_past_leaves_it_free():

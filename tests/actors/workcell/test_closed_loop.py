@@ -81,6 +81,20 @@ def test_a_dead_camera_gives_no_mask_and_the_cell_goes_on():
     assert 5 <= min(named) < 8
 
 
+def test_who_vanishes_behind_the_cabinet_between_two_sets_is_in_the_second_one():
+    """They were in no set for a period: the robot ran at full speed as if nobody was there."""
+    hiding = dataclasses.replace(scenario_of("S4", 7, 12.0), seconds=2.8)
+    trace = ClosedLoop(hiding).run()
+    truth = truth_of(trace)
+    hulls = {
+        round(truth.at_s(kept.stamp_ns), 1): kept.datum
+        for kept in trace.of(words.WORKSPACE.name, words.HULL)
+    }
+    assert hulls[2.4].tight.any()
+    assert not hulls[2.5].tight.any()
+    assert all(len(hulls[second].voxels) for second in (2.4, 2.5, 2.6))
+
+
 def test_a_box_is_filled_by_capsules_within_it():
     box = Box("thing", (1.0, 0.0, 0.15), (0.15, 0.15, 0.15))
     balls = capsules_in(box)
