@@ -82,7 +82,7 @@ def test_a_dead_camera_gives_no_mask_and_the_cell_goes_on():
 
 
 def test_who_vanishes_behind_the_cabinet_between_two_sets_is_in_the_second_one():
-    """They were in no set for a period: the robot ran at full speed as if nobody was there."""
+    """The hull was empty for that period, so the robot was allowed its full speed."""
     hiding = dataclasses.replace(scenario_of("S4", 7, 12.0), seconds=2.8)
     trace = ClosedLoop(hiding).run()
     truth = truth_of(trace)

@@ -203,7 +203,7 @@ def test_a_frozen_camera_is_named_and_replaced_and_taken_back(trial: Trial) -> N
 
 
 def test_the_robot_rests_while_the_hull_is_late_and_goes_on_by_itself(trial: Trial) -> None:
-    """Its reconstruction is stopped, not dead: no one is told, and the last commands run out."""
+    """Its reconstruction is stopped, not dead: the shard reports no death, and the last commands run out."""
     trial.moves()
     with trial.stopped("reconstruction"):
         trial.rests()
