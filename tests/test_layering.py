@@ -31,6 +31,7 @@ PURE = {
     },
 }  # fmt: skip
 ACTORS_MAY_IMPORT = {"enact_dist", "enact_dist.testing", "enact_dist.errors"}
+TOP_LEVEL = {"LICENSE", "README.md", "actors", "deploy", "enact_dist", "pyproject.toml", "tests"}
 LINES_MAX = 500
 EXCUSED: dict[str, int] = {}
 FUNCTION_LINES_MAX = 70
@@ -161,3 +162,17 @@ def test_no_pickle_and_no_unfinished_marks():
         text = file.read_text("utf-8")
         assert "pickle" not in {name.split(".")[0] for name in imports(file)}, file
         assert not any(mark in text for mark in marks), file
+
+
+def test_the_top_level_holds_the_agreed_names_alone():
+    """A package that a tool downloaded was committed once."""
+    if not (ROOT / ".git").exists():
+        pytest.skip(f"{ROOT} is no clone, so what belongs to the repository is not known")
+    listed = subprocess.run(
+        ["git", "ls-tree", "--name-only", "HEAD"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout.split()
+    assert {name for name in listed if not name.startswith(".")} == TOP_LEVEL
