@@ -40,6 +40,12 @@ if TYPE_CHECKING:
 
     F64 = npt.NDArray[np.float64]
 
+CONFIRMED_S: Final = 0.25
+"""For how long a person must have been seen to count as hidden when they are seen no longer.
+
+What was seen for less was not a person: the arm as it comes into view, a bad image.  Trackers of
+many targets call this the confirmation of a track.
+"""
 AT_S: Final = tuple(k / 10.0 for k in range(1, 11))
 """For when a person is predicted, seconds after the stamp."""
 EDGE_M: Final = 0.4
@@ -57,7 +63,8 @@ class HumanTracking(Actor):
 
     A person is a component of the tight hull of 20 litres or more.  A person no longer seen
     has left if last seen at a side of the workspace; otherwise they are hidden, and may reappear
-    wherever they may have walked.
+    wherever they may have walked.  A component seen for less than :data:`CONFIRMED_S` was not a
+    person.
 
     Attributes:
         hidden_s_max: How long someone stays hidden before the track ends.
@@ -168,7 +175,9 @@ class HumanTracking(Actor):
         there = before.position_m[:2] if before.hidden else state[0][:2]
         inside_m = float(np.minimum(there - low, high - there).min())
         hidden_s = self._hidden_s(name, now_ns)
-        if (not before.hidden and inside_m < EDGE_M) or hidden_s > self.hidden_s_max:
+        brief = before.seen_ns - before.first_ns < CONFIRMED_S * 1e9
+        left = not before.hidden and inside_m < EDGE_M
+        if brief or left or hidden_s > self.hidden_s_max:
             self._hidden_since_ns.pop(name, None)
             lock[self.tracks].pop(name, None)
             lock[self.limbs].pop(name, None)

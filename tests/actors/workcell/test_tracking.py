@@ -168,6 +168,17 @@ def test_hidden_person_is_kept_and_found_again(cell):
     np.testing.assert_allclose(back["human/0"].position_m[:2], (0.8, 0.6), atol=0.1)
 
 
+def test_brief_sight_is_not_a_person(cell):
+    """What two sets show in the middle of the workspace, and no later one, leaves no track.
+
+    The arm does so as the cell starts: the first hull still has it, the later ones do not.
+    """
+    counts = [len(cell.see(*bodies)) for bodies in ([body((0.4, 0.0))], [body((0.4, 0.0))], [])]
+
+    assert counts == [1, 1, 0]
+    assert [cell.each(aspect) for aspect in (LIMBS, PREDICTION)] == [{}, {}]
+
+
 def test_person_who_leaves_is_gone(cell):
     """At a side of the workspace the track ends with all that was known; a new one is new."""
     for place in line((1.0, 0.0), (1.85, 0.0), 9):
@@ -185,7 +196,8 @@ def test_person_who_leaves_is_gone(cell):
 def test_hiding_ends(cell):
     """A track that was hidden for longer than allowed ends."""
     cell.actor.hidden_s_max = 0.5
-    cell.see(body((0.0, 0.0)))
+    for _ in range(5):
+        cell.see(body((0.0, 0.0)))
 
     counts = [len(cell.see()) for _ in range(9)]
 
