@@ -169,15 +169,41 @@ def deformed(
         half = np.abs(vertices_m[relative > 0.9, :2]).max(axis=0)
         centre = random.uniform(-0.5, 0.5, 2) * half
         sigma = random.uniform(0.014, 0.022)
-        distance2 = ((vertices_m[:, :2] - centre) ** 2).sum(axis=1)
-        depth = truth.amount / 1000.0 * np.exp(-distance2 / (2.0 * sigma**2))
-        sign = -1.0 if truth.kind == "dent" else 1.0
-        bent[:, 2] += sign * depth * np.clip((relative - 0.3) / 0.4, 0.0, 1.0)
+        sign = 1.0 if truth.kind == "dent" else -1.0
+        at, inwards = np.array([*centre, height]), np.array([0.0, 0.0, -1.0])
+        bent = pressed(vertices_m, at, inwards, depth_m=sign * truth.amount / 1e3, sigma_m=sigma)
     elif truth.kind == "crush":
         loss = truth.amount / 100.0
         bent[:, 2] *= 1.0 - loss
         bent[:, :2] *= 1.0 + 0.3 * loss * np.sin(np.pi * relative)[:, None]
     return bent
+
+
+def pressed(
+    vertices_m: npt.NDArray[np.float64],
+    at_m: npt.NDArray[np.float64],
+    inwards: npt.NDArray[np.float64],
+    *,
+    depth_m: float,
+    sigma_m: float,
+) -> npt.NDArray[np.float64]:
+    """Return the vertices of a body with a round dent; what lies opposite stays as it is.
+
+    Args:
+        vertices_m: (N, 3), metres.
+        at_m: (3,), middle of the dent.
+        inwards: (3,), unit vector into the body.
+        depth_m: How deep; negative for a bulge.
+        sigma_m: Radius of the dent, one sigma.
+    """
+    outwards = -(vertices_m @ inwards)
+    relative = (outwards - outwards.min()) / max(float(np.ptp(outwards)), 1e-9)
+    beside = vertices_m - at_m
+    distance2 = (beside**2).sum(axis=1) - (beside @ inwards) ** 2
+    depth = depth_m * np.exp(-distance2 / (2.0 * sigma_m**2))
+    return np.asarray(
+        vertices_m + (depth * np.clip((relative - 0.3) / 0.4, 0.0, 1.0))[:, None] * inwards
+    )
 
 
 def _draw_truth(random: np.random.Generator) -> Truth:

@@ -51,7 +51,7 @@ def product_mesh(name: str) -> tuple[Vertices, Triangles]:
 def box_mesh(size_m: tuple[float, float, float]) -> tuple[Vertices, Triangles]:
     """Return a box that stands on z = 0 around the origin; (8, 3) and (12, 3)."""
     corners = np.array([[x, y, z] for z in (0.0, 1.0) for y in (-0.5, 0.5) for x in (-0.5, 0.5)])
-    return _hull(corners * size_m)
+    return hull_mesh(corners * size_m)
 
 
 def _milk_carton() -> tuple[Vertices, Triangles]:
@@ -62,7 +62,7 @@ def _milk_carton() -> tuple[Vertices, Triangles]:
     ]
     ridge = [[length + gable, y, height / 2] for y in (-half_width, half_width)]
     corners = np.array(block + ridge) - [(length + gable) / 2, 0.0, 0.0]
-    return _subdivided(*_hull(corners), times=5)
+    return _subdivided(*hull_mesh(corners), times=5)
 
 
 def _meal_tray() -> tuple[Vertices, Triangles]:
@@ -123,8 +123,8 @@ def _turned(
     return vertices, np.concatenate(walls + caps).astype(np.int32)
 
 
-def _hull(corners_m: Vertices) -> tuple[Vertices, Triangles]:
-    """Return the convex hull of points with all triangles outwards."""
+def hull_mesh(corners_m: Vertices) -> tuple[Vertices, Triangles]:
+    """Return the convex hull of points: the points, and triangles outwards."""
     from scipy.spatial import ConvexHull
 
     hull = ConvexHull(corners_m)

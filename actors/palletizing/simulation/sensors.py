@@ -32,6 +32,15 @@ if TYPE_CHECKING:
 OVERHEAD_M: Final = 0.95
 """Height of the overhead sensor above the tray."""
 
+TRAY_M: Final = (0.90, 0.64)
+"""Length and width of the tray, along x and y of its frame."""
+
+RIM_M: Final = 0.008
+"""Height of its rim."""
+
+FLOOR_M: Final = -0.12
+"""Height of the floor, tray frame."""
+
 ORBIT_M: Final = 0.45
 """Distance of the eye-in-hand sensor from the product."""
 
@@ -67,8 +76,8 @@ class SimulatedTraySensor:
         return self._seen(visible, np.random.default_rng([self._seed, 1, stop]))
 
     def _seen(self, visible: Sequence[Package], random: np.random.Generator) -> DepthFrame:
-        meshes = [*_tray(), *(mesh for package in visible for mesh in package.meshes())]
-        return _capture(meshes, self._acquisition, self._acquisition, random)
+        meshes = [*tray_meshes(), *(mesh for package in visible for mesh in package.meshes())]
+        return captured(meshes, self._acquisition, self._acquisition, random)
 
 
 class SimulatedOrbitSensor:
@@ -95,8 +104,8 @@ class SimulatedOrbitSensor:
         reported = looking_at(centre + ORBIT_M * orbit_direction(view, views), centre)
         error = random.standard_normal(6) * np.repeat([ROBOT_SPREAD_RAD, ROBOT_SPREAD_M], 3)
         true = reported @ small_motion(error)
-        plate = _moved(box_mesh((0.6, 0.6, 0.02)), [0.0, 0.0, -0.02])
-        return _capture([mesh, plate], Acquisition(VGA, true), Acquisition(VGA, reported), random)
+        plate = shifted(box_mesh((0.6, 0.6, 0.02)), [0.0, 0.0, -0.02])
+        return captured([mesh, plate], Acquisition(VGA, true), Acquisition(VGA, reported), random)
 
 
 def orbit_direction(view: int, views: int) -> npt.NDArray[np.float64]:
@@ -132,30 +141,51 @@ def tray_sensor(packages: str = "16", seed: str = "1", products: str = "") -> Si
     )
 
 
-def _capture(
+def captured(
     meshes: Sequence[Mesh],
     true: Acquisition,
     reported: Acquisition,
     random: np.random.Generator,
 ) -> DepthFrame:
+    """Return what a sensor sees of meshes.
+
+    Args:
+        meshes: Everything in view, in the world of the poses.
+        true: From where it looks.
+        reported: From where it says it looks.
+        random: Source of the noise.
+    """
+    depth_m = true_depth(meshes, true)
+    return DepthFrame(sensed(depth_m, random), reported)
+
+
+def true_depth(meshes: Sequence[Mesh], acquisition: Acquisition) -> npt.NDArray[np.float32]:
+    """Return the depth image of meshes without noise, (H, W) float32, metres, NaN: nothing hit."""
     vertices = np.concatenate([mesh[0] for mesh in meshes])
     first = np.cumsum([0] + [len(mesh[0]) for mesh in meshes])
     triangles = np.concatenate(
         [mesh[1] + start for mesh, start in zip(meshes, first, strict=False)]
     )
-    scene: Any = ray_scene(moved(vertices, inverse(true.world_from_camera)), triangles)
-    return DepthFrame(sensed(cast(scene, directions(true.camera)), random), reported)
+    scene: Any = ray_scene(moved(vertices, inverse(acquisition.world_from_camera)), triangles)
+    return cast(scene, directions(acquisition.camera))
 
 
-def _tray() -> list[Mesh]:
-    """A sheet of metal with a rim of 8 mm, and the floor 120 mm below it."""
-    sheet = _moved(box_mesh((0.90, 0.64, 0.002)), [0.0, 0.0, -0.002])
-    floor = _moved(box_mesh((3.0, 3.0, 0.01)), [0.0, 0.0, -0.13])
-    long_side, short_side = box_mesh((0.90, 0.004, 0.010)), box_mesh((0.004, 0.64, 0.010))
-    rim = [_moved(long_side, [0.0, y, -0.002]) for y in (-0.32, 0.32)]
-    rim += [_moved(short_side, [x, 0.0, -0.002]) for x in (-0.45, 0.45)]
+def tray_meshes(rim_m: float = RIM_M) -> list[Mesh]:
+    """Return a sheet of metal with a rim, and the floor below it, in the tray frame.
+
+    Args:
+        rim_m: Height of the rim above the sheet.
+    """
+    length, width = TRAY_M
+    sheet = shifted(box_mesh((length, width, 0.002)), [0.0, 0.0, -0.002])
+    floor = shifted(box_mesh((3.0, 3.0, 0.01)), [0.0, 0.0, FLOOR_M - 0.01])
+    high = rim_m + 0.002
+    long_side, short_side = box_mesh((length, 0.004, high)), box_mesh((0.004, width, high))
+    rim = [shifted(long_side, [0.0, y, -0.002]) for y in (-width / 2.0, width / 2.0)]
+    rim += [shifted(short_side, [x, 0.0, -0.002]) for x in (-length / 2.0, length / 2.0)]
     return [sheet, floor, *rim]
 
 
-def _moved(mesh: Mesh, offset_m: Sequence[float]) -> Mesh:
+def shifted(mesh: Mesh, offset_m: Sequence[float]) -> Mesh:
+    """Return a mesh somewhere else."""
     return mesh[0] + np.asarray(offset_m), mesh[1]

@@ -1,0 +1,386 @@
+"""SIMULATED palletizing cell with physics (MuJoCo): packages slip, tilt and dent by themselves.
+
+    cell = PhysicalCell(12, seed=59)
+    cell.feed()                       # the next package, at the start of the belt
+    cell.run_belt()                   # until it interrupts the light barrier
+    arm = cell.arm                    # an `ArmController`
+    arm.start()
+    while ...:
+        arm.command(q)
+        cell.step()                   # one cycle of 4 ms
+    cell.truth()                      # where everything is, what became of it
+
+Rules a change must keep: a cell is a function of its packages, its seed and the commands it got in
+each cycle; `mj_forward` follows every pose that is set by hand, or bodies are where they were
+before; poses are read off bodies, never off geoms (MuJoCo moves the geom of a mesh to its centre).
+It is not for several threads: `cell_thread` runs it in one of its own.
+"""
+
+from __future__ import annotations
+
+import os
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from actors.geometry.poses import inverse, on_tray
+from actors.palletizing.controller import ControllerError
+from actors.palletizing.simulation.cell_arm import CYCLE_S, STEPS, SimulatedArm
+from actors.palletizing.simulation.cell_contacts import Contacts, GripWatch
+from actors.palletizing.simulation.cell_scene import (
+    BARRIER_M,
+    BELT_AHEAD_M,
+    BELT_HALF_M,
+    BELT_M_S,
+    BIN_HALF_M,
+    PACKAGES_GROUP,
+    CellLayout,
+    collision_corners,
+    scene_xml,
+)
+from actors.palletizing.simulation.cell_truth import (
+    CellTruth,
+    PackageTruth,
+    ShownCell,
+    ShownPackage,
+    place_of,
+)
+from actors.palletizing.simulation.physical_packages import (
+    Damage,
+    PhysicalPackage,
+    draw_packages,
+)
+from actors.palletizing.simulation.sensors import TRAY_M
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    import numpy.typing as npt
+
+    F64 = npt.NDArray[np.float64]
+
+FEED_X_M: Final = -0.75
+"""Where a package comes onto the belt, from the light barrier."""
+PICTURE_PX: Final = (960, 720)
+"""Greatest width and height of a rendered picture."""
+NEAR_M: Final = 0.3
+"""A package farther from the tool than this is not the one that was missed."""
+
+
+class PhysicalCell:
+    """The cell: arm, gripper, belt, tray, packages, and the truth about them.
+
+    Args:
+        packages: How many come, or which.
+        seed: Seed of the packages and of the wrist sensor.
+        layout: Where things stand.
+        epoch_ns: What the stamps of measurements begin with, nanoseconds since 1970.
+
+    Attributes:
+        arm: The controller of arm and gripper.
+        layout: Where things stand.
+        seed: As given.
+    """
+
+    def __init__(
+        self,
+        packages: int | Sequence[PhysicalPackage],
+        *,
+        seed: int,
+        layout: CellLayout | None = None,
+        epoch_ns: int = 0,
+    ) -> None:
+        if isinstance(packages, int):
+            packages = draw_packages(packages, seed=seed)
+        self.layout, self.seed = layout or CellLayout(), seed
+        self._packages, self._epoch_ns = tuple(packages), epoch_ns
+        self._mujoco = load_mujoco()
+        text = scene_xml(self._packages, self.layout, picture=PICTURE_PX)
+        self.model: Any = self._mujoco.MjModel.from_xml_string(text)
+        self.data: Any = self._mujoco.MjData(self.model)
+        model = self.model
+        names = [f"package{package.number}" for package in self._packages]
+        self._bodies = [int(model.body(name).id) for name in names]
+        self._geoms = [int(model.geom(name).id) for name in names]
+        self._package_of = np.full(model.ngeom, -1)
+        self._package_of[self._geoms] = np.arange(len(names))
+        self._pads = (int(model.geom("left").id), int(model.geom("right").id))
+        self._belt = int(model.geom("belt").id)
+        self._centres = [_centre(package.product) for package in self._packages]
+        self._damages = [Damage(package) for package in self._packages]
+        self._harmless_n = np.array(
+            [min(p.yield_n("top"), p.yield_n("front")) for p in self._packages]
+        )
+        self._pressed: set[int] = set()
+        self._present: list[bool] = [False] * len(names)
+        self._away: list[bool] = [False] * len(names)
+        self._fed = 0
+        self._cycles = 0
+        self._running = self._interrupted = False
+        self._grip = GripWatch()
+        self._finger_dof = int(model.joint("left").dofadr[0])
+        self._areas = self._areas_of_layout()
+        self.arm = SimulatedArm(model, self.data, self._mujoco.mj_mulM, seed=seed)
+        self._mujoco.mj_forward(model, self.data)
+        self.arm.measure(self._stamp_ns())
+
+    @property
+    def time_s(self) -> float:
+        """Simulated time since the beginning."""
+        return self._cycles * CYCLE_S
+
+    @property
+    def coming(self) -> int:
+        """How many packages have not come yet."""
+        return len(self._packages) - self._fed
+
+    def step(self, cycles: int = 1) -> None:
+        """Let the cell go on by cycles of control, 4 ms each."""
+        for _ in range(cycles):
+            self.arm.drive()
+            self._mujoco.mj_step(self.model, self.data, STEPS)
+            self._cycles += 1
+            self._drive_belt()
+            self._notice()
+            self.arm.measure(self._stamp_ns())
+
+    # The belt
+
+    def run_belt(self) -> None:
+        """Move the belt until a package interrupts the light barrier."""
+        self._running = True
+
+    def stop_belt(self) -> None:
+        """Stop the belt."""
+        self._running = False
+
+    def arrived(self) -> bool:
+        """Return whether a package stands in the light barrier, the belt at rest."""
+        return self._interrupted and not self._moving
+
+    def feed(self) -> int:
+        """Put the next package onto the start of the belt; return its number.
+
+        Raises:
+            ControllerError: No package is left, or one stands where it would come.
+        """
+        if not self.coming:
+            raise ControllerError(f"all {len(self._packages)} packages have come")
+        package = self._packages[self._fed]
+        beside = on_tray(FEED_X_M, package.belt_y_m, package.belt_yaw_rad)
+        pose = self.layout.base_from_belt @ beside
+        for number, present in enumerate(self._present):
+            where = self.data.xpos[self._bodies[number]]
+            if present and np.linalg.norm(where[:2] - pose[:2, 3]) < 0.22:
+                raise ControllerError(
+                    f"package {package.number} cannot come: package {number} stands at the start"
+                    " of the belt; run the belt first"
+                )
+        self.put(package.number, pose)
+        return package.number
+
+    def put(self, number: int, base_from_product: F64) -> None:
+        """Put a package somewhere, at rest: a person's hand, or the start of a test.
+
+        Args:
+            number: Which; if it has not come yet, those before it will not come any more.
+            base_from_product: (4, 4), metres.
+        """
+        address = int(self.model.jnt_qposadr[self.model.body_jntadr[self._bodies[number]]])
+        dof = int(self.model.jnt_dofadr[self.model.body_jntadr[self._bodies[number]]])
+        self._appear(number)
+        self.data.qpos[address : address + 3] = base_from_product[:3, 3]
+        turn = np.empty(4)
+        self._mujoco.mju_mat2Quat(turn, np.ascontiguousarray(base_from_product[:3, :3]).ravel())
+        self.data.qpos[address + 3 : address + 7] = turn
+        self.data.qvel[dof : dof + 6] = 0.0
+        self._mujoco.mj_forward(self.model, self.data)
+        self._fed = max(self._fed, number + 1)
+
+    def take_away(self, number: int) -> None:
+        """Take a package out of the cell: a person's hand, or a tray that is changed."""
+        if not self._present[number]:
+            return
+        body = self._bodies[number]
+        self._present[number], self._away[number] = False, True
+        self._touchable(number, yes=False)
+        address = int(self.model.jnt_qposadr[self.model.body_jntadr[body]])
+        dof = int(self.model.jnt_dofadr[self.model.body_jntadr[body]])
+        self.data.qpos[address : address + 7] = [0.0, 0.0, -5.0 - number, 1.0, 0.0, 0.0, 0.0]
+        self.data.qvel[dof : dof + 6] = 0.0
+        self._mujoco.mj_forward(self.model, self.data)
+        self._damages[number].calm()
+
+    def change_tray(self) -> list[int]:
+        """Take the tray away with all that is on it; return the numbers of those packages."""
+        taken = [truth.number for truth in self.truth().packages if truth.where == "tray"]
+        for number in taken:
+            self.take_away(number)
+        return taken
+
+    # The truth
+
+    def pose(self, number: int) -> F64:
+        """Return base_from_product of a package, (4, 4)."""
+        body = self._bodies[number]
+        pose = np.eye(4)
+        pose[:3, :3] = self.data.xmat[body].reshape(3, 3)
+        pose[:3, 3] = self.data.xpos[body]
+        return pose
+
+    def truth(self) -> CellTruth:
+        """Return what is true now."""
+        tray_from_base = inverse(self.layout.base_from_tray)
+        found = []
+        for number, package in enumerate(self._packages):
+            pose = self.pose(number)
+            kinds = [event.kind for event in self._grip.events if event.package == number]
+            found.append(
+                PackageTruth(
+                    number=number,
+                    product=package.product,
+                    where=self._where(number, pose),
+                    base_from_product=pose,
+                    tray_from_product=tray_from_base @ pose,
+                    tilt_rad=float(np.arccos(np.clip(pose[2, 2], -1.0, 1.0))),
+                    dents=tuple(self._damages[number].dents),
+                    missed=kinds.count("missed"),
+                    lost=kinds.count("lost"),
+                    friction=package.friction,
+                    mass_kg=package.mass_kg,
+                )
+            )
+        return CellTruth(self.time_s, tuple(found), tuple(self._grip.events))
+
+    def shown(self) -> ShownCell:
+        """Return what a sensor can see now."""
+        measured = self.arm.measured()
+        return ShownCell(
+            stamp_ns=self._stamp_ns(),
+            q=measured.q,
+            width_m=measured.width_m,
+            packages=tuple(
+                ShownPackage(
+                    number=number,
+                    product=package.product,
+                    base_from_product=self.pose(number),
+                    dents=tuple(self._damages[number].dents),
+                    pick_offset_m=package.pick_offset_m,
+                )
+                for number, package in enumerate(self._packages)
+                if self._present[number]
+            ),
+        )
+
+    # Inside
+
+    def _stamp_ns(self) -> int:
+        return self._epoch_ns + self._cycles * round(CYCLE_S * 1e9)
+
+    @property
+    def _moving(self) -> bool:
+        return bool(self.model.geom_surfacevel[self._belt].any())
+
+    def _areas_of_layout(self) -> dict[str, tuple[F64, F64]]:
+        layout = self.layout
+        tray, bin_half = np.array(TRAY_M) / 2.0, np.array(BIN_HALF_M)
+        length, across = BELT_HALF_M[0], BELT_HALF_M[1]
+        start = BELT_AHEAD_M - 2.0 * length
+        return {
+            "tray": (layout.base_from_tray, np.array([-tray, tray])),
+            "belt": (layout.base_from_belt, np.array([[start, -across], [BELT_AHEAD_M, across]])),
+            "bin": (layout.base_from_bin, np.array([-bin_half, bin_half])),
+        }
+
+    def _where(self, number: int, pose: F64) -> str:
+        if not self._present[number]:
+            return "away" if self._away[number] else "coming"
+        if number == self._grip.held:
+            return "held"
+        corners = collision_corners(self._packages[number].product)
+        lowest = float((corners @ pose[2, :3]).min() + pose[2, 3])
+        return place_of(lowest, pose[:3, :3] @ self._centres[number] + pose[:3, 3], self._areas)
+
+    def _appear(self, number: int) -> None:
+        self._touchable(number, yes=True)
+        self._present[number], self._away[number] = True, False
+
+    def _touchable(self, number: int, *, yes: bool) -> None:
+        """Let a package collide and fall, or float where nothing is."""
+        model, body, geom = self.model, self._bodies[number], self._geoms[number]
+        model.geom_contype[geom] = model.geom_conaffinity[geom] = int(yes)
+        # The broad phase asks the body, whose bits the compiler made of those of its geoms.
+        model.body_contype[body] = model.body_conaffinity[body] = int(yes)
+        model.body_gravcomp[body] = float(not yes)
+
+    def _drive_belt(self) -> None:
+        frame = self.layout.base_from_belt
+        across = BELT_HALF_M[1]
+        start = frame[:3, 3] - across * frame[:3, 1] + BARRIER_M * frame[:3, 2]
+        groups = np.zeros(6, np.uint8)
+        groups[PACKAGES_GROUP] = 1
+        seen = np.array([-1], np.int32)
+        hit_m = self._mujoco.mj_ray(self.model, self.data, start, frame[:3, 1], groups, 0, -1, seen)
+        self._interrupted = 0.0 <= hit_m <= 2.0 * across
+        moving = self._running and not self._interrupted
+        self.model.geom_surfacevel[self._belt, 0] = BELT_M_S if moving else 0.0
+
+    def _notice(self) -> None:
+        """Take the contacts of this cycle: what is deformed, what is in the gripper."""
+        contacts = Contacts(self.model, self.data, self._package_of)
+        # A package that is pressed by less than its yield force, all patches together, is safe.
+        on_each = contacts.on_packages(len(self._packages))
+        pressed = {int(number) for number in np.flatnonzero(on_each > self._harmless_n)}
+        for number in pressed:
+            pose = self.pose(number)
+            for patch in contacts.patches(self._geoms[number]):
+                self._damages[number].press(
+                    patch.by,
+                    patch.force_n,
+                    patch.area_m2,
+                    pose[:3, :3].T @ (patch.at_m - pose[:3, 3]),
+                    pose[:3, :3].T @ patch.inwards,
+                )
+        for number in self._pressed - pressed:
+            self._damages[number].calm()
+        self._pressed = pressed
+        self._grip.watch(
+            contacts.between(self._pads),
+            closing_cycles=self.arm.gripping_cycles if self.arm.gripping else 0,
+            rate_m_s=float(self.data.qvel[self._finger_dof]),
+            nearest=self._nearest,
+            now_s=self.time_s,
+        )
+
+    def _nearest(self) -> int:
+        tool = self.arm.measured().tcp[:3, 3]
+        distances = {
+            number: float(np.linalg.norm(self.pose(number)[:3, 3] - tool))
+            for number, present in enumerate(self._present)
+            if present
+        }
+        near = min(distances, key=lambda number: distances[number], default=-1)
+        return near if near >= 0 and distances[near] < NEAR_M else -1
+
+
+def _centre(product: str) -> F64:
+    """Return the middle of a product, (3,), product frame."""
+    corners = collision_corners(product)
+    return np.asarray((corners.max(axis=0) + corners.min(axis=0)) / 2.0)
+
+
+def load_mujoco() -> Any:
+    """Return MuJoCo's module, which draws by EGL unless the environment names something else.
+
+    Raises:
+        ControllerError: It is not installed.
+    """
+    os.environ.setdefault("MUJOCO_GL", "egl")
+    os.environ.setdefault("LP_NUM_THREADS", "1")
+    try:
+        import mujoco
+    except ImportError as error:
+        raise ControllerError(
+            f"the physical cell needs MuJoCo 4 ({error}); install enact-dist[workcell]"
+        ) from error
+    return mujoco

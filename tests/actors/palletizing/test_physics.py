@@ -1,0 +1,452 @@
+"""Claims about the simulated cell with physics, on exact cases."""
+
+import dataclasses
+import itertools
+
+import numpy as np
+import pytest
+
+from actors.geometry.kinematics import tool_poses
+from actors.geometry.poses import on_tray
+from actors.palletizing.controller import ControllerError, open_controller
+from actors.palletizing.simulation.cell_arm import CYCLE_S, DDDQ_MAX, DDQ_MAX
+from actors.palletizing.simulation.cell_scene import ARM, BELT_M_S, HOME_RAD
+from actors.palletizing.simulation.physical_packages import Spread, draw_packages
+from actors.palletizing.simulation.physics import PhysicalCell
+
+from .moves import Hand, above, carton
+
+pytest.importorskip("open3d", exc_type=ImportError)
+pytest.importorskip("mujoco", exc_type=ImportError)
+
+G = 9.81
+
+
+def on_belt(x_m=0.40, y_m=0.62, yaw_rad=0.0):
+    return on_tray(x_m, y_m, yaw_rad)
+
+
+# The gripper
+
+
+def test_held_firmly_does_not_slip():
+    """A carton of 0.5 kg held with 45 N stays in the hand at 6 rad/s², within a millimetre."""
+    hand = Hand([carton()])
+    hand.cell.put(0, on_belt())
+    hand.grasp(0.38, 0.62, 45.0)
+    before = hand.tool_from(0)
+
+    hand.swing(6.0, 0.8)
+
+    hand.cell.step(50)
+    assert hand.package(0).where == "held"
+    assert np.linalg.norm((hand.tool_from(0) - before)[:3, 3]) < 1e-3
+    assert [event.kind for event in hand.cell.truth().events] == ["grasped"]
+    assert hand.package(0).dents == ()
+
+
+def test_held_weakly_is_lost():
+    """With 5 N and a friction of 0.4 the same carton stays behind: 4 N do not carry 4.9 N."""
+    hand = Hand([carton()])
+    hand.cell.put(0, on_belt())
+
+    hand.grasp(0.38, 0.62, 5.0)
+
+    assert hand.package(0).where == "belt"
+    assert hand.package(0).lost == 1
+    assert [event.kind for event in hand.cell.truth().events] == ["grasped", "lost"]
+
+
+def test_closing_beside_a_package_misses_it():
+    """Fingers that close on nothing stop at their end, and the truth names what was near."""
+    hand = Hand([carton()])
+    hand.cell.put(0, on_belt())
+
+    hand.grasp(0.38, 0.44, 45.0)
+
+    assert hand.arm.measured().width_m == pytest.approx(0.055, abs=5e-4)
+    assert hand.package(0).missed == 1
+    assert hand.package(0).where == "belt"
+
+
+def test_opening_releases():
+    """What is put down and let go of is released, not lost, and lies where it was put."""
+    hand = Hand([carton()])
+    hand.cell.put(0, on_belt())
+    hand.grasp(0.38, 0.62, 45.0)
+    hand.to(above(0.50, 0.15, 0.20), 1.5)
+    hand.to(above(0.50, 0.15, 0.036), 1.0)
+
+    hand.arm.grip_width(0.12, 30.0)
+    hand.cell.step(150)
+
+    package = hand.package(0)
+    assert (package.where, package.lost, package.tipped) == ("tray", 0, False)
+    assert [event.kind for event in hand.cell.truth().events] == ["grasped", "released"]
+    np.testing.assert_allclose(package.base_from_product[:3, 3], [0.52, 0.15, 0.0], atol=3e-3)
+
+
+def test_width_and_force_are_measured():
+    """Closed on a carton, the gripper reports its width and the force that was asked for."""
+    hand = Hand([carton()])
+    hand.cell.put(0, on_belt())
+    open_m = hand.arm.measured().width_m
+
+    hand.grasp(0.38, 0.62, 45.0)
+
+    measured = hand.arm.measured()
+    assert open_m == pytest.approx(0.125, abs=5e-4)
+    assert measured.width_m == pytest.approx(0.095, abs=1e-3)
+    assert measured.grip_force_n == pytest.approx(45.0, abs=0.5)
+    assert abs(measured.width_rate_m_s) < 1e-3
+
+
+@pytest.mark.parametrize("weight_kg", [0.3, 0.7])
+def test_wrist_carries_the_weight(weight_kg):
+    """The wrist's force grows by the weight of what is lifted, along the tool's z, down."""
+    hand = Hand([carton(mass_kg=weight_kg)])
+    hand.cell.put(0, on_belt())
+    hand.to(above(0.40, 0.62, 0.25), 1.2)
+    hand.cell.step(50)
+    empty = np.mean([(hand.cell.step(), hand.arm.measured().wrench)[1] for _ in range(50)], axis=0)
+
+    hand.grasp(0.38, 0.62, 60.0)
+    hand.cell.step(100)
+    full = np.mean([(hand.cell.step(), hand.arm.measured().wrench)[1] for _ in range(50)], axis=0)
+
+    np.testing.assert_allclose((full - empty)[:3], [0.0, 0.0, weight_kg * G], atol=0.1)
+
+
+# Damage
+
+
+def test_press_dents_above_the_yield_only():
+    """A finger that presses on the top with 20 N leaves nothing; the dent of 100 N is as ruled."""
+    hand = Hand([carton()])
+    hand.cell.put(0, on_belt())
+    hand.arm.grip_width(0.056, 50.0)
+    hand.to(above(0.40, 0.62, 0.092), 1.5)
+    hand.cell.step(25)
+    tare_n = hand.arm.measured().wrench[2]
+
+    def press_until(force_n):
+        z_m = tool_poses(ARM, hand.q)[0, 2, 3]
+        while tare_n - hand.arm.measured().wrench[2] < force_n:
+            z_m -= 1e-4
+            hand.to(above(0.40, 0.62, z_m), 0.02)
+
+    press_until(20.0)
+    light = hand.package(0).dents
+    press_until(100.0)
+    dents = hand.package(0).dents
+
+    assert light == ()
+    assert {dent.face for dent in dents} == {"top"}
+    assert {dent.by for dent in dents} <= {"left", "right"}
+    deepest = max(dents, key=lambda dent: dent.depth_mm)
+    assert deepest.depth_mm == pytest.approx((deepest.force_n - 40.0) / 5.0)
+    assert 50.0 < deepest.force_n < 110.0
+    assert deepest.at_m[2] == pytest.approx(0.07, abs=2e-3)
+
+
+# Belt
+
+
+def test_belt_reaches_its_speed_and_stops_without_drift():
+    """A package moves with 0.25 m/s, stops in the light barrier and stays there, unturned."""
+    cell = PhysicalCell([carton()], seed=1)
+    cell.feed()
+    cell.run_belt()
+    cell.step(150)
+
+    along = cell.pose(0)[0, 3]
+    cell.step(100)
+    speed = (cell.pose(0)[0, 3] - along) / (100 * CYCLE_S)
+    while not cell.arrived():
+        cell.step()
+        assert cell.time_s < 6.0
+    cell.step(100)
+    stopped = cell.pose(0)
+    cell.step(250)
+
+    assert speed == pytest.approx(BELT_M_S, abs=0.002)
+    assert np.abs(cell.pose(0) - stopped).max() < 1e-5
+    head = (cell.pose(0) @ [0.1, 0.0, 0.0, 1.0])[0]
+    assert head == pytest.approx(0.45, abs=0.03)
+
+
+def test_belt_stopped_by_hand_stops():
+    """A belt that is stopped has nothing in its light barrier, and goes on when it is run."""
+    cell = PhysicalCell([carton()], seed=1)
+    cell.feed()
+    cell.run_belt()
+    cell.step(100)
+
+    cell.stop_belt()
+    cell.step(100)
+    along = cell.pose(0)[0, 3]
+    cell.step(50)
+    stood = cell.pose(0)[0, 3]
+    cell.run_belt()
+    cell.step(50)
+
+    assert not cell.arrived()
+    assert stood == pytest.approx(along, abs=1e-5)
+    assert cell.pose(0)[0, 3] > stood + 0.02
+
+
+def test_packages_come_one_after_the_other():
+    """No package comes onto another, and none after the last; both are one line."""
+    cell = PhysicalCell(2, seed=1)
+    assert cell.feed() == 0
+
+    with pytest.raises(ControllerError, match="package 1 cannot come: package 0 stands"):
+        cell.feed()
+    cell.run_belt()
+    cell.step(300)
+    assert cell.feed() == 1
+    with pytest.raises(ControllerError, match="all 2 packages have come"):
+        cell.feed()
+
+
+# The truth
+
+
+def test_pose_is_that_of_the_product_at_once():
+    """A pose set by hand is true before the next step, though MuJoCo moves a mesh's geom."""
+    cell = PhysicalCell([carton()], seed=1)
+    pose = on_belt(0.3, 0.6, 0.4)
+
+    cell.put(0, pose)
+
+    truth = cell.truth().packages[0]
+    np.testing.assert_allclose(truth.base_from_product, pose, atol=1e-12)
+    geom = cell.data.geom("package0").xpos
+    assert np.linalg.norm(geom - pose[:3, 3]) > 0.03, "the geom is not where the product frame is"
+
+
+def test_truth_says_where_a_package_is():
+    """Every place has its name; what leans by more than 5° has tipped."""
+    cell = PhysicalCell([carton(n) for n in range(6)], seed=1)
+    layout = cell.layout
+    tilted = np.eye(4)
+    tilted[:3, :3] = [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]
+    tilted[:3, 3] = 0.0, 0.0, 0.049
+
+    cell.put(0, layout.base_from_tray @ on_tray(-0.1, 0.0, 0.0))
+    cell.put(1, on_belt())
+    cell.put(2, layout.base_from_bin)
+    cell.put(3, layout.base_from_tray @ on_tray(0.2, 0.1, 0.0) @ tilted)
+    beside = on_tray(-0.6, -0.5, 0.0)
+    beside[2, 3] = -0.12
+    cell.put(4, beside)
+    cell.step(100)
+
+    packages = cell.truth().packages
+    assert [package.where for package in packages] == [
+        "tray", "belt", "bin", "tray", "beside", "coming",
+    ]  # fmt: skip
+    assert [package.tipped for package in packages] == [False, False, False, True, False, False]
+    shift_m, turn_rad = packages[0].beside_plan(on_tray(-0.1, 0.003, 0.02))
+    assert shift_m == pytest.approx(0.003, abs=2e-4)
+    assert turn_rad == pytest.approx(0.02, abs=1e-3)
+    assert cell.change_tray() == [0, 3]
+    assert [package.where for package in cell.truth().packages[:4]] == [
+        "away",
+        "belt",
+        "bin",
+        "away",
+    ]
+
+
+def test_nothing_moves_that_nothing_moves():
+    """Packages at rest on the tray stay within 50 µm for two seconds, those to come in place."""
+    cell = PhysicalCell(4, seed=5)
+    for number, x in enumerate((-0.3, 0.0, 0.3)):
+        cell.put(number, cell.layout.base_from_tray @ on_tray(x, 0.1, 0.3))
+    cell.step(100)
+    before = [cell.pose(number) for number in range(3)]
+
+    cell.step(500)
+
+    for number in range(3):
+        assert np.abs(cell.pose(number) - before[number])[:3, 3].max() < 5e-5
+    assert [package.dents for package in cell.truth().packages] == [()] * 4
+
+
+def test_same_commands_give_the_same_truth():
+    """Two cells of one seed that get the same commands agree in every bit; another seed differs."""
+
+    def run(seed):
+        cell = PhysicalCell(2, seed=seed)
+        cell.feed()
+        cell.run_belt()
+        cell.arm.start()
+        for cycle in range(300):
+            cell.arm.command(np.array(HOME_RAD) + 0.1 * np.sin(cycle * CYCLE_S * 4.0))
+            if cycle == 150:
+                cell.arm.grip_force(30.0)
+            cell.step()
+        return cell.pose(0), cell.arm.measured()
+
+    (pose, measured), (again, measured_again), (other, _) = run(3), run(3), run(4)
+
+    np.testing.assert_array_equal(pose, again)
+    for field in dataclasses.fields(measured):
+        one, two = getattr(measured, field.name), getattr(measured_again, field.name)
+        np.testing.assert_array_equal(one, two)
+    assert not np.array_equal(pose, other)
+
+
+def test_packages_are_a_function_of_the_seed():
+    """They keep the spread, and a longer sequence begins with the shorter one."""
+    spread = Spread()
+
+    few, many = draw_packages(3, seed=9), draw_packages(200, seed=9)
+
+    assert few == many[:3]
+    assert few != draw_packages(3, seed=10)
+    friction = [package.friction for package in many]
+    assert 0.2 <= min(friction) < 0.25
+    assert 0.55 < max(friction) <= 0.6
+    masses = [package.mass_kg for package in many if package.product == "milk_carton"]
+    assert 0.35 <= min(masses) < 0.38
+    assert 0.62 < max(masses) <= 0.65
+    picked = np.std([package.pick_offset_m for package in many])
+    assert picked == pytest.approx(spread.pick_m, rel=0.15)
+    with pytest.raises(ValueError, match="no product 'brick'; there are milk_carton"):
+        draw_packages(1, seed=1, products=["brick"])
+
+
+# The controller
+
+
+def test_commands_are_limited():
+    """A position far away is reached within the limits of speed, acceleration and jerk."""
+    cell = PhysicalCell([carton()], seed=1)
+    cell.arm.start()
+    goal = np.add(HOME_RAD, [-1.2, 0.3, 0.4, 0.3, -0.5, -0.4, 1.0])
+    told = []
+
+    for _ in range(600):
+        cell.arm.command(goal)
+        cell.step()
+        limiter = cell.arm.limiter
+        told.append((limiter.q_rad, limiter.dq_rad_s, limiter.ddq_rad_s2))
+
+    q, dq, ddq = (np.array(values) for values in zip(*told, strict=True))
+    assert (np.abs(dq).max(0) <= ARM.dq_max + 1e-9).all()
+    assert (np.abs(ddq).max(0) <= DDQ_MAX + 1e-9).all()
+    assert (np.abs(np.diff(ddq, axis=0)).max(0) <= DDDQ_MAX * CYCLE_S + 1e-6).all()
+    np.testing.assert_allclose(q[-1], goal, atol=1e-6)
+    measured = cell.arm.measured()
+    np.testing.assert_allclose(measured.q, goal, atol=2e-4)
+    np.testing.assert_allclose(measured.tcp, tool_poses(ARM, measured.q)[0], atol=1e-9)
+
+
+def test_smooth_commands_are_followed():
+    """What keeps the limits is followed within 2 mrad, with no more acceleration than it has."""
+    cell = PhysicalCell([carton()], seed=1)
+    cell.arm.start()
+    errors, accelerations = [], []
+
+    for cycle in range(500):
+        goal = np.array(HOME_RAD) + 0.2 * (1.0 - np.cos(3.0 * cycle * CYCLE_S))
+        cell.arm.command(goal)
+        cell.step()
+        errors.append(np.abs(cell.arm.measured().q - goal).max())
+        accelerations.append(np.abs(cell.arm.limiter.ddq_rad_s2).max())
+
+    assert max(errors) < 4e-3
+    assert max(accelerations[20:]) < 1.3 * 0.2 * 3.0**2 + 0.5
+
+
+def test_arm_without_commands_comes_to_rest():
+    """An arm whose commands stay away in the midst of a motion stops by itself, near by."""
+    cell = PhysicalCell([carton()], seed=1)
+    cell.arm.start()
+    q = np.array(HOME_RAD)
+    for _ in range(100):
+        q = q + np.array([0.8 * CYCLE_S, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+        cell.arm.command(q)
+        cell.step()
+
+    cell.step(200)
+
+    measured = cell.arm.measured()
+    assert np.abs(measured.dq).max() < 2e-3
+    assert np.abs(measured.q - q).max() < 0.02
+
+
+def test_brake_stops_and_holds():
+    """A braked arm stops at once, keeps what it holds, and takes commands after a start only."""
+    hand = Hand([carton()])
+    hand.cell.put(0, on_belt())
+    hand.grasp(0.38, 0.62, 45.0)
+    q = hand.q
+    for cycle in range(100):
+        speed = min(0.8, 4.0 * cycle * CYCLE_S)
+        q = q - np.array([speed * CYCLE_S, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+        hand.send(q)
+
+    hand.arm.brake()
+    hand.cell.step(round(0.8 / DDQ_MAX[0] / CYCLE_S) + 10)
+    told = hand.arm.limiter.dq_rad_s
+    hand.cell.step(100)
+
+    measured = hand.arm.measured()
+    assert np.abs(told).max() < 1e-9
+    assert np.abs(measured.dq).max() < 5e-3
+    assert abs(measured.q[0] - q[0]) < 0.8**2 / 2.0 / DDQ_MAX[0] + 0.02
+    assert hand.package(0).where == "held"
+    with pytest.raises(ControllerError, match=r"braked .* call start\(\) first"):
+        hand.arm.command(q)
+    hand.arm.start()
+    hand.arm.command(measured.q)
+    hand.cell.step(50)
+    assert hand.package(0).where == "held"
+
+
+def test_impossible_commands_are_one_line():
+    """A position out of range, a width or a force that the gripper has not: named with its limit."""
+    arm = PhysicalCell([carton()], seed=1).arm
+    arm.start()
+
+    with pytest.raises(ControllerError, match=r"joint 2 at 143.2°; its range is ±120°"):
+        arm.command(np.array([0.0, 2.5, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    with pytest.raises(ControllerError, match="seven finite numbers"):
+        arm.command(np.array([0.0, np.nan, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    with pytest.raises(ControllerError, match=r"asked for 140.0 mm .* opens from 55 to 125 mm"):
+        arm.grip_width(0.14, 20.0)
+    with pytest.raises(
+        ControllerError, match="grip of 300 N; this gripper presses with up to 100 N"
+    ):
+        arm.grip_force(300.0)
+
+
+@pytest.mark.parametrize(
+    ("address", "text"),
+    [
+        ("actors.palletizing", "is no controller; write MODULE:FUNCTION"),
+        ("actors.palletizing.nowhere:arm", "no controller at"),
+        ("actors.palletizing.controller:ControllerError?hue=3", "refuses its values"),
+    ],
+)
+def test_wrong_addresses_are_one_line(address, text):
+    """An address that leads nowhere says why."""
+    with pytest.raises(ValueError, match=text) as caught:
+        open_controller(address)
+    assert "\n" not in str(caught.value)
+
+
+def test_stamps_are_simulated_time():
+    """Each cycle's measurement is 4 ms younger than the one before, from the epoch on."""
+    cell = PhysicalCell([carton()], seed=1, epoch_ns=7_000_000_000)
+    stamps = [cell.arm.measured().stamp_ns]
+
+    for _ in range(5):
+        cell.step()
+        stamps.append(cell.arm.measured().stamp_ns)
+
+    assert stamps[0] == 7_000_000_000
+    assert {late - early for early, late in itertools.pairwise(stamps)} == {4_000_000}
