@@ -1,8 +1,11 @@
 """Products trained once per test run, and a simulated tray."""
 
+import os
 from functools import lru_cache
 
 import pytest
+
+os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo chooses what draws when it is imported
 
 
 @pytest.fixture(scope="session")

@@ -1,0 +1,254 @@
+"""SIMULATED depth sensors that see what physics did: ray casting of the cell's present poses.
+
+One looks down at the tray, one at the end of the belt.  Packages are drawn with their dents, arm
+and gripper where they are: a sensor that shall see all of the tray has the arm moved aside first.
+
+Rules a change must keep: an image depends on the seed, the simulated time and on what it shows;
+the sensor of the tray is that of the list-driven simulator, so that perception knows no difference.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import TYPE_CHECKING, Final, Protocol
+
+import numpy as np
+
+from actors.geometry.kinematics import link_poses
+from actors.geometry.poses import inverse, looking_at, moved
+from actors.geometry.shapes import VGA, Acquisition, DepthFrame
+from actors.palletizing.simulation.cell_scene import (
+    ARM,
+    BELT_AHEAD_M,
+    BELT_HALF_M,
+    BIN_HALF_M,
+    BIN_WALL_M,
+    HAND_HALF_M,
+    PAD_CENTRE_M,
+    PAD_HALF_M,
+    CellLayout,
+)
+from actors.palletizing.simulation.physical_packages import dented_mesh
+from actors.palletizing.simulation.products import box_mesh, hull_mesh
+from actors.palletizing.simulation.sensors import (
+    OVERHEAD_M,
+    captured,
+    shifted,
+    tray_meshes,
+    true_depth,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    import numpy.typing as npt
+
+    from actors.palletizing.simulation.cell_truth import ShownCell, ShownPackage
+
+    F64 = npt.NDArray[np.float64]
+    Mesh = tuple[F64, npt.NDArray[np.int32]]
+
+BELT_OVERHEAD_M: Final = 0.80
+"""Height of the belt's sensor above the belt."""
+BELT_LOOKS_AT_M: Final = -0.10
+"""Where it looks, along the belt from the light barrier: at the middle of what has arrived."""
+
+
+class BeltSensor(Protocol):
+    """A depth sensor fixed above the end of the belt; the world of its poses is the belt frame.
+
+    A real one implements the same two methods, as for the tray.
+    """
+
+    def capture_empty(self) -> DepthFrame:
+        """Return an image of the belt with nothing on it."""
+        ...
+
+    def capture(self, stop: int) -> DepthFrame:
+        """Return an image of the belt, a package in the light barrier.
+
+        Args:
+            stop: Number of the package, from 0; a real sensor ignores it.
+        """
+        ...
+
+
+class _FixedSensor:
+    """A depth sensor at a fixed place over the physical cell."""
+
+    def __init__(
+        self, shown: Callable[[], ShownCell], layout: CellLayout, world: F64, true: F64, seed: int
+    ) -> None:
+        self._shown, self._layout = shown, layout
+        self._world_from_base = inverse(world)
+        self._true = Acquisition(VGA, true)
+        self._seed = seed
+
+    def capture_empty(self) -> DepthFrame:
+        """Return an image with nothing but what stands still."""
+        meshes = _in(self._world_from_base, still_meshes(self._layout))
+        return captured(meshes, self._true, self._true, np.random.default_rng([self._seed, 0]))
+
+    def capture(self, stop: int) -> DepthFrame:
+        """Return an image of what is there now.
+
+        Args:
+            stop: Ignored, as by a real sensor.
+        """
+        shown = self._shown()
+        random = np.random.default_rng([self._seed, 1, shown.stamp_ns])
+        return captured(self._meshes(shown), self._true, self._reported(shown), random)
+
+    def true_depth(self) -> npt.NDArray[np.float32]:
+        """Return the present image without noise, (H, W) float32, metres, NaN where nothing is."""
+        return true_depth(self._meshes(self._shown()), self._true)
+
+    @property
+    def acquisition(self) -> Acquisition:
+        """From where it really looks."""
+        return self._true
+
+    def _meshes(self, shown: ShownCell) -> list[Mesh]:
+        return _in(
+            self._world_from_base,
+            [*still_meshes(self._layout), *package_meshes(shown), *arm_meshes(shown)],
+        )
+
+    def _reported(self, shown: ShownCell) -> Acquisition:
+        return self._true
+
+
+class PhysicalTraySensor(_FixedSensor):
+    """Depth sensor 0.95 m above the tray of the physical cell; a `TraySensor`.
+
+    Args:
+        shown: Returns what moves in the cell, as it is now.
+        layout: Where things stand.
+        seed: Seed of the noise.
+    """
+
+    def __init__(
+        self, shown: Callable[[], ShownCell], *, seed: int, layout: CellLayout | None = None
+    ) -> None:
+        layout = layout or CellLayout()
+        true = looking_at(np.array([0.0, 0.0, OVERHEAD_M]), np.zeros(3))
+        super().__init__(shown, layout, layout.base_from_tray, true, seed)
+
+
+class PhysicalBeltSensor(_FixedSensor):
+    """Depth sensor 0.80 m above the end of the belt; a `BeltSensor`.
+
+    Its calibration to the robot is off by a little, and differently for each package that lies in
+    the light barrier: so the robot grasps beside where it means to, as it does in a plant.
+
+    Args:
+        shown: Returns what moves in the cell, as it is now.
+        layout: Where things stand.
+        seed: Seed of the noise.
+    """
+
+    def __init__(
+        self, shown: Callable[[], ShownCell], *, seed: int, layout: CellLayout | None = None
+    ) -> None:
+        layout = layout or CellLayout()
+        target = np.array([BELT_LOOKS_AT_M, 0.0, 0.0])
+        true = looking_at(np.array([BELT_LOOKS_AT_M, 0.0, BELT_OVERHEAD_M]), target)
+        super().__init__(shown, layout, layout.base_from_belt, true, seed + 1_000_003)
+
+    def _reported(self, shown: ShownCell) -> Acquisition:
+        package = self._arrived(shown)
+        if package is None:
+            return self._true
+        world_from_camera = np.array(self._true.world_from_camera)
+        offset = np.array([*package.pick_offset_m, 0.0])
+        world_from_camera[:3, 3] += self._world_from_base[:3, :3] @ offset
+        return Acquisition(self._true.camera, world_from_camera)
+
+    def _arrived(self, shown: ShownCell) -> ShownPackage | None:
+        """Return the package nearest to where arrived ones lie, if there is one."""
+        distances = {}
+        for package in shown.packages:
+            x, y, _ = (self._world_from_base @ package.base_from_product)[:3, 3]
+            distances[package.number] = float(np.hypot(x - BELT_LOOKS_AT_M, y))
+        nearest = min(shown.packages, key=lambda package: distances[package.number], default=None)
+        near = nearest is not None and distances[nearest.number] < BELT_HALF_M[1] + 0.1
+        return nearest if near else None
+
+
+def still_meshes(layout: CellLayout) -> list[Mesh]:
+    """Return what stands still: tray, floor, belt and reject bin, in the base frame."""
+    length, across, thick = (2.0 * half for half in BELT_HALF_M)
+    middle = BELT_AHEAD_M - BELT_HALF_M[0]
+    belt = shifted(box_mesh((length, across, thick)), [middle, 0.0, -thick])
+    x, y = BIN_HALF_M
+    rejects = [shifted(box_mesh((2.0 * x, 2.0 * y, 0.02)), [0.0, 0.0, -0.02])]
+    long_side, short_side = (
+        box_mesh((2.0 * x, 0.008, BIN_WALL_M)),
+        box_mesh((0.008, 2.0 * y, BIN_WALL_M)),
+    )
+    rejects += [shifted(long_side, [0.0, side * y, 0.0]) for side in (-1.0, 1.0)]
+    rejects += [shifted(short_side, [side * x, 0.0, 0.0]) for side in (-1.0, 1.0)]
+    return [
+        *_in(layout.base_from_tray, tray_meshes(layout.rim_m)),
+        *_in(layout.base_from_belt, [belt]),
+        *_in(layout.base_from_bin, rejects),
+    ]
+
+
+def package_meshes(shown: ShownCell) -> list[Mesh]:
+    """Return the packages as they are, dents included, in the base frame."""
+    return [
+        mesh
+        for package in shown.packages
+        for mesh in _in(package.base_from_product, [dented_mesh(package.product, package.dents)])
+    ]
+
+
+def arm_meshes(shown: ShownCell) -> list[Mesh]:
+    """Return arm and gripper where they are, in the base frame."""
+    frames = np.concatenate([ARM.base[None], link_poses(ARM, shown.q)[0]])
+    meshes = []
+    for first, _, second, _, radius in ARM.capsules:
+        start, end = frames[int(first), :3, 3], frames[int(second), :3, 3]
+        length = float(np.linalg.norm(end - start))
+        if length < 1e-9:
+            continue  # the tool: the hand is drawn as what it is
+        if second == len(ARM.dh):
+            length -= HAND_HALF_M[2]
+        pose = np.array(frames[int(second)])
+        # The link ends in the frame's origin, along the axis of the frame before.
+        pose[:3, :3] = _frame_along((end - start) / np.linalg.norm(end - start))
+        pose[:3, 3] = start
+        meshes += _in(pose, [_capsule(round(length, 9), float(radius))])
+    hand = box_mesh((2 * HAND_HALF_M[0], 2 * HAND_HALF_M[1], 2 * HAND_HALF_M[2]))
+    pads = []
+    for side in (-1.0, 1.0):
+        pad = box_mesh((2 * PAD_HALF_M[0], 2 * PAD_HALF_M[1], 2 * PAD_HALF_M[2]))
+        beside = side * (shown.width_m / 2.0 + PAD_HALF_M[1])
+        pads.append(shifted(pad, [0.0, beside, PAD_CENTRE_M - PAD_HALF_M[2]]))
+    return [*meshes, *_in(frames[-1], [hand, *pads])]
+
+
+def _frame_along(z: F64) -> F64:
+    """Return a right-handed turn, (3, 3), whose z axis is a unit vector."""
+    x = np.cross(z, [1.0, 0.0, 0.0] if abs(z[0]) < 0.7 else [0.0, 1.0, 0.0])
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z], axis=1)
+
+
+@lru_cache(maxsize=16)
+def _capsule(length_m: float, radius_m: float) -> Mesh:
+    """Return a capsule along z from the origin, within a hundredth of its radius."""
+    around = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)
+    rise = np.linspace(0.0, np.pi / 2.0, 6)[:, None]
+    ring = np.stack(
+        [np.cos(rise) * np.cos(around), np.cos(rise) * np.sin(around), np.sin(rise) + 0 * around],
+        axis=-1,
+    )
+    cap = np.unique(ring.reshape(-1, 3).round(9), axis=0) * radius_m
+    far = cap + np.array([0.0, 0.0, length_m])
+    return hull_mesh(np.concatenate([far, cap * [1.0, 1.0, -1.0]]))
+
+
+def _in(b_from_a: F64, meshes: list[Mesh]) -> list[Mesh]:
+    return [(moved(vertices, b_from_a), triangles) for vertices, triangles in meshes]
