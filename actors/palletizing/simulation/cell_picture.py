@@ -50,11 +50,19 @@ class CellPictures:
 
     def draw(self) -> npt.NDArray[np.uint8]:
         """Return the cell as it is now, (height, width, 3) uint8, red first; dents are marked."""
+        self.look()
+        return self.drawn()
+
+    def look(self) -> None:
+        """Take what the cell shows now; quick, for a cell that must not stand still for long."""
         self._renderer.update_scene(self._cell.data, "cell")
         for truth in self._cell.truth().packages:
             for dent in truth.dents:
                 pose = truth.base_from_product
                 self._mark(pose[:3, :3] @ dent.at_m + pose[:3, 3], dent.depth_mm)
+
+    def drawn(self) -> npt.NDArray[np.uint8]:
+        """Return the picture of the last look; the cell may go on meanwhile."""
         return np.array(self._renderer.render())
 
     def close(self) -> None:

@@ -1,0 +1,210 @@
+"""The physical cell in another process: what actors open of it, by address.
+
+==================================  ================================================================
+`…remote_cell:arm?port=7460`        an `ArmController`, for `open_controller`
+`…remote_cell:belt?port=7460`       a `BeltController`, for `open_controller`
+`…remote_cell:tray_sensor?port=…`   a `TraySensor`, for `open_sensor`
+`…remote_cell:belt_sensor?port=…`   a `BeltSensor`, for `open_sensor`
+==================================  ================================================================
+
+Rule a change must keep: one request at a time over a connection; a connection that was lost is made
+anew by the next request, but whoever commanded the arm has to start it again.
+"""
+
+from __future__ import annotations
+
+import socket
+import threading
+from contextlib import closing
+from typing import TYPE_CHECKING, Any, Final
+
+from actors.palletizing.controller import ControllerError, Measured
+from actors.palletizing.simulation.cell_arm import CYCLE_S
+from actors.palletizing.simulation.cell_messages import receive, send
+from actors.palletizing.simulation.physical_sensors import PhysicalBeltSensor, PhysicalTraySensor
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    import numpy as np
+    import numpy.typing as npt
+
+    from actors.palletizing.simulation.cell_truth import CellTruth, ShownCell
+
+    F64 = npt.NDArray[np.float64]
+
+ANSWER_S: Final = 10.0
+"""A cell that does not answer for so long is gone; drawing the first picture takes 2 s."""
+
+
+class RemoteCell:
+    """A connection to a cell's process; opened by the first request.
+
+    Args:
+        port: Where it listens.
+        host: On which host.
+    """
+
+    def __init__(self, port: int, host: str = "127.0.0.1") -> None:
+        self._address = (host, port)
+        self._connection: socket.socket | None = None
+        self._lock = threading.Lock()
+
+    def ask(self, name: str, *arguments: Any) -> Any:
+        """Return the cell's answer to a request.
+
+        Raises:
+            ControllerError: The cell cannot be reached, or it refuses.
+        """
+        with self._lock:
+            try:
+                if self._connection is None:
+                    self._connection = socket.create_connection(self._address, timeout=ANSWER_S)
+                    self._connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                send(self._connection, [name, *arguments])
+                answer = receive(self._connection)
+            except (OSError, EOFError, ControllerError) as error:
+                self._drop()
+                host, port = self._address
+                raise ControllerError(
+                    f"asked the cell at {host}:{port} for {name}: {error}; run"
+                    " actors.palletizing.simulation.cell_server with this port"
+                ) from error
+        if "error" in answer:
+            raise ControllerError(answer["error"])
+        return answer["value"]
+
+    def close(self) -> None:
+        """Close the connection; an arm that it commanded brakes."""
+        with self._lock:
+            self._drop()
+
+    def truth(self) -> CellTruth:
+        """Return what is true now."""
+        found: CellTruth = self.ask("truth")
+        return found
+
+    def shown(self) -> ShownCell:
+        """Return what a sensor can see now."""
+        found: ShownCell = self.ask("shown")
+        return found
+
+    def picture(self, width: int = 640, height: int = 480) -> npt.NDArray[np.uint8]:
+        """Return the cell as a person would see it, (height, width, 3) uint8, red first.
+
+        Raises:
+            ControllerError: The cell's process cannot draw; the text says why.
+        """
+        found: npt.NDArray[np.uint8] = self.ask("picture", width, height)
+        return found
+
+    def _drop(self) -> None:
+        if self._connection is not None:
+            self._connection.close()
+            self._connection = None
+
+
+class RemoteArm:
+    """Arm and gripper of a cell in another process; an `ArmController`."""
+
+    def __init__(self, cell: RemoteCell) -> None:
+        self._cell = cell
+
+    @property
+    def cycle_s(self) -> float:
+        """Period of control."""
+        return CYCLE_S
+
+    def start(self) -> None:
+        """Take commands of this connection from now on, and of no other."""
+        self._cell.ask("start")
+
+    def measured(self) -> Measured:
+        """Return the newest state."""
+        found: Measured = self._cell.ask("measured")
+        return found
+
+    def command(self, q: F64) -> None:
+        """Command where the joints are to be one cycle from now."""
+        self._cell.ask("command", q)
+
+    def grip_width(self, width_m: float, force_limit_n: float) -> None:
+        """Move the fingers to a distance."""
+        self._cell.ask("grip_width", float(width_m), float(force_limit_n))
+
+    def grip_force(self, force_n: float) -> None:
+        """Close the fingers until they press with a force."""
+        self._cell.ask("grip_force", float(force_n))
+
+    def brake(self) -> None:
+        """Stop the arm; the gripper goes on holding."""
+        self._cell.ask("brake")
+
+    def close(self) -> None:
+        """Disconnect; the arm brakes."""
+        self._cell.close()
+
+
+class RemoteBelt:
+    """Belt and tray of a cell in another process; a `BeltController`."""
+
+    def __init__(self, cell: RemoteCell) -> None:
+        self._cell = cell
+
+    def run_belt(self) -> None:
+        """Move the belt until a package interrupts the light barrier."""
+        self._cell.ask("run_belt")
+
+    def stop_belt(self) -> None:
+        """Stop the belt."""
+        self._cell.ask("stop_belt")
+
+    def arrived(self) -> bool:
+        """Return whether a package stands in the light barrier, the belt at rest."""
+        return bool(self._cell.ask("arrived"))
+
+    def coming(self) -> int:
+        """Return how many packages have not come yet."""
+        return int(self._cell.ask("coming"))
+
+    def feed(self) -> int:
+        """Put the next package onto the start of the belt; return its number."""
+        return int(self._cell.ask("feed"))
+
+    def change_tray(self) -> list[int]:
+        """Take the tray away with all that is on it; return the numbers of those packages."""
+        return list(self._cell.ask("change_tray"))
+
+    def close(self) -> None:
+        """Disconnect."""
+        self._cell.close()
+
+
+def arm(port: str, host: str = "127.0.0.1") -> RemoteArm:
+    """Return the arm of the cell at a port; for `open_controller`."""
+    return RemoteArm(RemoteCell(int(port), host))
+
+
+def belt(port: str, host: str = "127.0.0.1") -> RemoteBelt:
+    """Return the belt of the cell at a port; for `open_controller`."""
+    return RemoteBelt(RemoteCell(int(port), host))
+
+
+def tray_sensor(port: str, seed: str = "1", host: str = "127.0.0.1") -> PhysicalTraySensor:
+    """Return the sensor above the tray of the cell at a port; for `open_sensor`."""
+    return PhysicalTraySensor(_shown_of(int(port), host), seed=int(seed))
+
+
+def belt_sensor(port: str, seed: str = "1", host: str = "127.0.0.1") -> PhysicalBeltSensor:
+    """Return the sensor above the belt of the cell at a port; for `open_sensor`."""
+    return PhysicalBeltSensor(_shown_of(int(port), host), seed=int(seed))
+
+
+def _shown_of(port: int, host: str) -> Callable[[], ShownCell]:
+    """Return what shows a cell; a connection for each image, as sensors are never closed."""
+
+    def shown() -> ShownCell:
+        with closing(RemoteCell(port, host)) as cell:
+            return cell.shown()
+
+    return shown
