@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from actors.geometry.poses import on_tray
-from actors.palletizing.simulation.products import product_mesh
+from actors.palletizing.simulation.products import hull_mesh, product_mesh
 from actors.palletizing.simulation.sensors import FLOOR_M, TRAY_M
 from actors.workcell.simulation.arm import ARM as WORKCELL_ARM
 
@@ -57,6 +57,8 @@ HAND_HALF_M: Final = (0.030, 0.075, 0.040)
 FINGER_STIFFNESS_N_M: Final = 8000.0
 FINGER_DAMPING_N_S_M: Final = 160.0
 
+TABLE_M: Final = -0.15
+"""Height of tray and belt: so low that the arm neither folds nor stretches too far above them."""
 BELT_HALF_M: Final = (0.80, 0.11, 0.01)
 BELT_AHEAD_M: Final = 0.10
 """So far does the belt go on behind its light barrier."""
@@ -71,9 +73,9 @@ PACKAGES_GROUP: Final = 2
 _DIRECTIONS: Final = 240
 
 
-def _at(x_m: float, y_m: float, yaw_rad: float = 0.0, z_m: float = 0.0) -> F64:
+def _at(x_m: float, y_m: float, *, yaw_rad: float = 0.0, z_m: float = 0.0) -> F64:
     pose = on_tray(x_m, y_m, yaw_rad)
-    pose[2, 3] = z_m
+    pose[2, 3] = TABLE_M + z_m
     return pose
 
 
@@ -88,9 +90,9 @@ class CellLayout:
         rim_m: Height of the tray's rim: packages are pushed against it.
     """
 
-    base_from_tray: F64 = field(default_factory=lambda: _at(0.50, 0.0, np.pi / 2.0))
+    base_from_tray: F64 = field(default_factory=lambda: _at(0.58, 0.0, yaw_rad=np.pi / 2.0))
     base_from_belt: F64 = field(default_factory=lambda: _at(0.45, 0.62))
-    base_from_bin: F64 = field(default_factory=lambda: _at(0.25, -0.66, 0.0, -0.09))
+    base_from_bin: F64 = field(default_factory=lambda: _at(0.25, -0.66, z_m=-0.09))
     rim_m: float = 0.030
 
 
@@ -116,6 +118,17 @@ def collision_corners(product: str) -> F64:
     corners = np.array(vertices[outermost])
     corners.setflags(write=False)
     return corners
+
+
+@lru_cache(maxsize=8)
+def centre_of_mass(product: str) -> F64:
+    """Return the centre of mass of a product that is filled evenly, (3,), metres, product frame."""
+    corners, triangles = hull_mesh(collision_corners(product))
+    a, b, c = (corners[triangles[:, i]] for i in range(3))
+    volumes = np.einsum("ij,ij->i", a, np.cross(b, c)) / 6.0
+    centre = np.asarray(volumes @ (a + b + c) / 4.0 / volumes.sum())
+    centre.setflags(write=False)
+    return centre
 
 
 def scene_xml(
@@ -169,8 +182,11 @@ def _surroundings(layout: CellLayout) -> str:
     rejects = [("", (x, y, 0.01), (0.0, 0.0, -0.01), dark)]
     rejects += [("", (x, 0.004, wall), (0.0, s * y, wall), dark) for s in (-1, 1)]
     rejects += [("", (0.004, y, wall), (s * x, 0.0, wall), dark) for s in (-1, 1)]
+    floor = layout.base_from_tray[2, 3] + FLOOR_M
     text = (
-        f'<geom name="floor" type="plane" size="4 4 .1" pos="0 0 {FLOOR_M}" rgba=".55 .55 .53 1"/>'
+        f'<geom name="floor" type="plane" size="4 4 .1" pos="0 0 {floor}" rgba=".55 .55 .53 1"/>'
+        f'<geom class="arm" type="cylinder" fromto="0 0 {floor} 0 0 0" size=".11"'
+        ' rgba=".3 .3 .35 1"/>'
     )
     # A geom that is compiled without a surface velocity never gets one.
     moving = f' surfacevel="{BELT_M_S} 0 0"'
@@ -212,6 +228,7 @@ def _arm() -> str:
         ' mass=".8" rgba=".3 .3 .35 1"/>'
         f'<site name="tool" pos="0 0 {ARM.capsules[-1, 3]}"/>'
     )
+    # The pads get a surface velocity while they carry: see `PhysicalCell`.
     travel = (OPEN_M[1] - OPEN_M[0]) / 2.0
     for name, side in (("left", 1.0), ("right", -1.0)):
         text += (
@@ -219,7 +236,8 @@ def _arm() -> str:
             f'<joint name="{name}" type="slide" axis="0 {side} 0" range="0 {travel}"'
             ' damping="10" armature=".2" solreflimit=".004 1" solimplimit=".99 .999 .0001"/>'
             f'<geom name="{name}" class="arm" type="box" size="{_words(PAD_HALF_M)}"'
-            f' pos="0 {side * PAD_HALF_M[1]} {PAD_CENTRE_M}" mass=".08" rgba=".2 .2 .2 1"/></body>'
+            f' pos="0 {side * PAD_HALF_M[1]} {PAD_CENTRE_M}" mass=".08" surfacevel="1 0 0"'
+            ' rgba=".2 .2 .2 1"/></body>'
         )
     return text + "</body>" * 8
 
@@ -250,7 +268,7 @@ def _package(package: PhysicalPackage) -> str:
     corners = collision_corners(package.product)
     size = np.ptp(corners, axis=0)
     inertia = package.mass_kg / 12.0 * (np.sum(size**2) - size**2)
-    centre = (corners.max(axis=0) + corners.min(axis=0)) / 2.0 + package.centre_offset_m
+    centre = centre_of_mass(package.product) + package.centre_offset_m
     return (
         f'<body name="package{package.number}" pos="0 0 {-5.0 - package.number}" gravcomp="1">'
         f'<freejoint/><inertial pos="{_words(centre)}" mass="{package.mass_kg:.9g}"'

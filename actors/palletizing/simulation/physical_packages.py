@@ -266,8 +266,8 @@ class Damage:
             face=face,
             at_m=(float(at_m[0]), float(at_m[1]), float(at_m[2])),
             inwards=(float(inwards[0]), float(inwards[1]), float(inwards[2])),
-            force_n=smooth,
-            depth_mm=min(depth, DEEPEST_MM),
+            force_n=float(smooth),
+            depth_mm=float(min(depth, DEEPEST_MM)),
             by=by,
         )
         for number, old in enumerate(self.dents):

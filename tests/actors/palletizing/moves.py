@@ -4,7 +4,7 @@ import numpy as np
 
 from actors.geometry.kinematics import jacobians, tool_poses
 from actors.geometry.poses import on_tray
-from actors.palletizing.simulation.cell_scene import ARM, HOME_RAD
+from actors.palletizing.simulation.cell_scene import ARM, HOME_RAD, TABLE_M
 from actors.palletizing.simulation.physical_packages import PhysicalPackage
 from actors.palletizing.simulation.physics import PhysicalCell
 
@@ -16,10 +16,13 @@ def carton(number=0, *, product="milk_carton", mass_kg=0.5, friction=0.4, **more
     return PhysicalPackage(number, product, mass_kg, friction, **(plain | more))
 
 
-def above(x_m, y_m, z_m, *, yaw_rad=0.0):
-    """Return base_from_tool with the hand down; the fingers move along y at a yaw of 0."""
+def above(x_m, y_m, z_m, *, yaw_rad=np.pi):
+    """Return base_from_tool with the hand down, a height above the table, far from limits.
+
+    The fingers move along y.
+    """
     pose = on_tray(x_m, y_m, yaw_rad) @ np.diag([1.0, -1.0, -1.0, 1.0])
-    pose[2, 3] = z_m
+    pose[2, 3] = TABLE_M + z_m
     return pose
 
 
