@@ -41,7 +41,8 @@ class Measured:
     """The state of arm and gripper at one moment.
 
     Attributes:
-        stamp_ns: When it was measured, nanoseconds since 1970.
+        stamp_ns: When it was measured, nanoseconds since 1970.  It is the clock of a control loop:
+            a simulated arm's time may run faster or slower than the host's.
         q: (7,) float64, joints, rad.
         dq: (7,) float64, their speeds, rad/s.
         tcp: (4, 4) float64, base_from_tool, metres: z points out of the hand, the fingers move

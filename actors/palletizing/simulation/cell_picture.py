@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from actors.palletizing.controller import ControllerError
-from actors.palletizing.simulation.physics import PICTURE_PX, load_mujoco
+from actors.palletizing.simulation.cell_scene import load_mujoco
+from actors.palletizing.simulation.physics import PICTURE_PX
 
 if TYPE_CHECKING:
     import numpy.typing as npt

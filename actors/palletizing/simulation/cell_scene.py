@@ -16,13 +16,15 @@ a geom); a package's friction is that of all its contacts, hence its priority.
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from actors.geometry.poses import on_tray
+from actors.palletizing.controller import ControllerError
 from actors.palletizing.simulation.products import hull_mesh, product_mesh
 from actors.palletizing.simulation.sensors import FLOOR_M, TRAY_M
 from actors.workcell.simulation.arm import ARM as WORKCELL_ARM
@@ -94,6 +96,39 @@ class CellLayout:
     base_from_belt: F64 = field(default_factory=lambda: _at(0.45, 0.62))
     base_from_bin: F64 = field(default_factory=lambda: _at(0.25, -0.66, z_m=-0.09))
     rim_m: float = 0.030
+
+    def areas(self) -> dict[str, tuple[F64, F64]]:
+        """Return where packages can lie: frame (4, 4), least and greatest (x, y) in it (2, 2)."""
+        tray, bin_half = np.array(TRAY_M) / 2.0, np.array(BIN_HALF_M)
+        across = BELT_HALF_M[1]
+        start = BELT_AHEAD_M - 2.0 * BELT_HALF_M[0]
+        return {
+            "tray": (self.base_from_tray, np.array([-tray, tray])),
+            "belt": (self.base_from_belt, np.array([[start, -across], [BELT_AHEAD_M, across]])),
+            "bin": (self.base_from_bin, np.array([-bin_half, bin_half])),
+        }
+
+
+def load_mujoco() -> Any:
+    """Return MuJoCo's module, which draws by EGL unless the environment names something else.
+
+    Raises:
+        ControllerError: It is not installed.
+    """
+    os.environ.setdefault("MUJOCO_GL", "egl")
+    os.environ.setdefault("LP_NUM_THREADS", "1")
+    try:
+        import mujoco
+    except ImportError as error:
+        raise ControllerError(
+            f"the physical cell needs MuJoCo 4 ({error}); install enact-dist[workcell]"
+        ) from error
+    if int(mujoco.__version__.partition(".")[0]) < 4:
+        raise ControllerError(
+            f"the physical cell needs MuJoCo 4, for its surface velocities; {mujoco.__version__}"
+            " is installed"
+        )
+    return mujoco
 
 
 @lru_cache(maxsize=8)

@@ -18,7 +18,6 @@ It is not for several threads: `cell_thread` runs it in one of its own.
 
 from __future__ import annotations
 
-import os
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -29,14 +28,13 @@ from actors.palletizing.simulation.cell_arm import CYCLE_S, STEPS, SimulatedArm
 from actors.palletizing.simulation.cell_contacts import Contacts, GripWatch
 from actors.palletizing.simulation.cell_scene import (
     BARRIER_M,
-    BELT_AHEAD_M,
     BELT_HALF_M,
     BELT_M_S,
-    BIN_HALF_M,
     PACKAGES_GROUP,
     CellLayout,
     centre_of_mass,
     collision_corners,
+    load_mujoco,
     scene_xml,
 )
 from actors.palletizing.simulation.cell_truth import (
@@ -51,7 +49,6 @@ from actors.palletizing.simulation.physical_packages import (
     PhysicalPackage,
     draw_packages,
 )
-from actors.palletizing.simulation.sensors import TRAY_M
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -123,7 +120,7 @@ class PhysicalCell:
         self._hand = int(model.body("hand").id)
         self._change = np.zeros((3, model.nv))
         self._finger_dof = int(model.joint("left").dofadr[0])
-        self._areas = self._areas_of_layout()
+        self._areas = self.layout.areas()
         self.arm = SimulatedArm(model, self.data, self._mujoco.mj_mulM, seed=seed)
         self._mujoco.mj_forward(model, self.data)
         self.arm.measure(self._stamp_ns())
@@ -288,17 +285,6 @@ class PhysicalCell:
     def _moving(self) -> bool:
         return bool(self.model.geom_surfacevel[self._belt].any())
 
-    def _areas_of_layout(self) -> dict[str, tuple[F64, F64]]:
-        layout = self.layout
-        tray, bin_half = np.array(TRAY_M) / 2.0, np.array(BIN_HALF_M)
-        length, across = BELT_HALF_M[0], BELT_HALF_M[1]
-        start = BELT_AHEAD_M - 2.0 * length
-        return {
-            "tray": (layout.base_from_tray, np.array([-tray, tray])),
-            "belt": (layout.base_from_belt, np.array([[start, -across], [BELT_AHEAD_M, across]])),
-            "bin": (layout.base_from_bin, np.array([-bin_half, bin_half])),
-        }
-
     def _where(self, number: int, pose: F64) -> str:
         if not self._present[number]:
             return "away" if self._away[number] else "coming"
@@ -389,20 +375,3 @@ class PhysicalCell:
         }
         near = min(distances, key=lambda number: distances[number], default=-1)
         return near if near >= 0 and distances[near] < NEAR_M else -1
-
-
-def load_mujoco() -> Any:
-    """Return MuJoCo's module, which draws by EGL unless the environment names something else.
-
-    Raises:
-        ControllerError: It is not installed.
-    """
-    os.environ.setdefault("MUJOCO_GL", "egl")
-    os.environ.setdefault("LP_NUM_THREADS", "1")
-    try:
-        import mujoco
-    except ImportError as error:
-        raise ControllerError(
-            f"the physical cell needs MuJoCo 4 ({error}); install enact-dist[workcell]"
-        ) from error
-    return mujoco

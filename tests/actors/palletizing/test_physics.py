@@ -392,6 +392,9 @@ def test_smooth_commands_are_followed():
         errors.append(np.abs(cell.arm.measured().q - goal).max())
         accelerations.append(np.abs(cell.arm.limiter.ddq_rad_s2).max())
 
+    measured = cell.arm.measured()
+    assert np.abs(measured.dq).max() > 0.05
+    np.testing.assert_allclose(measured.tcp, tool_poses(ARM, measured.q)[0], atol=1e-9)
     assert max(errors) < 4e-3
     assert max(accelerations[20:]) < 1.3 * 0.2 * 3.0**2 + 0.5
 
