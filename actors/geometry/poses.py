@@ -26,6 +26,18 @@ def on_tray(x_m: float, y_m: float, yaw_rad: float) -> Pose:
     return pose
 
 
+def turned(roll_rad: float, pitch_rad: float, yaw_rad: float) -> npt.NDArray[np.float64]:
+    """Return the rotation Rz(yaw) Ry(pitch) Rx(roll), (3, 3): the turns follow each other so."""
+    (cr, cp, cy), (sr, sp, sy) = (f([roll_rad, pitch_rad, yaw_rad]) for f in (np.cos, np.sin))
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )
+
+
 def yaw_of(pose: Pose) -> float:
     """Return the turn about z that best explains a pose, radians, -pi … pi."""
     return float(np.arctan2(pose[1, 0] - pose[0, 1], pose[0, 0] + pose[1, 1]))
