@@ -120,7 +120,18 @@ def jacobians(chain: Chain, q_rad: F64) -> F64:
     Returns:
         (m, 6, n): rows are the tool's velocity (m/rad), then its turning (rad/rad), in the cell.
     """
+    return _jacobians(chain, link_poses(chain, q_rad))
+
+
+def tool_and_jacobian(chain: Chain, q_rad: F64) -> tuple[F64, F64]:
+    """Return cell_from_tool, (4, 4), and its Jacobian, (6, n), of one state; see `jacobians`."""
     links = link_poses(chain, q_rad)
+    pose = links[0, -1].copy()
+    pose[:3, 3] += np.asarray(chain.capsules)[-1, 3] * pose[:3, 2]
+    return pose, _jacobians(chain, links)[0]
+
+
+def _jacobians(chain: Chain, links: F64) -> F64:
     before = _with_base(chain, links)[:, :-1]
     tool = links[:, -1, :3, 3] + np.asarray(chain.capsules)[-1, 3] * links[:, -1, :3, 2]
     axes = before[:, :, :3, 2]

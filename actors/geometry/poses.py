@@ -38,6 +38,13 @@ def turned(roll_rad: float, pitch_rad: float, yaw_rad: float) -> npt.NDArray[np.
     )
 
 
+def roll_pitch_yaw(turn: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Return the angles, (3,) rad, from which `turned` makes a rotation; pitch is -π/2 … π/2."""
+    roll = np.arctan2(turn[2, 1], turn[2, 2])
+    pitch = np.arctan2(-turn[2, 0], np.hypot(turn[0, 0], turn[1, 0]))
+    return np.array([roll, pitch, np.arctan2(turn[1, 0], turn[0, 0])])
+
+
 def yaw_of(pose: Pose) -> float:
     """Return the turn about z that best explains a pose, radians, -pi … pi."""
     return float(np.arctan2(pose[1, 0] - pose[0, 1], pose[0, 0] + pose[1, 1]))
@@ -67,6 +74,12 @@ def inverse(b_from_a: Pose) -> Pose:
     pose[:3, :3] = b_from_a[:3, :3].T
     pose[:3, 3] = -b_from_a[:3, :3].T @ b_from_a[:3, 3]
     return pose
+
+
+def coordinates(world_from_frame: Pose, world_from_body: Pose) -> npt.NDArray[np.float64]:
+    """Return a body in a frame, (6,): x, y, z (m), roll, pitch, yaw (rad)."""
+    pose = inverse(world_from_frame) @ world_from_body
+    return np.concatenate((pose[:3, 3], roll_pitch_yaw(pose[:3, :3])))
 
 
 def looking_at(eye_m: Points, target_m: Points) -> Pose:

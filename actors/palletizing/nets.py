@@ -77,27 +77,6 @@ class NetError(ValueError):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Grasp:
-    """Where and how a product is held (product/*).
-
-    Attributes:
-        point: (3,) float64, metres, product frame: the middle between the fingers.
-        axis: (3,) float64, unit vector, product frame: from one finger to the other.
-        width_m: Between the fingers that hold it.
-        force_n: Of the fingers.
-        push_height_m: Above the product's base, where a push does not tip it.
-        mass_kg: Of the product.
-    """
-
-    point: npt.NDArray[np.float64]
-    axis: npt.NDArray[np.float64]
-    width_m: float
-    force_n: float
-    push_height_m: float
-    mass_kg: float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class TaskFrame:
     """The frame in which a primitive moves the tool.
 
