@@ -11,7 +11,7 @@ Rules a change must keep:
    same net ends with "interrupted:PRIMITIVE" before anything moves.
 3. A measurement that does not advance, or is no number, ends the net; so does a frame that gets
    lost and an arm that does not follow.
-4. One exit is taken per step at most, so that each primitive lasts a cycle and none is skipped.
+4. At most one exit is taken per step, so that each primitive lasts a cycle.
 """
 
 from __future__ import annotations
@@ -129,6 +129,7 @@ class Executor:
         frames: Returns base_from_entity, (4, 4), of an entity; KeyError if it is not known.
         net_version: Version of the datum that held the net.
         posture_rad: Where the joints go as far as the tool leaves it open; default: where they are.
+        from_rad: The last command to the arm; without it a net after another starts with a jerk.
         before: What an earlier process made of the same net, see the module's second rule.
 
     Attributes:
@@ -148,10 +149,11 @@ class Executor:
         *,
         net_version: int = 0,
         posture_rad: F64 | None = None,
+        from_rad: F64 | None = None,
         before: Execution | None = None,
     ) -> None:
         self._net, self._arm, self._frames = net, arm, frames
-        self._version, self._posture_rad = net_version, posture_rad
+        self._version, self._posture_rad, self._from_rad = net_version, posture_rad, from_rad
         self.result, self.trace = "", list[TraceStep]()
         self._rate: ResolvedRate | None = None
         self._phase: _Phase | None = None
@@ -235,7 +237,8 @@ class Executor:
         wrench = np.concatenate((turn @ measured.wrench[:3], turn @ measured.wrench[3:]))
         if self._rate is None:
             posture = measured.q if self._posture_rad is None else self._posture_rad
-            self._rate = ResolvedRate(self._arm, measured.q, posture)
+            start = measured.q if self._from_rad is None else self._from_rad
+            self._rate = ResolvedRate(self._arm, start, posture)
             self._wrench = self._bias = wrench
         self._wrench = self._wrench + (wrench - self._wrench) * -math.expm1(-dt_s / FILTER_S)
         if self._measured is None or measured.stamp_ns != self._measured.stamp_ns:

@@ -2,8 +2,8 @@
 
 One object per executed net; it holds the *commanded* joints.  Time and measurements are arguments.
 
-Rules a change must keep: no joint leaves its range, its speed or its acceleration, also while
-braking; a tool that is blocked is not pushed ahead any further than the lead allows, since behind
+Rules a change must keep: no joint leaves its range, speed, acceleration or jerk, also while it
+brakes; a tool that is blocked is not pushed ahead any further than the lead allows, since behind
 the commanded position stands a spring, the arm's own controller.
 """
 
@@ -26,6 +26,12 @@ DAMPING: Final = 1e-4
 """λ² of the damped least squares: near a singularity the tool is slower, no joint faster."""
 ACCELERATION_RAD_S2: Final = 6.0
 """A carton of 0.5 kg that is held with 45 N slips in the hand above it."""
+SPEED_SHARE: Final = 0.95
+"""Of the joints' greatest speeds: an arm that limits them itself needs some to catch up with."""
+SMOOTHED: Final = 5
+"""Cycles over which the joints' speeds are averaged.  Averaging keeps all limits of speed and
+acceleration and bounds the jerk to 600 rad/s³ at 250 Hz; an arm that limits jerk itself could not
+follow steps of the acceleration, and would fall behind in midst of a move."""
 POSTURE_PER_S: Final = 0.5
 """How fast the elbow goes back to where it shall be; it moves nothing of the tool."""
 RANGE_RAD: Final = 0.02
@@ -54,8 +60,9 @@ class ResolvedRate:
     def __init__(self, arm: Arm, q_rad: F64, posture_rad: F64) -> None:
         self._arm, self._posture_rad = arm, np.array(posture_rad, np.float64)
         self.q_rad, self.dq_rad_s = np.array(q_rad, np.float64), np.zeros(len(q_rad))
+        self._speeds = np.zeros((SMOOTHED, len(q_rad)))
         self._q_max = np.asarray(arm.q_max, np.float64) - RANGE_RAD
-        self._dq_max = np.asarray(arm.dq_max, np.float64)
+        self._dq_max = SPEED_SHARE * np.asarray(arm.dq_max, np.float64)
         self._ddq_max = np.minimum(np.asarray(arm.ddq_max, np.float64), ACCELERATION_RAD_S2)
 
     @property
@@ -86,14 +93,15 @@ class ResolvedRate:
         self._advance(np.zeros_like(self.dq_rad_s), dt_s)
 
     def _advance(self, dq: F64, dt_s: float) -> None:
-        """Take joint speeds, within range and acceleration."""
-        change = dq - self.dq_rad_s
-        most = self._ddq_max * dt_s
-        greatest = float((np.abs(change) / np.maximum(most, 1e-12)).max())
-        dq = self.dq_rad_s + change * min(1.0, 1.0 / max(greatest, 1e-12))
+        """Take joint speeds, within range, acceleration and jerk."""
+        change = dq - self._speeds[-1]
+        greatest = float((np.abs(change) / np.maximum(self._ddq_max * dt_s, 1e-12)).max())
+        dq = self._speeds[-1] + change * min(1.0, 1.0 / max(greatest, 1e-12))
         up = np.sqrt(2.0 * self._ddq_max * np.maximum(self._q_max - self.q_rad, 0.0))
         down = np.sqrt(2.0 * self._ddq_max * np.maximum(self._q_max + self.q_rad, 0.0))
-        self.dq_rad_s = np.clip(dq, -down, up)
+        self._speeds[:-1] = self._speeds[1:]
+        self._speeds[-1] = np.clip(dq, -down, up)
+        self.dq_rad_s = self._speeds.mean(axis=0)
         self.q_rad = np.clip(self.q_rad + self.dq_rad_s * dt_s, -self._q_max, self._q_max)
 
 

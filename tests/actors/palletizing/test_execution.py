@@ -56,6 +56,7 @@ def test_position_axes_reach_their_target_within_all_limits():
     assert np.linalg.norm(rotation_vector(off)) < 0.03
     assert 0.3 < max(speeds) < 0.42
     assert arm.acceleration_max < ACCELERATION_RAD_S2 * 1.001
+    assert arm.jerk_max < 600.0 * 1.001
 
 
 @pytest.mark.parametrize(("follows", "moved_m"), [(False, 0.0), (True, 0.1)])
@@ -163,7 +164,7 @@ class BlockedArm(SpringArm):
         """Return how far the command is ahead."""
         from actors.geometry.kinematics import tool_poses
 
-        return float(np.linalg.norm(tool_poses(ARM, self._commanded)[0, :3, 3] - self.tcp[:3, 3]))
+        return float(np.linalg.norm(tool_poses(ARM, self.commanded)[0, :3, 3] - self.tcp[:3, 3]))
 
 
 def test_a_force_axis_keeps_its_force_while_another_moves():

@@ -18,6 +18,7 @@ from actors.palletizing.grounding import (
     ground,
 )
 from actors.palletizing.nets import NetError
+from actors.palletizing.resolved_rate import ACCELERATION_RAD_S2
 
 from .spring_arm import ARM, HOME_RAD, SpringArm, pose, run
 
@@ -140,7 +141,9 @@ def test_a_package_is_grasped_placed_and_pushed_into_contact():
     results, traces = [], []
     for name in ("grasp_from_belt", "place", "push_into_contact"):
         going = grounded(name, near_rad=arm.q)
-        executor = run(going, arm, frames, each=world, until_s=arm.now_s + 20.0)
+        executor = run(
+            going, arm, frames, each=world, until_s=arm.now_s + 20.0, from_rad=arm.commanded
+        )
         results.append(executor.result)
         traces += [step.primitive for step in executor.trace]
 
@@ -150,6 +153,7 @@ def test_a_package_is_grasped_placed_and_pushed_into_contact():
         "behind", "beside", "settle", "push", "contact", "retract",
     ]  # fmt: skip
     assert arm.now_s < 20.0
+    assert arm.acceleration_max < ACCELERATION_RAD_S2 * 1.001
 
 
 def test_a_package_that_slips_out_of_the_hand_is_lost():
@@ -158,7 +162,7 @@ def test_a_package_that_slips_out_of_the_hand_is_lost():
     arm.width_m = arm.goal_m = 0.095
 
     def drop(arm, executor):
-        if arm.now_s > 0.5:
+        if arm.now_s > 0.2:
             arm.held_m, arm.goal_m = None, 0.055
 
     ended = run(grounded("place"), arm, FRAMES.__getitem__, each=drop)
