@@ -28,7 +28,7 @@ class SpringArm:
         self.lag_s, self.walls, self.stiffness_n_m = lag_s, list(walls), stiffness_n_m
         self.held_m, self.width_m, self.width_rate_m_s, self.goal_m = held_m, 0.12, 0.0, 0.12
         self.weight_n, self.now_s, self.frozen = 8.0, 0.0, False
-        self.acceleration_max = self.jerk_max = 0.0
+        self.speed_share_max = self.acceleration_max = self.jerk_max = 0.0
         self.commanded, self._speed = np.array(q_rad, float), np.zeros(7)
         self._acceleration = np.zeros(7)
         self._stamp_ns = 0
@@ -60,6 +60,7 @@ class SpringArm:
         speed = (command.q - self.commanded) / CYCLE_S
         acceleration = (speed - self._speed) / CYCLE_S
         jerk = np.abs(acceleration - self._acceleration).max() / CYCLE_S
+        self.speed_share_max = max(self.speed_share_max, float((np.abs(speed) / ARM.dq_max).max()))
         self.acceleration_max = max(self.acceleration_max, float(np.abs(acceleration).max()))
         self.jerk_max = max(self.jerk_max, float(jerk))
         self.commanded, self._speed = command.q.copy(), speed
