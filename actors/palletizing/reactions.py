@@ -1,0 +1,138 @@
+"""What follows from how an action ended and from what the camera saw: one table of reasons.
+
+=============================  =====================================================================
+what happened                  what follows
+=============================  =====================================================================
+sound                          go on; align when it stands `ALIGN_MM` or more beside its row
+missed, lost, blocked          retry when it is seen on the belt, regrasp when upright on the tray
+blocked, no floor, in hand     reject: it is still held
+moved, short of its neighbour  push again, once
+moved up to `NEAR_MM`          regrasp, once more after a push
+moved farther, tipped,         ask the operator
+deformed, extra
+anything a second or third     ask the operator
+time, or unforeseen
+robot stopped by itself        stop
+=============================  =====================================================================
+
+Rule a change must keep: nothing that could make it worse is done without the operator being asked;
+every reaction has its reason in words.
+"""
+
+# The wire reads these annotations: they stay real types, without `from __future__`.
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Final
+
+REACTIONS: Final = ("go_on", "align", "push_again", "regrasp", "retry", "reject", "stop", "ask")
+ALIGN_MM: Final = 1.8
+"""A sound package that stands farther beside the middle of its row is pushed there."""
+NEAR_MM: Final = 30.0
+"""A package that stands farther from its place has not just slipped."""
+TURNED_DEG: Final = 20.0
+"""A package that is turned by more is nothing that the robot may take by itself."""
+MOST: Final = {"align": 1, "push_again": 1, "regrasp": 2, "retry": 2, "reject": 1}
+"""How often each is tried for one place."""
+CHOICES: Final = {
+    "tipped": ("removed", "reject"),
+    "deformed": ("reject", "removed", "go_on"),
+    "extra": ("removed", "go_on"),
+    "moved": ("regrasp", "removed", "go_on"),
+    "missing": ("retry", "skip"),
+}
+"""What an operator may answer, by what was seen; the first is what the rule of a script takes."""
+OTHERWISE: Final = ("removed", "retry", "skip")
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """What is known of a place after an action.
+
+    Attributes:
+        stage: Skeleton of the last net: "grasp_from_belt", "place", "push_into_contact" ...
+        result: How it ended.
+        success: Whether that is what it was for.
+        verdict: Of the place: "ok", "missing", "moved", "tipped", "deformed", "extra"; "" if it
+            was not judged.
+        along_mm: How far beyond its place the package stands along the push; negative: short of it.
+        across_mm: The same beside its row, to the left of the push.
+        turn_deg: Turn against its place.
+        seen: Where the package was seen last: "belt", "tray", "hand", or "" if nowhere.
+        tried: How often each reaction was tried for this place.
+    """
+
+    stage: str
+    result: str
+    success: bool
+    verdict: str = ""
+    along_mm: float = 0.0
+    across_mm: float = 0.0
+    turn_deg: float = 0.0
+    seen: str = ""
+    tried: Mapping[str, int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Reaction:
+    """What follows.
+
+    Attributes:
+        kind: One of `REACTIONS`.
+        reason: Why, in one line.
+    """
+
+    kind: str
+    reason: str
+
+
+def react(case: Case) -> Reaction:
+    """Return what follows from a case."""
+    if case.result.startswith(("sensor:", "not_following:", "no_frame:", "braked:")):
+        return Reaction("stop", f"{case.stage} ended with {case.result}")
+    if case.seen == "hand" and not case.success:
+        return _if_left(case, "reject", f"{case.stage}: {case.result}, the package is still held")
+    if case.verdict in {"tipped", "deformed", "extra"}:
+        return Reaction("ask", f"it is {case.verdict}")
+    if case.verdict == "ok":
+        return _sound(case)
+    if case.verdict == "moved":
+        return _moved(case)
+    what = case.result if not case.success else "not at its place"
+    if case.seen == "belt":
+        return _if_left(case, "retry", f"{case.stage}: {what}; it is on the belt")
+    if case.seen == "tray":
+        return _if_left(case, "regrasp", f"{case.stage}: {what}; it lies on the tray")
+    return Reaction("ask", f"{case.stage}: {what}; it is seen nowhere")
+
+
+def choices_of(verdict: str) -> tuple[str, ...]:
+    """Return what an operator may answer to a verdict."""
+    return CHOICES.get(verdict, OTHERWISE)
+
+
+def _sound(case: Case) -> Reaction:
+    beside = f"{abs(case.across_mm):.1f} mm beside the middle of its row"
+    if abs(case.across_mm) >= ALIGN_MM and case.tried.get("align", 0) < MOST["align"]:
+        return Reaction("align", beside)
+    return Reaction("go_on", "it stands as planned")
+
+
+def _moved(case: Case) -> Reaction:
+    where = f"{case.along_mm:+.0f} mm along the push, {case.across_mm:+.0f} mm across"
+    if max(abs(case.along_mm), abs(case.across_mm)) > NEAR_MM:
+        return Reaction("ask", f"{where}: too far away to be taken for a slip")
+    if abs(case.turn_deg) > TURNED_DEG:
+        return Reaction("ask", f"it is turned by {case.turn_deg:.0f}°")
+    short = case.along_mm < -abs(case.across_mm)
+    if short and case.tried.get("push_again", 0) < MOST["push_again"]:
+        return Reaction("push_again", f"{where}: short of its neighbour")
+    return _if_left(case, "regrasp", where)
+
+
+def _if_left(case: Case, kind: str, reason: str) -> Reaction:
+    """Return a reaction, or the question of the operator when it was tried often enough."""
+    tried = case.tried.get(kind, 0)
+    if tried >= MOST[kind]:
+        return Reaction("ask", f"{reason}; {kind} was tried {tried} times")
+    return Reaction(kind, reason)

@@ -1,0 +1,129 @@
+"""Where packages shall stand, how they are held, and what follows from what was seen."""
+
+import numpy as np
+import pytest
+
+from actors.geometry.reaching import reach
+from actors.geometry.shapes import Surface
+from actors.palletizing.grasps import grasp_of, size_of
+from actors.palletizing.reactions import MOST, REACTIONS, Case, react
+from actors.palletizing.rows import planned_rows
+from actors.palletizing.simulation.cell_scene import (
+    ARM,
+    HOME_RAD,
+    CellLayout,
+    centre_of_mass,
+)
+from actors.palletizing.simulation.products import PRODUCTS, product_mesh
+from actors.palletizing.simulation.sensors import TRAY_M
+
+SIZES = {
+    "milk_carton": np.array([0.2, 0.095, 0.07]),
+    "meal_tray": np.array([0.16, 0.12, 0.054]),
+    "yoghurt_cup": np.array([0.095, 0.095, 0.102]),
+}
+
+
+def true_surface(product):
+    vertices, triangles = product_mesh(product)
+    return Surface.free_form(vertices, triangles)
+
+
+def boxes(slots, products):
+    """Return (least, greatest) x and y of each slot."""
+    for slot, product in zip(slots, products, strict=True):
+        half = np.abs(slot.tray_from_product[:2, :2]) @ SIZES[product][:2] / 2.0
+        middle = slot.tray_from_product[:2, 3]
+        yield middle - half, middle + half
+
+
+def test_rows_stay_on_the_tray_and_never_overlap():
+    products = [PRODUCTS[n % 3] for n in range(40)]
+    slots = planned_rows(products, SIZES)
+    placed = list(boxes(slots, products))
+    for number, (low, high) in enumerate(placed):
+        assert (np.abs([low, high]) <= np.array(TRAY_M) / 2.0).all()
+        for other in range(number):
+            if slots[other].tray == slots[number].tray:
+                apart = np.maximum(placed[other][0] - high, low - placed[other][1])
+                assert apart.max() > 0.0
+
+
+def test_neighbours_of_a_row_touch_and_lie_where_the_push_goes():
+    products = ["milk_carton", "meal_tray"] * 3
+    slots = planned_rows(products, SIZES)
+    placed = list(boxes(slots, products))
+    assert placed[0][0][0] == pytest.approx(-0.4475)  # at the rim
+    for one, next_one, slot in zip(placed, placed[1:], slots, strict=False):
+        assert next_one[0][0] - one[1][0] == pytest.approx(0.0005)
+        assert slot.push.tolist() == [-1.0, 0.0, 0.0]
+
+
+def test_a_cup_is_not_pushed_and_stands_in_a_row_of_its_own():
+    slots = planned_rows(["milk_carton", "yoghurt_cup", "meal_tray"], SIZES)
+    assert not slots[1].push.any()
+    assert slots[0].tray_from_product[1, 3] == slots[2].tray_from_product[1, 3]
+    assert abs(slots[0].tray_from_product[1, 3] - slots[1].tray_from_product[1, 3]) > 0.2
+
+
+def test_what_no_row_takes_is_refused():
+    with pytest.raises(ValueError, match=r"beam takes 300 x 50 mm of a row; a row has 210 x 748"):
+        planned_rows(["beam"], {"beam": np.array([0.3, 0.05, 0.05])})
+
+
+def test_the_arm_reaches_all_places():
+    layout = CellLayout()
+    slots = planned_rows(["milk_carton"] * 20 + ["yoghurt_cup"] * 20, SIZES)
+    for slot in slots:
+        pose = layout.base_from_tray @ slot.tray_from_product
+        for height in (0.04, 0.2):
+            down = pose @ np.diag([1.0, -1.0, -1.0, 1.0])
+            down[2, 3] += height
+            assert reach(ARM, down, np.array(HOME_RAD)).off_m < 1e-3
+
+
+@pytest.mark.parametrize("product", PRODUCTS)
+def test_a_product_is_held_over_its_centre_of_mass_where_it_is_narrow(product):
+    surface = true_surface(product)
+    grasp = grasp_of(surface, mass_kg=0.5)
+    assert abs(grasp.axis @ [0.0, 1.0, 0.0]) > 0.99
+    assert grasp.width_m == pytest.approx(SIZES[product][1], abs=0.0008)
+    assert np.abs(grasp.point[:2] - centre_of_mass(product)[:2]).max() < 0.0015
+    assert size_of(surface) == pytest.approx(SIZES[product], abs=0.001)
+
+
+def test_flat_faces_are_pressed_harder_than_rims():
+    force_n = {name: grasp_of(true_surface(name), mass_kg=0.5).force_n for name in PRODUCTS}
+    assert force_n["milk_carton"] > force_n["meal_tray"] == force_n["yoghurt_cup"]
+
+
+@pytest.mark.parametrize(
+    ("case", "kind"),
+    [
+        (Case("push_into_contact", "in_contact", success=True, verdict="ok"), "go_on"),
+        (Case("push_into_contact", "in_contact", True, "ok", across_mm=-4.0), "align"),
+        (Case("grasp_from_belt", "missed", success=False, seen="belt"), "retry"),
+        (Case("place", "lost", success=False, verdict="missing", seen="tray"), "regrasp"),
+        (Case("place", "lost", success=False, verdict="missing"), "ask"),
+        (Case("place", "blocked", success=False, seen="hand"), "reject"),
+        (Case("push_into_contact", "in_contact", True, "moved", along_mm=-14.0), "push_again"),
+        (Case("push_into_contact", "in_contact", True, "moved", across_mm=14.0), "regrasp"),
+        (Case("push_into_contact", "in_contact", True, "moved", across_mm=64.0), "ask"),
+        (Case("push_into_contact", "in_contact", True, "tipped"), "ask"),
+        (Case("push_into_contact", "in_contact", True, "deformed"), "ask"),
+        (Case("place", "sensor:frozen", success=False, seen="hand"), "stop"),
+    ],
+)
+def test_a_reaction_follows_from_what_was_seen(case, kind):
+    assert react(case).kind == kind
+
+
+@pytest.mark.parametrize("kind", sorted(MOST.keys() - {"align", "push_again"}))
+def test_what_was_tried_often_enough_is_asked(kind):
+    seen = {"regrasp": "tray", "retry": "belt", "reject": "hand"}[kind]
+    case = Case("place", "lost", success=False, seen=seen)
+    assert react(case).kind == kind
+    again = Case("place", "lost", success=False, seen=seen, tried={kind: MOST[kind]})
+    assert react(again).kind == "ask"
+    assert react(again).reason.endswith(f"{kind} was tried {MOST[kind]} times")
+    assert kind in REACTIONS
