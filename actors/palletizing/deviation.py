@@ -67,7 +67,7 @@ class DeviationDetection(Actor):
             observed.frame, observed.before_mm, model, plan.tray_from_product, limits=self.limits
         )
         new = [name for name in observed.packages if Entity(name) in lock[self.sightings]]
-        poses = [lock[self.sightings][Entity(name)].tray_from_package for name in new]
+        poses = [lock[self.sightings][Entity(name)].frame_from_package for name in new]
         chosen = nearest(found.tray_from_product[:2, 3], [pose[:2, 3] for pose in poses])
         flag = Deviation(
             package="" if chosen is None or found.verdict == "missing" else new[chosen],
@@ -78,6 +78,7 @@ class DeviationDetection(Actor):
             shift_mm=found.shift_mm,
             turn_deg=found.turn_deg,
             captured_ns=observed.captured_ns,
+            tray_from_product=found.tray_from_product,
         )
         lock[self.region] = found.region
         lock[self.standing] = Standing(plan.product, found.verdict, found.shift_mm, found.turn_deg)

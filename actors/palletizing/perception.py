@@ -119,7 +119,7 @@ class OnlinePerception(Actor):
         known = {e: seen for e, seen in lock[self.sightings].items() if seen.tray == tray}
         matches = assigned(
             [piece.centre_m[:2] for piece in pieces],
-            [seen.tray_from_package[:2, 3] for seen in known.values()],
+            [seen.frame_from_package[:2, 3] for seen in known.values()],
         )
         new = []
         for piece, match in zip(pieces, matches, strict=True):

@@ -6,22 +6,30 @@ entity                  stands for                                              
 `product/<name>`        a kind of food package: what to scan, its complete surface    training
 `view/<product>/<i>`    one viewpoint of the eye-in-hand robot around a product       training
 `place/<n>`             n-th place of the plan: expected content; what was seen       both
-`tray`                  the tray: its empty image                                     training
-`conveyor`              the conveyor: its present stop                                online
-`package/<id>`          one real thing on the tray                                    online
-`system`                the cell: one flag per judged place                           online
-`user`                  the operator: notices                                         online
+`tray`, `belt`          their empty images                                            training
+`cell`                  where tray, belt and reject bin stand                         training
+`conveyor`              the conveyor: its present stop, what has arrived              online
+`package/<id>`          one real thing on belt or tray                                online
+`system`                the cell: flags, requests, the net, its outcome, decisions    online
+`robot`, `gripper`      what the arm and its gripper do                               online
+`user`                  the operator: notices, questions                              online
 ======================  ============================================================  =========
 
 Frames: *product* has its origin on the base, z up; *tray* has its origin in the middle of the
-tray, z up.  Stop n of the conveyor brings the package for place n; places go on counting over
-trays, so that a place has one package for ever.
+tray, z up; *belt* on the belt in its light barrier, x where it moves to; *base* is the arm's.
+Stop n of the conveyor brings the package for place n; places go on counting over trays, so that a
+place has one package for ever.
+
+What the robot does goes round: feedback writes `request`, the action generator grounds a net for
+each of its stages (`candidate`), action attaches it to the system (`net`), the robot executes it
+(`execution`), and when the last stage ends the action generator writes the `outcome`, upon which
+perception looks, deviation detection judges, and feedback requests what comes next.
 """
 
 # The wire reads these annotations: they stay real types, without `from __future__`.
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -30,6 +38,8 @@ import numpy.typing as npt
 from actors.comparators import CloudDistance, SurfaceDistance
 from actors.geometry.deviation import Limits
 from actors.geometry.shapes import Acquisition, DepthFrame, PointCloud, Surface
+from actors.palletizing.grounding import Grasp
+from actors.palletizing.nets import Execution, Net
 from enact_dist import Aspect, Durability, Entities, Entity, Tolerance
 
 PRODUCTS: Final = Entities("product/*")
@@ -38,6 +48,10 @@ PLACES: Final = Entities("place/*")
 PACKAGES: Final = Entities("package/*")
 TRAY: Final = Entity("tray")
 CONVEYOR: Final = Entity("conveyor")
+BELT: Final = Entity("belt")
+CELL: Final = Entity("cell")
+ROBOT: Final = Entity("robot")
+GRIPPER: Final = Entity("gripper")
 SYSTEM: Final = Entity("system")
 USER: Final = Entity("user")
 
@@ -63,11 +77,14 @@ class Plan:
         product: Name of the product.
         tray: Number of the tray; a place of another tray is out of sight.
         tray_from_product: Where on it, (4, 4) float64, metres.
+        push: (3,) float64, level unit vector, tray frame: where it is pushed to once it stands;
+            zeros: it is not pushed.
     """
 
     product: str
     tray: int
     tray_from_product: npt.NDArray[np.float64]
+    push: npt.NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,16 +110,21 @@ class Sighting:
     """Where a package was seen.
 
     Attributes:
-        tray: Number of the tray.
-        tray_from_package: What its outline suggests, (4, 4) float64, metres; x along its length.
-        first_stop: Stop at which it was seen first.
-        last_stop: Stop at which it was seen last.
+        tray: Number of the tray that it is on or for.
+        frame_from_package: (4, 4) float64, metres; on the tray what its outline suggests, x along
+            its length; on the belt the pose of the product that it was recognised as.
+        first_stop: Stop or arrival at which it was seen first.
+        last_stop: Stop or arrival at which it was seen last.
+        frame: "tray" or "belt".
+        product: What it was recognised as; empty: nothing was looked for.
     """
 
     tray: int
-    tray_from_package: npt.NDArray[np.float64]
+    frame_from_package: npt.NDArray[np.float64]
     first_stop: int
     last_stop: int
+    frame: str = "tray"
+    product: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,19 +147,20 @@ class Standing:
     turn_deg: float
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Deviation:
     """The flag of one judged place.
 
     Attributes:
         package: Entity that was judged; empty if nothing came.
         product: What it should be.
-        verdict: "ok", "missing", "extra", "moved" or "deformed".
+        verdict: "ok", "missing", "extra", "tipped", "moved" or "deformed".
         deviation_mm: By how much, see `actors.geometry.deviation.Finding`.
         area_mm2: Area of the deviating region.
         shift_mm: Distance from the planned position.
         turn_deg: Turn against the planned pose.
         captured_ns: When the judged image was taken, nanoseconds since 1970.
+        tray_from_product: (4, 4) float64, metres, where it stands; as planned if it is missing.
     """
 
     package: str
@@ -148,6 +171,7 @@ class Deviation:
     shift_mm: float
     turn_deg: float
     captured_ns: int
+    tray_from_product: npt.NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,6 +187,161 @@ class Notice:
     text: str
     captured_ns: int
     latency_ms: float
+
+
+@dataclass(frozen=True, slots=True)
+class Arrival:
+    """A package stands in the light barrier of the belt (conveyor).
+
+    Attributes:
+        number: How many came before it.
+        stamp_ns: When, nanoseconds since 1970.
+    """
+
+    number: int
+    stamp_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """What the robot shall do next (system).
+
+    Attributes:
+        number: Grows by one with each request.
+        kind: "pack" (grasp from the belt, place, push), "retry" (the same after a new look at the
+            belt), "push_again", "regrasp" (grasp on the tray, place, push), "reject" (from belt or
+            tray into the bin), "stop" (nothing more), "ask" (wait for the operator).
+        place: Name of the entity; empty if it is about none.
+        package: Name of the entity; empty if it is about none.
+        reason: Why, in words.
+    """
+
+    number: int
+    kind: str
+    place: str
+    package: str
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidate:
+    """A stage of a request, grounded (system).
+
+    Attributes:
+        request: Number of the request.
+        stage: "grasp", "regrasp", "place", "push", "remove" or "aside".
+        net: What the robot shall execute; None if it cannot be grounded.
+        error: Why it cannot, in one line; empty if it can.
+        frames: base_from_entity, (4, 4) float64, metres, of the entities that the net names.
+    """
+
+    request: int
+    stage: str
+    net: Net | None
+    error: str
+    frames: dict[str, npt.NDArray[np.float64]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Attached:
+    """The net that the robot executes (system); its `Execution` names the version of this datum.
+
+    Attributes:
+        number: Grows by one with each net.
+        request: Number of the request that it is for.
+        stage: As of `Candidate`.
+        net: What to execute.
+        frames: As of `Candidate`.
+    """
+
+    number: int
+    request: int
+    stage: str
+    net: Net
+    frames: dict[str, npt.NDArray[np.float64]]
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """How a request ended (system).
+
+    Attributes:
+        request: Number of the request.
+        stage: The last stage that was executed, or could not be grounded.
+        result: End of its net, "timeout:…", "interrupted:…", or "no_net:" with the reason.
+        success: Whether all stages succeeded.
+        stamp_ns: When, nanoseconds since 1970.
+    """
+
+    request: int
+    stage: str
+    result: str
+    success: bool
+    stamp_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class GripCommand:
+    """A command to the gripper.
+
+    Attributes:
+        number: Grows by one with each command.
+        kind: "width" or "force".
+        value: m or N.
+    """
+
+    number: int
+    kind: str
+    value: float
+
+
+@dataclass(frozen=True, slots=True)
+class GripState:
+    """The state of the gripper.
+
+    Attributes:
+        number: Of the command that it follows.
+        width_m: Distance between the fingers.
+        width_rate_m_s: How fast it grows.
+        force_n: With what force the fingers close.
+        stamp_ns: When it was measured, nanoseconds since 1970.
+    """
+
+    number: int
+    width_m: float
+    width_rate_m_s: float
+    force_n: float
+    stamp_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """A question to the operator (user).
+
+    Attributes:
+        request: Number of the request of kind "ask".
+        text: What is the matter.
+        choices: The answers that can be given.
+    """
+
+    request: int
+    text: str
+    choices: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """What the operator has decided (system).
+
+    Attributes:
+        request: Number of the request of kind "ask".
+        choice: One of the choices of the question.
+        by: Who.
+    """
+
+    request: int
+    choice: str
+    by: str
 
 
 SCAN: Final = Aspect("scan", int)
@@ -204,6 +383,31 @@ DEVIATIONS: Final = Aspect("deviation", dict[str, Deviation])
 """The flags, by name of the place (system)."""
 NOTICES: Final = Aspect("notices", dict[str, Notice])
 """Notices, by name of the place (user)."""
+GRASP: Final = Aspect("grasp", Grasp)
+"""Where and how a product is held (product/*, training)."""
+FRAMES: Final = Aspect("frames", dict[str, npt.NDArray[np.float64]])
+"""base_from_tray, base_from_belt and base_from_bin, (4, 4) float64, metres, under "tray", "belt"
+and "bin" (cell, training)."""
+ARRIVAL: Final = Aspect("arrival", Arrival)
+"""What has come last (conveyor)."""
+REQUEST: Final = Aspect("request", Request)
+"""What the robot shall do (system)."""
+CANDIDATE: Final = Aspect("candidate", Candidate)
+"""The next stage of the request, grounded (system)."""
+NET: Final = Aspect("net", Attached)
+"""What the robot executes (system)."""
+OUTCOME: Final = Aspect("outcome", Outcome)
+"""How the last request ended (system)."""
+QUESTION: Final = Aspect("question", Question)
+"""What the operator is asked (user)."""
+DECISION: Final = Aspect("decision", Decision)
+"""What the operator answered last (system)."""
+EXECUTION: Final = Aspect("execution", Execution, Durability.OS)
+"""How far the robot is with its net (robot)."""
+COMMAND: Final = Aspect("command", GripCommand, Durability.VOLATILE)
+"""What the gripper shall do (gripper)."""
+STATE: Final = Aspect("state", GripState, Durability.VOLATILE)
+"""What the gripper does (gripper)."""
 
 
 def view_entity(product: str, number: int) -> Entity:
