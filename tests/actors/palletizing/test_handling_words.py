@@ -23,7 +23,7 @@ NET = net(
         (words.SYSTEM, words.REQUEST, words.Request(1, "pack", "place/0", "package/a", "why")),
         (words.SYSTEM, words.CANDIDATE, words.Candidate(1, "push", None, "too wide", {})),
         (words.SYSTEM, words.NET, words.Attached(1, 1, "push", NET, {"place/0": np.eye(4)})),
-        (words.SYSTEM, words.OUTCOME, words.Outcome(1, "push", "in_contact", True, 7)),  # noqa: FBT003
+        (words.SYSTEM, words.OUTCOME, words.Outcome(1, "push", "in_contact", True, 7)),
         (words.USER, words.QUESTION, words.Question(1, "what now?", ("reject", "stop"))),
         (words.SYSTEM, words.DECISION, words.Decision(1, "reject", "a test")),
         (words.GRIPPER, words.COMMAND, words.GripCommand(1, "width", 0.1)),
