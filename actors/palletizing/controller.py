@@ -1,8 +1,9 @@
-"""What the actors need of the cell's controllers: the arm with its gripper, and the belt.
+"""What the actors need of the cell's controllers: of the arm, of the gripper, and of the belt.
 
-The simulated cell and a real one both give this; no actor knows which.  To connect a real arm,
-write a class with the methods of `ArmController` over the interface of its controller for cyclic
-commands (KUKA FRI, UR servoj, Franka joint positions) and name it in `cell.toml`:
+The simulated cell and a real one both give this; no actor knows which.  Arm and gripper are two
+devices with a process each.  To connect a real arm, write a class with the methods of
+`ArmController` over the interface of its controller for cyclic commands (KUKA FRI, UR servoj,
+Franka joint positions) and name it in `cell.toml`; for a gripper likewise (`GripperController`):
 
 =============  ====================================================================================
 method         over a real controller
@@ -10,15 +11,16 @@ method         over a real controller
 start          connect, release the brakes, wait until the controller takes positions
 measured       the newest state that arrived; never waits for the next one
 command        hand on the next position; the controller interpolates until the one after it
+brake          the controller's own stop at full deceleration; positions are refused from then on
+close          come to rest, disconnect
 grip_width     position mode of the gripper with its force limit
 grip_force     force mode of the gripper: close until the fingers press so hard
-brake          the controller's own stop at full deceleration; positions are refused from then on
-close          come to rest, disconnect; what the gripper holds stays held
 =============  ====================================================================================
 
 Rules a change must keep: SI units; every pose is in the frame of the arm's base; the wrench is the
 sensor's, not tared, since the executor tares before each guarded motion; an arm that gets no
-commands any more comes to rest by itself, since the process that commands it can be killed.
+commands any more comes to rest by itself, and a gripper goes on holding what it holds, since the
+processes that command them can be killed.
 """
 
 # The wire reads these annotations: they stay real types, without `from __future__`.
@@ -31,14 +33,16 @@ from urllib.parse import parse_qsl
 import numpy as np
 import numpy.typing as npt
 
+from actors.geometry.joint_paths import Arm
+
 
 class ControllerError(RuntimeError):
     """The controller cannot do what it was asked to; the text names what, and what to do."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Measured:
-    """The state of arm and gripper at one moment.
+class ArmMeasured:
+    """The state of the arm at one moment.
 
     Attributes:
         stamp_ns: When it was measured, nanoseconds since 1970.  It is the clock of a control loop:
@@ -50,9 +54,6 @@ class Measured:
         wrench: (6,) float64, what the wrist carries, N and Nm, at the origin and in the axes of
             the tool frame, not tared: the hand at rest shows its weight.  A force that presses
             the fingertips into the hand is negative in z.
-        width_m: Distance between the fingers.
-        width_rate_m_s: How fast it grows.
-        grip_force_n: With what force the drive closes the fingers; negative when it opens them.
     """
 
     stamp_ns: int
@@ -60,17 +61,56 @@ class Measured:
     dq: npt.NDArray[np.float64]
     tcp: npt.NDArray[np.float64]
     wrench: npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Measured(ArmMeasured):
+    """The state of arm and gripper at one moment, as nets are executed by it.
+
+    Attributes:
+        width_m: Distance between the fingers.
+        width_rate_m_s: How fast it grows.
+        grip_force_n: With what force the drive closes the fingers; negative when it opens them.
+    """
+
     width_m: float
     width_rate_m_s: float
     grip_force_n: float
 
 
+@dataclass(frozen=True, slots=True)
+class GripperMeasured:
+    """The state of the gripper at one moment.
+
+    Attributes:
+        stamp_ns: When it was measured, nanoseconds since 1970, by the clock of the arm.
+        width_m: Distance between the fingers.
+        width_rate_m_s: How fast it grows.
+        force_n: With what force the drive closes the fingers; negative when it opens them.
+    """
+
+    stamp_ns: int
+    width_m: float
+    width_rate_m_s: float
+    force_n: float
+
+
 class ArmController(Protocol):
-    """An arm of seven axes with a wrist sensor and a parallel gripper."""
+    """An arm of seven axes with a wrist sensor."""
 
     @property
     def cycle_s(self) -> float:
         """How often a position is to be commanded, s; 0.004 for 250 Hz."""
+        ...
+
+    @property
+    def model(self) -> Arm:
+        """Kinematics and limits; known before it is started."""
+        ...
+
+    @property
+    def posture_rad(self) -> npt.NDArray[np.float64]:
+        """(7,), rad: where the joints go as far as the tool leaves it open."""
         ...
 
     def start(self) -> None:
@@ -81,7 +121,7 @@ class ArmController(Protocol):
         """
         ...
 
-    def measured(self) -> Measured:
+    def measured(self) -> ArmMeasured:
         """Return the newest state; at once."""
         ...
 
@@ -97,6 +137,30 @@ class ArmController(Protocol):
         Raises:
             ControllerError: The position is out of the range of a joint, or the arm is braked.
         """
+        ...
+
+    def brake(self) -> None:
+        """Stop the arm as fast as it can."""
+        ...
+
+    def close(self) -> None:
+        """Come to rest and disconnect."""
+        ...
+
+
+class GripperController(Protocol):
+    """A parallel gripper."""
+
+    def start(self) -> None:
+        """Take commands from now on.
+
+        Raises:
+            ControllerError: The gripper cannot be reached, or is not ready.
+        """
+        ...
+
+    def gripped(self) -> GripperMeasured:
+        """Return the newest state; at once."""
         ...
 
     def grip_width(self, width_m: float, force_limit_n: float) -> None:
@@ -115,12 +179,8 @@ class ArmController(Protocol):
         """
         ...
 
-    def brake(self) -> None:
-        """Stop the arm as fast as it can; the gripper holds what it holds."""
-        ...
-
     def close(self) -> None:
-        """Come to rest and disconnect."""
+        """Disconnect; what the gripper holds stays held."""
         ...
 
 

@@ -14,7 +14,12 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from actors.palletizing.controller import ControllerError, Measured
+from actors.palletizing.controller import (
+    ArmMeasured,
+    ControllerError,
+    GripperMeasured,
+    Measured,
+)
 from actors.palletizing.simulation.cell_scene import (
     ARM,
     DAMPING_NM_S_RAD,
@@ -29,6 +34,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     import numpy.typing as npt
+
+    from actors.geometry.joint_paths import Arm
 
     F64 = npt.NDArray[np.float64]
 
@@ -142,7 +149,7 @@ class JointLimiter:
 
 
 class SimulatedArm:
-    """Arm and gripper of the cell, as their controller shows them; an `ArmController`.
+    """Arm and gripper of the cell: an `ArmController` and a `GripperController` in one.
 
     Args:
         model: MuJoCo's model of the cell.
@@ -184,6 +191,16 @@ class SimulatedArm:
         return CYCLE_S
 
     @property
+    def model(self) -> Arm:
+        """Kinematics and limits."""
+        return ARM
+
+    @property
+    def posture_rad(self) -> F64:
+        """Where the joints go as far as the tool leaves it open."""
+        return np.array(HOME_RAD)
+
+    @property
     def limiter(self) -> JointLimiter:
         """What the drives are told."""
         return self._limiter
@@ -197,6 +214,16 @@ class SimulatedArm:
         """Return the state of the last cycle."""
         assert self._measured is not None, "the cell measures when it is made"
         return self._measured
+
+    def arm_measured(self) -> ArmMeasured:
+        """Return the state of the last cycle without the gripper's."""
+        now = self.measured()
+        return ArmMeasured(now.stamp_ns, now.q, now.dq, now.tcp, now.wrench)
+
+    def gripped(self) -> GripperMeasured:
+        """Return the gripper's state of the last cycle."""
+        now = self.measured()
+        return GripperMeasured(now.stamp_ns, now.width_m, now.width_rate_m_s, now.grip_force_n)
 
     def command(self, q: F64) -> None:
         """Command where the joints are to be one cycle from now.

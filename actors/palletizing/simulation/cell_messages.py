@@ -15,7 +15,7 @@ from typing import Any, Final
 import msgpack
 import numpy as np
 
-from actors.palletizing.controller import ControllerError, Measured
+from actors.palletizing.controller import ArmMeasured, ControllerError, GripperMeasured
 from actors.palletizing.simulation.cell_truth import (
     CellTruth,
     GripEvent,
@@ -29,7 +29,16 @@ BYTES_MAX: Final = 16 * 1024 * 1024
 """Greatest message: a picture has 2 MiB, all else far less."""
 _KINDS: Final[dict[str, Any]] = {
     kind.__name__: kind
-    for kind in (Measured, CellTruth, PackageTruth, GripEvent, Dent, ShownCell, ShownPackage)
+    for kind in (
+        ArmMeasured,
+        GripperMeasured,
+        CellTruth,
+        PackageTruth,
+        GripEvent,
+        Dent,
+        ShownCell,
+        ShownPackage,
+    )
 }
 _DTYPES: Final = {"float64", "uint8", "int64", "bool"}
 

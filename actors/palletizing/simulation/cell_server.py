@@ -5,8 +5,9 @@
 It runs in real time from the start, or at another speed.  `remote_cell` has what the actors open:
 controller, belt and sensors at an address with this port.
 
-Rules a change must keep: one connection commands the arm, the one that started it last; when that
-connection ends, for whatever reason, the arm brakes and the gripper holds what it holds.
+Rules a change must keep: one connection commands the arm and one the gripper, those that started
+them last; when that of the arm ends, for whatever reason, the arm brakes; when that of the gripper
+ends, it goes on holding what it holds.
 """
 
 from __future__ import annotations
@@ -28,8 +29,17 @@ from actors.palletizing.simulation.physics import PhysicalCell
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-COMMANDS: Final = ("command", "grip_width", "grip_force", "brake")
-"""What only the connection that started the arm may ask for."""
+STARTS: Final = {"start": "arm", "start_gripper": "gripper"}
+"""The requests that make a connection the one that commands a device."""
+COMMANDS: Final = {
+    "command": "arm",
+    "brake": "arm",
+    "grip_width": "gripper",
+    "grip_force": "gripper",
+}
+"""What only the connection that started a device may ask of it."""
+MEASURED: Final = {"measured": "arm_measured", "gripped": "gripped"}
+"""What anybody may ask at any time, by its name and that of the simulated arm."""
 STOPPED: Final = (
     "run_belt",
     "stop_belt",
@@ -60,7 +70,7 @@ class CellServer:
         self._running = running
         self._listener = socket.create_server((host, port))
         self.port = int(self._listener.getsockname()[1])
-        self._owner: socket.socket | None = None
+        self._owners: dict[str, socket.socket] = {}
         self._lock = threading.Lock()
         self._open: set[socket.socket] = set()
         self._thread = threading.Thread(target=self._accept, name="cell server", daemon=True)
@@ -121,9 +131,11 @@ class CellServer:
     def _leave(self, connection: socket.socket) -> None:
         with self._lock:
             self._open.discard(connection)
-            if self._owner is connection:
-                self._owner = None
-                self._running.arm.brake()
+            for device, owner in list(self._owners.items()):
+                if owner is connection:
+                    del self._owners[device]
+                    if device == "arm":
+                        self._running.arm.brake()
 
     def _answer(
         self,
@@ -134,18 +146,20 @@ class CellServer:
         if not isinstance(request, tuple) or not request:
             raise ControllerError(f"{request!r} is no request")
         name, *arguments = request
-        if name == "measured":
-            return self._running.arm.measured()
-        if name == "start":
+        if name in MEASURED:
+            return getattr(self._running.arm, MEASURED[name])()
+        if name in STARTS:
             with self._lock:
-                self._owner = connection
-                self._running.arm.start()
+                self._owners[STARTS[name]] = connection
+                if STARTS[name] == "arm":
+                    self._running.arm.start()
             return None
         if name in COMMANDS:
             with self._lock:
-                if self._owner is not connection:
+                if self._owners.get(COMMANDS[name]) is not connection:
                     raise ControllerError(
-                        "the arm takes no commands from this connection; call start() first"
+                        f"the {COMMANDS[name]} takes no commands from this connection; call"
+                        " start() first"
                     )
                 return getattr(self._running.arm, name)(*arguments)
         if name in STOPPED:

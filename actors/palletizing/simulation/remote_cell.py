@@ -2,13 +2,14 @@
 
 ==================================  ================================================================
 `…remote_cell:arm?port=7460`        an `ArmController`, for `open_controller`
+`…remote_cell:gripper?port=7460`    a `GripperController`, for `open_controller`
 `…remote_cell:belt?port=7460`       a `BeltController`, for `open_controller`
 `…remote_cell:tray_sensor?port=…`   a `TraySensor`, for `open_sensor`
 `…remote_cell:belt_sensor?port=…`   a `BeltSensor`, for `open_sensor`
 ==================================  ================================================================
 
 Rule a change must keep: one request at a time over a connection; a connection that was lost is made
-anew by the next request, but whoever commanded the arm has to start it again.
+anew by the next request, but whoever commanded arm or gripper has to start it again.
 """
 
 from __future__ import annotations
@@ -18,17 +19,20 @@ import threading
 from contextlib import closing
 from typing import TYPE_CHECKING, Any, Final
 
-from actors.palletizing.controller import ControllerError, Measured
+import numpy as np
+
+from actors.palletizing.controller import ArmMeasured, ControllerError, GripperMeasured
 from actors.palletizing.simulation.cell_arm import CYCLE_S
 from actors.palletizing.simulation.cell_messages import receive, send
+from actors.palletizing.simulation.cell_scene import ARM, HOME_RAD
 from actors.palletizing.simulation.physical_sensors import PhysicalBeltSensor, PhysicalTraySensor
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    import numpy as np
     import numpy.typing as npt
 
+    from actors.geometry.joint_paths import Arm
     from actors.palletizing.simulation.cell_truth import CellTruth, ShownCell
 
     F64 = npt.NDArray[np.float64]
@@ -105,7 +109,7 @@ class RemoteCell:
 
 
 class RemoteArm:
-    """Arm and gripper of a cell in another process; an `ArmController`."""
+    """The arm of a cell in another process; an `ArmController`."""
 
     def __init__(self, cell: RemoteCell) -> None:
         self._cell = cell
@@ -115,18 +119,52 @@ class RemoteArm:
         """Period of control."""
         return CYCLE_S
 
+    @property
+    def model(self) -> Arm:
+        """Kinematics and limits."""
+        return ARM
+
+    @property
+    def posture_rad(self) -> F64:
+        """Where the joints go as far as the tool leaves it open."""
+        return np.array(HOME_RAD)
+
     def start(self) -> None:
         """Take commands of this connection from now on, and of no other."""
         self._cell.ask("start")
 
-    def measured(self) -> Measured:
+    def measured(self) -> ArmMeasured:
         """Return the newest state."""
-        found: Measured = self._cell.ask("measured")
+        found: ArmMeasured = self._cell.ask("measured")
         return found
 
     def command(self, q: F64) -> None:
         """Command where the joints are to be one cycle from now."""
         self._cell.ask("command", q)
+
+    def brake(self) -> None:
+        """Stop the arm."""
+        self._cell.ask("brake")
+
+    def close(self) -> None:
+        """Disconnect; the arm brakes."""
+        self._cell.close()
+
+
+class RemoteGripper:
+    """The gripper of a cell in another process; a `GripperController`."""
+
+    def __init__(self, cell: RemoteCell) -> None:
+        self._cell = cell
+
+    def start(self) -> None:
+        """Take commands of this connection from now on, and of no other."""
+        self._cell.ask("start_gripper")
+
+    def gripped(self) -> GripperMeasured:
+        """Return the newest state."""
+        found: GripperMeasured = self._cell.ask("gripped")
+        return found
 
     def grip_width(self, width_m: float, force_limit_n: float) -> None:
         """Move the fingers to a distance."""
@@ -136,12 +174,8 @@ class RemoteArm:
         """Close the fingers until they press with a force."""
         self._cell.ask("grip_force", float(force_n))
 
-    def brake(self) -> None:
-        """Stop the arm; the gripper goes on holding."""
-        self._cell.ask("brake")
-
     def close(self) -> None:
-        """Disconnect; the arm brakes."""
+        """Disconnect; what it holds stays held."""
         self._cell.close()
 
 
@@ -183,6 +217,11 @@ class RemoteBelt:
 def arm(port: str, host: str = "127.0.0.1") -> RemoteArm:
     """Return the arm of the cell at a port; for `open_controller`."""
     return RemoteArm(RemoteCell(int(port), host))
+
+
+def gripper(port: str, host: str = "127.0.0.1") -> RemoteGripper:
+    """Return the gripper of the cell at a port; for `open_controller`."""
+    return RemoteGripper(RemoteCell(int(port), host))
 
 
 def belt(port: str, host: str = "127.0.0.1") -> RemoteBelt:

@@ -34,20 +34,25 @@ def cell():
 def test_cell_is_used_by_addresses(cell):
     """Arm, belt and sensors at an address do what those of the cell itself do."""
     running, port = cell
-    arm, belt = (open_controller(f"{REMOTE}:{name}?port={port}") for name in ("arm", "belt"))
+    arm, gripper, belt = (
+        open_controller(f"{REMOTE}:{name}?port={port}") for name in ("arm", "gripper", "belt")
+    )
     sensor = open_sensor(f"{REMOTE}:tray_sensor?port={port}&seed=3")
 
     arm.start()
     goal = np.array(HOME_RAD) + 0.1
     arm.command(goal)
-    arm.grip_width(0.07, 30.0)
+    gripper.start()
+    gripper.grip_width(0.07, 30.0)
     number = belt.feed()
     belt.run_belt()
     running.wait_cycles(1000)
 
-    measured = arm.measured()
-    np.testing.assert_allclose(measured.q, goal, atol=1e-3)
-    assert measured.width_m == pytest.approx(0.07, abs=1e-3)
+    np.testing.assert_allclose(arm.measured().q, goal, atol=1e-3)
+    assert gripper.gripped().width_m == pytest.approx(0.07, abs=1e-3)
+    np.testing.assert_allclose(arm.measured().tcp, running.arm.measured().tcp, atol=1e-3)
+    np.testing.assert_array_equal(arm.model.dh, running.arm.model.dh)
+    np.testing.assert_array_equal(arm.posture_rad, HOME_RAD)
     assert (number, belt.arrived(), belt.coming()) == (0, True, 1)
     with closing(RemoteCell(port)) as remote:
         truth = remote.truth()
@@ -55,8 +60,8 @@ def test_cell_is_used_by_addresses(cell):
     assert sensor.capture(0).depth_mm.shape == (480, 640)
     with pytest.raises(ControllerError, match="its range is"):
         arm.command(goal + 5.0)
-    arm.close()
-    belt.close()
+    for one in (arm, gripper, belt):
+        one.close()
 
 
 def test_arm_brakes_when_its_commander_is_gone():
@@ -100,6 +105,30 @@ def test_last_start_takes_over(cell):
     first.close()
     second.command(np.array(HOME_RAD))
     second.close()
+
+
+def test_arm_and_gripper_have_an_owner_each(cell):
+    """Who commands the one does not command the other; the gripper holds when its owner is gone."""
+    running, port = cell
+    arm, gripper, other = (
+        open_controller(f"{REMOTE}:{name}?port={port}") for name in ("arm", "gripper", "gripper")
+    )
+    arm.start()
+    with pytest.raises(ControllerError, match=r"the gripper takes no commands .* call start\(\)"):
+        gripper.grip_force(30.0)
+    gripper.start()
+    gripper.grip_force(30.0)
+
+    gripper.close()
+    running.wait_cycles(200)
+
+    assert running.arm.gripping
+    arm.command(np.array(HOME_RAD))
+    other.start()
+    other.grip_width(0.08, 30.0)
+    assert not running.arm.gripping
+    for one in (arm, other):
+        one.close()
 
 
 def test_no_cell_is_one_line():
