@@ -9,12 +9,16 @@ Annotations stay real types here (no `from __future__ import annotations`): the 
 """
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 DEPTH_UNKNOWN_MM = 0
 """What a depth sensor reports where it has no answer."""
+
+NEAREST_MM = 50.0
+"""No depth sensor sees nearer; an image whose largest depth is below is in metres."""
 
 FREE_FORM = -1
 """Patch number of a vertex that lies on no planar patch."""
@@ -94,15 +98,23 @@ class DepthFrame:
     """One image of a depth sensor.
 
     Attributes:
-        depth_mm: (H, W) uint16, millimetres along the optical axis; 0 where unknown.
+        depth_mm: (H, W) millimetres along the optical axis, 0 where unknown: uint16 as a sensor
+            gives them, float32 where several images were fused (`depth.fused`).
         acquisition: The camera and its pose; H and W are those of the camera.
     """
 
-    depth_mm: npt.NDArray[np.uint16]
+    depth_mm: npt.NDArray[Any]
     acquisition: Acquisition
 
     def __post_init__(self) -> None:
-        _check("depth_mm", self.depth_mm, np.uint16, self.acquisition.camera.shape)
+        fused = getattr(self.depth_mm, "dtype", None) == np.float32
+        dtype = np.float32 if fused else np.uint16
+        _check("depth_mm", self.depth_mm, dtype, self.acquisition.camera.shape)
+        if fused and 0.0 < self.depth_mm.max() < NEAREST_MM:
+            raise ValueError(
+                f"depth_mm: asked for millimetres, found at most {self.depth_mm.max():.3f}:"
+                " these are metres"
+            )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

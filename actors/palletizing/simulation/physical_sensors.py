@@ -3,8 +3,9 @@
 One looks down at the tray, one at the end of the belt.  Packages are drawn with their dents, arm
 and gripper where they are: a sensor that shall see all of the tray has the arm moved aside first.
 
-Rules a change must keep: an image depends on the seed, the simulated time and on what it shows;
-the sensor of the tray is that of the list-driven simulator, so that perception knows no difference.
+Rules a change must keep: an image depends on the seed, the simulated time, how many were taken at
+that time, and on what it shows; the sensor of the tray is that of the list-driven simulator, so
+that perception knows no difference.
 """
 
 from __future__ import annotations
@@ -28,10 +29,12 @@ from actors.palletizing.simulation.cell_scene import (
     PAD_HALF_M,
     CellLayout,
 )
+from actors.palletizing.simulation.noise import sensed
 from actors.palletizing.simulation.physical_packages import dented_mesh
 from actors.palletizing.simulation.products import box_mesh, hull_mesh
 from actors.palletizing.simulation.sensors import (
     OVERHEAD_M,
+    Repeats,
     captured,
     shifted,
     tray_meshes,
@@ -83,6 +86,8 @@ class _FixedSensor:
         self._world_from_base = inverse(world)
         self._true = Acquisition(VGA, true)
         self._seed = seed
+        self._moment = Repeats()
+        self._last: tuple[bytes, npt.NDArray[np.float32]] | None = None
 
     def capture_empty(self) -> DepthFrame:
         """Return an image with nothing but what stands still."""
@@ -96,17 +101,24 @@ class _FixedSensor:
             stop: Ignored, as by a real sensor.
         """
         shown = self._shown()
-        random = np.random.default_rng([self._seed, 1, shown.stamp_ns])
-        return captured(self._meshes(shown), self._true, self._reported(shown), random)
+        random = np.random.default_rng([self._seed, 1, *self._moment.again(shown.stamp_ns)])
+        return DepthFrame(sensed(self._depth(shown), random), self._reported(shown))
 
     def true_depth(self) -> npt.NDArray[np.float32]:
         """Return the present image without noise, (H, W) float32, metres, NaN where nothing is."""
-        return true_depth(self._meshes(self._shown()), self._true)
+        return self._depth(self._shown())
 
     @property
     def acquisition(self) -> Acquisition:
         """From where it really looks."""
         return self._true
+
+    def _depth(self, shown: ShownCell) -> npt.NDArray[np.float32]:
+        """Return the image without noise; the last one while nothing has moved by a hair."""
+        still = _fingerprint(shown)
+        if self._last is None or self._last[0] != still:
+            self._last = still, true_depth(self._meshes(shown), self._true)
+        return self._last[1]
 
     def _meshes(self, shown: ShownCell) -> list[Mesh]:
         return _in(
@@ -173,6 +185,14 @@ class PhysicalBeltSensor(_FixedSensor):
         nearest = min(shown.packages, key=lambda package: distances[package.number], default=None)
         near = nearest is not None and distances[nearest.number] < BELT_HALF_M[1] + 0.1
         return nearest if near else None
+
+
+def _fingerprint(shown: ShownCell) -> bytes:
+    """Return what tells two moments apart in which something moved by 10 micrometres or more."""
+    parts = [np.append(shown.q, shown.width_m), *(p.base_from_product for p in shown.packages)]
+    whole = np.concatenate([part.ravel() for part in parts])
+    which = [(p.number, p.product, p.dents) for p in shown.packages]
+    return np.rint(whole * 1e5).astype(np.int64).tobytes() + repr(which).encode()
 
 
 def still_meshes(layout: CellLayout) -> list[Mesh]:

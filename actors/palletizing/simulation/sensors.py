@@ -1,7 +1,8 @@
 """SIMULATED depth sensors: ray casting of the true shapes, then the noise of `noise`.
 
-Rules a change must keep: an image depends on the seed and on what it shows only, so that two
-sensors of one seed see the same; acquisition poses are off by what a robot is off.
+Rules a change must keep: an image depends on the seed, on what it shows and on how many were taken
+of that, so that two sensors of one seed see the same; acquisition poses are off by what a robot is
+off.
 """
 
 from __future__ import annotations
@@ -51,6 +52,20 @@ ROBOT_SPREAD_RAD: Final = 0.0015
 """The same as rotation per axis: 0.7 mm at the distance of the orbit."""
 
 
+class Repeats:
+    """Counts how often the same thing was looked at: each image of it has its own noise."""
+
+    def __init__(self) -> None:
+        self._last: tuple[int, ...] = ()
+        self._times = 0
+
+    def again(self, *what: int) -> tuple[int, ...]:
+        """Return what is looked at, and how often it was before if it was."""
+        self._times = self._times + 1 if what == self._last else 0
+        self._last = what
+        return (*what, self._times) if self._times else what
+
+
 class SimulatedTraySensor:
     """Depth sensor 0.95 m above the tray that sees a given sequence of packages.
 
@@ -62,22 +77,27 @@ class SimulatedTraySensor:
     def __init__(self, packages: Sequence[Package], *, seed: int) -> None:
         self._packages = packages
         self._seed = seed
+        self._stop = Repeats()
+        self._last: tuple[int, npt.NDArray[np.float32]] | None = None
         self._acquisition = Acquisition(
             VGA, looking_at(np.array([0.0, 0.0, OVERHEAD_M]), np.zeros(3))
         )
 
     def capture_empty(self) -> DepthFrame:
         """Return an image of the tray with nothing on it."""
-        return self._seen([], np.random.default_rng([self._seed, 0]))
+        return self._seen(-1, np.random.default_rng([self._seed, *self._stop.again(0)]))
 
     def capture(self, stop: int) -> DepthFrame:
         """Return an image of the tray with the packages of this tray up to the stop's own."""
-        visible = on_the_tray(self._packages, stop)
-        return self._seen(visible, np.random.default_rng([self._seed, 1, stop]))
+        random = np.random.default_rng([self._seed, *self._stop.again(1, stop)])
+        return self._seen(stop, random)
 
-    def _seen(self, visible: Sequence[Package], random: np.random.Generator) -> DepthFrame:
-        meshes = [*tray_meshes(), *(mesh for package in visible for mesh in package.meshes())]
-        return captured(meshes, self._acquisition, self._acquisition, random)
+    def _seen(self, stop: int, random: np.random.Generator) -> DepthFrame:
+        if self._last is None or self._last[0] != stop:
+            visible = on_the_tray(self._packages, stop) if stop >= 0 else []
+            meshes = [*tray_meshes(), *(mesh for package in visible for mesh in package.meshes())]
+            self._last = stop, true_depth(meshes, self._acquisition)
+        return DepthFrame(sensed(self._last[1], random), self._acquisition)
 
 
 class SimulatedOrbitSensor:

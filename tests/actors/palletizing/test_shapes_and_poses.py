@@ -36,9 +36,13 @@ def test_frame_refuses_an_image_of_another_camera():
 
 
 def test_frame_refuses_depth_in_metres():
-    """Depth as floats, which would be metres, is refused."""
-    with pytest.raises(ValueError, match="found float32"):
-        DepthFrame(np.zeros((480, 640), np.float32), Acquisition(VGA, np.eye(4)))
+    """Floats are millimetres of several images; metres, and double precision, are refused."""
+    seen_by = Acquisition(VGA, np.eye(4))
+    with pytest.raises(ValueError, match=r"asked for millimetres, found at most 0.950"):
+        DepthFrame(np.full((480, 640), 0.95, np.float32), seen_by)
+    with pytest.raises(ValueError, match="found float64"):
+        DepthFrame(np.full((480, 640), 950.0), seen_by)
+    assert DepthFrame(np.full((480, 640), 950.25, np.float32), seen_by).depth_mm[0, 0] == 950.25
 
 
 def test_camera_refuses_a_focal_length_of_zero():
