@@ -1,14 +1,16 @@
 """Where packages shall stand when a robot pushes them together: rows on trays.
 
-A row runs along the tray's x axis.  Its first package touches the rim, each further one the package
-before it.  What would tip under a push, since it is taller than it is deep, gets a row of its own,
-in which neighbours keep a little distance.
+A row runs along the tray's x axis, and so does the length of its packages: the fingers, which hold
+them by their sides, need room between the rows but none within one.  So the fingers decide where a
+package stands across its row, and the push where it stands along it.  The first package of a row
+touches the rim, each further one the package before it.  What would tip under a push, since it is
+taller than it is long, gets rows of its own, in which neighbours keep a little distance.
 
 Rule a change must keep: places are filled in their order; what has been put down is never between
-a package and the place that the robot comes from to push it.
+a package and the place that the robot comes from to push it, nor where its fingers go down.
 
 Sizes are those of the physical cell: a tray of 0.90 x 0.64 m, whose middle is 0.58 m in front of an
-arm that reaches from 0.42 to 0.79 m with its hand down.
+arm that reaches from 0.43 to 0.79 m with its hand down.
 """
 
 from __future__ import annotations
@@ -27,20 +29,24 @@ if TYPE_CHECKING:
 
     F64 = npt.NDArray[np.float64]
 
-ROWS_Y_M: Final = (-0.075, 0.140)
+ROWS_Y_M: Final = (-0.120, 0.010, 0.140)
 """Middles of the rows, tray frame, in the order they are filled: the far one first."""
-ROW_DEPTH_M: Final = 0.21
-"""No longer may a package be across its row."""
 ROW_START_M: Final = -0.448
 """Inner side of the rim that the first package touches."""
-ROW_END_M: Final = 0.300
-"""Where a row ends: behind it the closed hand needs 0.14 m to go down within the rim."""
+ROW_END_M: Final = 0.360
+"""Where a row ends: behind it the closed hand goes down within the rim."""
+WIDTH_MAX_M: Final = 0.125
+"""No wider may a package be across its row."""
 TOUCHING_M: Final = 0.0005
 """Between neighbours of a row, as planned: what a push leaves."""
-APART_M: Final = 0.012
-"""Between neighbours that are not pushed: the spread of where they are put down."""
-STEADY: Final = 1.0
-"""What is taller than this share of its depth along the push would tip."""
+APART_M: Final = 0.020
+"""Between neighbours that are not pushed: where they are put down is not better known."""
+BESIDE_M: Final = 0.005
+"""Between packages of two rows."""
+FINGER_M: Final = 0.021
+"""The same where a finger goes down: its thickness, and what it opens."""
+FINGER_HALF_M: Final = 0.035
+"""Half of where along the row that may be, from the middle of the package."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,51 +70,75 @@ def planned_rows(products: Sequence[str], sizes_m: Mapping[str, F64]) -> list[Sl
 
     Args:
         products: What comes, in its order.
-        sizes_m: Box of each product, (3,), metres, product frame: it is pushed along its y axis.
+        sizes_m: Box of each product, (3,), metres, product frame: it is held by the sides along its
+            y axis and pushed along its x axis.
 
     Raises:
-        ValueError: A product is longer than a row is deep, or wider than a row is long.
+        ValueError: A product is wider or longer than a row.
     """
     slots: list[Slot] = []
     tray, rows = 0, _Rows()
     for product in products:
-        size = np.asarray(sizes_m[product], np.float64)
-        pushed = bool(size[2] <= STEADY * size[1])
-        across, along = (size[0], size[1]) if pushed else (size[1], size[0])
-        if across > ROW_DEPTH_M or along > ROW_END_M - ROW_START_M:
-            room = f"{1e3 * ROW_DEPTH_M:.0f} x {1e3 * (ROW_END_M - ROW_START_M):.0f} mm"
-            found = f"{1e3 * across:.0f} x {1e3 * along:.0f} mm"
-            raise ValueError(f"{product} takes {found} of a row; a row has {room}")
-        if not rows.takes(along, pushed=pushed):
+        length, width, height = (float(each) for each in sizes_m[product])
+        if width > WIDTH_MAX_M or length > ROW_END_M - ROW_START_M:
+            room = f"{1e3 * (ROW_END_M - ROW_START_M):.0f} x {1e3 * WIDTH_MAX_M:.0f} mm"
+            found = f"{1e3 * length:.0f} x {1e3 * width:.0f} mm"
+            raise ValueError(f"{product} is {found} large; a row takes {room}")
+        pushed = height <= length
+        found_at = rows.take(length, width, pushed=pushed)
+        if found_at is None:
             tray, rows = tray + 1, _Rows()
-        x, y = rows.take(along, pushed=pushed)
-        yaw = -np.pi / 2.0 if pushed else 0.0
+            found_at = rows.take(length, width, pushed=pushed)
+            assert found_at is not None, "an empty tray takes every product that is not too large"
         push = np.array([-1.0, 0.0, 0.0]) if pushed else np.zeros(3)
-        slots.append(Slot(tray, on_tray(x, y, yaw), push))
+        slots.append(Slot(tray, on_tray(*found_at, 0.0), push))
     return slots
 
 
+@dataclass(frozen=True, slots=True)
+class _Taken:
+    """A package on a tray: its row, its middle along it, half its size."""
+
+    row: int
+    x_m: float
+    half_length_m: float
+    half_width_m: float
+
+
 class _Rows:
-    """How far the rows of one tray are filled."""
+    """What stands on one tray."""
 
     def __init__(self) -> None:
-        self._free = list(ROWS_Y_M)
-        self._end: dict[bool, float] = {}
-        self._row: dict[bool, float] = {}
+        self._taken: list[_Taken] = []
+        self._pushed: dict[int, bool] = {}
 
-    def takes(self, along_m: float, *, pushed: bool) -> bool:
-        """Return whether another package fits."""
-        return bool(self._free) or self._fits(along_m, pushed=pushed)
+    def take(self, length_m: float, width_m: float, *, pushed: bool) -> tuple[float, float] | None:
+        """Return the middle of the next package, x and y in the tray frame; None if none fits."""
+        for row, y_m in enumerate(ROWS_Y_M):
+            if self._pushed.get(row, pushed) != pushed:
+                continue
+            apart_m = TOUCHING_M if pushed else APART_M
+            end_m = max((t.x_m + t.half_length_m for t in self._in(row)), default=ROW_START_M)
+            new = _Taken(row, end_m + apart_m + length_m / 2.0, length_m / 2.0, width_m / 2.0)
+            if new.x_m + new.half_length_m <= ROW_END_M and self._has_room(new):
+                self._pushed[row] = pushed
+                self._taken.append(new)
+                return new.x_m, y_m
+        return None
 
-    def take(self, along_m: float, *, pushed: bool) -> tuple[float, float]:
-        """Return the middle of the next package, x and y in the tray frame."""
-        if not self._fits(along_m, pushed=pushed):
-            self._row[pushed], self._end[pushed] = self._free.pop(0), ROW_START_M
-        apart_m = TOUCHING_M if pushed else APART_M
-        x = self._end[pushed] + apart_m + along_m / 2.0
-        self._end[pushed] = x + along_m / 2.0
-        return x, self._row[pushed]
+    def _in(self, row: int) -> list[_Taken]:
+        return [each for each in self._taken if each.row == row]
 
-    def _fits(self, along_m: float, *, pushed: bool) -> bool:
-        apart_m = TOUCHING_M if pushed else APART_M
-        return pushed in self._end and self._end[pushed] + apart_m + along_m <= ROW_END_M
+    def _has_room(self, new: _Taken) -> bool:
+        """Return whether package and fingers go down beside what stands in the other rows."""
+        for other in self._taken:
+            if other.row == new.row:
+                continue
+            between_m = abs(ROWS_Y_M[other.row] - ROWS_Y_M[new.row])
+            between_m -= other.half_width_m + new.half_width_m
+            along_m = abs(other.x_m - new.x_m) - other.half_length_m
+            if along_m < new.half_length_m and between_m < BESIDE_M:
+                return False
+            if along_m < FINGER_HALF_M and between_m < FINGER_M:
+                return False
+        return True
