@@ -20,7 +20,7 @@ from actors.workcell import vocabulary as words
 from actors.workcell.demo_cell import SETUP
 from actors.workcell.scenarios import scenario_of
 from actors.workcell.trace import ONLINE, RECORDED, TRUTH
-from enact_dist import Lock, View, Write
+from enact_dist import Lock, View, ViewEach, Write
 from enact_dist.actor_words import reports_of, tell_reported
 from enact_dist.config import load_config
 from enact_dist.errors import EnactError, ForgottenError, NullDatumError, ShardUnreachableError
@@ -63,6 +63,8 @@ ASKED_S: Final = 10.0
 """So long the end of a run waits for what is being kept."""
 LOOKING_ON_NICE: Final = 10
 """Nice value of the threads that record and look on: a tenth of the weight of an actor."""
+TRACKS_EVERY_S: Final = 1.0
+"""Time between two looks at what people have left."""
 NEARER_M: Final = 0.05
 """The nearest approach is kept anew only if it is so much nearer."""
 
@@ -112,7 +114,8 @@ class Conductor:
         self._cell, self._running, self._options, self._tell = cell, running, options, tell
         self._online, self._truth = cell.world(ONLINE), cell.world(TRUTH)
         self.notes = Notes()
-        self._kept_s = 0.0
+        self._kept_s = self._tracks_s = 0.0
+        self._foreign: set[Entity] = set()
         self._asking: threading.Thread | None = None
 
     def prepare(self) -> None:
@@ -238,12 +241,26 @@ class Conductor:
             self._aside(self._keep)
         if found is not None and found.state == "stop" and not self.notes.stop and now_s > 0.0:
             self._aside(self._keep_stop)
+        if now_s > self._tracks_s + TRACKS_EVERY_S:
+            self._tracks_s = now_s
+            self._look_for_foreign(now_s)
         if found is None:
             return before
         state, line = told(found, newest, time.time_ns())
         if state != before:
             self._say(now_s, line)
         return state
+
+    def _look_for_foreign(self, now_s: float) -> None:
+        """Report each object that somebody has left, once."""
+        request = ViewEach(self._online, words.HUMANS, words.TRACK)
+        for name, track in self._online.view(request)[request].items():
+            if track.foreign and name not in self._foreign:
+                self._foreign.add(name)
+                x, y, top = track.position_m
+                self._say(
+                    now_s, f"foreign object, {top:.2f} m high, at x {x:.2f} m, y {y:.2f} m ({name})"
+                )
 
     def _aside(self, act: Callable[[], None]) -> None:
         """Ask the shard at length in a thread, unless one does: the run must not wait for it."""

@@ -160,7 +160,7 @@ def _still(trace: Trace, truth: Truth, _: Mapping[str, float]) -> dict[str, bool
 
 
 def _left(trace: Trace, truth: Truth, _: Mapping[str, float]) -> dict[str, bool]:
-    """S6: an object left in the cell stays an obstacle."""
+    """S6: an object left in the cell stays an obstacle, and is reported."""
     thing = truth.things[0]
     after = [
         kept
@@ -179,7 +179,16 @@ def _left(trace: Trace, truth: Truth, _: Mapping[str, float]) -> dict[str, bool]
         < 0.1
         for kept in after
     ]
-    return {"what is left stays an obstacle": bool(kept_there) and all(kept_there)}
+    reported = [
+        kept.datum.foreign
+        for name in trace.entities(words.TRACK)
+        for kept in trace.of(name, words.TRACK)
+        if math.dist(kept.datum.position_m[:2], thing.centre_m[:2]) < PLACE_M
+    ]
+    return {
+        "what is left stays an obstacle": bool(kept_there) and all(kept_there),
+        "what is left is reported as foreign": any(reported),
+    }
 
 
 def _cameras(trace: Trace, truth: Truth, _: Mapping[str, float]) -> dict[str, bool]:

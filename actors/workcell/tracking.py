@@ -50,6 +50,11 @@ AT_S: Final = tuple(k / 10.0 for k in range(1, 11))
 """For when a person is predicted, seconds after the stamp."""
 EDGE_M: Final = 0.4
 """A person last seen this near to a side of the workspace has left."""
+FOREIGN_M: Final = 0.6
+"""What is lower than this, and still, is no standing person."""
+STILL_M: Final = 0.05
+STILL_S: Final = 3.0
+"""What has moved by less than `STILL_M` for this long is still."""
 GATE_M: Final = 0.35
 """Distance from where a person is expected at which they are recognised, whatever the spread."""
 HIDDEN_RADIUS_MAX_M: Final = 1.5
@@ -64,7 +69,7 @@ class HumanTracking(Actor):
     A person is a component of the tight hull of 20 litres or more.  A person no longer seen
     has left if last seen at a side of the workspace; otherwise they are hidden, and may reappear
     wherever they may have walked.  A component seen for less than :data:`CONFIRMED_S` was not a
-    person.
+    person.  What is low and still is marked as foreign, and counts as a person all the same.
 
     Attributes:
         hidden_s_max: How long someone stays hidden before the track ends.
@@ -85,6 +90,7 @@ class HumanTracking(Actor):
     def __init__(self) -> None:
         self._last_ns = self._next = self._sets = 0
         self._hidden_since_ns: dict[Entity, int] = {}
+        self._still_since: dict[Entity, tuple[F64, int]] = {}
 
     def update(self, lock: Lock) -> None:
         """Find the people of the newest hull again."""
@@ -152,7 +158,13 @@ class HumanTracking(Actor):
         height_m = body.top_m if before is None else 0.8 * before.height_m + 0.2 * body.top_m
         first_ns = now_ns if before is None else before.first_ns
         lock[self.tracks][name] = _track(
-            state, body.top_m, height_m, body.volume_m3, first_ns, now_ns
+            state,
+            body.top_m,
+            height_m,
+            body.volume_m3,
+            first_ns,
+            now_ns,
+            foreign=body.top_m < FOREIGN_M and self._is_still(name, body.centre_m, now_ns),
         )
         if before is None or before.hidden or self._sets % self.limbs_every == 0:
             lock[self.limbs][name] = limbs(body.points_m)
@@ -160,6 +172,13 @@ class HumanTracking(Actor):
         lock[self.predictions][name] = Prediction(
             np.array(AT_S), *predicted(*state, AT_S, radius_m)
         )
+
+    def _is_still(self, name: Entity, centre_m: F64, now_ns: int) -> bool:
+        place_m, since_ns = self._still_since.get(name, (centre_m, now_ns))
+        if np.hypot(*(centre_m - place_m)) > STILL_M:
+            place_m, since_ns = centre_m, now_ns
+        self._still_since[name] = place_m, since_ns
+        return now_ns - since_ns >= STILL_S * 1e9
 
     def _lose(
         self,
@@ -179,6 +198,7 @@ class HumanTracking(Actor):
         left = not before.hidden and inside_m < EDGE_M
         if brief or left or hidden_s > self.hidden_s_max:
             self._hidden_since_ns.pop(name, None)
+            self._still_since.pop(name, None)
             lock[self.tracks].pop(name, None)
             lock[self.limbs].pop(name, None)
             lock[self.predictions].pop(name, None)
@@ -221,6 +241,7 @@ def _track(
     seen_ns: int,
     *,
     hidden: bool = False,
+    foreign: bool = False,
 ) -> Track:
     covariance = np.zeros((6, 6))
     kept = [0, 1, 3, 4]
@@ -235,6 +256,7 @@ def _track(
         first_ns=first_ns,
         hidden=hidden,
         seen_ns=seen_ns,
+        foreign=foreign,
     )
 
 

@@ -179,6 +179,23 @@ def test_brief_sight_is_not_a_person(cell):
     assert [cell.each(aspect) for aspect in (LIMBS, PREDICTION)] == [{}, {}]
 
 
+def test_what_is_left_is_foreign_once_it_is_still(cell):
+    """Low and in one place for three seconds: foreign.  A person who stands there is not."""
+    marks = [
+        {name: track.foreign for name, track in tracks.items()}
+        for tracks in (
+            cell.see(body((0.6, 0.6), height_m=0.4), body((-0.6, 0.0))) for _ in range(32)
+        )
+    ]
+    moved = cell.see(body((0.7, 0.6), height_m=0.4), body((-0.6, 0.0)))
+
+    low = max(marks[-1], key=lambda name: marks[-1][name])
+    assert sorted(marks[29].values()) == [False, False]
+    assert sorted(marks[30].values()) == [False, True]
+    assert sorted(moved) == ["human/0", "human/1"]
+    assert not moved[low].foreign
+
+
 def test_person_who_leaves_is_gone(cell):
     """At a side of the workspace the track ends with all that was known; a new one is new."""
     for place in line((1.0, 0.0), (1.85, 0.0), 9):
