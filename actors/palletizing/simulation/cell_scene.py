@@ -121,7 +121,7 @@ def load_mujoco() -> Any:
         import mujoco
     except ImportError as error:
         raise ControllerError(
-            f"the physical cell needs MuJoCo 4 ({error}); install enact-dist[workcell]"
+            f"the physical cell needs MuJoCo 4 ({error}); install enact-dist[actors]"
         ) from error
     if int(mujoco.__version__.partition(".")[0]) < 4:
         raise ControllerError(
