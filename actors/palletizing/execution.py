@@ -127,7 +127,7 @@ class Executor:
         net: What to execute.
         arm: Kinematics and limits; its base is the frame of the measurements.
         frames: Returns base_from_entity, (4, 4), of an entity; KeyError if it is not known.
-        net_version: Version of the datum that held the net.
+        net_version: Number under which the net was attached.
         posture_rad: Where the joints go as far as the tool leaves it open; default: where they are.
         from_rad: The last command to the arm; without it a net after another starts with a jerk.
         before: What an earlier process made of the same net, see the module's second rule.
@@ -167,7 +167,9 @@ class Executor:
             self._at, self.trace = before.primitive, list(before.trace)
             self._end(f"interrupted:{before.primitive}", "the robot was started again")
 
-    def step(self, measured: Measured, now_s: float, scale: float = 1.0) -> Command:
+    def step(
+        self, measured: Measured, now_s: float, scale: float = 1.0, *, waits: bool = False
+    ) -> Command:
         """Go on for one cycle.
 
         Args:
@@ -175,13 +177,18 @@ class Executor:
             now_s: Time of any clock that only goes on.
             scale: Share of all speeds, 0 to 1; at 0 the arm rests where it is, the time limit of
                 the primitive waits, and the net goes on from there afterwards.
+            waits: The gripper has not taken its last command yet: the move goes on, but no exit is
+                taken and the primitive's time stands still.
         """
         dt_s = min(max(now_s - self._now_s, 0.0), DT_S_MAX) if now_s > self._now_s else 0.0
         self._grip = None
         rate = self._sense(measured, now_s, dt_s)
         errors = None if self.result else self._errors(dt_s, scale)
         if errors is not None:
-            errors = self._ways_out(errors, dt_s, scale)
+            if waits:
+                self._running.start_s += dt_s
+            else:
+                errors = self._ways_out(errors, dt_s, scale)
         if errors is None or scale <= 0.0:
             rate.brake(dt_s)
         else:
@@ -189,10 +196,15 @@ class Executor:
             rate.move(self._twist(errors, scale), measured.tcp, speed_m_s, dt_s)
         return Command(rate.q_rad, self._grip, self.result or None, rate.at_rest)
 
-    def brake(self, reason: str) -> None:
-        """End the net with "braked:REASON"; the next steps bring the arm to rest."""
+    def brake(self, reason: str, because: str = "") -> None:
+        """End the net with "braked:REASON"; the next steps bring the arm to rest.
+
+        Args:
+            reason: One word.
+            because: The same in words, for the trace; by default the word.
+        """
         if not self.result:
-            self._end(f"braked:{reason}", reason)
+            self._end(f"braked:{reason}", because or reason)
 
     def execution(self) -> Execution:
         """Return how far the net is, as the datum that is published.

@@ -283,7 +283,8 @@ class Execution:
         since_ns: Stamp of the measurement with which that primitive started.
         trace: The primitives before.
         result: "" while it runs; an end of the net; "timeout:PRIMITIVE", "braked:REASON",
-            "interrupted:PRIMITIVE", "no_frame:ENTITY" or "sensor:REASON".
+            "interrupted:PRIMITIVE", "no_frame:ENTITY", "sensor:REASON", "not_following:JOINT" or
+            "refused:REASON".
         wrench: (6,) float64, N and Nm, on the tool, in the base frame, since the tare.
         width_m: Of the gripper.
         tcp: (4, 4) float64, metres, base_from_tool.

@@ -40,7 +40,8 @@ from actors.geometry.deviation import Limits
 from actors.geometry.shapes import Acquisition, DepthFrame, PointCloud, Surface
 from actors.palletizing.grounding import Grasp
 from actors.palletizing.nets import Execution, Net
-from enact_dist import Aspect, Durability, Entities, Entity, Tolerance
+from enact_dist import Aspect, Durability, Entities, Entity, Retention, Tolerance
+from enact_dist.outcome import Outcome as NetOutcome
 
 PRODUCTS: Final = Entities("product/*")
 VIEWS: Final = Entities("view/*/*")
@@ -244,7 +245,7 @@ class Candidate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Attached:
-    """The net that the robot executes (system); its `Execution` names the version of this datum.
+    """The net that the robot executes (system); its `Execution` names the number.
 
     Attributes:
         number: Grows by one with each net.
@@ -312,6 +313,28 @@ class GripState:
     width_rate_m_s: float
     force_n: float
     stamp_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Control:
+    """How regularly the robot's inner loop has run since its start (robot).
+
+    Attributes:
+        cycles: How often.
+        median_ms: Of its period.
+        p99_ms: Of its period.
+        longest_ms: Its longest period.
+        late: Periods of more than 8 ms.
+        locked_ms: How long at most its process needed for what it does under a lock; the loop
+            itself takes none.
+    """
+
+    cycles: int
+    median_ms: float
+    p99_ms: float
+    longest_ms: float
+    late: int
+    locked_ms: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -404,6 +427,10 @@ DECISION: Final = Aspect("decision", Decision)
 """What the operator answered last (system)."""
 EXECUTION: Final = Aspect("execution", Execution, Durability.OS)
 """How far the robot is with its net (robot)."""
+NET_OUTCOME: Final = Aspect("net_outcome", NetOutcome)
+"""Which version of `net` was taken, so that it is executed once at most (robot)."""
+CONTROL: Final = Aspect("control", Control, Durability.VOLATILE, retention=Retention(versions=10))
+"""How regularly the robot is controlled (robot)."""
 COMMAND: Final = Aspect("command", GripCommand, Durability.VOLATILE)
 """What the gripper shall do (gripper)."""
 STATE: Final = Aspect("state", GripState, Durability.VOLATILE)

@@ -1,0 +1,83 @@
+"""The gripper: follows the newest command and publishes what its fingers do."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from actors.palletizing.controller import ControllerError, open_controller
+from actors.palletizing.vocabulary import COMMAND, GRIPPER, STATE, GripState
+from enact_dist import Actor, View, World, Write
+
+if TYPE_CHECKING:
+    from actors.palletizing.controller import GripperController
+    from actors.palletizing.vocabulary import GripCommand
+    from enact_dist import Lock
+
+EVERY_S: Final = 0.025
+
+
+class Gripper(Actor):
+    """Follow the newest command, publish the state at 40 Hz (ENACT 4.2).
+
+    A command is a level: after a restart the newest one is followed again.  One that the gripper
+    refuses is an error of this actor, and the state goes on naming the command before it.
+
+    Args:
+        controller: Address of the gripper, ``MODULE:FUNCTION?name=value``, see `GripperController`.
+        force_limit_n: With which it moves to a width.
+        every_s: Period of publishing, s.
+    """
+
+    online = World("online")
+    command = View(online, GRIPPER, COMMAND)
+    state = Write(online, GRIPPER, STATE)
+
+    def __init__(
+        self, controller: str, force_limit_n: float = 40.0, every_s: float = EVERY_S
+    ) -> None:
+        self.controller, self.force_limit_n, self.every_s = controller, force_limit_n, every_s
+        self._gripper: GripperController | None = None
+        self._started = False
+        self._number: int | None = None
+        self._refused: int | None = None
+
+    def start(self) -> None:
+        """Make the connection ready; it is opened by the first update."""
+        self._gripper = open_controller(self.controller)
+
+    def stop(self) -> None:
+        """Disconnect; what the gripper holds stays held."""
+        if self._gripper is not None:
+            self._gripper.close()
+
+    def update(self, lock: Lock) -> None:
+        """Hand on a new command, publish the state."""
+        gripper = self._gripper
+        assert gripper is not None
+        if not self._started:
+            gripper.start()
+            self._started, self._number = True, None
+        command = lock.get(self.command)
+        try:
+            if command is not None and command.number not in (self._number, self._refused):
+                self._refused = command.number
+                self._obey(gripper, command)
+                self._number, self._refused = command.number, None
+            now = gripper.gripped()
+        except ControllerError:
+            # Refused, or out of reach: a connection that is made anew has to be started again.
+            self._started = False
+            raise
+        lock[self.state] = GripState(
+            number=0 if self._number is None else self._number,
+            width_m=now.width_m,
+            width_rate_m_s=now.width_rate_m_s,
+            force_n=now.force_n,
+            stamp_ns=now.stamp_ns,
+        )
+
+    def _obey(self, gripper: GripperController, command: GripCommand) -> None:
+        if command.kind == "width":
+            gripper.grip_width(command.value, self.force_limit_n)
+        else:
+            gripper.grip_force(command.value)

@@ -1,0 +1,194 @@
+"""The robot: executes the net that is attached to the system, and publishes how far it is.
+
+Two actors share one arm, hence one process (`process = "robot"` in `cell.toml`).  `Robot` takes
+each net at most once, whatever is killed, and holds no lock while the arm moves.  `RobotJoints`
+runs the arm's inner loop, publishes what it does, and hands on what it asks of the gripper.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import replace
+from typing import TYPE_CHECKING, Final
+
+from actors.palletizing.control_loop import ControlLoop, ended_without_step
+from actors.palletizing.controller import open_controller
+from actors.palletizing.nets import TraceStep
+from actors.palletizing.vocabulary import (
+    COMMAND,
+    CONTROL,
+    EXECUTION,
+    GRIPPER,
+    NET,
+    NET_OUTCOME,
+    ROBOT,
+    STATE,
+    SYSTEM,
+)
+from actors.workcell.vocabulary import JOINTS
+from enact_dist import Actor, View, World, Write
+
+if TYPE_CHECKING:
+    from actors.palletizing.nets import Execution
+    from actors.palletizing.vocabulary import Control
+    from enact_dist import Lock
+
+LEASE_S: Final = 2.0
+OPENING_S: Final = 5.0
+"""How long a net waits for the arm to be opened."""
+LOOK_S: Final = 0.02
+"""How often a running net looks whether it is to end."""
+EVERY_S: Final = 0.025
+JOINTS_TICKS: Final = 4
+"""The joints are published at every so many ticks."""
+CONTROL_TICKS: Final = 40
+
+_loops: Final[dict[str, ControlLoop]] = {}
+"""The running loops of this process, by the address of their controller."""
+_opened: Final[dict[str, threading.Event]] = {}
+"""Set while the loop of an address runs in this process."""
+
+
+def _is_open(address: str) -> threading.Event:
+    return _opened.setdefault(address, threading.Event())
+
+
+class Robot(Actor):
+    """Execute each net that is attached to the system, once (ENACT 4.2).
+
+    Args:
+        controller: Address of the arm, as of `RobotJoints`, which has to run in the same process.
+    """
+
+    online = World("online")
+    net = View(online, SYSTEM, NET)
+    net_outcome = Write(online, ROBOT, NET_OUTCOME)
+    triggers = (net,)
+    once = True
+
+    def __init__(self, controller: str) -> None:
+        self.controller = controller
+
+    def update(self, lock: Lock) -> None:
+        """Execute the net to its end; a newer one, or none any more, brakes it."""
+        loop = _loops.get(self.controller) if _is_open(self.controller).wait(OPENING_S) else None
+        if loop is None:
+            raise RuntimeError(
+                f"no arm {self.controller!r} is open in this process; run RobotJoints with this"
+                ' controller beside Robot: process = "robot" in the tables of both in cell.toml'
+            )
+        loop.execute(lock[self.net])
+        while not loop.wait(LOOK_S):
+            if lock.newer.is_set():
+                loop.brake(lock.newer.reason)
+
+
+class RobotJoints(Actor):
+    """Run the arm's inner loop; publish execution, joints, and the commands to the gripper.
+
+    Args:
+        controller: Address of the arm, ``MODULE:FUNCTION?name=value``, see `ArmController`.
+        lease_s: A net ends when no shard answers, or the gripper is silent, for longer than this.
+        every_s: Period of publishing, s.
+    """
+
+    online = World("online")
+    net = View(online, SYSTEM, NET)
+    net_outcome = View(online, ROBOT, NET_OUTCOME)
+    gripper = View(online, GRIPPER, STATE)
+    execution = Write(online, ROBOT, EXECUTION)
+    joints = Write(online, ROBOT, JOINTS)
+    control = Write(online, ROBOT, CONTROL)
+    command = Write(online, GRIPPER, COMMAND)
+
+    def __init__(self, controller: str, lease_s: float = LEASE_S, every_s: float = EVERY_S) -> None:
+        if not lease_s > 0.0:
+            raise ValueError(f"lease_s is {lease_s}; it has to be more than 0 s")
+        self.controller, self.lease_s, self.every_s = controller, lease_s, every_s
+        self._told: Execution | None = None
+        self._ended: Execution | None = None
+        self._ticks = 0
+        self._locked_ms = 0.0
+
+    def start(self) -> None:
+        """Open the arm."""
+        _loops[self.controller] = ControlLoop(
+            open_controller(self.controller), lease_s=self.lease_s
+        )
+        _is_open(self.controller).set()
+
+    def stop(self) -> None:
+        """Brake and close the arm."""
+        _is_open(self.controller).clear()
+        loop = _loops.pop(self.controller, None)
+        if loop is not None:
+            loop.close()
+
+    def update(self, lock: Lock) -> None:
+        """Publish what is new."""
+        began_s = time.monotonic()
+        loop = _loops[self.controller]
+        gripper = lock.get(self.gripper)
+        if self._ticks == 0:
+            numbers = [one.number for one in (gripper, lock.get(self.command)) if one is not None]
+            loop.grip_number = max(numbers, default=0)
+        loop.reached(gripper)
+        self._tell_execution(lock, loop)
+        grip = loop.grip
+        if grip is not None and lock.get(self.command) != grip:
+            lock[self.command] = grip
+        joints = loop.joints() if self._ticks % JOINTS_TICKS == 0 else None
+        if joints is not None:
+            lock[self.joints] = joints
+        if self._ticks % CONTROL_TICKS == 0:
+            lock[self.control] = self.figures(loop)
+        self._ticks += 1
+        self._locked_ms = max(self._locked_ms, 1e3 * (time.monotonic() - began_s))
+
+    def figures(self, loop: ControlLoop) -> Control:
+        """Return what the periods of the loop were, and how long this actor held its lock."""
+        return replace(loop.figures(), locked_ms=self._locked_ms)
+
+    def _tell_execution(self, lock: Lock, loop: ControlLoop) -> None:
+        """Publish the result of each net, then how far the present one is.
+
+        A result is published until the world has it, since a commit can fail after the update.
+        """
+        if self._ended is not None and _is(lock.get(self.execution), self._ended):
+            self._ended = None
+        if self._ended is None and loop.ended:
+            self._ended = loop.ended.popleft()
+        if self._ended is not None:
+            lock[self.execution] = self._ended
+        elif loop.execution is None:
+            self._tell_interrupted(lock)
+        elif loop.execution is not self._told and not loop.execution.result:
+            lock[self.execution] = self._told = loop.execution
+
+    def _tell_interrupted(self, lock: Lock) -> None:
+        """Say of a net that an earlier process had begun that it does not go on."""
+        before = lock.get(self.execution)
+        if before is not None and not before.result:
+            lock[self.execution] = interrupted(before)
+            return
+        taken, attached = lock.get(self.net_outcome), lock.get(self.net)
+        if taken is None or attached is None or taken.state != "interrupted":
+            return
+        if before is None or before.net_version != attached.number:
+            unbegun = ended_without_step(attached, before, None, "")
+            lock[self.execution] = interrupted(unbegun)
+
+
+def _is(found: Execution | None, published: Execution) -> bool:
+    return found is not None and (found.net_version, found.result) == (
+        published.net_version,
+        published.result,
+    )
+
+
+def interrupted(execution: Execution) -> Execution:
+    """Return the execution of a net whose process ended in midst of it."""
+    result = f"interrupted:{execution.primitive}"
+    step = TraceStep(execution.primitive, result, 0.0, "the robot was started again")
+    return replace(execution, result=result, trace=(*execution.trace, step))
