@@ -79,7 +79,6 @@ class JointLimiter:
         self._ruckig = ruckig.Ruckig(7, CYCLE_S)
         self._state, self._next = ruckig.InputParameter(7), ruckig.OutputParameter(7)
         self._state.synchronization = ruckig.Synchronization.No
-        self._state.max_velocity = [float(v) for v in ARM.dq_max]
         self._state.max_acceleration = [float(v) for v in DDQ_MAX]
         self._state.max_jerk = [float(v) for v in DDDQ_MAX]
         self._goal_rad = np.array(q_rad, float)
@@ -114,6 +113,10 @@ class JointLimiter:
             follows = np.abs(dq) <= ARM.dq_max
             follows &= np.abs(ddq) <= DDQ_MAX
             follows &= np.abs(ddq - self.ddq_rad_s2) <= DDDQ_MAX * CYCLE_S
+            # A joint that comes upon its goal too fast to stay there would swing about it.
+            after = (speed - dq) / CYCLE_S
+            follows &= np.abs(after) <= DDQ_MAX
+            follows &= np.abs(after - ddq) <= DDDQ_MAX * CYCLE_S
             q = goal
             if not follows.all():
                 quickest = self._quickest(goal, speed)
@@ -125,16 +128,26 @@ class JointLimiter:
         self._since += 1
 
     def _quickest(self, goal: F64 | None, speed: F64) -> tuple[F64, F64, F64]:
-        """Return the next state on the quickest way to a state, or to a speed wherever that is."""
+        """Return the next state on the quickest way to a goal that moves on, or to rest.
+
+        It is planned as the goal sees it: planned to where the goal is now, it would be behind
+        by the same distance for ever.
+
+        Args:
+            goal: (7,), where it is after the next cycle; None: to come to rest, wherever that is.
+            speed: (7,), of the goal.
+        """
         state = self._state
-        state.current_position = self.q_rad
-        state.current_velocity, state.current_acceleration = self.dq_rad_s, self.ddq_rad_s2
-        state.target_velocity = speed
-        if goal is None:
-            state.control_interface = self._interfaces.Velocity
-        else:
-            state.control_interface = self._interfaces.Position
-            state.target_position = goal
+        here = self.q_rad if goal is None else self.q_rad - (goal - speed * CYCLE_S)
+        state.current_position = here
+        state.current_velocity = self.dq_rad_s - speed
+        state.current_acceleration = self.ddq_rad_s2
+        state.target_position, state.target_velocity = np.zeros(7), np.zeros(7)
+        state.max_velocity = ARM.dq_max - speed
+        state.min_velocity = -ARM.dq_max - speed
+        state.control_interface = (
+            self._interfaces.Velocity if goal is None else self._interfaces.Position
+        )
         result = self._ruckig.update(state, self._next)
         assert int(result) >= 0, f"ruckig refuses {state} with {result}"
         q, dq, ddq = (
@@ -145,7 +158,7 @@ class JointLimiter:
                 self._next.new_acceleration,
             )
         )
-        return q, dq, ddq
+        return (q if goal is None else q + goal), dq + speed, ddq
 
 
 class SimulatedArm:

@@ -9,7 +9,7 @@ import pytest
 from actors.geometry.kinematics import tool_poses
 from actors.geometry.poses import on_tray
 from actors.palletizing.controller import ControllerError, open_controller
-from actors.palletizing.simulation.cell_arm import CYCLE_S, DDDQ_MAX, DDQ_MAX
+from actors.palletizing.simulation.cell_arm import CYCLE_S, DDDQ_MAX, DDQ_MAX, JointLimiter
 from actors.palletizing.simulation.cell_scene import (
     ARM,
     BELT_M_S,
@@ -397,6 +397,31 @@ def test_smooth_commands_are_followed():
     np.testing.assert_allclose(measured.tcp, tool_poses(ARM, measured.q)[0], atol=1e-9)
     assert max(errors) < 4e-3
     assert max(accelerations[20:]) < 1.3 * 0.2 * 3.0**2 + 0.5
+
+
+@pytest.mark.parametrize("kept_out", [0, 7])
+def test_limiter_catches_up_after_commands_beyond_its_limits(kept_out):
+    """Speed that begins at once, or after some lost commands, is followed exactly soon after."""
+    limiter, q = JointLimiter(np.array(HOME_RAD)), np.array(HOME_RAD)
+    speed = np.array([0.8, -0.5, 0.3, 0.2, 0.0, 0.4, -0.6])
+    behind, told = [], []
+
+    for cycle in range(250):
+        q = q + speed * CYCLE_S * min(1.0, max(0.0, (240 - cycle) / 90.0))
+        if cycle < 100 or cycle >= 100 + kept_out:
+            limiter.aim(q)
+        limiter.advance(braking=False)
+        behind.append(np.abs(limiter.q_rad - q).max())
+        told.append((limiter.dq_rad_s, limiter.ddq_rad_s2))
+
+    dq, ddq = (np.array(values) for values in zip(*told, strict=True))
+    assert max(behind) > 0.01, "the stream is beyond the limits"
+    assert behind[99] < 1e-9, "it has caught up with the first"
+    assert behind[149] < 1e-9, "and after the gap"
+    assert behind[-1] < 1e-9
+    assert (np.abs(dq).max(0) <= ARM.dq_max + 1e-9).all()
+    assert (np.abs(ddq).max(0) <= DDQ_MAX + 1e-9).all()
+    assert (np.abs(np.diff(ddq, axis=0)).max(0) <= DDDQ_MAX * CYCLE_S + 1e-6).all()
 
 
 def test_arm_without_commands_comes_to_rest():
