@@ -291,8 +291,12 @@ class SimulatedArm:
         """Stop the arm."""
         self.brake()
 
-    def drive(self) -> None:
-        """Set what the drives are told for the next cycle."""
+    def drive(self, *, slack: bool = False) -> None:
+        """Set what the drives are told for the next cycle.
+
+        Args:
+            slack: The fingers open, whatever they were commanded.
+        """
         commanded, self._commanded = self._commanded, None
         if commanded is not None and self._started:
             self._limiter.aim(commanded)
@@ -307,11 +311,13 @@ class SimulatedArm:
             + self._torques[:7] / np.array(STIFFNESS_NM_RAD)
         )
         self.gripping_cycles += 1
-        goal_m = 0.0 if self.gripping else (self._width_m - OPEN_M[0]) / 2.0
+        goal_m = (self._width_m - OPEN_M[0]) / 2.0
         # What a finger is told stays within reach of where it is, so that it presses at once less
         # when it is opened.
         reach_m = 1.2 * self._force_n / self._model.actuator_gainprm[7, 0]
-        if self.gripping:
+        if slack:
+            goal_m = (OPEN_M[1] - OPEN_M[0]) / 2.0
+        elif self.gripping:
             goal_m = -reach_m
         finger_m = float(data.qpos[self._fingers].mean())
         step_m = FINGER_M_S * CYCLE_S

@@ -48,6 +48,7 @@ STOPPED: Final = (
     "put",
     "take_away",
     "change_tray",
+    "fail",
     "truth",
     "shown",
 )

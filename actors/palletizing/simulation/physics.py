@@ -63,6 +63,13 @@ PICTURE_PX: Final = (960, 720)
 """Greatest width and height of a rendered picture."""
 DAMPED: Final = 0.95
 """Greatest impedance of MuJoCo's contacts, by which it divides their damping."""
+FAILURES: Final = {
+    "belt": "the belt does not move",
+    "gripper": "the fingers open, whatever is commanded",
+    "wrist": "arm and gripper measure nothing new",
+    "camera": "the depth sensors see what they saw",
+}
+"""What can be made to fail for a while, and how it shows."""
 NEAR_M: Final = 0.3
 """A package farther from the tool than this is not the one that was missed."""
 
@@ -116,6 +123,8 @@ class PhysicalCell:
         self._fed = 0
         self._cycles = 0
         self._running = self._interrupted = False
+        self._failing: dict[str, int] = {}
+        self._seen_last: ShownCell | None = None
         self._grip = GripWatch()
         self._hand = int(model.body("hand").id)
         self._change = np.zeros((3, model.nv))
@@ -138,7 +147,7 @@ class PhysicalCell:
     def step(self, cycles: int = 1) -> None:
         """Let the cell go on by cycles of control, 4 ms each."""
         for _ in range(cycles):
-            self.arm.drive()
+            self.arm.drive(slack=self._fails("gripper"))
             self._carry()
             self._mujoco.mj_step(self.model, self.data, STEPS)
             # A step leaves bodies where they were before it.
@@ -146,7 +155,28 @@ class PhysicalCell:
             self._cycles += 1
             self._drive_belt()
             self._notice()
-            self.arm.measure(self._stamp_ns())
+            if not self._fails("wrist"):
+                self.arm.measure(self._stamp_ns())
+
+    def fail(self, kind: str, seconds: float) -> None:
+        """Let something fail from now on.
+
+        Args:
+            kind: One of `FAILURES`.
+            seconds: Simulated time until it works again; 0 mends it.
+
+        Raises:
+            ControllerError: No such kind.
+        """
+        if kind not in FAILURES:
+            known = ", ".join(FAILURES)
+            raise ControllerError(f"asked for the failure {kind!r}; this cell has {known}")
+        if kind == "camera":
+            self._seen_last = self.shown()
+        self._failing[kind] = self._cycles + round(seconds / CYCLE_S)
+
+    def _fails(self, kind: str) -> bool:
+        return self._cycles < self._failing.get(kind, 0)
 
     # The belt
 
@@ -258,6 +288,8 @@ class PhysicalCell:
 
     def shown(self) -> ShownCell:
         """Return what a sensor can see now."""
+        if self._fails("camera") and self._seen_last is not None:
+            return self._seen_last
         measured = self.arm.measured()
         return ShownCell(
             stamp_ns=self._stamp_ns(),
@@ -316,7 +348,7 @@ class PhysicalCell:
         seen = np.array([-1], np.int32)
         hit_m = self._mujoco.mj_ray(self.model, self.data, start, frame[:3, 1], groups, 0, -1, seen)
         self._interrupted = 0.0 <= hit_m <= 2.0 * across
-        moving = self._running and not self._interrupted
+        moving = self._running and not self._interrupted and not self._fails("belt")
         self.model.geom_surfacevel[self._belt, 0] = BELT_M_S if moving else 0.0
 
     def _carry(self) -> None:

@@ -93,6 +93,14 @@ class RemoteCell:
         found: ShownCell = self.ask("shown")
         return found
 
+    def fail(self, kind: str, seconds: float) -> None:
+        """Let something fail from now on, see `physics.FAILURES`.
+
+        Raises:
+            ControllerError: No such kind.
+        """
+        self.ask("fail", kind, float(seconds))
+
     def picture(self, width: int = 640, height: int = 480) -> npt.NDArray[np.uint8]:
         """Return the cell as a person would see it, (height, width, 3) uint8, red first.
 

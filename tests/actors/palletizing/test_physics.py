@@ -236,6 +236,49 @@ def test_packages_come_one_after_the_other():
         cell.feed()
 
 
+def test_failures_show_and_end():
+    """The belt stands and goes on, the gripper lets go, measurements and pictures stand still."""
+    cell = PhysicalCell([carton()], seed=1)
+    cell.feed()
+    cell.run_belt()
+    cell.step(100)
+    cell.fail("belt", 0.8)
+    cell.step(150)
+    along = cell.pose(0)[0, 3]
+    cell.step(40)
+    assert cell.pose(0)[0, 3] == pytest.approx(along, abs=1e-5)
+    cell.step(60)
+    assert cell.pose(0)[0, 3] > along + 0.01
+
+    cell.fail("wrist", 0.04)
+    cell.fail("camera", 0.08)
+    stamp_ns, seen_ns = cell.arm.measured().stamp_ns, cell.shown().stamp_ns
+    cell.step(9)
+    assert (cell.arm.measured().stamp_ns, cell.shown().stamp_ns) == (stamp_ns, seen_ns)
+    cell.step(1)
+    assert cell.arm.measured().stamp_ns == stamp_ns + 10 * 4_000_000
+    assert cell.shown().stamp_ns == seen_ns
+    cell.step(10)
+    assert cell.shown().stamp_ns == seen_ns + 20 * 4_000_000
+    with pytest.raises(ControllerError, match="the failure 'arm'; this cell has belt, gripper"):
+        cell.fail("arm", 1.0)
+
+
+def test_gripper_that_fails_loses_its_package():
+    """It opens in the air, and closes on nothing afterwards."""
+    hand = Hand([carton()])
+    hand.cell.put(0, on_belt())
+    hand.grasp(0.38, 0.62, 45.0)
+    hand.cell.fail("gripper", 0.3)
+    hand.cell.step(75)
+    opened_m = hand.arm.measured().width_m
+    hand.cell.step(150)
+
+    assert opened_m > 0.115
+    assert hand.package(0).lost == 1
+    assert hand.arm.measured().width_m < 0.06
+
+
 # The truth
 
 
