@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
     Numbers = npt.NDArray[np.floating]
 
+AT_ONCE: Final = 8192
+"""Points whose distances to the capsules of an arm fit a processor's cache."""
 NEAR_M: Final = 0.05
 """Nearer to a camera's plane than this nothing of a capsule is drawn."""
 
@@ -81,7 +83,11 @@ def distance_to_points(capsules: Numbers, points_m: Numbers) -> npt.NDArray[np.f
     """
     if not len(capsules):
         return np.full(len(points_m), np.inf, np.float32)
-    return np.asarray(distances_to_points(capsules, points_m).min(0))
+    nearest = np.empty(len(points_m), np.float32)
+    for first in range(0, len(points_m), AT_ONCE):
+        part = slice(first, first + AT_ONCE)
+        nearest[part] = distances_to_points(capsules, points_m[part]).min(0)
+    return nearest
 
 
 def segment_distances(one_m: Numbers, other_m: Numbers) -> npt.NDArray[np.float64]:

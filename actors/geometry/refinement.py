@@ -45,6 +45,7 @@ from actors.geometry.overruled import grown, overruled
 from actors.geometry.pockets import Pockets
 from actors.geometry.silhouettes import packed, unpacked
 from actors.geometry.visibility import floor_seen, seen_by, static_voxels, surface_voxels
+from actors.geometry.voxels import PER_BLOCK
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -207,6 +208,7 @@ class Refinement:
         self._appeared = 0
         self._live: tuple[int, ...] | None = None
         self._says = np.empty(0, np.uint8)
+        self._unseen = self._seen_blocks = np.empty(0, np.int64)
         self._pockets = Pockets(self._grid, np.zeros(self._grid.voxels, bool))
 
     def step(
@@ -230,15 +232,16 @@ class Refinement:
         """
         self._note_live(tuple(n for n, bits in enumerate(silhouettes) if bits is not None))
         outline = self._explaining(robot)
-        seen = self._with_robot(self._moved(silhouettes, outline), robot)
-        self._hull.load(seen, self._moved(shades, outline) if shades else ())
-        raw, one_veto = self._hull.carve_leniently(self._was_near())
-        counts = {"raw": len(raw)}
-        rows = raw[~self._static[raw]]
-        counts["static"] = len(raw) - len(rows)
+        with_robot = self._with_robot(self._moved(silhouettes, outline), robot)
+        self._hull.load(with_robot, self._moved(shades, outline) if shades else ())
+        found, one_veto = self._hull.carve_leniently(self._was_near(), self._seen_blocks)
+        found = found[self._says[found] > 0]
+        raw = np.concatenate([found, self._unseen])
+        rows = found[~self._static[found]]
+        counts = {"raw": len(raw), "static": len(found) - len(rows)}
         dark = self._hull.in_shadow(rows[self._surface[rows]], self._floor)
         shadow = self._hull.shaded(rows, dark)
-        rows = rows[~shadow]
+        rows = np.concatenate([rows[~shadow], self._unseen])
         counts["shadow"] = int(shadow.sum())
         kept = self._possible(rows, elapsed_s, robot, outline)
         counts["unreachable"] = len(rows) - len(kept)
@@ -249,9 +252,10 @@ class Refinement:
         counts["forgiven"] = len(forgiven)
         more = self._beside_robot(forgiven, robot, outline, counts)
         tight = np.zeros(len(away.rows) + len(more.rows), bool)
-        tight[: len(away.rows)] = self._hull.tight(away.rows) & (self._says[away.rows] > 0)
+        seen = np.flatnonzero(self._says[away.rows] > 0)
+        tight[seen] = self._hull.tight(away.rows[seen])
         solid = tight.copy()
-        solid[: len(away.rows)] |= self._hull.dark(away.rows) & (self._says[away.rows] > 0)
+        solid[seen] |= self._hull.dark(away.rows[seen])
         return self._components(away.with_more(more), (tight, solid), counts, raw)
 
     def _with_robot(
@@ -308,7 +312,10 @@ class Refinement:
         self._says = (
             seen_by([tables[n] for n in live]) if live else np.zeros(self._grid.voxels, np.uint8)
         )
-        self._pockets = Pockets(self._grid, (self._says == 0) & ~self._static, self._pockets)
+        unseen = (self._says == 0) & ~self._static
+        self._unseen = np.flatnonzero(unseen)
+        self._seen_blocks = np.flatnonzero(self._says.reshape(-1, PER_BLOCK).any(1))
+        self._pockets = Pockets(self._grid, unseen, self._pockets)
         if self._before is not None:
             rows = self._grid.rows_in(np.flatnonzero(self._before.ravel()))
             self._pockets.hold(rows[(said[rows] > 0) & (self._says[rows] == 0)])

@@ -204,15 +204,18 @@ class VisualHull:
         return rows
 
     def carve_leniently(
-        self, near: npt.NDArray[np.bool_]
+        self, near: npt.NDArray[np.bool_], blocks: Rows | None = None
     ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
         """Return the rows of all voxels that no camera, and of those that one says to be free.
 
         Args:
             near: Blocks (i, j, k) of which those are looked for that one camera says to be free.
+            blocks: Numbers of the blocks to look at; all when absent.
         """
         start = (~near).ravel().astype(np.uint8)
-        vetoes, blocks = start, np.arange(self.grid.blocks)
+        if blocks is None:
+            blocks = np.arange(self.grid.blocks)
+        vetoes = start[blocks]
         for number in self._given:
             free = self._masks[number].cells[self.tables[number].cell[blocks]] == 0
             vetoes = vetoes + free
