@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Final
 from actors.palletizing.control_loop import ControlLoop, ended_without_step
 from actors.palletizing.controller import open_controller
 from actors.palletizing.nets import TraceStep
+from actors.palletizing.urgency import make_urgent
 from actors.palletizing.vocabulary import (
     COMMAND,
     CONTROL,
@@ -91,6 +92,7 @@ class RobotJoints(Actor):
         controller: Address of the arm, ``MODULE:FUNCTION?name=value``, see `ArmController`.
         lease_s: A net ends when no shard answers, or the gripper is silent, for longer than this.
         every_s: Period of publishing, s.
+        urgent: Let this process go before others on its host, where the system allows it.
     """
 
     online = World("online")
@@ -102,10 +104,18 @@ class RobotJoints(Actor):
     control = Write(online, ROBOT, CONTROL)
     command = Write(online, GRIPPER, COMMAND)
 
-    def __init__(self, controller: str, lease_s: float = LEASE_S, every_s: float = EVERY_S) -> None:
+    def __init__(
+        self,
+        controller: str,
+        lease_s: float = LEASE_S,
+        every_s: float = EVERY_S,
+        *,
+        urgent: bool = False,
+    ) -> None:
         if not lease_s > 0.0:
             raise ValueError(f"lease_s is {lease_s}; it has to be more than 0 s")
         self.controller, self.lease_s, self.every_s = controller, lease_s, every_s
+        self.urgent = urgent
         self._told: Execution | None = None
         self._ended: Execution | None = None
         self._ticks = 0
@@ -113,6 +123,8 @@ class RobotJoints(Actor):
 
     def start(self) -> None:
         """Open the arm."""
+        if self.urgent:
+            make_urgent()
         _loops[self.controller] = ControlLoop(
             open_controller(self.controller), lease_s=self.lease_s
         )

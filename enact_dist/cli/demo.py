@@ -33,7 +33,8 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
         example="enact demo palletizing --packages 6 --seed 1 --out demo\n"
         "enact demo palletizing --cell cell.toml --out demo\n"
         "enact demo palletizing --views redwood_rgbd --out surface\n"
-        "enact demo palletizing --model milk.pcd --scene table.pcd --out pose",
+        "enact demo palletizing --model milk.pcd --scene table.pcd --out pose\n"
+        "enact demo palletizing --check-net push.toml --out nets",
     )
     demo.add_argument("--packages", type=whole, metavar="N", help="how many packages come by")
     demo.add_argument("--seed", type=int, metavar="S", help="of sensor noise and damage")
@@ -46,6 +47,12 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
         type=Path,
         metavar="FILE",
         help="the cell.toml of a palletizing cell that runs already, to be watched and scored",
+    )
+    demo.add_argument(
+        "--check-net",
+        type=Path,
+        metavar="FILE",
+        help="check a primitive net or skeleton (TOML) and draw it to DIR; nothing runs",
     )
     real = demo.add_argument_group("real recordings instead of the simulated sensor")
     real.add_argument("--views", type=Path, metavar="DIR", help="train from an RGB-D recording")
@@ -66,6 +73,8 @@ def run_palletizing(arguments: argparse.Namespace) -> int:
 
 def _run(arguments: argparse.Namespace) -> int:
     out: Path = arguments.out or Path("demo_out")
+    if arguments.check_net:
+        return _check_net(arguments.check_net, out)
     if arguments.views:
         from actors.palletizing.real_input import run_views
 
@@ -83,6 +92,17 @@ def _run(arguments: argparse.Namespace) -> int:
     return run_demo(out=out, keep_running=arguments.keep_running, **given)
 
 
+def _check_net(file: Path, out: Path) -> int:
+    from actors.palletizing.net_check import check_net
+    from actors.palletizing.nets import NetError
+
+    try:
+        print(check_net(file, out))
+    except (NetError, OSError) as error:
+        raise ConfigError(str(error)) from error
+    return 0
+
+
 def _refuse_mixture(arguments: argparse.Namespace) -> None:
     if (arguments.model is None) != (arguments.scene is None):
         raise ConfigError("--model and --scene belong together: the model is found in the scene")
@@ -94,6 +114,8 @@ def _refuse_mixture(arguments: argparse.Namespace) -> None:
         if getattr(arguments, name) not in {None, False}
     ]
     option = f"--{simulated[0].replace('_', '-')}" if simulated else ""
+    if arguments.check_net and (option or arguments.cell or arguments.views or arguments.model):
+        raise ConfigError("--check-net only checks a file; it goes with --out and no other option")
     if arguments.cell and (arguments.views or arguments.model):
         raise ConfigError("--cell watches a cell that runs; recordings need none")
     if arguments.cell and option:

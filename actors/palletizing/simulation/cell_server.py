@@ -25,6 +25,7 @@ from actors.palletizing.simulation.cell_messages import receive, send
 from actors.palletizing.simulation.cell_picture import CellPictures
 from actors.palletizing.simulation.cell_thread import RunningCell
 from actors.palletizing.simulation.physics import PhysicalCell
+from actors.palletizing.urgency import make_urgent
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -199,6 +200,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (ControllerError, ValueError, OSError) as error:
         print(f"cell: {error}")
         return 1
+    make_urgent()  # it stands for a machine that has a computer of its own
     ended = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: ended.set())
