@@ -6,15 +6,17 @@ refuses what lacks, what the gripper cannot hold and where the arm cannot go.
 ======================  ========  ==================================================================
 parameter               type      is
 ======================  ========  ==================================================================
-package, place, bin     entity    what the job names
+package, place, bin     entity    what the job names; belt: the cell's
 grasp.frame             pose      in the package: between the fingers, y from one to the other, z up
 grasp.width_m           m         between the fingers that hold it; grasp.open_m before
 grasp.height_m          m         of the fingers above the package's base
 grasp.force_n           N         of the fingers
 hand.turn_rad           rad       0, or π for the hand turned round
+hand.aside_rad          rad       halfway between belt and tray, in the frame of the belt
 push.frame              pose      in the place: origin as grasp.frame, x along the push, z up
 hand.push_turn_rad      rad       the hand in it
-push.gap_m              m         so far short of its place the package is put down
+push.gap_m              m         so far short of its place the package is put down, 0 if nothing
+                                  pushes it
 push.behind_m           m         from its grasp to the middle of the closed hand behind it
 push.drop_m             m         so much lower than the grasp the hand pushes
 push.force_n            N         tells the contact; push.travel_m (m) that there is none
@@ -49,7 +51,7 @@ FOLDER: Final = Path(__file__).parent / "skeletons"
 SKELETONS: Final = tuple(sorted(file.stem for file in FOLDER.glob("*.toml")))
 """Names of the skeletons that come with the cell."""
 CLEAR_M: Final = 0.16
-PUSH_GAP_M: Final = 0.03
+PUSH_GAP_M: Final = 0.02
 PUSH_FORCE_N: Final = 14.0
 PUSH_TRAVEL_M: Final = 0.085
 BESIDE_M: Final = 0.010
@@ -81,7 +83,7 @@ class Grasp:
 
 @dataclass(frozen=True, slots=True)
 class Gripper:
-    """What a parallel gripper can do; by default a stroke of 70 mm from 55 mm on.
+    """What a parallel gripper can do; by default a stroke of 70 mm from 65 mm on.
 
     Attributes:
         least_m: Between the closed fingers.
@@ -92,11 +94,11 @@ class Gripper:
         half_across_m: Half the fingers across it.
     """
 
-    least_m: float = 0.055
-    most_m: float = 0.125
+    least_m: float = 0.065
+    most_m: float = 0.135
     play_m: float = 0.010
     force_n_max: float = 60.0
-    half_m: float = 0.0395
+    half_m: float = 0.0445
     half_across_m: float = 0.012
 
 
@@ -109,7 +111,8 @@ class Job:
         grasp: Of its product.
         size_m: (3,) float64, the product's box, product frame.
         place: Entity of the place; "" if the action has none.
-        push: (3,) float64, direction of the push, base frame; it is taken level.
+        push: (3,) float64, direction of the push, base frame; it is taken level.  Zeros: what is put
+            down at its place stays there.
         bin: Entity of the reject bin; "" if the action has none.
         turned: The hand is turned round by π: what was grasped so is placed so.
     """
@@ -193,6 +196,8 @@ def parameters(job: Job, gripper: Gripper, frames: Frames) -> dict[str, Value]:
         "grasp.height_m": float(grasp.point[2]),
         "grasp.force_n": grasp.force_n,
         "hand.turn_rad": math.pi if job.turned else 0.0,
+        "hand.aside_rad": -0.75 * math.pi if job.turned else 0.25 * math.pi,
+        "belt": "belt",
         "gripper.closed_m": gripper.least_m + 0.001,
         "clear_m": CLEAR_M,
     }
@@ -222,6 +227,9 @@ def _push_values(job: Job, gripper: Gripper, base_from_place: F64) -> dict[str, 
     along = inverse(base_from_place)[:3, :3] @ push
     along[2] = 0.0
     length = float(np.linalg.norm(along))
+    gap_m = PUSH_GAP_M if push.any() else 0.0
+    if not push.any():
+        along, length = np.array([1.0, 0.0, 0.0]), 1.0
     if not length > 0.5:
         found = np.round(push, 3).tolist()
         raise NetError(f"push of {job.package} at {job.place}: {found} is no level direction")
@@ -237,7 +245,7 @@ def _push_values(job: Job, gripper: Gripper, base_from_place: F64) -> dict[str, 
     return {
         "push.frame": frame,
         "hand.push_turn_rad": math.remainder(yaw, 2.0 * math.pi),
-        "push.gap_m": PUSH_GAP_M,
+        "push.gap_m": gap_m,
         "push.behind_m": package_m + ahead_m + float(hand) + BESIDE_M,
         "push.drop_m": float(grasp.point[2]) - grasp.push_height_m,
         "push.force_n": PUSH_FORCE_N,

@@ -2,7 +2,7 @@
 
 ===========  ==================================================================================
 arm          the kinematics and capsules of the workcell's arm, its base at the world's origin
-hand         a box with two coupled fingers, 55 to 125 mm apart, pads of 24 x 140 mm
+hand         a box with two coupled fingers, 65 to 135 mm apart, pads of 24 x 140 mm
 belt         a static box with a surface velocity; a light barrier across its end
 tray         that of the simulated depth sensor, with a rim of the layout's height
 bin          a box with four walls for rejected packages
@@ -49,7 +49,7 @@ DAMPING_NM_S_RAD: Final = (300.0, 300.0, 200.0, 200.0, 100.0, 80.0, 50.0)
 JOINT_DAMPING: Final = 5.0
 """Friction of each joint, Nm s/rad."""
 
-OPEN_M: Final = (0.055, 0.125)
+OPEN_M: Final = (0.065, 0.135)
 """Least and greatest distance between the fingers."""
 PAD_HALF_M: Final = (0.012, 0.006, 0.070)
 """Half of a finger's pad, hand frame."""

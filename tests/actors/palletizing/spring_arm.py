@@ -69,7 +69,7 @@ class SpringArm:
         self.dq = (command.q - self.q) * share / CYCLE_S
         self.q = self.q + self.dq * CYCLE_S
         if command.grip is not None:
-            self.goal_m = command.grip.value if command.grip.kind == "width" else 0.055
+            self.goal_m = command.grip.value if command.grip.kind == "width" else 0.065
         before_m = self.width_m
         self.width_m += float(np.clip(self.goal_m - self.width_m, -0.0006, 0.0006))
         if self.held_m is not None:

@@ -163,7 +163,7 @@ def test_a_package_that_slips_out_of_the_hand_is_lost():
 
     def drop(arm, executor):
         if arm.now_s > 0.2:
-            arm.held_m, arm.goal_m = None, 0.055
+            arm.held_m, arm.goal_m = None, 0.065
 
     ended = run(grounded("place"), arm, FRAMES.__getitem__, each=drop)
 

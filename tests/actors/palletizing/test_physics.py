@@ -91,7 +91,7 @@ def test_closing_beside_a_package_misses_it():
 
     hand.grasp(0.38, 0.44, 45.0)
 
-    assert hand.arm.measured().width_m == pytest.approx(0.055, abs=5e-4)
+    assert hand.arm.measured().width_m == pytest.approx(0.065, abs=5e-4)
     assert hand.package(0).missed == 1
     assert hand.package(0).where == "belt"
 
@@ -122,7 +122,7 @@ def test_width_and_force_are_measured():
     hand.grasp(0.38, 0.62, 45.0)
 
     measured = hand.arm.measured()
-    assert open_m == pytest.approx(0.125, abs=5e-4)
+    assert open_m == pytest.approx(0.135, abs=5e-4)
     assert measured.width_m == pytest.approx(0.095, abs=1e-3)
     assert measured.grip_force_n == pytest.approx(45.0, abs=0.5)
     assert abs(measured.width_rate_m_s) < 1e-3
@@ -522,7 +522,7 @@ def test_impossible_commands_are_one_line():
         arm.command(np.array([0.0, 2.5, 0.0, 0.0, 0.0, 0.0, 0.0]))
     with pytest.raises(ControllerError, match="seven finite numbers"):
         arm.command(np.array([0.0, np.nan, 0.0, 0.0, 0.0, 0.0, 0.0]))
-    with pytest.raises(ControllerError, match=r"asked for 140.0 mm .* opens from 55 to 125 mm"):
+    with pytest.raises(ControllerError, match=r"asked for 140.0 mm .* opens from 65 to 135 mm"):
         arm.grip_width(0.14, 20.0)
     with pytest.raises(
         ControllerError, match="grip of 300 N; this gripper presses with up to 100 N"

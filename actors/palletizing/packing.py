@@ -1,0 +1,409 @@
+"""The whole palletizing cell in one process, in simulated time: physics, sensors, decisions.
+
+    run = Packing(draw_packages(12, seed=59), models, seed=59)
+    packed = run.run()
+
+It does what the actors do, with the same functions, as fast as it goes: a package arrives, the belt
+sensor sees it, nets are grounded and executed, the hand goes aside, the tray sensor looks, every
+place whose neighbourhood has changed is judged, and what was seen decides what follows.
+
+Rules a change must keep: decisions see pictures and measurements only, never the truth of physics;
+truth is noted beside each verdict, for the score (`packing_scores`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from actors.geometry.poses import coordinates, inverse
+from actors.palletizing.execution import Executor
+from actors.palletizing.grasps import grasp_of, size_of
+from actors.palletizing.grounding import Gripper, Job, easier_turn, ground
+from actors.palletizing.nets import NetError
+from actors.palletizing.reactions import CHOICES, OTHERWISE, Case, Reaction, react
+from actors.palletizing.rows import planned_rows
+from actors.palletizing.simulation.cell_scene import ARM, HOME_RAD, CellLayout
+from actors.palletizing.simulation.physical_packages import MATERIALS
+from actors.palletizing.simulation.physical_sensors import PhysicalBeltSensor, PhysicalTraySensor
+from actors.palletizing.simulation.physics import PhysicalCell
+from actors.palletizing.tray_watch import TrayWatch
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    import numpy.typing as npt
+
+    from actors.geometry.shapes import Surface
+    from actors.palletizing.nets import Net
+    from actors.palletizing.simulation.cell_truth import PackageTruth
+    from actors.palletizing.simulation.physical_packages import PhysicalPackage
+    from actors.palletizing.tray_watch import Seen
+
+    F64 = npt.NDArray[np.float64]
+
+STAGES: Final = {
+    "pack": ("grasp_from_belt", "place", "push_into_contact"),
+    "retry": ("grasp_from_belt", "place", "push_into_contact"),
+    "regrasp": ("regrasp", "place", "push_into_contact"),
+    "push_again": ("push_into_contact",),
+    "reject": ("remove_to_reject",),
+}
+"""Skeletons that a request runs, one after the other."""
+HELD_N: Final = 40.0
+"""With which the fingers move to a width at most."""
+WAIT_S: Final = 8.0
+"""A package that the belt does not bring within that time does not come."""
+HELD_M: Final = 0.006
+"""A package in the hand measures at most so much more or less than its width."""
+
+
+@dataclass(frozen=True, slots=True)
+class Judgement:
+    """A verdict on a place beside what was true at that moment.
+
+    Attributes:
+        place: Number of the place.
+        verdict: What was seen: "ok", "missing", "moved", "tipped", "deformed", "extra".
+        truth: What was so, in the same words.
+        shift_mm: Of the true pose against the plan.
+        turn_deg: The same turn.
+        pose_error_mm: Of the found against the true position; NaN if nothing was found.
+        dent_mm: True depth of the deepest dent that the sensor could see.
+        at_s: When, simulated time.
+    """
+
+    place: int
+    verdict: str
+    truth: str
+    shift_mm: float
+    turn_deg: float
+    pose_error_mm: float
+    dent_mm: float
+    at_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One request, what became of it, and what followed.
+
+    Attributes:
+        request: "pack", "retry", ...
+        stages: Skeleton and result of each net.
+        reaction: What followed.
+        reason: Why.
+        choice: What the operator chose; "" if not asked.
+        seconds: Simulated time that it took, looking included.
+        before: What was true of the package before.
+        after: What was true afterwards.
+    """
+
+    request: str
+    stages: tuple[tuple[str, str], ...]
+    reaction: str
+    reason: str
+    choice: str
+    seconds: float
+    before: str
+    after: str
+
+
+@dataclass(slots=True, eq=False)
+class Packed:
+    """What became of one package.
+
+    Attributes:
+        number: From 0.
+        product: Its name.
+        friction: Coefficient of its contacts.
+        steps: All that was done.
+        judgements: All verdicts on its place.
+        cycle_s: From its first net until the hand was free for the next package.
+        by_hand: The operator had to touch it.
+        along_mm, across_mm, turn_deg: Against its place, in the end; NaN if it is not on the tray.
+        gap_mm: To its neighbour, or the rim, in the end; NaN if it was not pushed.
+        dents_mm: Depth of each dent in the end.
+        dented_by: What made them.
+    """
+
+    number: int
+    product: str
+    friction: float
+    steps: list[Step] = field(default_factory=list)
+    judgements: list[Judgement] = field(default_factory=list)
+    cycle_s: float = float("nan")
+    by_hand: bool = False
+    along_mm: float = float("nan")
+    across_mm: float = float("nan")
+    turn_deg: float = float("nan")
+    gap_mm: float = float("nan")
+    dents_mm: tuple[float, ...] = ()
+    dented_by: tuple[str, ...] = ()
+
+
+class Packing:
+    """A closed loop over the packages of one tray.
+
+    Args:
+        packages: What comes, in its order.
+        models: Trained surface of each product.
+        seed: Of physics and sensors.
+        layout: Where things stand.
+        told: Called with a line per step.
+
+    Raises:
+        ValueError: The packages do not find room on one tray.
+    """
+
+    def __init__(
+        self,
+        packages: Sequence[PhysicalPackage],
+        models: Mapping[str, Surface],
+        *,
+        seed: int,
+        layout: CellLayout | None = None,
+        told: Callable[[str], None] = lambda _: None,
+    ) -> None:
+        self.layout, self._told = layout or CellLayout(), told
+        self.cell = PhysicalCell(packages, seed=seed, layout=self.layout)
+        self._packages, self._models = tuple(packages), models
+        self._sizes = {name: size_of(model) for name, model in models.items()}
+        self._grasps = {
+            name: grasp_of(model, mass_kg=MATERIALS[name].mass_kg) for name, model in models.items()
+        }
+        self.slots = planned_rows([package.product for package in packages], self._sizes)
+        if self.slots[-1].tray:
+            fits = sum(slot.tray == 0 for slot in self.slots)
+            raise ValueError(f"{len(packages)} packages for one tray, which takes {fits}")
+        shown = self.cell.shown
+        self._belt = PhysicalBeltSensor(shown, seed=seed, layout=self.layout)
+        tray = PhysicalTraySensor(shown, seed=seed, layout=self.layout)
+        self.watch = TrayWatch(tray, models)
+        self._frames = {"belt": self.layout.base_from_belt, "bin": self.layout.base_from_bin}
+        for number, slot in enumerate(self.slots):
+            pose = self.layout.base_from_tray @ slot.tray_from_product
+            self._frames[f"place/{number}"] = pose
+        self._last_rad: F64 | None = None
+        self._turned = False
+        self.cell.arm.start()
+
+    def run(self) -> list[Packed]:
+        """Pack all packages; return what became of them."""
+        self._feed()
+        packed = [
+            Packed(package.number, package.product, package.friction) for package in self._packages
+        ]
+        for each in packed:
+            self._pack(each, packed)
+        truth = self.cell.truth().packages
+        for each in packed:
+            self._finish(each, truth)
+        return packed
+
+    # One package
+
+    def _pack(self, packed: Packed, all_packed: Sequence[Packed]) -> None:
+        number = packed.number
+        request, tried = "pack", dict[str, int]()
+        start_s = self.cell.time_s
+        while request:
+            began_s, before = self.cell.time_s, self._state(number)
+            stages, case = self._act(request, number)
+            self._execute("go_aside", self._job(number))
+            seen = self._look(number, all_packed)
+            case = self._case(case, number, seen, tried)
+            reaction = react(case)
+            choice = self._asked(reaction, case, packed)
+            step = Step(
+                request, tuple(stages), reaction.kind, reaction.reason, choice,
+                self.cell.time_s - began_s, before, self._state(number),
+            )  # fmt: skip
+            packed.steps.append(step)
+            self._told(f"{number} {packed.product}: {step}")
+            again = choice if choice in STAGES else reaction.kind
+            request = again if again in STAGES else ""
+            if request:
+                tried[request] = tried.get(request, 0) + 1
+        packed.cycle_s = self.cell.time_s - start_s
+        if self.cell.coming and number + 1 == len(self._packages) - self.cell.coming:
+            self._feed()
+
+    def _act(self, request: str, number: int) -> tuple[list[tuple[str, str]], Case]:
+        """Run the nets of a request; return their results, and how the last one ended."""
+        stages: list[tuple[str, str]] = []
+        if request in {"pack", "retry"} and not self._see_on_belt(number):
+            return stages, Case("grasp_from_belt", "not_seen", success=False)
+        job = self._job(number)
+        success, result = True, ""
+        for skeleton in STAGES[request]:
+            if skeleton == "push_into_contact" and not self.slots[number].push.any():
+                continue
+            if skeleton in {"grasp_from_belt", "regrasp"}:
+                near = self.cell.arm.measured().q
+                turned = easier_turn(job, arm=ARM, frames=self._frames.__getitem__, near_rad=near)
+                self._turned = turned
+                job = replace(job, turned=turned)
+            result, success = self._execute(skeleton, job)
+            stages.append((skeleton, result))
+            if not success:
+                break
+            if skeleton == "place" and request == "pack" and self.cell.coming:
+                self._feed()
+        return stages, Case(stages[-1][0], result, success)
+
+    def _job(self, number: int) -> Job:
+        slot, product = self.slots[number], self._packages[number].product
+        return Job(
+            package=f"package/{number}",
+            grasp=self._grasps[product],
+            size_m=self._sizes[product],
+            place=f"place/{number}",
+            push=self.layout.base_from_tray[:3, :3] @ slot.push,
+            bin="bin",
+            turned=self._turned,
+        )
+
+    def _execute(self, skeleton: str, job: Job) -> tuple[str, bool]:
+        """Ground a skeleton and execute its net; return its result and whether it succeeded."""
+        frames, arm = self._frames.__getitem__, self.cell.arm
+        try:
+            net = ground(
+                skeleton, job, arm=ARM, gripper=Gripper(), frames=frames, near_rad=arm.measured().q
+            )
+        except NetError as error:
+            return f"refused: {error}", False
+        return self._run_net(net)
+
+    def _run_net(self, net: Net) -> tuple[str, bool]:
+        arm = self.cell.arm
+        executor = Executor(
+            net, ARM, self._frames.__getitem__,
+            posture_rad=np.array(HOME_RAD), from_rad=self._last_rad,
+        )  # fmt: skip
+        while True:
+            command = executor.step(arm.measured(), self.cell.time_s)
+            self._last_rad = command.q
+            arm.command(command.q)
+            if command.grip is not None and command.grip.kind == "width":
+                arm.grip_width(command.grip.value, HELD_N)
+            elif command.grip is not None:
+                arm.grip_force(command.grip.value)
+            self.cell.step()
+            if command.result and command.at_rest:
+                return command.result, bool(net.outcome(command.result))
+
+    def _rest(self) -> None:
+        """Let one cycle pass, the arm where it is."""
+        if self._last_rad is not None:
+            self.cell.arm.command(self._last_rad)
+        self.cell.step()
+
+    # Seeing
+
+    def _feed(self) -> None:
+        self.cell.feed()
+        self.cell.run_belt()
+
+    def _see_on_belt(self, number: int) -> bool:
+        """Wait until a package stands in the light barrier and look; return whether one is seen."""
+        until_s = self.cell.time_s + WAIT_S
+        while not self.cell.arrived() and self.cell.time_s < until_s:
+            self._rest()
+        if not self.cell.arrived():
+            return False
+        pose = np.array(self.cell.pose(number))
+        pose[:2, 3] += self._packages[number].pick_offset_m
+        self._frames[f"package/{number}"] = pose
+        return True
+
+    def _look(self, number: int, all_packed: Sequence[Packed]) -> Seen:
+        """Look at the tray, judge each place whose neighbourhood has changed; return this one's."""
+        places = {
+            each: (self._packages[each].product, self.slots[each].tray_from_product)
+            for each in range(number + 1)
+        }
+        found = self.watch.judged(places, newest=number)
+        truth = self.cell.truth().packages
+        for place, seen in found.items():
+            all_packed[place].judgements.append(self._judgement(place, seen, truth[place]))
+        for place, seen in found.items():
+            if seen.pose is not None:
+                self._frames[f"package/{place}"] = self.layout.base_from_tray @ seen.pose
+        return found[number]
+
+    def _case(self, case: Case, number: int, seen: Seen, tried: Mapping[str, int]) -> Case:
+        """Return the case with what was seen."""
+        grasp = self._grasps[self._packages[number].product]
+        width_m = self.cell.arm.measured().width_m
+        held = self.cell.arm.gripping and abs(width_m - grasp.width_m) < HELD_M
+        where = "hand" if held else "tray" if seen.verdict != "missing" else ""
+        if not where and self.cell.arrived():
+            where = "belt"
+        slot = self.slots[number]
+        along = across = 0.0
+        if seen.pose is not None:
+            off_mm = 1e3 * (seen.pose[:2, 3] - slot.tray_from_product[:2, 3])
+            push = slot.push[:2] if slot.push.any() else np.array([1.0, 0.0])
+            along = float(push @ off_mm)
+            across = float(push[0] * off_mm[1] - push[1] * off_mm[0])
+        return replace(
+            case, verdict=seen.verdict, along_mm=along, across_mm=across, turn_deg=seen.turn_deg,
+            seen=where, tried=dict(tried),
+        )  # fmt: skip
+
+    # The operator
+
+    def _asked(self, reaction: Reaction, case: Case, packed: Packed) -> str:
+        """Return what the operator chose, who answers by rule and sets right what he touches."""
+        if reaction.kind not in {"ask", "stop"}:
+            return ""
+        packed.by_hand = True
+        choice = CHOICES.get(case.verdict, OTHERWISE)[0]
+        number = packed.number
+        if choice == "replaced":
+            pose = self.layout.base_from_tray @ self.slots[number].tray_from_product
+            self.cell.replace(number, pose)
+            self.watch.forget()
+        return choice
+
+    # The truth, for the score
+
+    def _state(self, number: int) -> str:
+        truth = self.cell.truth().packages[number]
+        if truth.where != "tray":
+            return truth.where
+        return truth_of(truth, self.slots[number].tray_from_product)
+
+    def _judgement(self, place: int, seen: Seen, truth: PackageTruth) -> Judgement:
+        planned = self.slots[place].tray_from_product
+        shift_m, turn_rad = truth.beside_plan(planned)
+        error_m = float("nan")
+        if seen.pose is not None:
+            error_m = float(np.hypot(*(seen.pose - truth.tray_from_product)[:2, 3]))
+        return Judgement(
+            place=place,
+            verdict=seen.verdict,
+            truth=truth_of(truth, planned),
+            shift_mm=1e3 * shift_m,
+            turn_deg=float(np.degrees(turn_rad)),
+            pose_error_mm=1e3 * error_m,
+            dent_mm=top_dent_mm(truth),
+            at_s=self.cell.time_s,
+        )
+
+    def _finish(self, packed: Packed, truth: Sequence[PackageTruth]) -> None:
+        own, slot = truth[packed.number], self.slots[packed.number]
+        packed.dents_mm = tuple(dent.depth_mm for dent in own.dents)
+        packed.dented_by = tuple(dent.by for dent in own.dents)
+        if own.where != "tray":
+            return
+        off = coordinates(slot.tray_from_product, own.tray_from_product)
+        push = slot.push if slot.push.any() else np.array([1.0, 0.0, 0.0])
+        turn = slot.tray_from_product[:3, :3].T @ push
+        packed.along_mm = 1e3 * float(turn[:2] @ off[:2])
+        packed.across_mm = 1e3 * float(turn[0] * off[1] - turn[1] * off[0])
+        packed.turn_deg = float(np.degrees(off[5]))
+        if slot.push.any():
+            packed.gap_mm = 1e3 * gap_m(packed.number, self.slots, truth)

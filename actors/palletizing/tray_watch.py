@@ -1,0 +1,140 @@
+"""What the sensor above the tray makes of places that touch each other.
+
+picture -> which places have changed -> the picture as it would be without the package of each ->
+`inspect_place`, as for a package that has just come
+
+Rules a change must keep: depth is the only evidence; a place is judged against what stands around
+it now, not against what stood there before, since a push moves the neighbours too.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from actors.geometry.depth import median_known, metres
+from actors.geometry.deviation import Limits, inspect_place
+from actors.geometry.rendering import render_depth
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    import numpy.typing as npt
+
+    from actors.geometry.shapes import DepthFrame, Surface
+    from actors.palletizing.sensor import TraySensor
+
+    F64 = npt.NDArray[np.float64]
+    Depth = npt.NDArray[np.uint16]
+    Places = Mapping[int, tuple[str, F64]]
+
+CHANGED_M: Final = 0.004
+"""A pixel that is nearer or farther by more than this has changed."""
+CHANGED_SHARE: Final = 0.03
+"""A place has changed when this share of its pixels has."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Seen:
+    """What was found at one place.
+
+    Attributes:
+        verdict: See `actors.geometry.deviation.VERDICTS`.
+        pose: tray_from_product, (4, 4); None if nothing was found there.
+        shift_mm: Distance from the planned position.
+        turn_deg: Turn against the planned pose.
+        deviation_mm: By how much it deviates.
+    """
+
+    verdict: str
+    pose: F64 | None
+    shift_mm: float
+    turn_deg: float
+    deviation_mm: float
+
+
+class TrayWatch:
+    """Judges the places of one tray, picture by picture.
+
+    Args:
+        sensor: Above the tray.
+        models: Trained surface of each product.
+        limits: Of the inspection; the calibrated ones when absent.
+    """
+
+    def __init__(
+        self, sensor: TraySensor, models: Mapping[str, Surface], *, limits: Limits | None = None
+    ) -> None:
+        self._sensor, self._models, self._limits = sensor, models, limits
+        self._empty = sensor.capture_empty()
+        self._last: DepthFrame | None = None
+        self.seen: dict[int, Seen] = {}
+        self.frame = self._empty
+
+    def forget(self) -> None:
+        """Somebody has changed something: the next picture judges every place."""
+        self._last = None
+
+    def judged(self, places: Places, *, newest: int) -> dict[int, Seen]:
+        """Look; return what stands at the newest place and at all others that have changed.
+
+        Args:
+            places: Product and tray_from_product as planned of every place that is in use.
+            newest: Number of the place that something was done to.
+        """
+        self.frame = self._sensor.capture(newest)
+        changed = self._changed(places) | {newest}
+        self._last = self.frame
+        found: dict[int, Seen] = {}
+        # The newest first: what was pushed against is judged beside where the newest is now.
+        for place in sorted(changed, key=lambda each: (each != newest, each)):
+            found[place] = self.seen[place] = self._inspected(place, places)
+        return found
+
+    def _inspected(self, place: int, places: Places) -> Seen:
+        product, planned = places[place]
+        before_mm = self._without(place, places)
+        found = inspect_place(
+            self.frame, before_mm, self._models[product], planned, limits=self._limits
+        )
+        return Seen(
+            verdict=found.verdict,
+            pose=None if found.verdict == "missing" else found.tray_from_product,
+            shift_mm=found.shift_mm,
+            turn_deg=found.turn_deg,
+            deviation_mm=found.deviation_mm,
+        )
+
+    def _without(self, place: int, places: Places) -> Depth:
+        """Return the picture as it would be without the package of a place, (H, W) millimetres."""
+        others = [
+            (self._models[places[number][0]], seen.pose)
+            for number, seen in self.seen.items()
+            if number != place and number in places and seen.pose is not None
+        ]
+        if not others:
+            return self._empty.depth_mm
+        rendered = render_depth(others, self.frame.acquisition)
+        covered = np.isfinite(rendered)
+        before_mm = np.array(self._empty.depth_mm)
+        before_mm[covered] = np.round(1000.0 * rendered[covered]).astype(np.uint16)
+        return before_mm
+
+    def _changed(self, places: Places) -> set[int]:
+        """Return the places whose pixels differ from those of the picture before."""
+        if self._last is None:
+            return set(places) & set(self.seen)
+        now, before = (median_known(metres(f.depth_mm), 5) for f in (self.frame, self._last))
+        with np.errstate(invalid="ignore"):
+            differs = np.abs(now - before) > CHANGED_M
+        changed = set()
+        for number, seen in self.seen.items():
+            if number in places:
+                pose = places[number][1] if seen.pose is None else seen.pose
+                model = self._models[places[number][0]]
+                own = np.isfinite(render_depth([(model, pose)], self.frame.acquisition))
+                if own.any() and differs[own].mean() > CHANGED_SHARE:
+                    changed.add(number)
+        return changed
