@@ -12,6 +12,7 @@ grasp.width_m           m         between the fingers that hold it; grasp.open_m
 grasp.height_m          m         of the fingers above the package's base
 grasp.force_n           N         of the fingers
 hand.turn_rad           rad       0, or π for the hand turned round
+hand.bin_rad            rad       the hand over the bin
 hand.aside_rad          rad       halfway between belt and tray, in the frame of the belt
 push.frame              pose      in the place: origin as grasp.frame, x along the push, z up
 hand.push_turn_rad      rad       the hand in it
@@ -162,20 +163,24 @@ def ground(
 def easier_turn(job: Job, *, arm: Arm, frames: Frames, near_rad: F64) -> bool:
     """Return whether the hand has less to turn when it grasps turned round, see `Job.turned`.
 
+    What it turns on the way to the place, if there is one, counts as well.
+
     Raises:
-        NetError: It is not known where the package is.
+        NetError: It is not known where the package or its place is.
     """
-    grasp = _known(frames, job.package) @ _grasp_frame(job.grasp)
+    entities = [job.package, job.place] if job.place else [job.package]
     travel = []
     for turn_rad in (0.0, math.pi):
-        pose = grasp.copy()
-        pose[:3, :3] = grasp[:3, :3] @ turned(math.pi, 0.0, turn_rad)
-        reached = reach(arm, pose, near_rad)
-        away = (
-            np.inf
-            if not (reached.there and reached.nearby)
-            else float(np.abs(reached.q_rad - near_rad).max())
-        )
+        away, q_rad = 0.0, near_rad
+        for entity in entities:
+            pose = _known(frames, entity) @ _grasp_frame(job.grasp)
+            pose[:3, :3] = pose[:3, :3] @ turned(math.pi, 0.0, turn_rad)
+            reached = reach(arm, pose, q_rad)
+            if not (reached.there and reached.nearby):
+                away = np.inf
+                break
+            away += float(np.abs(reached.q_rad - q_rad).max())
+            q_rad = reached.q_rad
         travel.append(away)
     return travel[1] < travel[0]
 
@@ -196,7 +201,8 @@ def parameters(job: Job, gripper: Gripper, frames: Frames) -> dict[str, Value]:
         "grasp.height_m": float(grasp.point[2]),
         "grasp.force_n": grasp.force_n,
         "hand.turn_rad": math.pi if job.turned else 0.0,
-        "hand.aside_rad": -0.75 * math.pi if job.turned else 0.25 * math.pi,
+        "hand.aside_rad": 0.75 * math.pi if job.turned else -0.25 * math.pi,
+        "hand.bin_rad": 0.5 * math.pi if job.turned else -0.5 * math.pi,
         "belt": "belt",
         "gripper.closed_m": gripper.least_m + 0.001,
         "clear_m": CLEAR_M,

@@ -18,13 +18,17 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from actors.geometry.poses import coordinates, inverse
+from actors.geometry.depth import fused
+from actors.geometry.poses import coordinates
+from actors.palletizing.belt_sight import seen_on_belt
 from actors.palletizing.execution import Executor
 from actors.palletizing.grasps import grasp_of, size_of
 from actors.palletizing.grounding import Gripper, Job, easier_turn, ground
 from actors.palletizing.nets import NetError
+from actors.palletizing.packing_truth import gap_m, top_dent_mm, truth_of
 from actors.palletizing.reactions import CHOICES, OTHERWISE, Case, Reaction, react
-from actors.palletizing.rows import planned_rows
+from actors.palletizing.rows import contacts_between, planned_rows
+from actors.palletizing.sensor import FRAMES
 from actors.palletizing.simulation.cell_scene import ARM, HOME_RAD, CellLayout
 from actors.palletizing.simulation.physical_packages import MATERIALS
 from actors.palletizing.simulation.physical_sensors import PhysicalBeltSensor, PhysicalTraySensor
@@ -36,7 +40,7 @@ if TYPE_CHECKING:
 
     import numpy.typing as npt
 
-    from actors.geometry.shapes import Surface
+    from actors.geometry.shapes import DepthFrame, Surface
     from actors.palletizing.nets import Net
     from actors.palletizing.simulation.cell_truth import PackageTruth
     from actors.palletizing.simulation.physical_packages import PhysicalPackage
@@ -52,6 +56,8 @@ STAGES: Final = {
     "reject": ("remove_to_reject",),
 }
 """Skeletons that a request runs, one after the other."""
+FRAME_CYCLES: Final = 8
+"""Cycles of control between two images: 30 a second."""
 HELD_N: Final = 40.0
 """With which the fingers move to a width at most."""
 WAIT_S: Final = 8.0
@@ -173,20 +179,26 @@ class Packing:
         self._grasps = {
             name: grasp_of(model, mass_kg=MATERIALS[name].mass_kg) for name, model in models.items()
         }
-        self.slots = planned_rows([package.product for package in packages], self._sizes)
+        self.slots = planned_rows(
+            [package.product for package in packages], self._sizes, contacts_between(models)
+        )
         if self.slots[-1].tray:
             fits = sum(slot.tray == 0 for slot in self.slots)
             raise ValueError(f"{len(packages)} packages for one tray, which takes {fits}")
         shown = self.cell.shown
         self._belt = PhysicalBeltSensor(shown, seed=seed, layout=self.layout)
         tray = PhysicalTraySensor(shown, seed=seed, layout=self.layout)
-        self.watch = TrayWatch(tray, models)
+        self.watch = TrayWatch(tray.capture_empty(), models)
+        self._tray = tray
+        self._pictures: list[DepthFrame] = []
+        self._belt_empty_mm = self._belt.capture_empty().depth_mm
         self._frames = {"belt": self.layout.base_from_belt, "bin": self.layout.base_from_bin}
         for number, slot in enumerate(self.slots):
             pose = self.layout.base_from_tray @ slot.tray_from_product
             self._frames[f"place/{number}"] = pose
         self._last_rad: F64 | None = None
         self._turned = False
+        self._belt_seen, self._arrived_cycles = True, 0
         self.cell.arm.start()
 
     def run(self) -> list[Packed]:
@@ -233,6 +245,8 @@ class Packing:
     def _act(self, request: str, number: int) -> tuple[list[tuple[str, str]], Case]:
         """Run the nets of a request; return their results, and how the last one ended."""
         stages: list[tuple[str, str]] = []
+        if request == "retry":
+            self._look_at_belt()
         if request in {"pack", "retry"} and not self._see_on_belt(number):
             return stages, Case("grasp_from_belt", "not_seen", success=False)
         job = self._job(number)
@@ -290,33 +304,51 @@ class Packing:
                 arm.grip_width(command.grip.value, HELD_N)
             elif command.grip is not None:
                 arm.grip_force(command.grip.value)
-            self.cell.step()
+            self._cycle()
             if command.result and command.at_rest:
                 return command.result, bool(net.outcome(command.result))
 
-    def _rest(self) -> None:
-        """Let one cycle pass, the arm where it is."""
-        if self._last_rad is not None:
-            self.cell.arm.command(self._last_rad)
+    def _rest(self, cycles: int = 1) -> None:
+        """Let time pass, the arm where it is."""
+        for _ in range(cycles):
+            if self._last_rad is not None:
+                self.cell.arm.command(self._last_rad)
+            self._cycle()
+
+    def _cycle(self) -> None:
+        """Let one cycle pass; take pictures of the belt while a package stands there unseen."""
         self.cell.step()
+        if not self._belt_seen and self.cell.arrived():
+            self._arrived_cycles += 1
+            if self._arrived_cycles % FRAME_CYCLES == 0:
+                self._pictures.append(self._belt.capture(0))
+                self._belt_seen = len(self._pictures) == FRAMES
 
     # Seeing
 
     def _feed(self) -> None:
         self.cell.feed()
         self.cell.run_belt()
+        self._look_at_belt()
+
+    def _look_at_belt(self) -> None:
+        """Take new pictures of the belt when a package stands there."""
+        self._pictures, self._belt_seen, self._arrived_cycles = [], False, 0
 
     def _see_on_belt(self, number: int) -> bool:
         """Wait until a package stands in the light barrier and look; return whether one is seen."""
         until_s = self.cell.time_s + WAIT_S
-        while not self.cell.arrived() and self.cell.time_s < until_s:
+        while not self._belt_seen and self.cell.time_s < until_s:
             self._rest()
-        if not self.cell.arrived():
+        if not self._belt_seen:
             return False
-        pose = np.array(self.cell.pose(number))
-        pose[:2, 3] += self._packages[number].pick_offset_m
-        self._frames[f"package/{number}"] = pose
-        return True
+        sights = seen_on_belt(fused(self._pictures), self._belt_empty_mm, self._models)
+        for sight in sights:
+            if sight.product == self._packages[number].product and sight.known:
+                pose = self.layout.base_from_belt @ sight.belt_from_product
+                self._frames[f"package/{number}"] = pose
+                return True
+        return False
 
     def _look(self, number: int, all_packed: Sequence[Packed]) -> Seen:
         """Look at the tray, judge each place whose neighbourhood has changed; return this one's."""
@@ -324,7 +356,11 @@ class Packing:
             each: (self._packages[each].product, self.slots[each].tray_from_product)
             for each in range(number + 1)
         }
-        found = self.watch.judged(places, newest=number)
+        pictures = []
+        for _ in range(FRAMES):
+            self._rest(FRAME_CYCLES)
+            pictures.append(self._tray.capture(number))
+        found = self.watch.judged(fused(pictures), places, newest=number)
         truth = self.cell.truth().packages
         for place, seen in found.items():
             all_packed[place].judgements.append(self._judgement(place, seen, truth[place]))

@@ -3,7 +3,7 @@
 =============================  =====================================================================
 what happened                  what follows
 =============================  =====================================================================
-sound                          go on; align when it stands `ALIGN_MM` or more beside its row
+sound                          go on
 missed, lost, blocked          retry when it is seen on the belt, regrasp when upright on the tray
 blocked, no floor, in hand     reject: it is still held
 moved, short of its neighbour  push again, once
@@ -25,24 +25,23 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
-REACTIONS: Final = ("go_on", "align", "push_again", "regrasp", "retry", "reject", "stop", "ask")
-ALIGN_MM: Final = 1.8
-"""A sound package that stands farther beside the middle of its row is pushed there."""
+REACTIONS: Final = ("go_on", "push_again", "regrasp", "retry", "reject", "stop", "ask")
 NEAR_MM: Final = 30.0
 """A package that stands farther from its place has not just slipped."""
 TURNED_DEG: Final = 20.0
 """A package that is turned by more is nothing that the robot may take by itself."""
-MOST: Final = {"align": 1, "push_again": 1, "regrasp": 2, "retry": 2, "reject": 1}
+MOST: Final = {"push_again": 1, "regrasp": 2, "retry": 2, "reject": 1}
 """How often each is tried for one place."""
 CHOICES: Final = {
-    "tipped": ("removed", "reject"),
-    "deformed": ("reject", "removed", "go_on"),
-    "extra": ("removed", "go_on"),
-    "moved": ("regrasp", "removed", "go_on"),
-    "missing": ("retry", "skip"),
+    "tipped": ("replaced", "go_on"),
+    "deformed": ("replaced", "go_on"),
+    "extra": ("replaced", "go_on"),
+    "moved": ("replaced", "regrasp", "go_on"),
+    "missing": ("replaced", "retry", "go_on"),
 }
-"""What an operator may answer, by what was seen; the first is what the rule of a script takes."""
-OTHERWISE: Final = ("removed", "retry", "skip")
+"""What an operator may answer, by what was seen; the first is what the rule of a script takes.
+"replaced": a person has put a sound package to the place."""
+OTHERWISE: Final = ("replaced", "retry", "go_on")
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +94,7 @@ def react(case: Case) -> Reaction:
     if case.verdict in {"tipped", "deformed", "extra"}:
         return Reaction("ask", f"it is {case.verdict}")
     if case.verdict == "ok":
-        return _sound(case)
+        return Reaction("go_on", "it stands as planned")
     if case.verdict == "moved":
         return _moved(case)
     what = case.result if not case.success else "not at its place"
@@ -109,13 +108,6 @@ def react(case: Case) -> Reaction:
 def choices_of(verdict: str) -> tuple[str, ...]:
     """Return what an operator may answer to a verdict."""
     return CHOICES.get(verdict, OTHERWISE)
-
-
-def _sound(case: Case) -> Reaction:
-    beside = f"{abs(case.across_mm):.1f} mm beside the middle of its row"
-    if abs(case.across_mm) >= ALIGN_MM and case.tried.get("align", 0) < MOST["align"]:
-        return Reaction("align", beside)
-    return Reaction("go_on", "it stands as planned")
 
 
 def _moved(case: Case) -> Reaction:

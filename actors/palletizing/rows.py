@@ -1,6 +1,6 @@
 """Where packages shall stand when a robot pushes them together: rows on trays.
 
-A row runs along the tray's x axis, and so does the length of its packages: the fingers, which hold
+A row begins at the rim where x is greatest and runs against the tray's x axis, and so does the length of its packages: the fingers, which hold
 them by their sides, need room between the rows but none within one.  So the fingers decide where a
 package stands across its row, and the push where it stands along it.  The first package of a row
 touches the rim, each further one the package before it.  What would tip under a push, since it is
@@ -27,18 +27,22 @@ if TYPE_CHECKING:
 
     import numpy.typing as npt
 
+    from actors.geometry.shapes import Surface
+
     F64 = npt.NDArray[np.float64]
 
 ROWS_Y_M: Final = (-0.120, 0.010, 0.140)
 """Middles of the rows, tray frame, in the order they are filled: the far one first."""
 ROW_START_M: Final = -0.448
-"""Inner side of the rim that the first package touches."""
+"""Inner side of the rim that the first package touches, against the tray's x axis."""
 ROW_END_M: Final = 0.360
-"""Where a row ends: behind it the closed hand goes down within the rim."""
+"""Where a row ends, so counted: behind it the closed hand goes down within the rim."""
 WIDTH_MAX_M: Final = 0.125
 """No wider may a package be across its row."""
 TOUCHING_M: Final = 0.0005
 """Between neighbours of a row, as planned: what a push leaves."""
+RIM_M: Final = 0.030
+"""Height of the tray's rim."""
 APART_M: Final = 0.020
 """Between neighbours that are not pushed: where they are put down is not better known."""
 BESIDE_M: Final = 0.005
@@ -65,19 +69,24 @@ class Slot:
     push: F64
 
 
-def planned_rows(products: Sequence[str], sizes_m: Mapping[str, F64]) -> list[Slot]:
+def planned_rows(
+    products: Sequence[str],
+    sizes_m: Mapping[str, F64],
+    contacts_m: Mapping[tuple[str, str], float] | None = None,
+) -> list[Slot]:
     """Return the place of each package.
 
     Args:
         products: What comes, in its order.
         sizes_m: Box of each product, (3,), metres, product frame: it is held by the sides along its
             y axis and pushed along its x axis.
+        contacts_m: See `contacts_between`; as of boxes when absent.
 
     Raises:
         ValueError: A product is wider or longer than a row.
     """
     slots: list[Slot] = []
-    tray, rows = 0, _Rows()
+    tray, rows = 0, _Rows(contacts_m or {})
     for product in products:
         length, width, height = (float(each) for each in sizes_m[product])
         if width > WIDTH_MAX_M or length > ROW_END_M - ROW_START_M:
@@ -85,20 +94,60 @@ def planned_rows(products: Sequence[str], sizes_m: Mapping[str, F64]) -> list[Sl
             found = f"{1e3 * length:.0f} x {1e3 * width:.0f} mm"
             raise ValueError(f"{product} is {found} large; a row takes {room}")
         pushed = height <= length
-        found_at = rows.take(length, width, pushed=pushed)
+        found_at = rows.take(product, length, width, pushed=pushed)
         if found_at is None:
-            tray, rows = tray + 1, _Rows()
-            found_at = rows.take(length, width, pushed=pushed)
+            tray, rows = tray + 1, _Rows(contacts_m or {})
+            found_at = rows.take(product, length, width, pushed=pushed)
             assert found_at is not None, "an empty tray takes every product that is not too large"
-        push = np.array([-1.0, 0.0, 0.0]) if pushed else np.zeros(3)
-        slots.append(Slot(tray, on_tray(*found_at, 0.0), push))
+        push = np.array([1.0, 0.0, 0.0]) if pushed else np.zeros(3)
+        slots.append(Slot(tray, on_tray(*found_at, np.pi), push))
     return slots
+
+
+def contacts_between(
+    surfaces: Mapping[str, Surface], *, rim_m: float = RIM_M
+) -> dict[tuple[str, str], float]:
+    """Return how far apart along x the origins of two products are when the hulls touch.
+
+    Args:
+        surfaces: Trained surface of each product, product frame.
+        rim_m: Height of the tray's rim.
+
+    Returns:
+        By the product that stands and the one that is pushed against it, metres; the one that
+        stands is "" for the rim, whose inner side is then the origin.
+    """
+    heights, sides = np.meshgrid(np.arange(0.001, 0.15, 0.002), np.arange(-0.08, 0.08, 0.004))
+    extents = {name: _extent(surface, sides, heights) for name, surface in surfaces.items()}
+    found = {}
+    for pushed, (low, _) in extents.items():
+        found["", pushed] = -float(low[heights <= rim_m].min())
+        for standing, (_, high) in extents.items():
+            found[standing, pushed] = float(np.nanmax(np.where(high < low, np.nan, high - low)))
+    return found
+
+
+def _extent(surface: Surface, y_m: F64, z_m: F64) -> tuple[F64, F64]:
+    """Return the least and greatest x of the hull of a surface at y and z; inf, -inf beside it."""
+    from scipy.spatial import ConvexHull
+
+    hull = ConvexHull(surface.vertices_m.astype(np.float64))
+    planes = np.unique(hull.equations.round(6), axis=0)
+    offset = planes[:, 1, None, None] * y_m + planes[:, 2, None, None] * z_m
+    offset = offset + planes[:, 3, None, None]
+    steep = np.abs(planes[:, 0]) > 1e-6
+    x = -offset[steep] / planes[steep, 0, None, None]
+    ahead = planes[steep, 0] > 0.0
+    low, high = x[~ahead].max(axis=0), x[ahead].min(axis=0)
+    inside = (low <= high) & (offset[~steep] <= 0.0).all(axis=0)
+    return np.where(inside, low, np.inf), np.where(inside, high, -np.inf)
 
 
 @dataclass(frozen=True, slots=True)
 class _Taken:
-    """A package on a tray: its row, its middle along it, half its size."""
+    """A package on a tray: its row, its middle along it (against x), half its size."""
 
+    product: str
     row: int
     x_m: float
     half_length_m: float
@@ -108,26 +157,34 @@ class _Taken:
 class _Rows:
     """What stands on one tray."""
 
-    def __init__(self) -> None:
+    def __init__(self, contacts_m: Mapping[tuple[str, str], float]) -> None:
+        self._contacts_m = contacts_m
         self._taken: list[_Taken] = []
         self._pushed: dict[int, bool] = {}
 
-    def take(self, length_m: float, width_m: float, *, pushed: bool) -> tuple[float, float] | None:
-        """Return the middle of the next package, x and y in the tray frame; None if none fits."""
+    def take(
+        self, product: str, length_m: float, width_m: float, *, pushed: bool
+    ) -> tuple[float, float] | None:
+        """Return where the next package stands, x and y in the tray frame; None if none fits."""
         for row, y_m in enumerate(ROWS_Y_M):
             if self._pushed.get(row, pushed) != pushed:
                 continue
-            apart_m = TOUCHING_M if pushed else APART_M
-            end_m = max((t.x_m + t.half_length_m for t in self._in(row)), default=ROW_START_M)
-            new = _Taken(row, end_m + apart_m + length_m / 2.0, length_m / 2.0, width_m / 2.0)
+            half_m = length_m / 2.0
+            stands = [each for each in self._taken if each.row == row]
+            if stands:
+                last = stands[-1]
+                apart_m = self._contacts_m.get((last.product, product), last.half_length_m + half_m)
+                x_m = last.x_m + apart_m
+            else:
+                x_m = ROW_START_M + self._contacts_m.get(("", product), half_m)
+            if not pushed:
+                x_m += APART_M
+            new = _Taken(product, row, x_m + TOUCHING_M, half_m, width_m / 2.0)
             if new.x_m + new.half_length_m <= ROW_END_M and self._has_room(new):
                 self._pushed[row] = pushed
                 self._taken.append(new)
-                return new.x_m, y_m
+                return -new.x_m, y_m
         return None
-
-    def _in(self, row: int) -> list[_Taken]:
-        return [each for each in self._taken if each.row == row]
 
     def _has_room(self, new: _Taken) -> bool:
         """Return whether package and fingers go down beside what stands in the other rows."""

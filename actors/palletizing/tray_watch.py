@@ -9,27 +9,32 @@ it now, not against what stood there before, since a push moves the neighbours t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from actors.geometry.depth import median_known, metres
 from actors.geometry.deviation import Limits, inspect_place
-from actors.geometry.rendering import render_depth
+from actors.geometry.rendering import directions, render_depth
+from actors.geometry.shapes import DepthFrame
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     import numpy.typing as npt
 
-    from actors.geometry.shapes import DepthFrame, Surface
-    from actors.palletizing.sensor import TraySensor
+    from actors.geometry.shapes import Surface
 
     F64 = npt.NDArray[np.float64]
-    Depth = npt.NDArray[np.uint16]
+    Depth = npt.NDArray[np.uint16 | np.float32]
     Places = Mapping[int, tuple[str, F64]]
 
+SEEN_M: Final = (1.00, 0.66)
+"""Length and width of what is looked at, along x and y at the height of the tray: the tray, and as
+much farther as the top of a package at its rim is seen."""
+LIMITS: Final = replace(Limits(), turned_rad=float(np.deg2rad(5.0)))
+"""In a row a package is turned by its neighbours: by more than this it does not touch them."""
 CHANGED_M: Final = 0.004
 """A pixel that is nearer or farther by more than this has changed."""
 CHANGED_SHARE: Final = 0.03
@@ -59,32 +64,38 @@ class TrayWatch:
     """Judges the places of one tray, picture by picture.
 
     Args:
-        sensor: Above the tray.
+        empty: The empty tray.
         models: Trained surface of each product.
-        limits: Of the inspection; the calibrated ones when absent.
+        limits: Of the inspection; `LIMITS` when absent.
     """
 
     def __init__(
-        self, sensor: TraySensor, models: Mapping[str, Surface], *, limits: Limits | None = None
+        self, empty: DepthFrame, models: Mapping[str, Surface], *, limits: Limits | None = None
     ) -> None:
-        self._sensor, self._models, self._limits = sensor, models, limits
-        self._empty = sensor.capture_empty()
+        self._empty, self._models, self._limits = empty, models, limits or LIMITS
+        eye = empty.acquisition.world_from_camera
+        rays = directions(empty.acquisition.camera) @ eye[:3, :3].T
+        on_tray = eye[:2, 3] - rays[..., :2] * (eye[2, 3] / rays[..., 2:])
+        self._outside = (2.0 * np.abs(on_tray) > SEEN_M).any(axis=-1)
         self._last: DepthFrame | None = None
         self.seen: dict[int, Seen] = {}
-        self.frame = self._empty
+        self.frame = empty
 
     def forget(self) -> None:
         """Somebody has changed something: the next picture judges every place."""
         self._last = None
 
-    def judged(self, places: Places, *, newest: int) -> dict[int, Seen]:
-        """Look; return what stands at the newest place and at all others that have changed.
+    def judged(self, frame: DepthFrame, places: Places, *, newest: int) -> dict[int, Seen]:
+        """Return what stands at the newest place and at all others that have changed.
 
         Args:
+            frame: The tray now.
             places: Product and tray_from_product as planned of every place that is in use.
             newest: Number of the place that something was done to.
         """
-        self.frame = self._sensor.capture(newest)
+        # The hand that waits beside the tray is seen beside it.
+        depth_mm = np.where(self._outside, self._empty.depth_mm, frame.depth_mm)
+        self.frame = DepthFrame(depth_mm.astype(frame.depth_mm.dtype), frame.acquisition)
         changed = self._changed(places) | {newest}
         self._last = self.frame
         found: dict[int, Seen] = {}
@@ -118,8 +129,8 @@ class TrayWatch:
             return self._empty.depth_mm
         rendered = render_depth(others, self.frame.acquisition)
         covered = np.isfinite(rendered)
-        before_mm = np.array(self._empty.depth_mm)
-        before_mm[covered] = np.round(1000.0 * rendered[covered]).astype(np.uint16)
+        before_mm = self._empty.depth_mm.astype(np.float32)
+        before_mm[covered] = 1000.0 * rendered[covered]
         return before_mm
 
     def _changed(self, places: Places) -> set[int]:

@@ -245,6 +245,11 @@ class PhysicalCell:
         self._mujoco.mj_forward(self.model, self.data)
         self._damages[number].calm()
 
+    def replace(self, number: int, base_from_product: F64) -> None:
+        """Put a sound package of the same kind somewhere in place of one: a person's hands."""
+        self._damages[number] = Damage(self._packages[number])
+        self.put(number, base_from_product)
+
     def change_tray(self) -> list[int]:
         """Take the tray away with all that is on it; return the numbers of those packages."""
         taken = [truth.number for truth in self.truth().packages if truth.where == "tray"]
