@@ -112,8 +112,8 @@ class Job:
         grasp: Of its product.
         size_m: (3,) float64, the product's box, product frame.
         place: Entity of the place; "" if the action has none.
-        push: (3,) float64, direction of the push, base frame; it is taken level.  Zeros: what is put
-            down at its place stays there.
+        push: (3,) float64, direction of the push, base frame; it is taken level.  Zeros: nothing
+            pushes it.
         bin: Entity of the reject bin; "" if the action has none.
         turned: The hand is turned round by π: what was grasped so is placed so.
     """

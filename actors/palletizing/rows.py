@@ -1,10 +1,11 @@
 """Where packages shall stand when a robot pushes them together: rows on trays.
 
-A row begins at the rim where x is greatest and runs against the tray's x axis, and so does the length of its packages: the fingers, which hold
-them by their sides, need room between the rows but none within one.  So the fingers decide where a
-package stands across its row, and the push where it stands along it.  The first package of a row
-touches the rim, each further one the package before it.  What would tip under a push, since it is
-taller than it is long, gets rows of its own, in which neighbours keep a little distance.
+A row begins at the rim where x is greatest and runs against the tray's x axis, and so does the
+length of its packages: the fingers, which hold them by their sides, need room between the rows but
+none within one.  So the fingers decide where a package stands across its row, and the push where it
+stands along it.  The first package of a row touches the rim, each further one the package before
+it.  What would tip under a push, since it is taller than it is long, gets rows of its own, in which
+neighbours keep a little distance.
 
 Rule a change must keep: places are filled in their order; what has been put down is never between
 a package and the place that the robot comes from to push it, nor where its fingers go down.

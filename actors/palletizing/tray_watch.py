@@ -10,7 +10,7 @@ it now, not against what stood there before, since a push moves the neighbours t
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from actors.geometry.shapes import Surface
 
     F64 = npt.NDArray[np.float64]
-    Depth = npt.NDArray[np.uint16 | np.float32]
+    Depth = npt.NDArray[Any]
     Places = Mapping[int, tuple[str, F64]]
 
 SEEN_M: Final = (1.00, 0.66)
