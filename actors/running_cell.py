@@ -15,6 +15,7 @@ import socket
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 import tomllib
 from pathlib import Path
@@ -22,13 +23,16 @@ from typing import TYPE_CHECKING, Any, Final, Self
 
 from actors.geometry.files import write_whole
 from enact_dist import connect
-from enact_dist.errors import LinkError
+from enact_dist.errors import EnactError, LinkError
+from enact_dist.link.signals import StopSignals
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from enact_dist import Cell
 
+LOOKING_ON_NICE: Final = 10
+"""Nice value of the threads that record and look on: a tenth of the weight of an actor."""
 UP_S: Final = 60.0
 """How long the shards may take to answer; one needs half a second on an idle machine."""
 TRY_S: Final = 2.0
@@ -188,6 +192,67 @@ class RunningCell(DemoCell):
         if self._process is not None and self._process.poll() is not None:
             lines = self._log.read_text(errors="replace").splitlines()[-8:]
             raise DemoError("\n".join([f"the cell went down; the end of {self.log}:", *lines]))
+
+
+def until_interrupted(running: DemoCell) -> None:
+    """Wait for Ctrl-C or SIGTERM, or until the cell goes down by itself."""
+    with StopSignals() as signals:
+        while not signals.event.wait(1.0):
+            running.check()
+
+
+def give_way() -> None:
+    """Let this thread run only where what it watches leaves a processor idle, or nearly so.
+
+    Who records or looks on must not make a robot's command late.
+    """
+    with contextlib.suppress(OSError):  # a host on which threads have no priority of their own
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), LOOKING_ON_NICE)
+
+
+@contextlib.contextmanager
+def recording(
+    cell: Cell,
+    path: Path,
+    *,
+    worlds: Sequence[str] = (),
+    aspects: Sequence[str] = (),
+    pictures: bool = True,
+) -> Iterator[None]:
+    """Record a cell while the block runs.
+
+    Args:
+        cell: The cell.
+        path: The file; an older one is replaced.
+        worlds: Names of the world contexts; all unless given.
+        aspects: Names of the aspects; all unless given.
+        pictures: Whether viewers such as Foxglove can show it.
+
+    Raises:
+        DemoError: The recording failed.
+    """
+    from enact_dist.recording import Recorder  # of an extra, which not every demonstration needs
+
+    path.unlink(missing_ok=True)
+    recorder = Recorder(cell, path, worlds=worlds, aspects=aspects, pictures=pictures)
+    stop, errors = threading.Event(), []
+
+    def run() -> None:
+        give_way()
+        try:
+            recorder.run(stop)
+        except (EnactError, OSError) as error:
+            errors.append(error)
+
+    thread = threading.Thread(target=run, name="recorder", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
+    if errors:
+        raise DemoError(f"the recording {path} failed: {errors[0]}") from errors[0]
 
 
 def placed(config: dict[str, Any], data: Path, ports: Sequence[int]) -> None:

@@ -188,7 +188,11 @@ class BeltController(Protocol):
     """A conveyor belt with a light barrier where packages are picked up."""
 
     def run_belt(self) -> None:
-        """Move the belt until a package interrupts the light barrier."""
+        """Let a package come, and move the belt until it interrupts the light barrier."""
+        ...
+
+    def change_tray(self) -> object:
+        """Bring an empty tray."""
         ...
 
     def stop_belt(self) -> None:

@@ -1,25 +1,42 @@
-"""Conveyor: lets the next package come when the last one has been judged."""
+"""Conveyor: lets the next package come when the last one is out of the way."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import time
+from typing import TYPE_CHECKING, Final
 
+from actors.palletizing.controller import open_controller
 from actors.palletizing.vocabulary import (
+    ARRIVAL,
+    BELT,
     CONVEYOR,
     DEVIATIONS,
+    EMPTY,
+    GRASP,
+    NET,
     PLACES,
     PLAN,
     PRODUCTS,
+    REQUEST,
+    RESULTS,
     STOP,
     SURFACE,
     SYSTEM,
+    Arrival,
     place_entity,
     product_entity,
 )
 from enact_dist import Actor, View, ViewEach, World, Write
 
 if TYPE_CHECKING:
+    from actors.palletizing.controller import BeltController
     from enact_dist import Lock
+
+OFF_THE_BELT: Final = ("place", "push", "remove")
+"""Stages during which the package is not on the belt."""
+LOOK_S: Final = 0.1
+LATE_S: Final = 15.0
+"""A belt that has brought nothing for so long is started again, and says so."""
 
 
 class Conveyor(Actor):
@@ -47,3 +64,71 @@ class Conveyor(Actor):
         last_is_judged = coming == 0 or place_entity(coming - 1).name in judged
         if last_is_judged and place_entity(coming) in plans:
             lock[self.stop_number] = coming
+
+
+class BeltConveyor(Actor):
+    """Run the belt until a package stands in its light barrier, as soon as the last one is off it.
+
+    It waits until there are a plan and a grasp of every product.  A tray that is full is changed
+    when its last package is done with.
+
+    Args:
+        controller: Address of the belt (`BeltController`), see `open_controller`.
+    """
+
+    training, online = World("training"), World("online")
+    plans = ViewEach(training, PLACES, PLAN)
+    grasps = ViewEach(training, PRODUCTS, GRASP)
+    empty = View(training, BELT, EMPTY)
+    request = View(online, SYSTEM, REQUEST)
+    attached = View(online, SYSTEM, NET)
+    results = View(online, SYSTEM, RESULTS)
+    arrival = Write(online, CONVEYOR, ARRIVAL)
+    every_s = LOOK_S
+
+    def __init__(self, controller: str) -> None:
+        self.belt: BeltController = open_controller(controller)
+        self._runs_s = 0.0
+
+    def update(self, lock: Lock) -> None:
+        """Start the belt, or say that a package has come."""
+        plans, trained = lock[self.plans], lock[self.grasps].keys()
+        last = lock.get(self.arrival)
+        coming = 0 if last is None else last.number + 1
+        place = place_entity(coming)
+        if place not in plans or lock.is_null(self.empty):
+            return
+        if not self._runs_s:
+            if any(product_entity(plan.product) not in trained for plan in plans.values()):
+                return
+            if last is not None and not self._is_free(lock, last.number):
+                return
+            self._run()
+        elif self.belt.arrived():
+            lock[self.arrival] = Arrival(coming, time.time_ns())
+            self._runs_s = 0.0
+        elif time.monotonic() - self._runs_s > LATE_S:
+            print(f"package {coming} has not come for {LATE_S:g} s; the belt is run again")
+            self._run()
+
+    def _run(self) -> None:
+        self.belt.run_belt()
+        self._runs_s = time.monotonic()
+
+    def _is_free(self, lock: Lock, number: int) -> bool:
+        """Return whether a package is off the belt; change the tray if it was its last one."""
+        place, plans = place_entity(number), lock[self.plans]
+        done = place.name in lock.get(self.results, {})
+        if plans[place_entity(number + 1)].tray != plans[place].tray:
+            if done:
+                self.belt.change_tray()
+            return done
+        request, attached = lock.get(self.request), lock.get(self.attached)
+        taken = (
+            request is not None
+            and attached is not None
+            and request.place == place.name
+            and (attached.request == request.number and attached.stage in OFF_THE_BELT)
+            and request.kind != "look"
+        )
+        return done or taken

@@ -44,10 +44,9 @@ from actors.palletizing.vocabulary import (
     VIEWS,
     place_entity,
 )
-from actors.running_cell import DemoError
+from actors.running_cell import DemoError, until_interrupted
 from enact_dist import View, ViewEach
 from enact_dist.errors import ShardUnreachableError
-from enact_dist.link.signals import StopSignals
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -131,7 +130,7 @@ def _shown(demo: PalletizingCell | RunningCell, out: Path, *, up: str, keep_runn
             console.print(f"pictures in {out}; {time.monotonic() - started_s:.0f} s in all")
             if keep_running:
                 console.print(f"the cell stays up: enact world tree --cell {running.config}")
-                _until_interrupted(running)
+                until_interrupted(running)
     except DemoError as error:
         print(f"enact demo: {error}", file=sys.stderr)
         return 1
@@ -258,10 +257,3 @@ def _tray_pictures(cell: Cell) -> dict[int, Picture]:
         ]
         pictures[tray] = tray_picture(frame, reference[empty].depth_mm, deviating)
     return pictures
-
-
-def _until_interrupted(running: PalletizingCell | RunningCell) -> None:
-    """Wait for Ctrl-C or SIGTERM, or until the cell goes down by itself."""
-    with StopSignals() as signals:
-        while not signals.event.wait(1.0):
-            running.check()

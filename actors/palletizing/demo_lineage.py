@@ -4,7 +4,18 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from actors.palletizing.vocabulary import CLOUD, DEVIATIONS, SYSTEM, view_entity
+from actors.palletizing.expectation import PREFIX
+from actors.palletizing.vocabulary import (
+    CLOUD,
+    DEVIATIONS,
+    PLACES,
+    REGION,
+    RESULTS,
+    STANDING,
+    SYSTEM,
+    view_entity,
+)
+from enact_dist import Entity, View
 from enact_dist.cli.lineage import drawn
 from enact_dist.cli.output import print_tree
 
@@ -43,4 +54,33 @@ def show_lineage(cell: Cell, product: str, console: Console) -> None:
     print_tree(drawn(verdict_causes(cell)))
     console.print(f"\nenact impact training {view} --depth {EFFECTS_DEPTH}", style="bold")
     print_tree(drawn(view_effects(cell, product)))
+    console.print()
+
+
+WHY_DEPTH: Final = 4
+"""From the region over the depth picture, the net and the grasp to the trained surface."""
+
+
+def show_packing(cell: Cell, console: Console) -> None:
+    """Print what was expected and did not come, and where one such verdict comes from.
+
+    Args:
+        cell: The cell, after its last package.
+        console: Where progress and table were printed.
+    """
+    online = cell.world("online")
+    results, flags = View(online, SYSTEM, RESULTS), View(online, SYSTEM, DEVIATIONS)
+    seen = online.view(results, flags)
+    judged = {place: flag for place, flag in seen.get(flags, {}).items() if place in seen[results]}
+    for name in sorted(name for name in cell.worlds() if name.startswith(PREFIX)):
+        expected = cell.world(name)
+        for row in expected.diff(online, PLACES, [STANDING]):
+            if row.left is not None and row.right is not None:
+                console.print(f"{name} against online: {row.entity.name}: {row.difference}")
+    bad = [place for place in judged if seen[results][place].result != "placed"]
+    place = Entity((bad or list(judged))[-1]) if judged else None
+    if place is None:
+        return
+    console.print(f"\nenact why online {place}/{REGION} --depth {WHY_DEPTH}", style="bold")
+    print_tree(drawn(cell.why(online, place, REGION, depth=WHY_DEPTH)))
     console.print()

@@ -2,24 +2,35 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
+from actors.palletizing.controller import open_controller
+from actors.palletizing.grasps import size_of
 from actors.palletizing.pallet import planned_pose, tray_of
+from actors.palletizing.rows import planned_rows
 from actors.palletizing.vocabulary import (
+    CELL,
+    FRAMES,
     PLACES,
     PLAN,
     PRODUCTS,
+    RESULTS,
     SCAN,
     STANDING,
+    SURFACE,
+    SYSTEM,
     Plan,
     Standing,
     place_entity,
     product_entity,
 )
-from enact_dist import Actor, World, WriteEach
+from enact_dist import Actor, View, ViewEach, World, Write, WriteEach
 
 if TYPE_CHECKING:
     from enact_dist import Lock
+
+STANDS: Final = ("placed", "accepted")
+"""Results after which a place is filled."""
 
 
 class Planning(Actor):
@@ -52,3 +63,69 @@ class Planning(Actor):
             place, product = place_entity(stop), self.products[stop % len(self.products)]
             lock[self.plans][place] = Plan(product, tray_of(stop), planned_pose(stop))
             lock[self.standing][place] = Standing(product, "ok", shift_mm=0.0, turn_deg=0.0)
+
+
+class RowPlanning(Actor):
+    """Order the scans; when all products are trained, plan rows in which packages touch.
+
+    A package that does not come onto the tray leaves no gap: the places after its own are planned
+    anew, as if it had not been announced.
+
+    Args:
+        packages: How many packages will come.
+        products: Names of the products, separated by spaces; they come in turn.
+        frames: Address of what returns where tray, belt and bin stand, see `vocabulary.FRAMES`.
+        views: How many views of each product are wanted.
+    """
+
+    training, online = World("training"), World("online")
+    surfaces = ViewEach(training, PRODUCTS, SURFACE)
+    results = View(online, SYSTEM, RESULTS)
+    frames = Write(training, CELL, FRAMES)
+    scans = WriteEach(training, PRODUCTS, SCAN)
+    plans = WriteEach(training, PLACES, PLAN)
+    standing = WriteEach(training, PLACES, STANDING)
+    every_s = 0.2
+
+    def __init__(self, packages: int, products: str, frames: str, views: int = 14) -> None:
+        self.packages, self.products, self.views = packages, products.split(), views
+        if packages < 1 or views < 3 or not self.products:
+            raise ValueError("planning needs a package, a product and three views at least")
+        self.cell_frames = open_controller(frames)
+        self._coming: list[int] = []
+
+    def update(self, lock: Lock) -> None:
+        """Write what is missing; plan anew when a package has left its place empty."""
+        if lock.is_null(self.frames):
+            lock[self.frames] = self.cell_frames
+        for product in map(product_entity, self.products):
+            if product not in lock[self.scans]:
+                lock[self.scans][product] = self.views
+        trained = lock[self.surfaces].keys()
+        if any(product_entity(product) not in trained for product in self.products):
+            return
+        results = lock.get(self.results, {})
+        coming = [
+            number
+            for number in range(self.packages)
+            if (found := results.get(place_entity(number).name)) is None or found.result in STANDS
+        ]
+        if coming != self._coming:
+            self._plan(lock, coming, set(results))
+            self._coming = coming
+
+    def _plan(self, lock: Lock, coming: list[int], done: set[str]) -> None:
+        """Plan the places of the packages that come, except of those that are there."""
+        products = [self.products[number % len(self.products)] for number in coming]
+        sizes = {
+            product: size_of(lock[self.surfaces][product_entity(product)])
+            for product in set(products)
+        }
+        slots = planned_rows(products, sizes)
+        for number, product, slot in zip(coming, products, slots, strict=True):
+            place = place_entity(number)
+            if place.name not in done:
+                lock[self.plans][place] = Plan(
+                    product, slot.tray, slot.tray_from_product, slot.push
+                )
+                lock[self.standing][place] = Standing(product, "ok", shift_mm=0.0, turn_deg=0.0)

@@ -39,7 +39,19 @@ from actors.comparators import CloudDistance, SurfaceDistance
 from actors.geometry.deviation import Limits
 from actors.geometry.shapes import Acquisition, DepthFrame, PointCloud, Surface
 from actors.palletizing.grounding import Grasp
-from actors.palletizing.nets import Execution, Net
+from actors.palletizing.handling_data import Arrival as Arrival  # noqa: PLC0414
+from actors.palletizing.handling_data import Attached as Attached  # noqa: PLC0414
+from actors.palletizing.handling_data import Candidate as Candidate  # noqa: PLC0414
+from actors.palletizing.handling_data import Control as Control  # noqa: PLC0414
+from actors.palletizing.handling_data import Decision as Decision  # noqa: PLC0414
+from actors.palletizing.handling_data import GripCommand as GripCommand  # noqa: PLC0414
+from actors.palletizing.handling_data import GripState as GripState  # noqa: PLC0414
+from actors.palletizing.handling_data import Look as Look  # noqa: PLC0414
+from actors.palletizing.handling_data import Outcome as Outcome  # noqa: PLC0414
+from actors.palletizing.handling_data import Question as Question  # noqa: PLC0414
+from actors.palletizing.handling_data import Request as Request  # noqa: PLC0414
+from actors.palletizing.handling_data import Result as Result  # noqa: PLC0414
+from actors.palletizing.nets import Execution
 from enact_dist import Aspect, Durability, Entities, Entity, Retention, Tolerance
 from enact_dist.outcome import Outcome as NetOutcome
 
@@ -116,7 +128,7 @@ class Sighting:
             its length; on the belt the pose of the product that it was recognised as.
         first_stop: Stop or arrival at which it was seen first.
         last_stop: Stop or arrival at which it was seen last.
-        frame: "tray" or "belt".
+        frame: "tray" or "belt"; "" when it has left the cell.
         product: What it was recognised as; empty: nothing was looked for.
     """
 
@@ -190,183 +202,6 @@ class Notice:
     latency_ms: float
 
 
-@dataclass(frozen=True, slots=True)
-class Arrival:
-    """A package stands in the light barrier of the belt (conveyor).
-
-    Attributes:
-        number: How many came before it.
-        stamp_ns: When, nanoseconds since 1970.
-    """
-
-    number: int
-    stamp_ns: int
-
-
-@dataclass(frozen=True, slots=True)
-class Request:
-    """What the robot shall do next (system).
-
-    Attributes:
-        number: Grows by one with each request.
-        kind: "pack" (grasp from the belt, place, push), "retry" (the same after a new look at the
-            belt), "push_again", "regrasp" (grasp on the tray, place, push), "reject" (from belt or
-            tray into the bin), "stop" (nothing more), "ask" (wait for the operator).
-        place: Name of the entity; empty if it is about none.
-        package: Name of the entity; empty if it is about none.
-        reason: Why, in words.
-    """
-
-    number: int
-    kind: str
-    place: str
-    package: str
-    reason: str
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Candidate:
-    """A stage of a request, grounded (system).
-
-    Attributes:
-        request: Number of the request.
-        stage: "grasp", "regrasp", "place", "push", "remove" or "aside".
-        net: What the robot shall execute; None if it cannot be grounded.
-        error: Why it cannot, in one line; empty if it can.
-        frames: base_from_entity, (4, 4) float64, metres, of the entities that the net names.
-    """
-
-    request: int
-    stage: str
-    net: Net | None
-    error: str
-    frames: dict[str, npt.NDArray[np.float64]]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Attached:
-    """The net that the robot executes (system); its `Execution` names the number.
-
-    Attributes:
-        number: Grows by one with each net.
-        request: Number of the request that it is for.
-        stage: As of `Candidate`.
-        net: What to execute.
-        frames: As of `Candidate`.
-    """
-
-    number: int
-    request: int
-    stage: str
-    net: Net
-    frames: dict[str, npt.NDArray[np.float64]]
-
-
-@dataclass(frozen=True, slots=True)
-class Outcome:
-    """How a request ended (system).
-
-    Attributes:
-        request: Number of the request.
-        stage: The last stage that was executed, or could not be grounded.
-        result: End of its net, "timeout:…", "interrupted:…", or "no_net:" with the reason.
-        success: Whether all stages succeeded.
-        stamp_ns: When, nanoseconds since 1970.
-    """
-
-    request: int
-    stage: str
-    result: str
-    success: bool
-    stamp_ns: int
-
-
-@dataclass(frozen=True, slots=True)
-class GripCommand:
-    """A command to the gripper.
-
-    Attributes:
-        number: Grows by one with each command.
-        kind: "width" or "force".
-        value: m or N.
-    """
-
-    number: int
-    kind: str
-    value: float
-
-
-@dataclass(frozen=True, slots=True)
-class GripState:
-    """The state of the gripper.
-
-    Attributes:
-        number: Of the command that it follows.
-        width_m: Distance between the fingers.
-        width_rate_m_s: How fast it grows.
-        force_n: With what force the fingers close.
-        stamp_ns: When it was measured, nanoseconds since 1970.
-    """
-
-    number: int
-    width_m: float
-    width_rate_m_s: float
-    force_n: float
-    stamp_ns: int
-
-
-@dataclass(frozen=True, slots=True)
-class Control:
-    """How regularly the robot's inner loop has run since its start (robot).
-
-    Attributes:
-        cycles: How often.
-        median_ms: Of its period.
-        p99_ms: Of its period.
-        longest_ms: Its longest period.
-        late: Periods of more than 8 ms.
-        locked_ms: How long at most its process needed for what it does under a lock; the loop
-            itself takes none.
-    """
-
-    cycles: int
-    median_ms: float
-    p99_ms: float
-    longest_ms: float
-    late: int
-    locked_ms: float
-
-
-@dataclass(frozen=True, slots=True)
-class Question:
-    """A question to the operator (user).
-
-    Attributes:
-        request: Number of the request of kind "ask".
-        text: What is the matter.
-        choices: The answers that can be given.
-    """
-
-    request: int
-    text: str
-    choices: tuple[str, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class Decision:
-    """What the operator has decided (system).
-
-    Attributes:
-        request: Number of the request of kind "ask".
-        choice: One of the choices of the question.
-        by: Who.
-    """
-
-    request: int
-    choice: str
-    by: str
-
-
 SCAN: Final = Aspect("scan", int)
 """How many views of a product are wanted (product/*)."""
 CLOUD: Final = Aspect("cloud", PointCloud, compare=CloudDistance(tolerance_m=0.004))
@@ -421,6 +256,12 @@ NET: Final = Aspect("net", Attached)
 """What the robot executes (system)."""
 OUTCOME: Final = Aspect("outcome", Outcome)
 """How the last request ended (system)."""
+LOOK: Final = Aspect("look", Look)
+"""What was seen when the last request had ended (system)."""
+RESULTS: Final = Aspect("results", dict[str, Result])
+"""What became of each package, by name of its place (system)."""
+LAST: Final = Aspect("last", DepthFrame, Durability.OS)
+"""The newest image of the tray with the arm aside (tray, online)."""
 QUESTION: Final = Aspect("question", Question)
 """What the operator is asked (user)."""
 DECISION: Final = Aspect("decision", Decision)

@@ -15,7 +15,8 @@ import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
-from actors.running_cell import DemoError
+from actors import running_cell
+from actors.running_cell import DemoError, give_way
 from actors.workcell import vocabulary as words
 from actors.workcell.demo_cell import SETUP
 from actors.workcell.scenarios import scenario_of
@@ -24,10 +25,9 @@ from enact_dist import Lock, View, ViewEach, Write
 from enact_dist.actor_words import reports_of, tell_reported
 from enact_dist.config import load_config
 from enact_dist.errors import EnactError, ForgottenError, NullDatumError, ShardUnreachableError
-from enact_dist.recording import Recorder
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Sequence
     from pathlib import Path
 
     import numpy as np
@@ -61,8 +61,6 @@ KEPT_EVERY_S: Final = 1.0
 """Shortest time between two updates of the nearest approach."""
 ASKED_S: Final = 10.0
 """So long the end of a run waits for what is being kept."""
-LOOKING_ON_NICE: Final = 10
-"""Nice value of the threads that record and look on: a tenth of the weight of an actor."""
 TRACKS_EVERY_S: Final = 1.0
 """Time between two looks at what people have left."""
 NEARER_M: Final = 0.05
@@ -398,17 +396,7 @@ def masks_of(tree: CauseTree) -> list[CauseTree]:
     return sorted(masks, key=lambda cause: str(cause.entity))
 
 
-def give_way() -> None:
-    """Let this thread run only where what it watches leaves a processor idle, or nearly so.
-
-    Who records or looks on must not make a robot's command late.
-    """
-    with contextlib.suppress(OSError):  # a host on which threads have no priority of their own
-        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), LOOKING_ON_NICE)
-
-
-@contextlib.contextmanager
-def recording(cell: Cell, path: Path) -> Iterator[None]:
+def recording(cell: Cell, path: Path) -> contextlib.AbstractContextManager[None]:
     """Record a cell exactly, without messages for viewers, while the block runs.
 
     Args:
@@ -418,23 +406,6 @@ def recording(cell: Cell, path: Path) -> Iterator[None]:
     Raises:
         DemoError: The recording failed.
     """
-    path.unlink(missing_ok=True)
-    recorder = Recorder(cell, path, worlds=(ONLINE, TRUTH), aspects=RECORDED, pictures=False)
-    stop, errors = threading.Event(), []
-
-    def run() -> None:
-        give_way()
-        try:
-            recorder.run(stop)
-        except (EnactError, OSError) as error:
-            errors.append(error)
-
-    thread = threading.Thread(target=run, name="recorder", daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        stop.set()
-        thread.join()
-    if errors:
-        raise DemoError(f"the recording {path} failed: {errors[0]}") from errors[0]
+    return running_cell.recording(
+        cell, path, worlds=(ONLINE, TRUTH), aspects=RECORDED, pictures=False
+    )

@@ -28,16 +28,19 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
     demo = add_verb(
         verbs,
         "palletizing",
-        "actors train a model of a package, watch a tray and report damaged packages",
+        "a robot packs a tray; actors train models, judge each package and react",
         run=run_palletizing,
-        example="enact demo palletizing --packages 6 --seed 1 --out demo\n"
+        example="enact demo palletizing --packages 6 --seed 1 --speed 1 --out demo\n"
         "enact demo palletizing --cell cell.toml --out demo\n"
         "enact demo palletizing --views redwood_rgbd --out surface\n"
         "enact demo palletizing --model milk.pcd --scene table.pcd --out pose\n"
         "enact demo palletizing --check-net push.toml --out nets",
     )
     demo.add_argument("--packages", type=whole, metavar="N", help="how many packages come by")
-    demo.add_argument("--seed", type=int, metavar="S", help="of sensor noise and damage")
+    demo.add_argument("--seed", type=int, metavar="S", help="of packages and sensors")
+    demo.add_argument(
+        "--speed", type=float, metavar="X", help="simulated time per real time (default: 1.5)"
+    )
     demo.add_argument("--out", type=Path, metavar="DIR", help="where pictures and tables go")
     demo.add_argument(
         "--keep-running", action="store_true", help="leave the cell up afterwards, until Ctrl-C"
@@ -83,13 +86,17 @@ def _run(arguments: argparse.Namespace) -> int:
         from actors.palletizing.real_input import run_match
 
         return run_match(arguments.model, arguments.scene, out)
-    from actors.palletizing.demo import run_demo, watch_demo
-
     if arguments.cell:
-        return watch_demo(arguments.cell, out=out)
-    chosen = {"packages": arguments.packages, "seed": arguments.seed}
-    given = {name: value for name, value in chosen.items() if value is not None}
-    return run_demo(out=out, keep_running=arguments.keep_running, **given)
+        from actors.palletizing.demo_packing import watch_packing
+
+        return watch_packing(arguments.cell, out=out)
+    from actors.palletizing.demo_packing import run_packing
+
+    names = ("packages", "seed", "speed")
+    given = {
+        name: getattr(arguments, name) for name in names if getattr(arguments, name) is not None
+    }
+    return run_packing(out=out, keep_running=arguments.keep_running, **given)
 
 
 def _check_net(file: Path, out: Path) -> int:
@@ -110,7 +117,7 @@ def _refuse_mixture(arguments: argparse.Namespace) -> None:
         raise ConfigError("--views trains, --model and --scene find: run them one after the other")
     simulated = [
         name
-        for name in ("packages", "seed", "keep_running")
+        for name in ("packages", "seed", "speed", "keep_running")
         if getattr(arguments, name) not in {None, False}
     ]
     option = f"--{simulated[0].replace('_', '-')}" if simulated else ""

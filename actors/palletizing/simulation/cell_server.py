@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 import signal
 import socket
+import sys
 import threading
 import time
 from contextlib import closing, suppress
@@ -184,6 +185,11 @@ class CellServer:
         return pictures[width, height].drawn()
 
 
+def _until_eof(ended: threading.Event) -> None:
+    sys.stdin.read()
+    ended.set()
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a cell until a signal ends it; return the exit code."""
     parser = argparse.ArgumentParser(description="The simulated palletizing cell with physics.")
@@ -192,6 +198,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--host", default="127.0.0.1", help="address to listen at (this host's)")
     parser.add_argument("--port", type=int, default=7460, help="port to listen at (7460)")
     parser.add_argument("--speed", type=float, default=1.0, help="times real time (1)")
+    parser.add_argument(
+        "--until-eof", action="store_true", help="end with whoever holds the standard input open"
+    )
     options = parser.parse_args(arguments)
     try:
         cell = PhysicalCell(options.packages, seed=options.seed, epoch_ns=time.time_ns())
@@ -204,6 +213,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     ended = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: ended.set())
+    if options.until_eof:
+        threading.Thread(target=_until_eof, args=(ended,), daemon=True).start()
     with running, server:
         print(f"cell: {options.packages} packages, port {server.port}", flush=True)
         ended.wait()

@@ -3,7 +3,9 @@
 ==================================  ================================================================
 `…remote_cell:arm?port=7460`        an `ArmController`, for `open_controller`
 `…remote_cell:gripper?port=7460`    a `GripperController`, for `open_controller`
-`…remote_cell:belt?port=7460`       a `BeltController`, for `open_controller`
+`…remote_cell:belt?port=7460`       a `BeltController`; `&feeds=1`: packages come by themselves
+`…remote_cell:hands?port=7460`      what a person does, for the operator
+`…remote_cell:cell_frames`          where tray, belt and bin stand
 `…remote_cell:tray_sensor?port=…`   a `TraySensor`, for `open_sensor`
 `…remote_cell:belt_sensor?port=…`   a `BeltSensor`, for `open_sensor`
 ==================================  ================================================================
@@ -24,7 +26,7 @@ import numpy as np
 from actors.palletizing.controller import ArmMeasured, ControllerError, GripperMeasured
 from actors.palletizing.simulation.cell_arm import CYCLE_S
 from actors.palletizing.simulation.cell_messages import receive, send
-from actors.palletizing.simulation.cell_scene import ARM, HOME_RAD
+from actors.palletizing.simulation.cell_scene import ARM, HOME_RAD, CellLayout
 from actors.palletizing.simulation.physical_sensors import PhysicalBeltSensor, PhysicalTraySensor
 
 if TYPE_CHECKING:
@@ -188,13 +190,22 @@ class RemoteGripper:
 
 
 class RemoteBelt:
-    """Belt and tray of a cell in another process; a `BeltController`."""
+    """Belt and tray of a cell in another process; a `BeltController`.
 
-    def __init__(self, cell: RemoteCell) -> None:
-        self._cell = cell
+    Args:
+        cell: The cell.
+        feeds: Whether a package is put onto the start of the belt each time that it is run, as a
+            plant does upstream.
+    """
+
+    def __init__(self, cell: RemoteCell, *, feeds: bool = False) -> None:
+        self._cell, self._feeds, self._fed = cell, feeds, False
 
     def run_belt(self) -> None:
-        """Move the belt until a package interrupts the light barrier."""
+        """Let a package come, if the belt feeds; move it until one interrupts the barrier."""
+        if self._feeds and not self._fed and not self.arrived() and self.coming():
+            self.feed()
+            self._fed = True
         self._cell.ask("run_belt")
 
     def stop_belt(self) -> None:
@@ -203,7 +214,9 @@ class RemoteBelt:
 
     def arrived(self) -> bool:
         """Return whether a package stands in the light barrier, the belt at rest."""
-        return bool(self._cell.ask("arrived"))
+        there = bool(self._cell.ask("arrived"))
+        self._fed = self._fed and not there
+        return there
 
     def coming(self) -> int:
         """Return how many packages have not come yet."""
@@ -222,6 +235,17 @@ class RemoteBelt:
         self._cell.close()
 
 
+class RemoteHands:
+    """What a person does by hand in a cell in another process."""
+
+    def __init__(self, cell: RemoteCell) -> None:
+        self._cell = cell
+
+    def remove(self, number: int) -> None:
+        """Take the package that came as the number-th out of the cell."""
+        self._cell.ask("take_away", number)
+
+
 def arm(port: str, host: str = "127.0.0.1") -> RemoteArm:
     """Return the arm of the cell at a port; for `open_controller`."""
     return RemoteArm(RemoteCell(int(port), host))
@@ -232,9 +256,24 @@ def gripper(port: str, host: str = "127.0.0.1") -> RemoteGripper:
     return RemoteGripper(RemoteCell(int(port), host))
 
 
-def belt(port: str, host: str = "127.0.0.1") -> RemoteBelt:
+def belt(port: str, host: str = "127.0.0.1", feeds: str = "") -> RemoteBelt:
     """Return the belt of the cell at a port; for `open_controller`."""
-    return RemoteBelt(RemoteCell(int(port), host))
+    return RemoteBelt(RemoteCell(int(port), host), feeds=bool(feeds))
+
+
+def hands(port: str, host: str = "127.0.0.1") -> RemoteHands:
+    """Return the hands of a person at the cell at a port; for `open_controller`."""
+    return RemoteHands(RemoteCell(int(port), host))
+
+
+def cell_frames() -> dict[str, F64]:
+    """Return where tray, belt and reject bin of the cell stand, base_from_entity by name."""
+    layout = CellLayout()
+    return {
+        "tray": layout.base_from_tray,
+        "belt": layout.base_from_belt,
+        "bin": layout.base_from_bin,
+    }
 
 
 def tray_sensor(port: str, seed: str = "1", host: str = "127.0.0.1") -> PhysicalTraySensor:

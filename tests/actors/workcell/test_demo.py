@@ -20,6 +20,7 @@ from rich.console import Console
 pytest.importorskip("cv2", exc_type=ImportError)
 pytest.importorskip("mcap", exc_type=ImportError)
 
+from actors import running_cell
 from actors.running_cell import DemoCell, DemoError, toml_of
 from actors.workcell import demo_cell, demo_conduct
 from actors.workcell import vocabulary as words
@@ -319,7 +320,7 @@ def test_who_looks_on_gives_way_to_the_cell():
     found = []
 
     def look_on():
-        demo_conduct.give_way()
+        running_cell.give_way()
         found.append(os.getpriority(os.PRIO_PROCESS, threading.get_native_id()))
 
     before = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
@@ -327,7 +328,7 @@ def test_who_looks_on_gives_way_to_the_cell():
     thread.start()
     thread.join()
 
-    assert found == [demo_conduct.LOOKING_ON_NICE]
+    assert found == [running_cell.LOOKING_ON_NICE]
     assert os.getpriority(os.PRIO_PROCESS, threading.get_native_id()) == before
 
 

@@ -1,0 +1,193 @@
+"""Action generator: parametrizes grounded action skeletons in the form of nets (ENACT 4.2)."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING
+
+from actors.palletizing.controller import open_controller
+from actors.palletizing.expectation import Expectations
+from actors.palletizing.grasps import size_of
+from actors.palletizing.grounding import Gripper
+from actors.palletizing.handling import (
+    ASIDE,
+    BY_ITSELF,
+    IDLE,
+    RISKY,
+    Handled,
+    Known,
+    Stages,
+    aside_net,
+    frames_of,
+    stages_of,
+)
+from actors.palletizing.nets import NetError
+from actors.palletizing.vocabulary import (
+    CANDIDATE,
+    CELL,
+    DEVIATIONS,
+    EXECUTION,
+    FRAMES,
+    GRASP,
+    NET,
+    OUTCOME,
+    PACKAGES,
+    PLACES,
+    PLAN,
+    PRODUCTS,
+    REQUEST,
+    ROBOT,
+    SIGHTING,
+    SURFACE,
+    SYSTEM,
+    Candidate,
+    Outcome,
+    product_entity,
+)
+from actors.workcell.vocabulary import JOINTS
+from enact_dist import Actor, Entity, View, ViewEach, World, Write
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+    from actors.palletizing.controller import ArmController
+    from actors.palletizing.vocabulary import Attached, Request
+    from enact_dist import Lock
+
+
+class ActionGenerator(Actor):
+    """Ground the next stage of the request; say how the request ended, and take the arm aside.
+
+    Before a stage that can spoil what stands on the tray it forks the online context and writes
+    there what it expects, see `expectation`.
+
+    Args:
+        controller: Address of the arm, for its kinematics, see `open_controller`.
+        cell: The `cell.toml`, or an endpoint of the cell, for the forks; empty: no forks.
+    """
+
+    training, online = World("training"), World("online")
+    request = View(online, SYSTEM, REQUEST)
+    attached = View(online, SYSTEM, NET)
+    execution = View(online, ROBOT, EXECUTION)
+    joints = View(online, ROBOT, JOINTS)
+    cell_frames = View(training, CELL, FRAMES)
+    plans = ViewEach(training, PLACES, PLAN)
+    grasps = ViewEach(training, PRODUCTS, GRASP)
+    surfaces = ViewEach(training, PRODUCTS, SURFACE)
+    sightings = ViewEach(online, PACKAGES, SIGHTING)
+    flags = View(online, SYSTEM, DEVIATIONS)
+    candidate = Write(online, SYSTEM, CANDIDATE)
+    outcome = Write(online, SYSTEM, OUTCOME)
+    triggers = (request, attached, execution)
+
+    def __init__(self, controller: str, cell: str = "") -> None:
+        self.controller = controller
+        self.expectations = Expectations(cell) if cell else None
+        self._arm: ArmController | None = None
+
+    def start(self) -> None:
+        """Look up the arm; it is not started here."""
+        self._arm = open_controller(self.controller)
+
+    def stop(self) -> None:
+        """Leave the cell of the forks."""
+        if self.expectations is not None:
+            self.expectations.close()
+
+    def update(self, lock: Lock) -> None:
+        """Go on with the request, if the robot has ended what it did for it."""
+        request, attached = lock.get(self.request), lock.get(self.attached)
+        if request is None or request.kind in IDLE:
+            return
+        mine = attached if attached is not None and attached.request == request.number else None
+        result = "" if mine is None else self._result(lock, mine)
+        if mine is not None and (mine.stage == ASIDE or not result):
+            return
+        stages = self._stages(lock, request)
+        success = mine is None or mine.net.outcome(result)
+        left = stages if mine is None else stages[stages.index(mine.stage) + 1 :]
+        if success and left:
+            error = self._propose(lock, request, left, mine)
+            if not error:
+                return
+            self._end(lock, request, left[0], f"no_net: {error}", success=False)
+        else:
+            error = ""
+            self._end(lock, request, "" if mine is None else mine.stage, result, success=success)
+        if not result.startswith(BY_ITSELF):
+            self._clear(lock, request, error, turned=mine is not None and mine.turned)
+
+    def _result(self, lock: Lock, attached: Attached) -> str:
+        """Return how the robot ended a net; empty while it has not."""
+        found = lock.get(self.execution)
+        return found.result if found is not None and found.net_version == attached.number else ""
+
+    def _stages(self, lock: Lock, request: Request) -> tuple[str, ...]:
+        plan = lock[self.plans].get(Entity(request.place)) if request.place else None
+        return stages_of(request, plan)
+
+    def _propose(
+        self, lock: Lock, request: Request, left: tuple[str, ...], before: Attached | None
+    ) -> str:
+        """Write the candidate of the first stage that is left; return why that cannot be."""
+        known = self._known(lock, request)
+        try:
+            stages = self._ground(lock, request, known)
+            near_rad = self._near_rad(lock)
+            turned = stages.turn(left, near_rad) if before is None else before.turned
+            net = stages.net(left[0], turned=turned, near_rad=near_rad)
+            frames = frames_of(net, known)
+        except NetError as error:
+            return str(error)
+        if left[0] in RISKY and self.expectations is not None:
+            plan = known.plans[request.place]
+            self.expectations.before(request, plan, lock.get(self.flags, {}))
+        self._write(lock, Candidate(request.number, left[0], net, "", frames, turned))
+        return ""
+
+    def _clear(self, lock: Lock, request: Request, error: str, *, turned: bool) -> None:
+        """Propose to take the arm aside, so that the sensors see everything."""
+        net = aside_net(turned=turned)
+        frames = {"belt": lock[self.cell_frames]["belt"]}
+        self._write(lock, Candidate(request.number, ASIDE, net, error, frames))
+
+    def _write(self, lock: Lock, candidate: Candidate) -> None:
+        before = lock.get(self.candidate)
+        same = before is not None and (before.request, before.stage) == (
+            candidate.request,
+            candidate.stage,
+        )
+        if not same:
+            lock[self.candidate] = candidate
+
+    def _end(self, lock: Lock, request: Request, stage: str, result: str, *, success: bool) -> None:
+        before = lock.get(self.outcome)
+        if before is None or before.request != request.number:
+            lock[self.outcome] = Outcome(request.number, stage, result, success, time.time_ns())
+
+    def _known(self, lock: Lock, request: Request) -> Known:
+        """Return where what the request is about is, and no more: all of it becomes a cause."""
+        plans, sightings, place = {}, {}, Entity(request.place) if request.place else None
+        if place is not None and place in lock[self.plans]:
+            plans[request.place] = lock[self.plans][place]
+        if request.package and Entity(request.package) in lock[self.sightings]:
+            sightings[request.package] = lock[self.sightings][Entity(request.package)]
+        return Known(lock.get(self.cell_frames, {}), plans, sightings)
+
+    def _ground(self, lock: Lock, request: Request, known: Known) -> Stages:
+        seen = known.sightings.get(request.package)
+        if seen is None or not seen.product:
+            raise NetError(f"{request.kind}: it is not known what {request.package or 'it'} is")
+        product = product_entity(seen.product)
+        if product not in lock[self.grasps]:
+            raise NetError(f"{request.kind}: no grasp of {seen.product} is known")
+        handled = Handled(lock[self.grasps][product], size_of(lock[self.surfaces][product]))
+        assert self._arm is not None
+        return Stages(request, handled, known, arm=self._arm.model, gripper=Gripper())
+
+    def _near_rad(self, lock: Lock) -> npt.NDArray[np.float64]:
+        joints = lock.get(self.joints)
+        assert self._arm is not None
+        return self._arm.posture_rad if joints is None else joints.q[-1]

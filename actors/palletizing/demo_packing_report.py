@@ -1,0 +1,162 @@
+"""The outcome of a demonstration with the robot: rows, table, score, lines.
+
+The score is the one place where verdicts meet the truth of physics.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from actors.geometry.deviation import Limits
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from rich.table import Table
+
+    from actors.palletizing.simulation.cell_truth import PackageTruth
+    from actors.palletizing.vocabulary import Deviation, Plan, Result
+
+DENT_MM: Final = 4.0
+"""A shallower dent is none."""
+TURNED_DEG: Final = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One package.
+
+    Attributes:
+        place: Name of its place.
+        product: What it is.
+        planned: Where it was to stand, mm, tray frame.
+        truth: What physics made of it, in the words of the verdicts.
+        physical: The same in numbers.
+        verdict: What was found.
+        correct: Whether that is right.
+        reactions: Kinds of the requests that followed the first one.
+        result: What became of it.
+        reason: Why.
+    """
+
+    place: str
+    product: str
+    planned: str
+    truth: str
+    physical: str
+    verdict: str
+    correct: bool
+    reactions: tuple[str, ...]
+    result: str
+    reason: str
+
+
+def truth_of(package: PackageTruth, plan: Plan) -> tuple[str, str]:
+    """Return what became of a package in the words of the verdicts, and in numbers.
+
+    Args:
+        package: The truth.
+        plan: Where it was to stand.
+    """
+    if package.where != "tray":
+        return "missing", f"{package.where}{_grip(package)}"
+    shift_m, turn_rad = package.beside_plan(plan.tray_from_product)
+    shift_mm, turn_deg = 1e3 * shift_m, math.degrees(turn_rad)
+    words = [f"{shift_mm:.1f} mm", f"{turn_deg:.1f}°"]
+    if package.tipped:
+        words.append(f"leans {math.degrees(package.tilt_rad):.0f}°")
+    if package.dent_mm > 0.0:
+        words.append(f"dent {package.dent_mm:.1f} mm")
+    kind = "ok"
+    if package.tipped:
+        kind = "tipped"
+    elif package.dent_mm >= DENT_MM:
+        kind = "deformed"
+    elif shift_mm > 1e3 * Limits().moved_m or turn_deg > TURNED_DEG:
+        kind = "moved"
+    return kind, ", ".join(words) + _grip(package)
+
+
+def _grip(package: PackageTruth) -> str:
+    counts = (("missed", package.missed), ("lost", package.lost))
+    return "".join(f", {word} {count}x" for word, count in counts if count)
+
+
+def row_of(
+    place: str,
+    plan: Plan,
+    package: PackageTruth,
+    flag: Deviation | None,
+    result: Result,
+    judged: tuple[str, str] | None,
+) -> Row:
+    """Return the row of one package.
+
+    Args:
+        place: Name of its place.
+        plan: Where it was to stand.
+        package: The truth in the end.
+        flag: The last verdict about its place; None: there was none.
+        result: What became of it.
+        judged: The truth when that verdict was given, as `truth_of` returns it; None: unknown.
+    """
+    truth, physical = truth_of(package, plan)
+    then = judged or (truth, physical)
+    x, y = 1e3 * plan.tray_from_product[:2, 3]
+    return Row(
+        place=place,
+        product=plan.product,
+        planned=f"{x:.0f}, {y:.0f}",
+        truth=then[0] if flag is not None else truth,
+        physical=then[1] if flag is not None else physical,
+        verdict="-" if flag is None else flag.verdict,
+        correct=flag is None or flag.verdict == then[0],
+        reactions=result.reactions,
+        result=result.result,
+        reason=result.reason,
+    )
+
+
+def table_of(rows: Sequence[Row]) -> Table:
+    """Return the rows as a table for the terminal."""
+    from rich.table import Table
+
+    table = Table(box=None, header_style="bold", pad_edge=False, padding=(0, 2, 0, 0))
+    for name in ("package", "planned (mm)", "physics", "verdict", "reactions", "result"):
+        table.add_column(name)
+    for row in rows:
+        colour = "red" if not row.correct else "green" if row.verdict == "ok" else "yellow"
+        table.add_row(
+            f"{row.place} {row.product}",
+            row.planned,
+            f"{row.truth}: {row.physical}",
+            f"[{colour}]{row.verdict}[/]" + ("" if row.correct else " (wrong)"),
+            ", ".join(row.reactions) or "-",
+            row.result,
+        )
+    return table
+
+
+def score_of(rows: Sequence[Row]) -> str:
+    """Return the score as one line."""
+    judged = [row for row in rows if row.verdict != "-"]
+    right = sum(row.correct for row in judged)
+    by_robot = sum(row.result == "placed" for row in rows)
+    return (
+        f"{right} of {len(judged)} verdicts right; {by_robot} of {len(rows)} packages placed as"
+        f" planned, {sum(bool(row.reactions) for row in rows)} after a reaction or not at all"
+    )
+
+
+def report_bytes(rows: Sequence[Row], figures: Mapping[str, object]) -> bytes:
+    """Return rows and figures as JSON, for `report.json`."""
+    content = {
+        **figures,
+        "right": sum(row.correct for row in rows),
+        "packages": [dataclasses.asdict(row) for row in rows],
+    }
+    return (json.dumps(content, indent=2) + "\n").encode()

@@ -1,0 +1,234 @@
+"""What a request asks of the robot: its stages, and a grounded net for each.
+
+PURE: requests, plans and sightings in, nets out; `action_generator` runs it.
+
+==============  ====================================================================================
+stage           skeleton
+==============  ====================================================================================
+grasp           grasp_from_belt
+regrasp         regrasp
+place           place
+push            push_into_contact
+remove          remove_to_reject
+aside           none: the tool goes between belt and tray, where it hides nothing
+==============  ====================================================================================
+
+Rule a change must keep: a stage names its frames by entity; where these are is fixed when the net
+is grounded and stays with the net, so that the robot moves by what was known then, and says so.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from actors.palletizing.grounding import Gripper, Job, easier_turn, ground
+from actors.palletizing.nets import Axis, Condition, Exit, Net, NetError, Primitive, TaskFrame
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    import numpy.typing as npt
+
+    from actors.geometry.joint_paths import Arm
+    from actors.palletizing.grounding import Grasp
+    from actors.palletizing.vocabulary import Plan, Request, Sighting
+
+    F64 = npt.NDArray[np.float64]
+
+ASIDE: Final = "aside"
+ASIDE_M: Final = (-0.10, -0.25, 0.30)
+"""Where the tool hides neither belt nor tray from the sensors above them, frame of the belt."""
+SKELETON_OF: Final = {
+    "grasp": "grasp_from_belt",
+    "regrasp": "regrasp",
+    "place": "place",
+    "push": "push_into_contact",
+    "remove": "remove_to_reject",
+}
+RISKY: Final = ("place", "push")
+"""Stages that can spoil what stands on the tray."""
+IDLE: Final = ("stop", "ask")
+"""Kinds of requests that move nothing."""
+BY_ITSELF: Final = ("sensor:", "not_following:", "no_frame:", "braked:", "interrupted:")
+"""Results of a robot that has stopped by itself: it must not move before someone has looked."""
+
+
+def stages_of(request: Request, plan: Plan | None) -> tuple[str, ...]:
+    """Return the stages of a request, in their order.
+
+    Args:
+        request: What is asked for.
+        plan: Of its place; None if it is about none.
+    """
+    push = ("push",) if plan is not None and plan.push.any() else ()
+    taken = {"belt": ("grasp",), "tray": ("regrasp",)}.get(request.seen, ())
+    return {
+        "pack": ("grasp", "place", *push),
+        "retry": ("grasp", "place", *push),
+        "regrasp": ("regrasp", "place", *push),
+        "push_again": push,
+        "reject": (*taken, "remove"),
+    }.get(request.kind, ())
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Known:
+    """Where everything is.
+
+    Attributes:
+        cell: base_from_entity by name, see `vocabulary.FRAMES`.
+        plans: By name of the place.
+        sightings: By name of the package.
+    """
+
+    cell: Mapping[str, F64]
+    plans: Mapping[str, Plan]
+    sightings: Mapping[str, Sighting]
+
+    def __call__(self, entity: str) -> F64:
+        """Return base_from_entity, (4, 4), metres.
+
+        Raises:
+            KeyError: It is not known.
+        """
+        if entity in self.plans:
+            return np.asarray(self.cell["tray"] @ self.plans[entity].tray_from_product)
+        if entity in self.sightings:
+            seen = self.sightings[entity]
+            return np.asarray(self.cell[seen.frame] @ seen.frame_from_package)
+        return np.asarray(self.cell[entity])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Handled:
+    """The package of a request.
+
+    Attributes:
+        grasp: Of its product.
+        size_m: (3,), box of its product.
+    """
+
+    grasp: Grasp
+    size_m: F64
+
+
+class Stages:
+    """Grounds the stages of one request.
+
+    Args:
+        request: What is asked for.
+        handled: Its package.
+        known: Where everything is.
+        arm: Kinematics and ranges.
+        gripper: What holds the package.
+    """
+
+    def __init__(
+        self, request: Request, handled: Handled, known: Known, *, arm: Arm, gripper: Gripper
+    ) -> None:
+        plan = known.plans.get(request.place)
+        push = None
+        if plan is not None:
+            push = known.cell["tray"][:3, :3] @ plan.push
+        self._job = Job(
+            package=request.package,
+            grasp=handled.grasp,
+            size_m=handled.size_m,
+            place=request.place,
+            push=push,
+            bin="bin",
+        )
+        self._known, self._arm, self._gripper = known, arm, gripper
+
+    def net(self, stage: str, *, turned: bool, near_rad: F64) -> Net:
+        """Return the net of a stage.
+
+        Args:
+            stage: Which.
+            turned: Whether the hand is turned round.
+            near_rad: (7,), where the arm is.
+
+        Raises:
+            NetError: It cannot be grounded; one line.
+        """
+        return ground(
+            SKELETON_OF[stage],
+            dataclasses.replace(self._job, turned=turned),
+            arm=self._arm,
+            gripper=self._gripper,
+            frames=self._known,
+            near_rad=near_rad,
+        )
+
+    def turn(self, stages: tuple[str, ...], near_rad: F64) -> bool:
+        """Return which way round the hand can go through all stages, the easier one if both.
+
+        Raises:
+            NetError: Neither; the reason of the easier one.
+        """
+        easier = False
+        if stages[0] in {"grasp", "regrasp"}:
+            easier = easier_turn(self._job, arm=self._arm, frames=self._known, near_rad=near_rad)
+        errors = []
+        for turned in (easier, not easier):
+            try:
+                for stage in stages:
+                    self.net(stage, turned=turned, near_rad=near_rad)
+            except NetError as error:
+                errors.append(error)
+            else:
+                return turned
+        raise errors[0]
+
+
+def aside_net(*, turned: bool) -> Net:
+    """Return the net that takes the tool between belt and tray, where it hides nothing.
+
+    Args:
+        turned: Whether the hand is turned round.
+    """
+    there = (Condition("error", "<", 0.03), Condition("turn_error", "<", 0.2))
+    pressed = (Condition("force", ">", 60.0, 0.02),)
+    yaw = 0.75 * math.pi if turned else -0.25 * math.pi
+    primitive = Primitive(
+        frame=TaskFrame("belt", np.eye(4)),
+        axes=tuple(Axis("position", value) for value in (*ASIDE_M, math.pi, 0.0, yaw)),
+        tool="keep",
+        tool_value=0.0,
+        speed_m_s=0.8,
+        tare=True,
+        exits=(Exit(pressed, "blocked"), Exit(there, "aside")),
+        limit_s=8.0,
+    )
+    return Net("go_aside", "go", {"go": primitive}, {"aside": True, "blocked": False})
+
+
+def frames_of(net: Net, known: Known) -> dict[str, F64]:
+    """Return where the entities of a net are, base_from_entity by name.
+
+    Raises:
+        NetError: It is not known.
+    """
+    names = {primitive.frame.entity for primitive in net.primitives.values()}
+    try:
+        return {name: known(name) for name in sorted(names - {"tool", "base"})}
+    except KeyError as error:
+        raise NetError(f"net {net.name}: it is not known where {error.args[0]} is") from None
+
+
+def along_and_across(plan: Plan, tray_from_product: F64) -> tuple[float, float]:
+    """Return how far beyond its place, and beside its row, a package stands, mm.
+
+    Args:
+        plan: Of the place.
+        tray_from_product: (4, 4), metres, where it stands.
+    """
+    beside = 1e3 * (tray_from_product[:2, 3] - plan.tray_from_product[:2, 3])
+    x, y = plan.push[:2] if plan.push.any() else np.array([1.0, 0.0])
+    length = math.hypot(x, y)
+    return float(beside @ [x, y]) / length, float(beside @ [-y, x]) / length

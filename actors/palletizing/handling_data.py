@@ -1,0 +1,236 @@
+"""The data by which a package is handled: requests, nets, outcomes, looks, questions, gripper.
+
+`vocabulary` says which entity has which; everybody imports them from there.
+"""
+
+# The wire reads these annotations: they stay real types, without `from __future__`.
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from actors.palletizing.nets import Net
+
+
+@dataclass(frozen=True, slots=True)
+class Arrival:
+    """A package stands in the light barrier of the belt (conveyor).
+
+    Attributes:
+        number: How many came before it.
+        stamp_ns: When, nanoseconds since 1970.
+    """
+
+    number: int
+    stamp_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """What the robot shall do next (system).
+
+    Attributes:
+        number: Grows by one with each request.
+        kind: "pack" (grasp from the belt, place, push), "retry" (the same after a new look at the
+            belt), "push_again", "regrasp" (grasp on
+            the tray, place, push), "reject" (from belt, tray or hand into the bin), "look" (only
+            look again), "stop" (nothing more), "ask" (wait for the operator).
+        place: Name of the entity; empty if it is about none.
+        package: Name of the entity; empty if it is about none.
+        reason: Why, in words.
+        seen: Where the package was seen last: "belt", "tray" or "hand".
+        tried: Kinds of the requests for this place before this one.
+    """
+
+    number: int
+    kind: str
+    place: str
+    package: str
+    reason: str
+    seen: str = "belt"
+    tried: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidate:
+    """A stage of a request, grounded (system).
+
+    Attributes:
+        request: Number of the request.
+        stage: "grasp", "regrasp", "place", "push", "remove" or "aside".
+        net: What the robot shall execute; None if it cannot be grounded.
+        error: Why it cannot, in one line; empty if it can.
+        frames: base_from_entity, (4, 4) float64, metres, of the entities that the net names.
+        turned: Whether the package is held with the hand turned round, see `grounding.Job`.
+    """
+
+    request: int
+    stage: str
+    net: Net | None
+    error: str
+    frames: dict[str, npt.NDArray[np.float64]]
+    turned: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Attached:
+    """The net that the robot executes (system); its `Execution` names the number.
+
+    Attributes:
+        number: From 1; grows by one with each net.
+        request: Number of the request that it is for.
+        stage: As of `Candidate`.
+        net: What to execute.
+        frames: As of `Candidate`.
+        turned: As of `Candidate`.
+    """
+
+    number: int
+    request: int
+    stage: str
+    net: Net
+    frames: dict[str, npt.NDArray[np.float64]]
+    turned: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """How a request ended (system).
+
+    Attributes:
+        request: Number of the request.
+        stage: The last stage that was executed, or could not be grounded.
+        result: End of its net, "timeout:…", "interrupted:…", or "no_net:" with the reason.
+        success: Whether all stages succeeded.
+        stamp_ns: When, nanoseconds since 1970.
+    """
+
+    request: int
+    stage: str
+    result: str
+    success: bool
+    stamp_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """What perception saw when a request had ended (system).
+
+    Attributes:
+        request: Number of the request.
+        seen: Where its package was seen: "belt", "tray", or "" if nowhere.
+        captured_ns: Capture of the observation of its place; 0: the tray was not looked at.
+    """
+
+    request: int
+    seen: str
+    captured_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """What became of the package for a place.
+
+    Attributes:
+        package: Name of its entity.
+        product: What it was recognised as.
+        verdict: The last verdict about the place; empty if it was not judged.
+        result: "placed", "rejected", "removed" (by the operator), "skipped" or "accepted" (with
+            its deviation, by the operator).
+        reactions: Kinds of all requests for it.
+        reason: Why the last of them.
+    """
+
+    package: str
+    product: str
+    verdict: str
+    result: str
+    reactions: tuple[str, ...]
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class GripCommand:
+    """A command to the gripper.
+
+    Attributes:
+        number: Grows by one with each command.
+        kind: "width" or "force".
+        value: m or N.
+    """
+
+    number: int
+    kind: str
+    value: float
+
+
+@dataclass(frozen=True, slots=True)
+class GripState:
+    """The state of the gripper.
+
+    Attributes:
+        number: Of the command that it follows.
+        width_m: Distance between the fingers.
+        width_rate_m_s: How fast it grows.
+        force_n: With what force the fingers close.
+        stamp_ns: When it was measured, nanoseconds since 1970.
+    """
+
+    number: int
+    width_m: float
+    width_rate_m_s: float
+    force_n: float
+    stamp_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Control:
+    """How regularly the robot's inner loop has run since its start (robot).
+
+    Attributes:
+        cycles: How often.
+        median_ms: Of its period.
+        p99_ms: Of its period.
+        longest_ms: Its longest period.
+        late: Periods of more than 8 ms.
+        locked_ms: How long at most its process needed for what it does under a lock; the loop
+            itself takes none.
+    """
+
+    cycles: int
+    median_ms: float
+    p99_ms: float
+    longest_ms: float
+    late: int
+    locked_ms: float
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """A question to the operator (user).
+
+    Attributes:
+        request: Number of the request of kind "ask".
+        text: What is the matter.
+        choices: The answers that can be given.
+    """
+
+    request: int
+    text: str
+    choices: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """What the operator has decided (system).
+
+    Attributes:
+        request: Number of the request of kind "ask".
+        choice: One of the choices of the question.
+        by: Who.
+    """
+
+    request: int
+    choice: str
+    by: str

@@ -1,0 +1,223 @@
+"""Perception where a robot packs: looks at belt and tray whenever something ended there.
+
+Rules a change must keep: a package keeps its entity from the belt to the tray; the tray is seen
+with the arm aside only; a package is judged beside what stands around it now, see `tray_changes`.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING
+
+from actors.geometry.open3d_on_use import open3d
+from actors.geometry.registration import register
+from actors.geometry.segmentation import new_pieces
+from actors.palletizing.belt_sight import seen_on_belt
+from actors.palletizing.handling import ASIDE
+from actors.palletizing.sensor import FRAMES as FRAMES_FUSED
+from actors.palletizing.sensor import open_sensor, steady
+from actors.palletizing.tray_changes import changed, tray_alone, without
+from actors.palletizing.vocabulary import (
+    ARRIVAL,
+    BELT,
+    CLOUD,
+    CONVEYOR,
+    EMPTY,
+    EXECUTION,
+    LAST,
+    LOOK,
+    NET,
+    OBSERVATION,
+    OUTCOME,
+    PACKAGES,
+    PLACES,
+    PLAN,
+    PRODUCTS,
+    REQUEST,
+    ROBOT,
+    SIGHTING,
+    SURFACE,
+    SYSTEM,
+    TRAY,
+    Look,
+    Observation,
+    Sighting,
+    product_entity,
+)
+from enact_dist import Actor, Entity, View, ViewEach, World, Write, WriteEach
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+    from actors.geometry.shapes import DepthFrame, Surface
+    from actors.palletizing.sensor import TraySensor
+    from actors.palletizing.vocabulary import Outcome, Request
+    from enact_dist import Lock
+
+    F64 = npt.NDArray[np.float64]
+    Depth = npt.NDArray[np.uint16]
+
+
+class EmptyBelt(Actor):
+    """Take the image of the empty belt; runs once, before the first package comes.
+
+    Args:
+        sensor: Address of the sensor above the belt; the world of its poses is the belt frame.
+    """
+
+    training = World("training")
+    empty = Write(training, BELT, EMPTY)
+
+    def __init__(self, sensor: str) -> None:
+        self.sensor: TraySensor = open_sensor(sensor)
+
+    def update(self, lock: Lock) -> None:
+        """Take it, unless it is there."""
+        if lock.is_null(self.empty):
+            lock[self.empty] = self.sensor.capture_empty()
+
+
+class HandlingPerception(Actor):
+    """Create the entity of each package on the belt, and look where it went (ENACT 4.2, online).
+
+    Args:
+        belt_sensor: Address of the sensor above the belt, see `open_sensor`.
+        tray_sensor: Address of the one above the tray (`TraySensor`).
+        frames: How many images are fused into one.
+    """
+
+    training, online = World("training"), World("online")
+    arrival = View(online, CONVEYOR, ARRIVAL)
+    request = View(online, SYSTEM, REQUEST)
+    outcome = View(online, SYSTEM, OUTCOME)
+    attached = View(online, SYSTEM, NET)
+    execution = View(online, ROBOT, EXECUTION)
+    plans = ViewEach(training, PLACES, PLAN)
+    models = ViewEach(training, PRODUCTS, SURFACE)
+    empty_tray = View(training, TRAY, EMPTY)
+    empty_belt = View(training, BELT, EMPTY)
+    last = Write(online, TRAY, LAST)
+    look = Write(online, SYSTEM, LOOK)
+    observations = WriteEach(online, PLACES, OBSERVATION)
+    clouds = WriteEach(online, PACKAGES, CLOUD)
+    sightings = WriteEach(online, PACKAGES, SIGHTING)
+    triggers = (arrival, outcome, execution)
+
+    def __init__(self, belt_sensor: str, tray_sensor: str, frames: int = FRAMES_FUSED) -> None:
+        self.belt_sensor: TraySensor = open_sensor(belt_sensor)
+        self.tray_sensor: TraySensor = open_sensor(tray_sensor)
+        self.frames = frames
+        self._arrived = -1
+        self._is_on_belt = False
+
+    def start(self) -> None:
+        """Load Open3D before the first package comes: it takes a second or two."""
+        open3d()
+
+    def update(self, lock: Lock) -> None:
+        """Look at the belt if a package has come, and where a request ended."""
+        arrival, outcome = lock.get(self.arrival), lock.get(self.outcome)
+        if arrival is not None and arrival.number != self._arrived:
+            known = lock[self.sightings].values()
+            if all(seen.first_stop != arrival.number for seen in known):
+                self._see_belt(lock, Entity.fresh("package"), arrival.number)
+            self._arrived = arrival.number
+        if outcome is None or not self._aside(lock, outcome):
+            return
+        before, request = lock.get(self.look), lock[self.request]
+        is_new = before is None or before.request != outcome.request
+        if is_new and request.number == outcome.request:
+            lock[self.look] = self._look(lock, request, outcome)
+
+    def _aside(self, lock: Lock, outcome: Outcome) -> bool:
+        """Return whether the arm has gone aside after a request."""
+        attached, doing = lock.get(self.attached), lock.get(self.execution)
+        return (
+            attached is not None
+            and doing is not None
+            and (attached.request, attached.stage) == (outcome.request, ASIDE)
+            and doing.net_version == attached.number
+            and bool(doing.result)
+        )
+
+    def _look(self, lock: Lock, request: Request, outcome: Outcome) -> Look:
+        """Look where the package of a request is; return what was seen."""
+        package, place = Entity(request.package), Entity(request.place)
+        number = lock[self.sightings][package].first_stop
+        self._is_on_belt = not outcome.success and self._see_belt(lock, package, number)
+        if self._is_on_belt and outcome.stage == "grasp":
+            return Look(request.number, "belt", 0)
+        empty = lock[self.empty_tray]
+        frame, now_ns = tray_alone(self._tray(), empty), time.time_ns()
+        tray = lock[self.plans][place].tray
+        standing = self._standing(lock, tray)
+        before = lock.get(self.last)
+        moved = [] if before is None else changed(frame, before, standing)
+        # The newest first: what it was pushed against is judged beside where it is now.
+        for name in dict.fromkeys((package.name, *moved)):
+            others = [standing[other] for other in standing if other != name]
+            before_mm = without(frame, empty.depth_mm, others)
+            there = self._see_tray(lock, Entity(name), frame, before_mm)
+            standing = self._standing(lock, tray)
+            if name != package.name or request.kind not in {"reject", "look"}:
+                at = Entity(f"place/{lock[self.sightings][Entity(name)].first_stop}")
+                seen = Observation(frame, before_mm, (name,) if there else (), now_ns)
+                lock[self.observations].put(at, seen, stamp_ns=now_ns)
+        lock[self.last] = frame
+        judged = request.kind not in {"reject", "look"}
+        return Look(request.number, lock[self.sightings][package].frame, now_ns if judged else 0)
+
+    def _standing(self, lock: Lock, tray: int) -> dict[str, tuple[Surface, F64]]:
+        """Return what stands on a tray: surface and tray_from_product by name of the package."""
+        return {
+            package.name: (
+                lock[self.models][product_entity(seen.product)],
+                seen.frame_from_package,
+            )
+            for package, seen in lock[self.sightings].items()
+            if seen.frame == "tray" and seen.tray == tray
+        }
+
+    def _tray(self) -> DepthFrame:
+        return steady(lambda: self.tray_sensor.capture(0), frames=self.frames)
+
+    def _see_belt(self, lock: Lock, package: Entity, number: int) -> bool:
+        """Look for a package on the belt; return whether there is one."""
+        frame = steady(lambda: self.belt_sensor.capture(number), frames=self.frames)
+        models = self._models(lock)
+        sights = seen_on_belt(frame, lock[self.empty_belt].depth_mm, models)
+        if not sights:
+            return False
+        sight, place = sights[0], Entity(f"place/{number}")
+        tray = lock[self.plans][place].tray if place in lock[self.plans] else 0
+        product = sight.product if sight.known else ""
+        lock[self.sightings][package] = Sighting(
+            tray, sight.belt_from_product, number, number, "belt", product
+        )
+        return True
+
+    def _see_tray(self, lock: Lock, package: Entity, frame: DepthFrame, before_mm: Depth) -> bool:
+        """Look for a package on the tray; return whether it is there."""
+        seen = lock[self.sightings][package]
+        plan = lock[self.plans][Entity(f"place/{seen.first_stop}")]
+        pieces = new_pieces(frame, before_mm) if seen.product else []
+        if pieces:
+            surface = lock[self.models][product_entity(seen.product)]
+            found = register(pieces[0].cloud, pieces[0].outline_m, surface, plan.tray_from_product)
+            lock[self.clouds][package] = pieces[0].cloud
+            where, pose = "tray", found.tray_from_product
+        elif seen.frame == "belt" and self._is_on_belt:
+            return False
+        else:
+            where, pose = "", seen.frame_from_package
+        lock[self.sightings][package] = Sighting(
+            plan.tray, pose, seen.first_stop, seen.last_stop, where, seen.product
+        )
+        return bool(pieces)
+
+    def _models(self, lock: Lock) -> dict[str, Surface]:
+        return {
+            product.name.removeprefix("product/"): surface
+            for product, surface in lock[self.models].items()
+        }

@@ -1,0 +1,110 @@
+"""The operator: answers what the cell asks, at a terminal or by a script."""
+
+from __future__ import annotations
+
+import queue
+import sys
+import threading
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
+
+from actors.palletizing.controller import open_controller
+from actors.palletizing.vocabulary import (
+    DECISION,
+    PACKAGES,
+    QUESTION,
+    REQUEST,
+    SIGHTING,
+    SYSTEM,
+    USER,
+    Decision,
+)
+from enact_dist import Actor, Entity, View, ViewEach, World, Write
+
+if TYPE_CHECKING:
+    from actors.palletizing.vocabulary import Question
+    from enact_dist import Lock
+
+
+class Hands(Protocol):
+    """A person's hands, where a simulated cell has none."""
+
+    def remove(self, number: int) -> None:
+        """Take a package out of the cell.
+
+        Args:
+            number: How many came before it.
+        """
+        ...
+
+
+class Operator(Actor):
+    """Ask the questions of the cell, and write each answer as a decision, so that `why` shows it.
+
+    Args:
+        answers: Words in the order of preference, such as "reject removed", or a file with them:
+            of a question's choices the first of these is taken, or else the first choice.  Empty:
+            a person is asked at the terminal of this process.
+        hands: Address of what removes a package for the answer "removed", see `Hands`; empty: the
+            person does so before answering.
+    """
+
+    online = World("online")
+    question = View(online, USER, QUESTION)
+    request = View(online, SYSTEM, REQUEST)
+    sightings = ViewEach(online, PACKAGES, SIGHTING)
+    decision = Write(online, SYSTEM, DECISION)
+    every_s = 0.2
+
+    def __init__(self, answers: str = "", hands: str = "") -> None:
+        path = Path(answers) if answers else None
+        self.answers = path.read_text().split() if path and path.is_file() else answers.split()
+        self.hands: Hands | None = open_controller(hands) if hands else None
+        self._lines: queue.SimpleQueue[str] | None = None
+        self._asked = -1
+
+    def update(self, lock: Lock) -> None:
+        """Answer the newest question, if it has no answer."""
+        question, before = lock.get(self.question), lock.get(self.decision)
+        if question is None or (before is not None and before.request >= question.request):
+            return
+        if question.request != self._asked:
+            print(f"{question.text}\n  {' | '.join(question.choices)}", flush=True)
+            self._asked = question.request
+        choice = self._scripted(question) if self.answers else self._typed(question)
+        if not choice:
+            return
+        if choice == "removed" and self.hands is not None:
+            self._remove(lock)
+        print(f"  {choice}", flush=True)
+        by = "script" if self.answers else "terminal"
+        lock[self.decision] = Decision(question.request, choice, by)
+
+    def _scripted(self, question: Question) -> str:
+        wanted = (word for word in self.answers if word in question.choices)
+        return next(wanted, question.choices[0])
+
+    def _typed(self, question: Question) -> str:
+        """Return what was typed, if it is a choice; never wait for it, since the lock would."""
+        if self._lines is None:
+            self._lines = queue.SimpleQueue()
+            threading.Thread(target=_read, args=(self._lines,), daemon=True).start()
+        try:
+            word = self._lines.get_nowait().strip()
+        except queue.Empty:
+            return ""
+        if word in question.choices:
+            return word
+        print(f"  {word!r} is none of {', '.join(question.choices)}", flush=True)
+        return ""
+
+    def _remove(self, lock: Lock) -> None:
+        request = lock[self.request]
+        seen = lock[self.sightings].get(Entity(request.package)) if request.package else None
+        if seen is not None and self.hands is not None:
+            self.hands.remove(seen.first_stop)
+
+
+def _read(lines: queue.SimpleQueue[str]) -> None:
+    for line in sys.stdin:
+        lines.put(line)

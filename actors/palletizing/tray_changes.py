@@ -1,0 +1,87 @@
+"""What has changed on a tray whose packages touch each other.
+
+A package is judged against the picture as it would be without it: the empty tray with all others
+where they stand now, since a push moves the neighbours too.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from actors.geometry.depth import median_known, metres
+from actors.geometry.rendering import directions, render_depth
+from actors.geometry.shapes import DepthFrame
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    import numpy.typing as npt
+
+    from actors.geometry.shapes import Surface
+
+    F64 = npt.NDArray[np.float64]
+    Depth = npt.NDArray[np.uint16]
+    Standing = tuple[Surface, F64]
+
+SEEN_M: Final = (1.00, 0.66)
+"""Length and width of what is looked at, along x and y at the height of the tray: the tray, and as
+much farther as the top of a package at its rim is seen."""
+CHANGED_M: Final = 0.004
+"""A pixel that is nearer or farther by more than this has changed."""
+CHANGED_SHARE: Final = 0.03
+"""A package has moved when this share of its pixels has changed."""
+
+
+def tray_alone(frame: DepthFrame, empty: DepthFrame) -> DepthFrame:
+    """Return a picture with nothing but the tray: what is beside it is as when it was empty.
+
+    The hand that waits between belt and tray is seen beside the tray.
+
+    Args:
+        frame: The picture now; its world is the tray frame.
+        empty: The empty tray, from the same place.
+    """
+    eye = empty.acquisition.world_from_camera
+    rays = directions(empty.acquisition.camera) @ eye[:3, :3].T
+    on_tray = eye[:2, 3] - rays[..., :2] * (eye[2, 3] / rays[..., 2:])
+    beside = (2.0 * np.abs(on_tray) > SEEN_M).any(axis=-1)
+    depth_mm = np.where(beside, empty.depth_mm, frame.depth_mm)
+    return DepthFrame(depth_mm.astype(frame.depth_mm.dtype), frame.acquisition)
+
+
+def without(frame: DepthFrame, empty_mm: Depth, others: Sequence[Standing]) -> Depth:
+    """Return the picture as it would be with nothing but the others on the tray, (H, W) mm.
+
+    Args:
+        frame: The picture now; its world is the tray frame.
+        empty_mm: (H, W), the empty tray.
+        others: Trained surface and tray_from_product of every other package on it.
+    """
+    if not others:
+        return empty_mm
+    rendered_m = render_depth(list(others), frame.acquisition)
+    covered = np.isfinite(rendered_m)
+    before_mm = np.array(empty_mm)
+    before_mm[covered] = np.round(1000.0 * rendered_m[covered]).astype(before_mm.dtype)
+    return before_mm
+
+
+def changed(now: DepthFrame, before: DepthFrame, packages: Mapping[str, Standing]) -> list[str]:
+    """Return the packages whose pixels differ between two pictures of one tray.
+
+    Args:
+        now: The newer picture.
+        before: The older one, from the same place.
+        packages: Trained surface and tray_from_product of each.
+    """
+    newer_m, older_m = (median_known(metres(frame.depth_mm), 5) for frame in (now, before))
+    with np.errstate(invalid="ignore"):
+        differs = np.abs(newer_m - older_m) > CHANGED_M
+    found = []
+    for name, standing in packages.items():
+        own = np.isfinite(render_depth([standing], now.acquisition))
+        if own.any() and differs[own].mean() > CHANGED_SHARE:
+            found.append(name)
+    return found

@@ -1,0 +1,299 @@
+"""Claims about the actors that pack with a robot, one by one, in process on the real core."""
+
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("open3d", exc_type=ImportError)
+pytest.importorskip("mujoco", exc_type=ImportError)
+
+from actors.palletizing import vocabulary as words
+from actors.palletizing.action import Action
+from actors.palletizing.action_generator import ActionGenerator
+from actors.palletizing.conveyor import BeltConveyor
+from actors.palletizing.demo_robot_cell import TEMPLATE, configured
+from actors.palletizing.feedback import HandlingFeedback
+from actors.palletizing.nets import Execution
+from actors.palletizing.operator import Operator
+from actors.palletizing.planning import RowPlanning
+from actors.palletizing.simulation.cell_scene import HOME_RAD, CellLayout
+from actors.palletizing.training_grasp import TrainingGrasp
+from actors.workcell.vocabulary import JOINTS, JOINTS_KEPT, Joints
+from enact_dist import Entity, Lock, View, ViewEach, Write, testing
+from enact_dist.actor_check import check_cell
+from enact_dist.config import load_config
+
+REMOTE = "actors.palletizing.simulation.remote_cell"
+ARM = f"{REMOTE}:arm?port=1"
+PACKAGE, PLACE = Entity("package/a"), Entity("place/0")
+NAMES = ("milk_carton", "meal_tray")
+
+
+@pytest.fixture
+def cell(trained):
+    """A cell with two trained products, grasps, and a plan of four packages."""
+    with testing.worlds("training", "online") as cell:
+        training = cell.world("training")
+        planning = RowPlanning(4, " ".join(NAMES), f"{REMOTE}:cell_frames")
+        testing.run_once(planning, cell)
+        for name in NAMES:
+            training.init(words.product_entity(name), words.SURFACE, trained(name))
+        testing.run_once(planning, cell)
+        testing.run_once(TrainingGrasp("milk_carton=0.5 meal_tray=0.35"), cell)
+        still = np.tile(np.array(HOME_RAD), (JOINTS_KEPT, 1))
+        stamps = np.arange(JOINTS_KEPT, dtype=np.int64)
+        write(cell, words.ROBOT, JOINTS, Joints(still, 0.0 * still, stamps))
+        yield cell
+
+
+def write(cell, entity, aspect, datum, world="online"):
+    request = Write(cell.world(world), entity, aspect)
+    with Lock(request) as lock:
+        lock[request] = datum
+
+
+def read(cell, entity, aspect, world="online"):
+    request = View(cell.world(world), entity, aspect)
+    return cell.world(world).view(request).get(request)
+
+
+def each(cell, pattern, aspect, world="training"):
+    request = ViewEach(cell.world(world), pattern, aspect)
+    return dict(cell.world(world).view(request)[request])
+
+
+def come(cell, *, product="milk_carton", number=0, package=PACKAGE):
+    """Let perception have seen a package on the belt."""
+    pose = np.eye(4)
+    pose[0, 3] = -0.1
+    seen = words.Sighting(0, pose, number, number, "belt", product)
+    write(cell, package, words.SIGHTING, seen)
+
+
+def executed(cell, result):
+    """Let the robot have ended the attached net."""
+    net = read(cell, words.SYSTEM, words.NET)
+    doing = Execution(
+        net.net.name, net.number, net.net.start, 7, (), result, np.zeros(6), 0.07, np.eye(4)
+    )
+    write(cell, words.ROBOT, words.EXECUTION, doing)
+
+
+def looked(cell, seen, verdict="", **found):
+    """Let perception and deviation detection have answered the outcome."""
+    request = read(cell, words.SYSTEM, words.REQUEST)
+    write(cell, words.SYSTEM, words.LOOK, words.Look(request.number, seen, 9 if verdict else 0))
+    if verdict:
+        plan = each(cell, words.PLACES, words.PLAN)[PLACE]
+        pose = np.array(plan.tray_from_product)
+        pose[0, 3] += found.pop("x_m", 0.0)
+        flag = words.Deviation(
+            PACKAGE.name, plan.product, verdict, 1.0, 1.0, 1.0, 1.0, 9, tray_from_product=pose
+        )
+        write(cell, words.SYSTEM, words.DEVIATIONS, {PLACE.name: flag})
+
+
+def packed(cell, *results):
+    """Run the stages of the present request with these results; the last one may fail."""
+    generator, action = ActionGenerator(ARM), Action()
+    stages = []
+    for result in results:
+        testing.run_once(generator, cell)
+        testing.run_once(action, cell)
+        stages.append(read(cell, words.SYSTEM, words.NET).stage)
+        executed(cell, result)
+    testing.run_once(generator, cell)
+    return stages
+
+
+def test_shipped_cell_fits_together():
+    """No two actors write one slot, every trigger is written, every option can be read."""
+    assert [f.text for f in check_cell(load_config(TEMPLATE)) if f.level == "error"] == []
+
+
+def test_cell_of_a_run_has_its_own_hardware_seed_and_folders():
+    """Every address names the run's port and seed; the actors are the shipped ones."""
+    text = configured(
+        TEMPLATE.read_text(),
+        packages=5,
+        seed=3,
+        data=Path("/data"),
+        ports=(7001, 7002),
+        hardware=7999,
+        config=Path("/run/cell.toml"),
+    )
+    run = tomllib.loads(text)
+    assert run["actors"].keys() == tomllib.loads(TEMPLATE.read_text())["actors"].keys()
+    assert run["actors"]["planning"]["options"]["packages"] == 5
+    assert run["actors"]["action-generator"]["options"]["cell"] == "/run/cell.toml"
+    assert "7460" not in text
+    assert "seed=59" not in text
+
+
+def test_planning_makes_rows_and_closes_the_gap_of_a_rejected_package(cell):
+    """All places touch; the place of the next package moves up when one was rejected."""
+    before = each(cell, words.PLACES, words.PLAN)
+    assert len(before) == 4
+    assert all(plan.push.any() for plan in before.values())
+    rejected = words.Result("package/a", "milk_carton", "deformed", "rejected", (), "why")
+    write(cell, words.SYSTEM, words.RESULTS, {PLACE.name: rejected})
+    testing.run_once(RowPlanning(4, " ".join(NAMES), f"{REMOTE}:cell_frames"), cell)
+    after = each(cell, words.PLACES, words.PLAN)
+    np.testing.assert_array_equal(after[PLACE].tray_from_product, before[PLACE].tray_from_product)
+    first, second = Entity("place/1"), Entity("place/2")
+    assert after[first].product == before[first].product
+    x = after[first].tray_from_product[0, 3], before[first].tray_from_product[0, 3]
+    assert abs(x[0]) > abs(x[1]) + 0.1
+    assert abs(after[second].tray_from_product[0, 3]) < abs(x[0])
+
+
+def test_a_package_is_grasped_placed_and_pushed(cell):
+    """One request has three nets, one after the other, then the arm goes aside."""
+    come(cell)
+    testing.run_once(HandlingFeedback(), cell)
+    assert read(cell, words.SYSTEM, words.REQUEST).kind == "pack"
+    stages = packed(cell, "held", "placed", "in_contact", "aside")
+    assert stages == ["grasp", "place", "push", "aside"]
+    outcome = read(cell, words.SYSTEM, words.OUTCOME)
+    assert (outcome.stage, outcome.result, outcome.success) == ("push", "in_contact", True)
+    looked(cell, "tray", "ok")
+    testing.run_once(HandlingFeedback(), cell)
+    result = read(cell, words.SYSTEM, words.RESULTS)[PLACE.name]
+    assert (result.result, result.reactions) == ("placed", ())
+
+
+def test_net_names_where_its_entities_are(cell):
+    """The frames that were known go with the net: package, place, nothing else."""
+    come(cell)
+    testing.run_once(HandlingFeedback(), cell)
+    packed(cell, "held")
+    candidate = read(cell, words.SYSTEM, words.CANDIDATE)
+    plan = each(cell, words.PLACES, words.PLAN)[PLACE]
+    assert candidate.stage == "place"
+    assert set(candidate.frames) == {PLACE.name}
+    expected = CellLayout().base_from_tray @ plan.tray_from_product
+    np.testing.assert_allclose(candidate.frames[PLACE.name], expected)
+
+
+def test_action_attaches_nothing_while_the_robot_moves(cell):
+    """The candidate of the next stage waits until the net before has ended."""
+    come(cell)
+    testing.run_once(HandlingFeedback(), cell)
+    generator, action = ActionGenerator(ARM), Action()
+    testing.run_once(generator, cell)
+    testing.run_once(action, cell)
+    first = read(cell, words.SYSTEM, words.NET)
+    candidate = read(cell, words.SYSTEM, words.CANDIDATE)
+    write(cell, words.SYSTEM, words.CANDIDATE, replace(candidate, stage="place"))
+    testing.run_once(action, cell)
+    assert read(cell, words.SYSTEM, words.NET).number == first.number
+    executed(cell, "held")
+    testing.run_once(action, cell)
+    assert read(cell, words.SYSTEM, words.NET).number == first.number + 1
+
+
+@pytest.mark.parametrize(
+    ("results", "seen", "verdict", "x_m", "wanted"),
+    [
+        (("missed", "aside"), "belt", "", 0.0, "retry"),
+        (("held", "lost", "aside"), "tray", "missing", 0.0, "regrasp"),
+        (("held", "placed", "in_contact", "aside"), "tray", "moved", 0.02, "regrasp"),
+        (("held", "placed", "in_contact", "aside"), "tray", "deformed", 0.0, "ask"),
+        (("held", "not_following:3"), "tray", "", 0.0, "ask"),
+    ],
+)
+def test_feedback_decides_by_what_was_seen(cell, results, seen, verdict, x_m, wanted):
+    """Missed and moved are tried again; what could become worse is asked, with the reason."""
+    come(cell)
+    testing.run_once(HandlingFeedback(), cell)
+    packed(cell, *results)
+    looked(cell, seen, verdict, x_m=x_m)
+    testing.run_once(HandlingFeedback(), cell)
+    request = read(cell, words.SYSTEM, words.REQUEST)
+    assert request.kind == wanted
+    assert request.reason
+    assert (read(cell, words.USER, words.QUESTION) is not None) == (wanted == "ask")
+
+
+def test_operator_answers_and_the_robot_rejects(cell, capsys):
+    """A deformed package goes to the bin when the operator says so; the result says why."""
+    come(cell)
+    testing.run_once(HandlingFeedback(), cell)
+    packed(cell, "held", "placed", "in_contact", "aside")
+    on_tray = each(cell, words.PLACES, words.PLAN)[PLACE].tray_from_product
+    write(cell, PACKAGE, words.SIGHTING, words.Sighting(0, on_tray, 0, 0, "tray", "milk_carton"))
+    looked(cell, "tray", "deformed")
+    testing.run_once(HandlingFeedback(), cell)
+    testing.run_once(Operator(answers="reject"), cell)
+    testing.run_once(HandlingFeedback(), cell)
+    assert read(cell, words.SYSTEM, words.REQUEST).kind == "reject"
+    assert packed(cell, "held", "rejected", "aside") == ["regrasp", "remove", "aside"]
+    looked(cell, "")
+    testing.run_once(HandlingFeedback(), cell)
+    result = read(cell, words.SYSTEM, words.RESULTS)[PLACE.name]
+    assert (result.result, result.reactions) == ("rejected", ("reject",))
+    assert "place/0: it is deformed" in capsys.readouterr().out
+
+
+def test_a_package_that_is_too_wide_is_refused_before_anything_moves(cell):
+    """One line says so; the operator is asked."""
+    come(cell)
+    carton = words.product_entity("milk_carton")
+    grasp = read(cell, carton, words.GRASP, "training")
+    write(cell, carton, words.GRASP, replace(grasp, width_m=0.18), "training")
+    testing.run_once(HandlingFeedback(), cell)
+    generator = ActionGenerator(ARM)
+    testing.run_once(generator, cell)
+    outcome = read(cell, words.SYSTEM, words.OUTCOME)
+    assert "180 mm wide" in outcome.result
+    assert "\n" not in outcome.result
+    looked(cell, "belt")
+    testing.run_once(HandlingFeedback(), cell)
+    assert read(cell, words.SYSTEM, words.REQUEST).kind == "ask"
+    assert read(cell, words.USER, words.QUESTION).choices == ("removed", "stop")
+
+
+class Belt:
+    """A belt that brings a package as soon as it is run."""
+
+    def __init__(self):
+        self.runs, self.changed, self.there = 0, 0, False
+
+    def run_belt(self):
+        self.runs += 1
+        self.there = True
+
+    def arrived(self):
+        return self.there
+
+    def change_tray(self):
+        self.changed += 1
+
+
+def test_belt_waits_until_the_package_before_is_off_it(cell, monkeypatch):
+    """The next one comes while the robot places the one before, not earlier."""
+    belt = Belt()
+    monkeypatch.setattr("actors.palletizing.conveyor.open_controller", lambda _: belt)
+    conveyor = BeltConveyor("any")
+    testing.run_once(conveyor, cell)
+    assert belt.runs == 0  # the belt has not been seen empty
+    empty = each(cell, words.PRODUCTS, words.SCAN)
+    assert empty
+    from actors.palletizing.simulation.physical_sensors import PhysicalBeltSensor
+    from actors.palletizing.simulation.physics import PhysicalCell
+
+    sensor = PhysicalBeltSensor(PhysicalCell(1, seed=1).shown, seed=1)
+    write(cell, words.BELT, words.EMPTY, sensor.capture_empty(), "training")
+    for _ in range(4):
+        testing.run_once(conveyor, cell)
+    assert (belt.runs, read(cell, words.CONVEYOR, words.ARRIVAL).number) == (1, 0)
+    come(cell)
+    testing.run_once(HandlingFeedback(), cell)
+    packed(cell, "held")
+    testing.run_once(Action(), cell)
+    for _ in range(3):
+        testing.run_once(conveyor, cell)
+    assert (belt.runs, read(cell, words.CONVEYOR, words.ARRIVAL).number) == (2, 1)
