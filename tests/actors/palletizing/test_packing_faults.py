@@ -1,0 +1,209 @@
+"""What only processes can show: the cell with its robot while parts of it are killed or fail.
+
+One cell runs for all of these tests.  Each breaks something in the midst of a package, and ends when
+it is known what became of that package; the next one takes the next package.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import time
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
+import pytest
+
+pytest.importorskip("open3d", exc_type=ImportError)
+pytest.importorskip("mujoco", exc_type=ImportError)
+
+from actors.palletizing.demo_robot_cell import RunningRobotCell
+
+from actors.palletizing.vocabulary import (
+    ARRIVAL,
+    CONTROL,
+    CONVEYOR,
+    EXECUTION,
+    NET,
+    REQUEST,
+    RESULTS,
+    ROBOT,
+    SYSTEM,
+)
+from enact_dist import View
+from enact_dist.errors import EnactError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from actors.palletizing.nets import Execution
+    from actors.palletizing.vocabulary import Request, Result
+    from enact_dist import Aspect, Cell, Entity
+
+pytestmark = [pytest.mark.slow, pytest.mark.timing]
+
+T = TypeVar("T")
+LONG_S = 90.0
+"""What a busy machine may take for anything; it is no claim."""
+PACKAGES = 4
+SEED = 7
+
+
+class Trial:
+    """A running cell, and what a test does to it."""
+
+    def __init__(self, processes: RunningRobotCell, cell: Cell) -> None:
+        self.processes, self.cell = processes, cell
+        self.online, self.hardware = cell.world("online"), processes.hardware
+
+    def get(self, entity: Entity, aspect: Aspect[T]) -> T | None:
+        """Return a datum, None if it is null."""
+        view = View(self.online, entity, aspect)
+        return self.online.view(view).get(view)
+
+    def until(self, what: str, condition: Callable[[], T]) -> T:
+        """Wait until a condition holds, and return what it found; a shard may be away meanwhile."""
+        deadline_s = time.monotonic() + LONG_S
+        while time.monotonic() < deadline_s:
+            self.processes.check()
+            with contextlib.suppress(EnactError, IndexError):
+                if found := condition():
+                    print(f"{time.strftime('%X')} {what}: {found}")
+                    return found
+            time.sleep(0.01)
+        log = self.processes.config.with_name("cell.log").read_text()[-3000:]
+        doing = self.get(ROBOT, EXECUTION), self.get(SYSTEM, REQUEST), self.get(SYSTEM, RESULTS)
+        raise AssertionError(f"not within {LONG_S:.0f} s: {what}\n{doing}\n{log}")
+
+    def doing(self, *primitives: str) -> Execution:
+        """Wait until the robot executes one of some primitives."""
+
+        def found() -> Execution | None:
+            now = self.get(ROBOT, EXECUTION)
+            return (
+                now if now is not None and not now.result and now.primitive in primitives else None
+            )
+
+        return self.until(f"the robot is at {', '.join(primitives)}", found)
+
+    def ended(self, begun: Execution) -> Execution:
+        """Wait until the net of an execution is over."""
+
+        def found() -> Execution | None:
+            every = [one.datum() for one in self.online.history(ROBOT, EXECUTION, count=50)]
+            return next(
+                (one for one in every if one.net_version == begun.net_version and one.result), None
+            )
+
+        return self.until(f"net {begun.net_version} is over", found)
+
+    def closed(self, place: str) -> Result:
+        """Wait until it is known what became of the package of a place."""
+        return self.until(
+            f"{place} is closed", lambda: (self.get(SYSTEM, RESULTS) or {}).get(place)
+        )
+
+    def requests(self, place: str) -> list[Request]:
+        """Return all requests about a place, the oldest first."""
+        every = [one.datum() for one in self.online.history(SYSTEM, REQUEST)]
+        return [one for one in every if one.place == place]
+
+    def pid(self, name: str) -> int:
+        """Return the process of an actor."""
+        return next(one.pid for one in self.cell.actors() if name in one.names())
+
+
+@pytest.fixture(scope="module")
+def trial(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Trial]:
+    """A cell that is up, and trains."""
+    out = tmp_path_factory.mktemp("cell")
+    running = RunningRobotCell(out, packages=PACKAGES, seed=SEED, speed=2.0)
+    with running as processes, processes.joined() as cell:
+        yield Trial(processes, cell)
+
+
+def test_robot_that_is_killed_brakes_holds_and_asks(trial: Trial) -> None:
+    """The arm stops with what it holds; the net does not begin again, and the operator is asked."""
+    begun = trial.doing("carry")
+    pid = trial.pid("robot")
+    os.kill(pid, signal.SIGKILL)
+
+    def rests() -> bool:
+        return float(np.abs(trial.hardware.ask("measured").dq).max()) < 0.01
+
+    trial.until("the arm rests", rests)
+    held = trial.hardware.truth().packages[0].where
+    done = trial.ended(begun)
+    result = trial.closed("place/0")
+
+    assert held == "held"
+    assert done.result.startswith("interrupted:")
+    assert trial.until("it is back", lambda: trial.pid("robot")) != pid
+    nets = [one.datum() for one in trial.online.history(SYSTEM, NET)]
+    assert [one.number for one in nets] == sorted({one.number for one in nets})
+    kinds = [one.kind for one in trial.requests("place/0")]
+    assert kinds[:2] == ["pack", "ask"]
+    assert result.result in {"rejected", "removed", "placed", "accepted"}
+
+
+def test_gripper_that_loses_its_package_is_noticed(trial: Trial) -> None:
+    """The net ends by the width, and what follows says so."""
+    begun = trial.doing("carry")
+    trial.hardware.fail("gripper", 0.4)
+
+    done = trial.ended(begun)
+    trial.closed("place/1")
+
+    assert done.result in {"lost", "blocked"}
+    assert trial.hardware.truth().packages[1].lost >= 1
+    assert len(trial.requests("place/1")) > 1
+
+
+def test_belt_that_stops_delays_the_next_package(trial: Trial) -> None:
+    """Nothing comes while it stands, and it goes on by itself; what the robot does is not disturbed."""
+    arrived = trial.until("what has come", lambda: trial.get(CONVEYOR, ARRIVAL))
+    trial.hardware.fail("belt", 3.0)
+    stopped_s = trial.hardware.truth().at_s
+
+    later = trial.until(
+        "the next package comes",
+        lambda: (now := trial.get(CONVEYOR, ARRIVAL)) and now.number > arrived.number and now,
+    )
+
+    assert trial.hardware.truth().at_s > stopped_s + 3.0
+    assert later.number == arrived.number + 1
+
+
+def test_sensor_that_freezes_ends_the_net(trial: Trial) -> None:
+    """The arm rests, the operator is asked, and the cell goes on when it measures again."""
+    begun = trial.doing("above", "carry")
+    trial.hardware.fail("wrist", 2.0)
+
+    done = trial.ended(begun)
+    place = trial.until("the request", lambda: trial.get(SYSTEM, REQUEST)).place
+    trial.closed(place)
+
+    assert done.result == "sensor:frozen"
+    assert "ask" in [one.kind for one in trial.requests(place)]
+
+
+def test_push_outlives_the_restart_of_its_shard(trial: Trial) -> None:
+    """The shard with the robot's data is killed in midst of it; the net ends, and what it did is seen."""
+    begun = trial.doing("push")
+    os.kill(trial.processes.shard_pid("right"), signal.SIGKILL)
+
+    done = trial.ended(begun)
+    place = trial.until("the request", lambda: trial.get(SYSTEM, REQUEST)).place
+    trial.closed(place)
+
+    assert done.result in {"in_contact", "no_neighbour", "braked:world_unreachable"}
+
+
+def test_control_was_regular_beside_all_actors(trial: Trial) -> None:
+    """The robot's loop has run at 250 Hz in spite of all that; its figures are published."""
+    control = trial.until("figures", lambda: trial.get(ROBOT, CONTROL))
+
+    print(control)
+    assert control.median_ms < 5.0
+    assert control.cycles > 1000
