@@ -11,7 +11,6 @@ from actors.palletizing.grasps import size_of
 from actors.palletizing.grounding import Gripper
 from actors.palletizing.handling import (
     ASIDE,
-    BY_ITSELF,
     IDLE,
     RISKY,
     Handled,
@@ -22,6 +21,7 @@ from actors.palletizing.handling import (
     stages_of,
 )
 from actors.palletizing.nets import NetError
+from actors.palletizing.reactions import BY_ITSELF
 from actors.palletizing.vocabulary import (
     CANDIDATE,
     CELL,

@@ -54,8 +54,6 @@ RISKY: Final = ("place", "push")
 """Stages that can spoil what stands on the tray."""
 IDLE: Final = ("stop", "ask")
 """Kinds of requests that move nothing."""
-BY_ITSELF: Final = ("sensor:", "not_following:", "no_frame:", "braked:", "interrupted:")
-"""Results of a robot that has stopped by itself: it must not move before someone has looked."""
 
 
 def stages_of(request: Request, plan: Plan | None) -> tuple[str, ...]:

@@ -26,6 +26,8 @@ from dataclasses import dataclass, field
 from typing import Final
 
 REACTIONS: Final = ("go_on", "push_again", "regrasp", "retry", "reject", "stop", "ask")
+BY_ITSELF: Final = ("sensor:", "not_following:", "no_frame:", "braked:", "interrupted:")
+"""Results of a robot that has stopped by itself: it must not move before someone has looked."""
 NEAR_MM: Final = 30.0
 """A package that stands farther from its place has not just slipped."""
 TURNED_DEG: Final = 20.0
@@ -87,7 +89,7 @@ class Reaction:
 
 def react(case: Case) -> Reaction:
     """Return what follows from a case."""
-    if case.result.startswith(("sensor:", "not_following:", "no_frame:", "braked:")):
+    if case.result.startswith(BY_ITSELF):
         return Reaction("stop", f"{case.stage} ended with {case.result}")
     if case.seen == "hand" and not case.success:
         return _if_left(case, "reject", f"{case.stage}: {case.result}, the package is still held")

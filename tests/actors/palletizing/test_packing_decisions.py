@@ -126,6 +126,7 @@ def test_flat_faces_are_pressed_harder_than_rims():
         (Case("push_into_contact", "in_contact", True, "tipped"), "ask"),
         (Case("push_into_contact", "in_contact", True, "deformed"), "ask"),
         (Case("place", "sensor:frozen", success=False, seen="hand"), "stop"),
+        (Case("place", "interrupted:carry", success=False, seen="hand"), "stop"),
     ],
 )
 def test_a_reaction_follows_from_what_was_seen(case, kind):

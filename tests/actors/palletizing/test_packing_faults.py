@@ -19,7 +19,6 @@ pytest.importorskip("open3d", exc_type=ImportError)
 pytest.importorskip("mujoco", exc_type=ImportError)
 
 from actors.palletizing.demo_robot_cell import RunningRobotCell
-
 from actors.palletizing.vocabulary import (
     ARRIVAL,
     CONTROL,
