@@ -32,7 +32,7 @@ LEAST_HEIGHT_M: Final = 0.040
 PUSH_HEIGHT_M: Final = 0.030
 FLAT_M2: Final = 0.0007
 """A flat contact has at least this area: what the dent of a finger would take."""
-FACE_N, LINE_N = 45.0, 25.0
+FACE_N, LINE_N = 40.0, 25.0
 """Of the fingers on flat faces, and on a rim or a round wall, which would give way."""
 FLAT_RAD: Final = float(np.deg2rad(10.0))
 THICKNESS_M: Final = 0.002

@@ -9,6 +9,8 @@ parameter               type      is
 package, place, bin     entity    what the job names; belt: the cell's
 grasp.frame             pose      in the package: between the fingers, y from one to the other, z up
 grasp.width_m           m         between the fingers that hold it; grasp.open_m before
+grasp.over_m            m         of the tool above the grasp when the fingers' tips are just above
+                                  the package
 grasp.height_m          m         of the fingers above the package's base
 grasp.force_n           N         of the fingers
 hand.turn_rad           rad       0, or π for the hand turned round
@@ -51,12 +53,15 @@ Value = str | float | F64
 FOLDER: Final = Path(__file__).parent / "skeletons"
 SKELETONS: Final = tuple(sorted(file.stem for file in FOLDER.glob("*.toml")))
 """Names of the skeletons that come with the cell."""
-CLEAR_M: Final = 0.16
+CLEAR_M: Final = 0.13
 PUSH_GAP_M: Final = 0.02
-PUSH_FORCE_N: Final = 14.0
-PUSH_TRAVEL_M: Final = 0.085
-BESIDE_M: Final = 0.010
+PUSH_FORCE_N: Final = 10.0
+PUSH_TRAVEL_M: Final = 0.065
+"""Beyond what the package stands short of its place."""
+BESIDE_M: Final = 0.022
 """Between the closed hand and the package before a push."""
+OVER_M: Final = 0.003
+"""Between the tips and the package before they go down beside it."""
 SQUEEZE_M: Final = 0.006
 """So much less or more than its width a package between the fingers measures at most."""
 
@@ -93,6 +98,7 @@ class Gripper:
         force_n_max: Of the fingers.
         half_m: Half the hand along the fingers' way when it is closed.
         half_across_m: Half the fingers across it.
+        tips_m: So far do the fingers reach beyond the tool.
     """
 
     least_m: float = 0.065
@@ -101,6 +107,7 @@ class Gripper:
     force_n_max: float = 60.0
     half_m: float = 0.0445
     half_across_m: float = 0.012
+    tips_m: float = 0.020
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -116,6 +123,7 @@ class Job:
             pushes it.
         bin: Entity of the reject bin; "" if the action has none.
         turned: The hand is turned round by π: what was grasped so is placed so.
+        gap_m: So far short of its place, against the push, the package is put down or stands.
     """
 
     package: str
@@ -125,6 +133,7 @@ class Job:
     push: npt.NDArray[np.float64] | None = None
     bin: str = ""
     turned: bool = False
+    gap_m: float = PUSH_GAP_M
 
 
 def ground(
@@ -198,6 +207,7 @@ def parameters(job: Job, gripper: Gripper, frames: Frames) -> dict[str, Value]:
         "grasp.frame": _grasp_frame(grasp),
         "grasp.width_m": grasp.width_m,
         "grasp.open_m": open_m,
+        "grasp.over_m": float(job.size_m[2] - grasp.point[2]) + gripper.tips_m + OVER_M,
         "grasp.height_m": float(grasp.point[2]),
         "grasp.force_n": grasp.force_n,
         "hand.turn_rad": math.pi if job.turned else 0.0,
@@ -233,7 +243,7 @@ def _push_values(job: Job, gripper: Gripper, base_from_place: F64) -> dict[str, 
     along = inverse(base_from_place)[:3, :3] @ push
     along[2] = 0.0
     length = float(np.linalg.norm(along))
-    gap_m = PUSH_GAP_M if push.any() else 0.0
+    gap_m = job.gap_m if push.any() else 0.0
     if not push.any():
         along, length = np.array([1.0, 0.0, 0.0]), 1.0
     if not length > 0.5:
@@ -255,7 +265,7 @@ def _push_values(job: Job, gripper: Gripper, base_from_place: F64) -> dict[str, 
         "push.behind_m": package_m + ahead_m + float(hand) + BESIDE_M,
         "push.drop_m": float(grasp.point[2]) - grasp.push_height_m,
         "push.force_n": PUSH_FORCE_N,
-        "push.travel_m": PUSH_TRAVEL_M,
+        "push.travel_m": PUSH_TRAVEL_M + gap_m,
     }
 
 

@@ -25,8 +25,8 @@ from actors.palletizing.execution import Executor
 from actors.palletizing.grasps import grasp_of, size_of
 from actors.palletizing.grounding import Gripper, Job, easier_turn, ground
 from actors.palletizing.nets import NetError
-from actors.palletizing.packing_truth import gap_m, top_dent_mm, truth_of
-from actors.palletizing.reactions import CHOICES, OTHERWISE, Case, Reaction, react
+from actors.palletizing.packing_truth import DENTED_MM, gap_m, top_dent_mm, truth_of
+from actors.palletizing.reactions import CHOICES, FELT_M, OTHERWISE, Case, Reaction, react
 from actors.palletizing.rows import contacts_between, planned_rows
 from actors.palletizing.sensor import FRAMES
 from actors.palletizing.simulation.cell_scene import ARM, HOME_RAD, CellLayout
@@ -49,6 +49,7 @@ if TYPE_CHECKING:
     F64 = npt.NDArray[np.float64]
 
 STAGES: Final = {
+    "look": (),
     "pack": ("grasp_from_belt", "place", "push_into_contact"),
     "retry": ("grasp_from_belt", "place", "push_into_contact"),
     "regrasp": ("regrasp", "place", "push_into_contact"),
@@ -58,6 +59,8 @@ STAGES: Final = {
 """Skeletons that a request runs, one after the other."""
 FRAME_CYCLES: Final = 8
 """Cycles of control between two images: 30 a second."""
+SETTLING_CYCLES: Final = 75
+"""Until what a person has put down stands still."""
 HELD_N: Final = 40.0
 """With which the fingers move to a width at most."""
 WAIT_S: Final = 8.0
@@ -98,22 +101,26 @@ class Step:
     Attributes:
         request: "pack", "retry", ...
         stages: Skeleton and result of each net.
+        succeeded: Whether the last of them did what it is for.
         reaction: What followed.
         reason: Why.
         choice: What the operator chose; "" if not asked.
         seconds: Simulated time that it took, looking included.
         before: What was true of the package before.
         after: What was true afterwards.
+        at_s: When it ended, simulated time.
     """
 
     request: str
     stages: tuple[tuple[str, str], ...]
+    succeeded: bool
     reaction: str
     reason: str
     choice: str
     seconds: float
     before: str
     after: str
+    at_s: float
 
 
 @dataclass(slots=True, eq=False)
@@ -197,7 +204,8 @@ class Packing:
             pose = self.layout.base_from_tray @ slot.tray_from_product
             self._frames[f"place/{number}"] = pose
         self._last_rad: F64 | None = None
-        self._turned = False
+        self._turned, self._felt_m = False, 0.0
+        self._flagged = set[int]()
         self._belt_seen, self._arrived_cycles = True, 0
         self.cell.arm.start()
 
@@ -208,7 +216,11 @@ class Packing:
             Packed(package.number, package.product, package.friction) for package in self._packages
         ]
         for each in packed:
-            self._pack(each, packed)
+            self.pack(each, packed)
+            each.cycle_s = each.steps[-1].at_s - each.steps[0].at_s + each.steps[0].seconds
+            self._feed_after(each.number)
+            for place in sorted(self._flagged - {each.number}):
+                self.pack(packed[place], packed, request="look")
         truth = self.cell.truth().packages
         for each in packed:
             self._finish(each, truth)
@@ -216,33 +228,45 @@ class Packing:
 
     # One package
 
-    def _pack(self, packed: Packed, all_packed: Sequence[Packed]) -> None:
+    def pack(self, packed: Packed, all_packed: Sequence[Packed], *, request: str = "pack") -> None:
+        """Do what is to be done about one package until it stands, or the operator was asked.
+
+        Args:
+            packed: The package; gets the steps.
+            all_packed: All packages; get the verdicts on their places.
+            request: What to begin with: "pack", or "look" at one that is on the tray.
+        """
         number = packed.number
-        request, tried = "pack", dict[str, int]()
-        start_s = self.cell.time_s
+        tried, short_mm = dict[str, int](), 0.0
+        self._felt_m = 0.0
+        self._flagged.clear()
         while request:
             began_s, before = self.cell.time_s, self._state(number)
-            stages, case = self._act(request, number)
+            stages, case = self._act(request, number, short_mm)
             self._execute("go_aside", self._job(number))
             seen = self._look(number, all_packed)
             case = self._case(case, number, seen, tried)
             reaction = react(case)
             choice = self._asked(reaction, case, packed)
+            after = self._state(number)
+            if choice == "replaced":
+                self._replace(number, all_packed)
             step = Step(
-                request, tuple(stages), reaction.kind, reaction.reason, choice,
-                self.cell.time_s - began_s, before, self._state(number),
+                request, tuple(stages), case.success, reaction.kind, reaction.reason, choice,
+                self.cell.time_s - began_s, before, after, self.cell.time_s,
             )  # fmt: skip
             packed.steps.append(step)
             self._told(f"{number} {packed.product}: {step}")
             again = choice if choice in STAGES else reaction.kind
             request = again if again in STAGES else ""
+            short_mm = max(0.0, -case.along_mm)
+            self._felt_m += FELT_M.get(case.result, 0.0)
             if request:
                 tried[request] = tried.get(request, 0) + 1
-        packed.cycle_s = self.cell.time_s - start_s
-        if self.cell.coming and number + 1 == len(self._packages) - self.cell.coming:
-            self._feed()
 
-    def _act(self, request: str, number: int) -> tuple[list[tuple[str, str]], Case]:
+    def _act(
+        self, request: str, number: int, short_mm: float
+    ) -> tuple[list[tuple[str, str]], Case]:
         """Run the nets of a request; return their results, and how the last one ended."""
         stages: list[tuple[str, str]] = []
         if request == "retry":
@@ -250,7 +274,9 @@ class Packing:
         if request in {"pack", "retry"} and not self._see_on_belt(number):
             return stages, Case("grasp_from_belt", "not_seen", success=False)
         job = self._job(number)
-        success, result = True, ""
+        if request == "push_again":
+            job = replace(job, gap_m=max(job.gap_m, short_mm / 1e3))
+        success, result = True, "seen"
         for skeleton in STAGES[request]:
             if skeleton == "push_into_contact" and not self.slots[number].push.any():
                 continue
@@ -263,9 +289,9 @@ class Packing:
             stages.append((skeleton, result))
             if not success:
                 break
-            if skeleton == "place" and request == "pack" and self.cell.coming:
-                self._feed()
-        return stages, Case(stages[-1][0], result, success)
+            if skeleton == "place":
+                self._feed_after(number)
+        return stages, Case(stages[-1][0] if stages else request, result, success)
 
     def _job(self, number: int) -> Job:
         slot, product = self.slots[number], self._packages[number].product
@@ -331,6 +357,11 @@ class Packing:
         self.cell.run_belt()
         self._look_at_belt()
 
+    def _feed_after(self, number: int) -> None:
+        """Let the package after this one come, unless it has."""
+        if self.cell.coming == len(self._packages) - number - 1 > 0:
+            self._feed()
+
     def _look_at_belt(self) -> None:
         """Take new pictures of the belt when a package stands there."""
         self._pictures, self._belt_seen, self._arrived_cycles = [], False, 0
@@ -346,6 +377,7 @@ class Packing:
         for sight in sights:
             if sight.product == self._packages[number].product and sight.known:
                 pose = self.layout.base_from_belt @ sight.belt_from_product
+                pose[:3, 3] += self._felt_m * (pose[:3, :3] @ self._grasps[sight.product].axis)
                 self._frames[f"package/{number}"] = pose
                 return True
         return False
@@ -365,6 +397,9 @@ class Packing:
         for place, seen in found.items():
             all_packed[place].judgements.append(self._judgement(place, seen, truth[place]))
         for place, seen in found.items():
+            self._flagged.discard(place)
+            if seen.verdict != "ok":
+                self._flagged.add(place)
             if seen.pose is not None:
                 self._frames[f"package/{place}"] = self.layout.base_from_tray @ seen.pose
         return found[number]
@@ -396,20 +431,22 @@ class Packing:
         if reaction.kind not in {"ask", "stop"}:
             return ""
         packed.by_hand = True
-        choice = CHOICES.get(case.verdict, OTHERWISE)[0]
-        number = packed.number
-        if choice == "replaced":
-            pose = self.layout.base_from_tray @ self.slots[number].tray_from_product
-            self.cell.replace(number, pose)
-            self.watch.forget()
-        return choice
+        return CHOICES.get(case.verdict, OTHERWISE)[0]
+
+    def _replace(self, number: int, all_packed: Sequence[Packed]) -> None:
+        """Let a person put a sound package to a place, and look at what is there then."""
+        pose = self.layout.base_from_tray @ self.slots[number].tray_from_product
+        self.cell.replace(number, pose)
+        self._rest(SETTLING_CYCLES)
+        self.watch.forget()
+        self._look(number, all_packed)
 
     # The truth, for the score
 
     def _state(self, number: int) -> str:
         truth = self.cell.truth().packages[number]
         if truth.where != "tray":
-            return truth.where
+            return "deformed" if top_dent_mm(truth) >= DENTED_MM else truth.where
         return truth_of(truth, self.slots[number].tray_from_product)
 
     def _judgement(self, place: int, seen: Seen, truth: PackageTruth) -> Judgement:

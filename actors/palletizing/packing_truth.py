@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
     F64 = npt.NDArray[np.float64]
 
+KINDS: Final = ("ok", "moved", "tipped", "deformed", "missing")
 MOVED_MM: Final = 10.0
 TURNED_DEG: Final = 5.0
 DENTED_MM: Final = 4.0

@@ -6,7 +6,7 @@ what happened                  what follows
 sound                          go on
 missed, lost, blocked          retry when it is seen on the belt, regrasp when upright on the tray
 blocked, no floor, in hand     reject: it is still held
-moved, short of its neighbour  push again, once
+moved, short of its neighbour  push again, once, up to `SHORT_MM`
 moved up to `NEAR_MM`          regrasp, once more after a push
 moved farther, tipped,         ask the operator
 deformed, extra
@@ -30,6 +30,11 @@ BY_ITSELF: Final = ("sensor:", "not_following:", "no_frame:", "braked:", "interr
 """Results of a robot that has stopped by itself: it must not move before someone has looked."""
 NEAR_MM: Final = 30.0
 """A package that stands farther from its place has not just slipped."""
+SHORT_MM: Final = 70.0
+"""Within its row it may stand farther off for a push to bring it there."""
+FELT_M: Final = {"blocked_left": 0.010, "blocked_right": -0.010}
+"""Where a package is that a finger came down on: so far beside where it was seen, along the grasp's
+axis."""
 TURNED_DEG: Final = 20.0
 """A package that is turned by more is nothing that the robot may take by itself."""
 MOST: Final = {"push_again": 1, "regrasp": 2, "retry": 2, "reject": 1}
@@ -114,11 +119,11 @@ def choices_of(verdict: str) -> tuple[str, ...]:
 
 def _moved(case: Case) -> Reaction:
     where = f"{case.along_mm:+.0f} mm along the push, {case.across_mm:+.0f} mm across"
-    if max(abs(case.along_mm), abs(case.across_mm)) > NEAR_MM:
-        return Reaction("ask", f"{where}: too far away to be taken for a slip")
     if abs(case.turn_deg) > TURNED_DEG:
         return Reaction("ask", f"it is turned by {case.turn_deg:.0f}°")
-    short = case.along_mm < -abs(case.across_mm)
+    short = -SHORT_MM < case.along_mm < -abs(case.across_mm) and abs(case.across_mm) < NEAR_MM
+    if not short and max(abs(case.along_mm), abs(case.across_mm)) > NEAR_MM:
+        return Reaction("ask", f"{where}: too far away to be taken for a slip")
     if short and case.tried.get("push_again", 0) < MOST["push_again"]:
         return Reaction("push_again", f"{where}: short of its neighbour")
     return _if_left(case, "regrasp", where)

@@ -99,9 +99,13 @@ class TrayWatch:
         changed = self._changed(places) | {newest}
         self._last = self.frame
         found: dict[int, Seen] = {}
-        # The newest first: what was pushed against is judged beside where the newest is now.
+        # The newest first, beside which the others are judged; then again what does not stand as
+        # it should, beside where the others are now.
         for place in sorted(changed, key=lambda each: (each != newest, each)):
             found[place] = self.seen[place] = self._inspected(place, places)
+        if len(changed) > 1:
+            for place in [each for each in changed if found[each].verdict != "ok"]:
+                found[place] = self.seen[place] = self._inspected(place, places)
         return found
 
     def _inspected(self, place: int, places: Places) -> Seen:

@@ -19,6 +19,7 @@ from enact_dist.bench.floors import Floors
 from enact_dist.bench.history import run_history
 from enact_dist.bench.layers import run_layers
 from enact_dist.bench.memory import run_memory
+from enact_dist.bench.palletizing import Asked, run_palletizing
 from enact_dist.bench.payloads import run_fetch, run_publish, run_wakeup
 from enact_dist.bench.pipeline import run_pipeline
 from enact_dist.bench.place import EMBEDDED, Place
@@ -70,6 +71,7 @@ BENCHES: Final[dict[str, Callable[[Run], None]]] = {
     "memory": run_memory,
     "recovery": run_recovery,
     "workcell": run_workcell,
+    "palletizing": run_palletizing,
 }
 BETWEEN_PROCESSES: Final = frozenset(name for name, told in TOLD.items() if not told.alone)
 """Benches that mean nothing within one process."""
@@ -146,7 +148,10 @@ def run(arguments: argparse.Namespace) -> int:
         floors = stack.enter_context(Floors(folder, memory))
         told = stack.enter_context(_progress())
         seconds_s = arguments.seconds_s or SECONDS_S
-        measured = Run(place, floors, seconds_s=seconds_s, told=told, seeds=arguments.seeds)
+        packing = Asked(arguments.packages, arguments.seed, arguments.processes, arguments.spread)
+        measured = Run(
+            place, floors, seconds_s=seconds_s, told=told, seeds=arguments.seeds, packing=packing
+        )
         failed = [name for name in names if not _ran(name, measured)]
         rows = measured.rows()
     if arguments.json:

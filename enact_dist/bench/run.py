@@ -17,6 +17,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.bench.floors import Floors
+from enact_dist.bench.palletizing import Asked
 from enact_dist.bench.rows import FLOOR, Case, Key, Row, Sample, row_of, sample_of
 
 if TYPE_CHECKING:
@@ -41,6 +42,7 @@ class Run:
         seconds_s: Measuring time of each case, all rounds together.
         told: Called with what is being measured.
         seeds: How many seeds are played, where a bench plays any.
+        packing: What is packed, where a bench packs.
     """
 
     def __init__(
@@ -51,10 +53,12 @@ class Run:
         seconds_s: float,
         told: Callable[[str], None],
         seeds: int = 1,
+        packing: Asked | None = None,
     ) -> None:
         self.place, self.floors = place, floors
         self.seconds_s = seconds_s
         self.told, self.seeds = told, seeds
+        self.packing = packing or Asked()
         self._figures: dict[Key, Sample] = {}
         self._times_us: dict[Key, list[float]] = {}
         self._cases: dict[Key, Case] = {}

@@ -73,6 +73,13 @@ BENCHES: Final = {
         minutes=True,
         named=True,
     ),
+    "palletizing": Told(
+        "robot, gripper and depth sensors pack --packages in simulated physics and time, scored on"
+        " what physics did: placements, verdicts by kind, recoveries, damage, cycle",
+        guest=False,
+        minutes=True,
+        named=True,
+    ),
 }
 """The benches, in the order in which they run and stand in the table."""
 _HEADING: Final = (
@@ -92,6 +99,7 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
         "enact bench update --embedded\n"
         "enact bench multi --shards 3\n"
         "enact bench fetch --connect tcp/tray-pc:7447\n"
+        "enact bench palletizing --packages 36 --spread 2,0.4\n"
         "enact bench --table run1.json run2.json run3.json",
     )
     assert bench.description is not None
@@ -138,6 +146,23 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
         help="`workcell --embedded` plays each scenario with seeds 1 to N (default: 1; one takes"
         " about 3 minutes of two processors)",
     )
+    packing = bench.add_argument_group("palletizing")
+    packing.add_argument(
+        "--packages", type=whole, default=36, metavar="N", help="how many (default: 36, 12 a tray)"
+    )
+    packing.add_argument(
+        "--seed", type=whole, default=1, metavar="N", help="of all that is random (default: 1)"
+    )
+    packing.add_argument(
+        "--processes", type=whole, default=2, metavar="N", help="trays side by side (default: 2)"
+    )
+    packing.add_argument(
+        "--spread",
+        type=_spread,
+        metavar="SIGMA_MM,FRICTION",
+        help="how far the belt's sensor is off, and friction (default: 2, 6 and 12 mm with 0.2, 0.4"
+        " and 0.6, in turn)",
+    )
     bench.add_argument("--json", action="store_true", help="print one JSON object")
     bench.add_argument(
         "--table",
@@ -160,6 +185,17 @@ def _line(name: str) -> str:
     marks = ", ".join(mark for mark, holds in but.items() if holds)
     text = f"{told.what} [{marks}]" if marks else told.what
     return textwrap.fill(text, 98, initial_indent=f"  {name:10}", subsequent_indent=" " * 12)
+
+
+def _spread(text: str) -> tuple[float, float]:
+    """Read "SIGMA_MM,FRICTION"; an `argparse` type."""
+    try:
+        sigma_mm, friction = (float(part) for part in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(
+            f"asked for {text!r}; it is SIGMA_MM,FRICTION, such as 2,0.4"
+        ) from None
+    return sigma_mm, friction
 
 
 def bench_name(text: str) -> str:

@@ -1,0 +1,68 @@
+"""Bench `palletizing`: the robot of ENACT 4.2 packs trays, scored on what physics did.
+
+Arm, gripper, belt, tray and depth sensors are simulated, in simulated time; what decides is what
+the actors of `enact demo palletizing` decide with.  Nothing of it depends on the machine.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from enact_dist.bench.rows import value_row
+from enact_dist.errors import MisuseError
+
+if TYPE_CHECKING:
+    from enact_dist.bench.run import Run
+
+NAME: Final = "palletizing"
+
+
+class Asked(NamedTuple):
+    """What is to be packed.
+
+    Attributes:
+        packages: How many.
+        seed: Of all that is random.
+        processes: How many trays are packed side by side.
+        spread: How far the belt's sensor is off (one sigma, mm) and friction; None: several.
+    """
+
+    packages: int = 36
+    seed: int = 1
+    processes: int = 2
+    spread: tuple[float, float] | None = None
+
+
+def run_palletizing(run: Run) -> None:
+    """Pack trays.
+
+    Raises:
+        MisuseError: The extras of the cell are not installed.
+    """
+    try:
+        import mujoco  # noqa: F401
+
+        from actors.palletizing import packing_scores as packing
+    except ImportError as error:
+        raise MisuseError(
+            f"bench {NAME} needs {error.name}, which is not installed; install its extras:"
+            " pip install -e '.[workcell,perception]' in the clone of enact-dist"
+        ) from error
+    asked = run.packing
+    settings = [asked.spread] if asked.spread else packing.SETTINGS
+    trays = packing.trays_of(asked.packages, seed=asked.seed, settings=settings)
+    found = packing.played(trays, processes=asked.processes, told=run.told)
+    scores = packing.scores_of(found)
+    failed = set(packing.missed(scores))
+    first, last = trays[0].seed, trays[-1].seed
+    run.add_row(
+        value_row(NAME, f"held-out seeds {first} to {last}", len(trays), "trays", len(trays))
+    )
+    for name, value in scores.items():
+        goal = packing.GOALS[name]
+        met = name not in failed if str(goal) else None
+        row = value_row(NAME, goal.what, value, "", asked.packages, str(goal), met=met)
+        run.add_row(row)
+    for (truth, verdict), count in sorted(packing.confusion(found).items()):
+        title = f"truth {truth}, judged {verdict}"
+        run.add_row(value_row(NAME, title, count, "places", asked.packages))
