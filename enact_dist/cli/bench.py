@@ -184,7 +184,7 @@ def _line(name: str) -> str:
     }
     marks = ", ".join(mark for mark, holds in but.items() if holds)
     text = f"{told.what} [{marks}]" if marks else told.what
-    return textwrap.fill(text, 98, initial_indent=f"  {name:10}", subsequent_indent=" " * 12)
+    return textwrap.fill(text, 98, initial_indent=f"  {name:12}", subsequent_indent=" " * 14)
 
 
 def _spread(text: str) -> tuple[float, float]:
