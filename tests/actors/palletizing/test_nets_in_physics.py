@@ -278,7 +278,7 @@ def test_finger_upon_a_package_is_blocked(worker):
     worker.put(1, *BELT)
     worker.see(1, beside_m=(0.0, 0.05))
 
-    assert worker.do(1, "grasp_from_belt") == "blocked"
+    assert worker.do(1, "grasp_from_belt") == "blocked_right"
     assert worker.truth(1).where == "belt"
 
 
