@@ -146,6 +146,19 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
         help="`workcell --embedded` plays each scenario with seeds 1 to N (default: 1; one takes"
         " about 3 minutes of two processors)",
     )
+    _add_packing(bench)
+    bench.add_argument("--json", action="store_true", help="print one JSON object")
+    bench.add_argument(
+        "--table",
+        nargs="+",
+        type=Path,
+        metavar="FILE",
+        help="measure nothing; print what earlier runs wrote with --json, as one Markdown table",
+    )
+
+
+def _add_packing(bench: Verb) -> None:
+    """Add what the bench `palletizing` alone asks for."""
     packing = bench.add_argument_group("palletizing")
     packing.add_argument(
         "--packages", type=whole, default=36, metavar="N", help="how many (default: 36, 12 a tray)"
@@ -162,14 +175,6 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
         metavar="SIGMA_MM,FRICTION",
         help="how far the belt's sensor is off, and friction (default: 2, 6 and 12 mm with 0.2, 0.4"
         " and 0.6, in turn)",
-    )
-    bench.add_argument("--json", action="store_true", help="print one JSON object")
-    bench.add_argument(
-        "--table",
-        nargs="+",
-        type=Path,
-        metavar="FILE",
-        help="measure nothing; print what earlier runs wrote with --json, as one Markdown table",
     )
 
 
