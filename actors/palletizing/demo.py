@@ -1,4 +1,7 @@
-"""`enact demo palletizing`: the whole cell as processes, watched from outside and scored.
+"""The list-driven cell as processes, watched from outside and scored: a test of perception.
+
+What stands on the tray, and what is wrong with it, comes from a seeded list, without a robot; the
+containers run this cell (`enact demo palletizing --cell`), and `demo_packing` the one with a robot.
 
 Two shard daemons and eight actors run as processes of their own, under `enact up` or in containers;
 this process only looks: it shows progress, and at the end sets the verdicts beside the truth.

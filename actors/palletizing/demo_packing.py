@@ -18,6 +18,7 @@ cell.toml, *.log         configuration and logs of the cell, if it ran here
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 import sys
 import time
 from dataclasses import dataclass, field
@@ -174,7 +175,7 @@ def show_cell(demo: RobotCell | RunningRobotCell, out: Path, *, up: str, keep_ru
     try:
         with demo as running, running.joined() as cell:
             console.print(f"{up}; log in {running.log}")
-            with recording(cell, out / "run.mcap"):
+            with _recorded(cell, out, console):
                 seen = _follow(cell, running, console)
             rows = _rows(cell, running, seen)
             console.print("\n", table_of(rows), f"\n{score_of(rows)}", sep="")
@@ -195,6 +196,14 @@ def show_cell(demo: RobotCell | RunningRobotCell, out: Path, *, up: str, keep_ru
         print(f"enact demo: {error}", file=sys.stderr)
         return 1
     return 0
+
+
+def _recorded(cell: Cell, out: Path, console: Console) -> contextlib.AbstractContextManager[None]:
+    """Record the run, if what that takes is installed."""
+    if importlib.util.find_spec("mcap") is None:
+        console.print("no recording: install the record extra, pip install -e '.[record]'")
+        return contextlib.nullcontext()
+    return recording(cell, out / "run.mcap")
 
 
 def _follow(cell: Cell, running: RobotCell | RunningRobotCell, console: Console) -> Seen:

@@ -109,7 +109,6 @@ class HandlingPerception(Actor):
         self.tray_sensor: TraySensor = open_sensor(tray_sensor)
         self.frames = frames
         self._arrived = -1
-        self._is_on_belt = False
 
     def start(self) -> None:
         """Load Open3D before the first package comes: it takes a second or two."""
@@ -145,8 +144,8 @@ class HandlingPerception(Actor):
         """Look where the package of a request is; return what was seen."""
         package, place = Entity(request.package), Entity(request.place)
         number = lock[self.sightings][package].first_stop
-        self._is_on_belt = not outcome.success and self._see_belt(lock, package, number)
-        if self._is_on_belt and outcome.stage == "grasp":
+        missed = not outcome.success and outcome.stage == "grasp"
+        if missed and self._see_belt(lock, package, number):  # later, the next one may lie there
             return Look(request.number, "belt", 0)
         empty = lock[self.empty_tray]
         frame, now_ns = tray_alone(self._tray(), empty), time.time_ns()
@@ -207,8 +206,6 @@ class HandlingPerception(Actor):
             found = register(pieces[0].cloud, pieces[0].outline_m, surface, plan.tray_from_product)
             lock[self.clouds][package] = pieces[0].cloud
             where, pose = "tray", found.tray_from_product
-        elif seen.frame == "belt" and self._is_on_belt:
-            return False
         else:
             where, pose = "", seen.frame_from_package
         lock[self.sightings][package] = Sighting(

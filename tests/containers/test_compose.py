@@ -60,11 +60,12 @@ FAR = READ.replace("range(400)", "range(1)")
 
 @pytest.fixture(scope="module")
 def alone(tmp_path_factory):
-    """The same demo on this machine, without containers; its report once it is done."""
+    """The same cell on this machine, without containers; its report once it is done."""
     out = tmp_path_factory.mktemp("alone")
-    words = ("-m", "enact_dist.cli.main", "demo", "palletizing", "--packages", str(PACKAGES))
+    run = "import pathlib, sys; from actors.palletizing.demo import run_demo"
+    run += "; sys.exit(run_demo(out=pathlib.Path(sys.argv[1]), packages=int(sys.argv[2])))"
     with subprocess.Popen(
-        [sys.executable, *words, "--out", str(out)], stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", run, str(out), str(PACKAGES)], stdout=subprocess.PIPE, text=True
     ) as process:
 
         @functools.cache

@@ -1,6 +1,7 @@
 """Claims about the demonstration around the cell: its configuration, its report, its run."""
 
 import json
+import re
 import socket
 import subprocess
 import tomllib
@@ -16,6 +17,7 @@ pytest.importorskip("open3d", exc_type=ImportError)
 from actors.geometry.shapes import Surface
 from actors.palletizing.demo import SEED, run_demo
 from actors.palletizing.demo_cell import TEMPLATE, RunningCell, configured, watched_cell
+from actors.palletizing.demo_packing import run_packing
 from actors.palletizing.demo_pictures import model_picture, tray_picture
 from actors.palletizing.demo_report import report_bytes, rows_of, score_of
 from actors.palletizing.feedback import sentence
@@ -225,3 +227,21 @@ def test_demo_runs_from_training_to_table(tmp_path, capsys):
     for name in ("model_milk_carton.png", "model_meal_tray.png", "tray_1.png"):
         assert (tmp_path / name).stat().st_size > 20_000
     assert "Traceback" not in (tmp_path / "cell.log").read_text()
+
+
+@pytest.mark.slow
+def test_robot_packs_from_training_to_table(tmp_path, capsys):
+    """Sixteen actors train two products and pack four packages in physics; table, why, pictures."""
+    pytest.importorskip("mujoco", exc_type=ImportError)
+    status = run_packing(out=tmp_path, packages=4, seed=59, speed=1.0)
+
+    printed = " ".join(capsys.readouterr().out.split())
+    assert status == 0
+    assert re.search(r"\d of 4 packages placed as planned", printed)
+    assert "enact why online place/" in printed
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert [row["place"] for row in report["packages"]] == [f"place/{n}" for n in range(4)]
+    assert all(row["result"] for row in report["packages"])
+    assert (tmp_path / "tray_1.png").stat().st_size > 20_000
+    assert "system" in (tmp_path / "actors.svg").read_text()
+    assert (tmp_path / "run.mcap").stat().st_size > 1_000_000
