@@ -78,7 +78,7 @@ LOOK_S: Final = 0.2
 STALL_S: Final = 90.0
 """Without any progress for this long something is wrong."""
 SEED: Final = 59
-SPEED: Final = 1.5
+SPEED: Final = 1.25
 """Simulated seconds per second: what two cores can do beside all actors."""
 PICTURE_PX: Final = (960, 720)
 

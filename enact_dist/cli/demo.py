@@ -39,7 +39,7 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
     demo.add_argument("--packages", type=whole, metavar="N", help="how many packages come by")
     demo.add_argument("--seed", type=int, metavar="S", help="of packages and sensors")
     demo.add_argument(
-        "--speed", type=float, metavar="X", help="simulated time per real time (default: 1.5)"
+        "--speed", type=float, metavar="X", help="simulated time per real time (default: 1.25)"
     )
     demo.add_argument("--out", type=Path, metavar="DIR", help="where pictures and tables go")
     demo.add_argument(

@@ -233,7 +233,7 @@ def test_demo_runs_from_training_to_table(tmp_path, capsys):
 def test_robot_packs_from_training_to_table(tmp_path, capsys):
     """Sixteen actors train two products and pack four packages in physics; table, why, pictures."""
     pytest.importorskip("mujoco", exc_type=ImportError)
-    status = run_packing(out=tmp_path, packages=4, seed=59, speed=1.0)
+    status = run_packing(out=tmp_path, packages=4, seed=59, speed=1.5)
 
     printed = " ".join(capsys.readouterr().out.split())
     assert status == 0
