@@ -16,6 +16,7 @@ TWO = ("--env-file", "deploy/multihost.env", *ONE, "--file", "deploy/compose.mul
         (ONE, 12),
         ((*ONE, "--profile", "tools"), 14),
         ((*ONE, "--profile", "workcell"), 32),
+        ((*ONE, "--profile", "packing"), 31),
         ((*TWO, "--profile", "shards"), 5),
         ((*TWO, "--profile", "perception"), 7),
     ],
