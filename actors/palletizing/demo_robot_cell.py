@@ -184,5 +184,5 @@ def watched_robot_cell(config: Path) -> RobotCell | None:
             path=str(config),
         )
     planning = next(actor.options for actor in loaded.actors if actor.name == "planning")
-    hardware = RemoteCell(int(found[1]), host[1] if host else "127.0.0.1")
+    hardware = RemoteCell(int(found[1]), host[1] if host else "")
     return RobotCell(config, hardware=hardware, packages=int(str(planning["packages"])))

@@ -16,6 +16,7 @@ anew by the next request, but whoever commanded arm or gripper has to start it a
 
 from __future__ import annotations
 
+import os
 import socket
 import threading
 from contextlib import closing
@@ -39,6 +40,8 @@ if TYPE_CHECKING:
 
     F64 = npt.NDArray[np.float64]
 
+HOST: Final = "ENACT_HARDWARE_HOST"
+"""Variable of the environment with the host of the cell's process, where an address names none."""
 ANSWER_S: Final = 10.0
 """A cell that does not answer for so long is gone; drawing the first picture takes 2 s."""
 
@@ -48,11 +51,11 @@ class RemoteCell:
 
     Args:
         port: Where it listens.
-        host: On which host.
+        host: On which host; empty: see `HOST`, else this one.
     """
 
-    def __init__(self, port: int, host: str = "127.0.0.1") -> None:
-        self._address = (host, port)
+    def __init__(self, port: int, host: str = "") -> None:
+        self._address = (host or os.environ.get(HOST, "127.0.0.1"), port)
         self._connection: socket.socket | None = None
         self._lock = threading.Lock()
 
@@ -246,22 +249,22 @@ class RemoteHands:
         self._cell.ask("take_away", number)
 
 
-def arm(port: str, host: str = "127.0.0.1") -> RemoteArm:
+def arm(port: str, host: str = "") -> RemoteArm:
     """Return the arm of the cell at a port; for `open_controller`."""
     return RemoteArm(RemoteCell(int(port), host))
 
 
-def gripper(port: str, host: str = "127.0.0.1") -> RemoteGripper:
+def gripper(port: str, host: str = "") -> RemoteGripper:
     """Return the gripper of the cell at a port; for `open_controller`."""
     return RemoteGripper(RemoteCell(int(port), host))
 
 
-def belt(port: str, host: str = "127.0.0.1", feeds: str = "") -> RemoteBelt:
+def belt(port: str, host: str = "", feeds: str = "") -> RemoteBelt:
     """Return the belt of the cell at a port; for `open_controller`."""
     return RemoteBelt(RemoteCell(int(port), host), feeds=bool(feeds))
 
 
-def hands(port: str, host: str = "127.0.0.1") -> RemoteHands:
+def hands(port: str, host: str = "") -> RemoteHands:
     """Return the hands of a person at the cell at a port; for `open_controller`."""
     return RemoteHands(RemoteCell(int(port), host))
 
@@ -276,12 +279,12 @@ def cell_frames() -> dict[str, F64]:
     }
 
 
-def tray_sensor(port: str, seed: str = "1", host: str = "127.0.0.1") -> PhysicalTraySensor:
+def tray_sensor(port: str, seed: str = "1", host: str = "") -> PhysicalTraySensor:
     """Return the sensor above the tray of the cell at a port; for `open_sensor`."""
     return PhysicalTraySensor(_shown_of(int(port), host), seed=int(seed))
 
 
-def belt_sensor(port: str, seed: str = "1", host: str = "127.0.0.1") -> PhysicalBeltSensor:
+def belt_sensor(port: str, seed: str = "1", host: str = "") -> PhysicalBeltSensor:
     """Return the sensor above the belt of the cell at a port; for `open_sensor`."""
     return PhysicalBeltSensor(_shown_of(int(port), host), seed=int(seed))
 
