@@ -46,7 +46,7 @@ def run_palletizing(run: Run) -> None:
     except ImportError as error:
         raise MisuseError(
             f"bench {NAME} needs {error.name}, which is not installed; install its extras:"
-            " pip install -e '.[workcell,perception]' in the clone of enact-dist"
+            " pip install -e '.[actors]' in the clone of enact-dist"
         ) from error
     asked = run.packing
     settings = [asked.spread] if asked.spread else packing.SETTINGS
