@@ -35,6 +35,8 @@ if TYPE_CHECKING:
 OFF_THE_BELT: Final = ("place", "push", "remove")
 """Stages during which the package is not on the belt."""
 LOOK_S: Final = 0.1
+OVERLOOKED_S: Final = 8.0
+"""When a package that has come was still not seen, it is said again."""
 LATE_S: Final = 15.0
 """A belt that has brought nothing for so long is started again, and says so."""
 
@@ -96,6 +98,9 @@ class BeltConveyor(Actor):
         last = lock.get(self.arrival)
         coming = 0 if last is None else last.number + 1
         place = place_entity(coming)
+        if last is not None and not self._runs_s and self._is_overlooked(lock, last):
+            lock[self.arrival] = Arrival(last.number, time.time_ns())
+            return
         if place not in plans or lock.is_null(self.empty):
             return
         if not self._runs_s:
@@ -114,6 +119,18 @@ class BeltConveyor(Actor):
     def _run(self) -> None:
         self.belt.run_belt()
         self._runs_s = time.monotonic()
+
+    def _is_overlooked(self, lock: Lock, last: Arrival) -> bool:
+        """Return whether nobody asks for what has come: then it was not seen, and is said again.
+
+        A package that fell back onto the belt stops it in the light barrier, too; when that is
+        taken away, the one after it comes with nobody looking.
+        """
+        name, request = place_entity(last.number).name, lock.get(self.request)
+        results = lock.get(self.results, {})
+        is_idle = request is None or (request.place != name and request.place in results)
+        waits_s = 1e-9 * (time.time_ns() - last.stamp_ns)
+        return is_idle and name not in results and waits_s > OVERLOOKED_S and self.belt.arrived()
 
     def _is_free(self, lock: Lock, number: int) -> bool:
         """Return whether a package is off the belt; change the tray if it was its last one."""

@@ -108,7 +108,9 @@ class HandlingPerception(Actor):
         self.belt_sensor: TraySensor = open_sensor(belt_sensor)
         self.tray_sensor: TraySensor = open_sensor(tray_sensor)
         self.frames = frames
-        self._arrived = -1
+        self._arrived_ns = 0
+        self._is_unseen = False
+        self._looked = 0
 
     def start(self) -> None:
         """Load Open3D before the first package comes: it takes a second or two."""
@@ -117,17 +119,40 @@ class HandlingPerception(Actor):
     def update(self, lock: Lock) -> None:
         """Look at the belt if a package has come, and where a request ended."""
         arrival, outcome = lock.get(self.arrival), lock.get(self.outcome)
-        if arrival is not None and arrival.number != self._arrived:
+        if arrival is not None and self._looks_for(lock, arrival.stamp_ns):
             known = lock[self.sightings].values()
-            if all(seen.first_stop != arrival.number for seen in known):
-                self._see_belt(lock, Entity.fresh("package"), arrival.number)
-            self._arrived = arrival.number
+            self._is_unseen = all(seen.first_stop != arrival.number for seen in known)
+            if self._is_unseen:
+                package = Entity.fresh("package")
+                self._is_unseen = not self._see_belt(lock, package, arrival.number)
         if outcome is None or not self._aside(lock, outcome):
             return
         before, request = lock.get(self.look), lock[self.request]
         is_new = before is None or before.request != outcome.request
         if is_new and request.number == outcome.request:
             lock[self.look] = self._look(lock, request, outcome)
+
+    def _looks_for(self, lock: Lock, arrived_ns: int) -> bool:
+        """Return whether to look at the belt for a package that has come.
+
+        At once, and as long as it was not seen, each time the arm has gone aside: an arm that
+        stopped above the belt hides it.
+        """
+        attached, doing = lock.get(self.attached), lock.get(self.execution)
+        is_aside = (
+            attached is not None
+            and doing is not None
+            and attached.stage == ASIDE
+            and doing.net_version == attached.number
+            and bool(doing.result)
+        )
+        aside = attached.number if attached is not None and is_aside else 0
+        looks = arrived_ns != self._arrived_ns or (
+            self._is_unseen and aside not in {0, self._looked}
+        )
+        if looks:
+            self._arrived_ns, self._looked = arrived_ns, aside
+        return looks
 
     def _aside(self, lock: Lock, outcome: Outcome) -> bool:
         """Return whether the arm has gone aside after a request."""

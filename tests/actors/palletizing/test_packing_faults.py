@@ -75,14 +75,14 @@ class Trial:
         doing = self.get(ROBOT, EXECUTION), self.get(SYSTEM, REQUEST), self.get(SYSTEM, RESULTS)
         raise AssertionError(f"not within {LONG_S:.0f} s: {what}\n{doing}\n{log}")
 
-    def doing(self, *primitives: str) -> Execution:
-        """Wait until the robot executes one of some primitives."""
+    def doing(self, *primitives: str, to_y_m: float = np.inf) -> Execution:
+        """Wait until the robot executes one of some primitives, the tool below some y."""
 
         def found() -> Execution | None:
             now = self.get(ROBOT, EXECUTION)
-            return (
-                now if now is not None and not now.result and now.primitive in primitives else None
-            )
+            if now is None or now.result or now.primitive not in primitives:
+                return None
+            return now if now.tcp[1, 3] < to_y_m else None
 
         return self.until(f"the robot is at {', '.join(primitives)}", found)
 
@@ -148,7 +148,7 @@ def test_robot_that_is_killed_brakes_holds_and_asks(trial: Trial) -> None:
 
 def test_gripper_that_loses_its_package_is_noticed(trial: Trial) -> None:
     """The net ends by the width, and what follows says so."""
-    begun = trial.doing("carry")
+    begun = trial.doing("carry", "lower", to_y_m=0.35)  # above the tray
     trial.hardware.fail("gripper", 0.4)
 
     done = trial.ended(begun)
