@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import TYPE_CHECKING, Final
 
 from actors.palletizing.expectation import PREFIX
@@ -57,8 +58,10 @@ def show_lineage(cell: Cell, product: str, console: Console) -> None:
     console.print()
 
 
-WHY_DEPTH: Final = 4
-"""From the region over the depth picture, the net and the grasp to the trained surface."""
+WHY_DEPTH: Final = 6
+"""From the region over the depth picture and the nets to the grasp."""
+WAY: Final = ("observation", "net", "candidate", "request", "grasp", "plan")
+"""What is shown of all these causes."""
 
 
 def show_packing(cell: Cell, console: Console) -> None:
@@ -82,5 +85,33 @@ def show_packing(cell: Cell, console: Console) -> None:
     if place is None:
         return
     console.print(f"\nenact why online {place}/{REGION} --depth {WHY_DEPTH}", style="bold")
-    print_tree(drawn(cell.why(online, place, REGION, depth=WHY_DEPTH)))
+    console.print(f"of it, the way over {', '.join(WAY)}:")
+    tree = cell.why(online, place, REGION, depth=WHY_DEPTH)
+    print_tree(drawn(way_of(tree, (place.name, f"product/{judged[place.name].product}", "system"))))
     console.print()
+
+
+def way_of(tree: CauseTree, entities: tuple[str, ...]) -> CauseTree:
+    """Return a tree of causes without what is not on the way from picture over net to grasp.
+
+    Args:
+        tree: Of all causes.
+        entities: Whose data are shown.
+    """
+    whole = {_slot(cause): cause for cause in tree.walk()}
+    shown: set[tuple[str, str, str, int]] = set()
+
+    def part(cause: CauseTree) -> CauseTree:
+        children = []
+        for child in cause.children:
+            on_it = str(child.aspect) in WAY and child.entity.name in entities
+            if on_it and child.aspect != cause.aspect and _slot(child) not in shown:
+                shown.add(_slot(child))
+                children.append(part(whole.get(_slot(child), child)))
+        return dataclasses.replace(cause, children=tuple(children), elsewhere=False, unfollowed=0)
+
+    return part(tree)
+
+
+def _slot(cause: CauseTree) -> tuple[str, str, str, int]:
+    return cause.world, cause.entity.name, str(cause.aspect), cause.version

@@ -44,6 +44,8 @@ FACES: Final = (
 
 LABEL_PX: Final = 17
 """Height of a capital letter of a verdict; its plate is less than twice as high."""
+OVER_M: Final = 0.25
+"""What is higher stands on no tray: the arm."""
 TRAY_HALF_M: Final = (0.447, 0.317)
 """What is drawn around the middle of the tray: all but its rim, where the floor shines through."""
 
@@ -101,7 +103,8 @@ def tray_picture(
     points = moved(points_grid(depth_m, camera).reshape(-1, 3), pose)
     with np.errstate(invalid="ignore"):
         risen = (rise(frame, empty_mm) > RISE_MIN_M).ravel()
-        depth_m[(np.abs(points[:, :2]) > TRAY_HALF_M).any(axis=1).reshape(camera.shape)] = np.nan
+        beside = (np.abs(points[:, :2]) > TRAY_HALF_M).any(axis=1) | (points[:, 2] > OVER_M)
+        depth_m[beside.reshape(camera.shape)] = np.nan
     colours = np.where(risen[:, None], CARTON, STEEL).astype(np.uint8)
     for _, _, region in regions:
         colours[region.ravel()] = ALARM
