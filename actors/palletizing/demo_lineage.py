@@ -7,10 +7,13 @@ from typing import TYPE_CHECKING, Final
 
 from actors.palletizing.expectation import PREFIX
 from actors.palletizing.vocabulary import (
+    CANDIDATE,
     CLOUD,
     DEVIATIONS,
+    NET,
     PLACES,
     REGION,
+    REQUEST,
     RESULTS,
     STANDING,
     SYSTEM,
@@ -21,6 +24,8 @@ from enact_dist.cli.lineage import drawn
 from enact_dist.cli.output import print_tree
 
 if TYPE_CHECKING:
+    from collections.abc import Collection
+
     from rich.console import Console
 
     from enact_dist import Cell
@@ -87,16 +92,37 @@ def show_packing(cell: Cell, console: Console) -> None:
     console.print(f"\nenact why online {place}/{REGION} --depth {WHY_DEPTH}", style="bold")
     console.print(f"of it, the way over {', '.join(WAY)}:")
     tree = cell.why(online, place, REGION, depth=WHY_DEPTH)
-    print_tree(drawn(way_of(tree, (place.name, f"product/{judged[place.name].product}", "system"))))
+    entities = (place.name, f"product/{judged[place.name].product}", SYSTEM.name)
+    print_tree(drawn(way_of(tree, entities, _of_other_places(cell, place.name))))
     console.print()
 
 
-def way_of(tree: CauseTree, entities: tuple[str, ...]) -> CauseTree:
+def _of_other_places(cell: Cell, place: str) -> set[tuple[str, int]]:
+    """Return aspect and version of all requests, candidates and nets for other places."""
+    online = cell.world("online")
+    requests = {made.version: made.datum() for made in online.history(SYSTEM, REQUEST)}
+    others = {each.number for each in requests.values() if each.place != place}
+    candidates = online.history(SYSTEM, CANDIDATE)
+    return {
+        *((str(REQUEST), version) for version, each in requests.items() if each.place != place),
+        *((str(CANDIDATE), made.version) for made in candidates if made.datum().request in others),
+        *(
+            (str(NET), made.version)
+            for made in online.history(SYSTEM, NET)
+            if made.datum().request in others
+        ),
+    }
+
+
+def way_of(
+    tree: CauseTree, entities: tuple[str, ...], left_out: Collection[tuple[str, int]]
+) -> CauseTree:
     """Return a tree of causes without what is not on the way from picture over net to grasp.
 
     Args:
         tree: Of all causes.
         entities: Whose data are shown.
+        left_out: Aspect and version of what is not shown.
     """
     whole = {_slot(cause): cause for cause in tree.walk()}
     shown: set[tuple[str, str, str, int]] = set()
@@ -104,7 +130,8 @@ def way_of(tree: CauseTree, entities: tuple[str, ...]) -> CauseTree:
     def part(cause: CauseTree) -> CauseTree:
         children = []
         for child in cause.children:
-            on_it = str(child.aspect) in WAY and child.entity.name in entities
+            on_it = child.aspect in WAY and child.entity.name in entities
+            on_it = on_it and (child.aspect, child.version) not in left_out
             if on_it and child.aspect != cause.aspect and _slot(child) not in shown:
                 shown.add(_slot(child))
                 children.append(part(whole.get(_slot(child), child)))
@@ -114,4 +141,4 @@ def way_of(tree: CauseTree, entities: tuple[str, ...]) -> CauseTree:
 
 
 def _slot(cause: CauseTree) -> tuple[str, str, str, int]:
-    return cause.world, cause.entity.name, str(cause.aspect), cause.version
+    return cause.world, cause.entity.name, cause.aspect, cause.version
