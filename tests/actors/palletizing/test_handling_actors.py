@@ -14,6 +14,7 @@ from actors.palletizing import vocabulary as words
 from actors.palletizing.action import Action
 from actors.palletizing.action_generator import ActionGenerator
 from actors.palletizing.conveyor import BeltConveyor
+from actors.palletizing.demo_lineage import show_packing
 from actors.palletizing.demo_robot_cell import TEMPLATE, configured
 from actors.palletizing.feedback import HandlingFeedback
 from actors.palletizing.nets import Execution
@@ -297,3 +298,25 @@ def test_belt_waits_until_the_package_before_is_off_it(cell, monkeypatch):
     for _ in range(3):
         testing.run_once(conveyor, cell)
     assert (belt.runs, read(cell, words.CONVEYOR, words.ARRIVAL).number) == (2, 1)
+
+
+def test_why_goes_back_from_a_verdict_to_net_and_grasp(cell, capsys):
+    """What the demonstration prints names picture, nets and grasp of this package alone."""
+    from rich.console import Console
+
+    come(cell)
+    testing.run_once(HandlingFeedback(), cell)
+    packed(cell, "held", "placed", "in_contact", "aside")
+    looked(cell, "tray", "ok")
+    testing.run_once(HandlingFeedback(), cell)
+    online = cell.world("online")
+    net, region = View(online, words.SYSTEM, words.NET), Write(online, PLACE, words.REGION)
+    with Lock(net, region) as lock:
+        assert lock[net].stage == "aside"
+        lock[region] = np.zeros((2, 2), bool)
+    show_packing(cell, Console(width=300))
+    printed = capsys.readouterr().out
+    assert "enact why online place/0/region" in printed
+    assert "training:product/milk_carton/grasp v1" in printed
+    assert "online:system/candidate v1" in printed
+    assert "training:product/meal_tray" not in printed
