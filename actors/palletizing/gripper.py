@@ -20,7 +20,7 @@ class Gripper(Actor):
     """Follow the newest command, publish the state at 40 Hz (ENACT 4.2).
 
     A command is a level: after a restart the newest one is followed again.  One that the gripper
-    refuses is an error of this actor, and the state goes on naming the command before it.
+    refuses is told once, and the state goes on naming the command before it.
 
     Args:
         controller: Address of the gripper, ``MODULE:FUNCTION?name=value``, see `GripperController`.
@@ -56,16 +56,14 @@ class Gripper(Actor):
         assert gripper is not None
         if not self._started:
             gripper.start()
-            self._started, self._number = True, None
+            self._started, self._number, self._refused = True, None, None
         command = lock.get(self.command)
         try:
             if command is not None and command.number not in (self._number, self._refused):
-                self._refused = command.number
                 self._obey(gripper, command)
-                self._number, self._refused = command.number, None
             now = gripper.gripped()
         except ControllerError:
-            # Refused, or out of reach: a connection that is made anew has to be started again.
+            # A connection that is made anew has to be started again, and the command repeated.
             self._started = False
             raise
         lock[self.state] = GripState(
@@ -77,7 +75,14 @@ class Gripper(Actor):
         )
 
     def _obey(self, gripper: GripperController, command: GripCommand) -> None:
-        if command.kind == "width":
-            gripper.grip_width(command.value, self.force_limit_n)
+        try:
+            if command.kind == "width":
+                gripper.grip_width(command.value, self.force_limit_n)
+            else:
+                gripper.grip_force(command.value)
+        except ControllerError as error:
+            gripper.gripped()  # raises if it is out of reach, which is no refusal
+            self._refused = command.number
+            print(f"command {command.number} is refused: {error}", flush=True)
         else:
-            gripper.grip_force(command.value)
+            self._number = command.number

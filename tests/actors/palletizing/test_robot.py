@@ -26,6 +26,7 @@ from actors.palletizing.vocabulary import (
     STATE,
     SYSTEM,
     Attached,
+    GripCommand,
 )
 from actors.workcell.vocabulary import JOINTS
 from enact_dist import Lock, View, Write, local, testing
@@ -237,7 +238,7 @@ class SilentGripper(Gripper):
         self._number = 0
 
     def _obey(self, gripper, command):
-        raise ControllerError("the gripper has no air")
+        pass
 
 
 @pytest.mark.parametrize(
@@ -387,6 +388,43 @@ def test_restarted_gripper_follows_the_newest_command(trial):
 
     assert trial.device.grips == [("width", 0.1, 40.0)]
     assert trial.get(GRIPPER, STATE).number == 1
+
+
+def test_gripper_that_refuses_goes_on_and_one_that_was_lost_is_started_again(trial, capsys):
+    """A refused command is told once; one that did not get through is given again."""
+    device, gripper = trial.device, trial.actors()[2]
+    width, calls = device.grip_width, []
+
+    def grip_width(width_m, force_limit_n):
+        calls.append(width_m)
+        raise ControllerError("asked for 300 mm between the fingers")
+
+    device.grip_width = grip_width
+    command = Write(trial.online, GRIPPER, COMMAND)
+    with Lock(command) as lock:
+        lock[command] = GripCommand(1, "width", 0.3)
+    for _ in range(2):
+        testing.run_once(gripper, trial.cell)
+
+    assert calls == [0.3]
+    assert trial.get(GRIPPER, STATE).number == 0
+    assert capsys.readouterr().out == "command 1 is refused: asked for 300 mm between the fingers\n"
+
+    with Lock(command) as lock:
+        lock[command] = GripCommand(2, "width", 0.1)
+    gripped = device.gripped
+
+    def away():
+        raise ControllerError("no answer")
+
+    device.gripped = away
+    with pytest.raises(ControllerError, match="no answer"):
+        testing.run_once(gripper, trial.cell)
+    device.gripped, device.grip_width = gripped, width
+    testing.run_once(gripper, trial.cell)
+
+    assert device.grips == [("width", 0.1, 40.0)]
+    assert trial.get(GRIPPER, STATE).number == 2
 
 
 def test_robot_without_its_arm_says_what_is_missing(trial, monkeypatch):
