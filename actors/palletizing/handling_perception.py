@@ -175,22 +175,28 @@ class HandlingPerception(Actor):
         empty = lock[self.empty_tray]
         frame, now_ns = tray_alone(self._tray(), empty), time.time_ns()
         tray = lock[self.plans][place].tray
-        standing = self._standing(lock, tray)
         before = lock.get(self.last)
-        moved = [] if before is None else changed(frame, before, standing)
-        # The newest first: what it was pushed against is judged beside where it is now.
-        for name in dict.fromkeys((package.name, *moved)):
-            others = [standing[other] for other in standing if other != name]
-            before_mm = without(frame, empty.depth_mm, others)
-            there = self._see_tray(lock, Entity(name), frame, before_mm)
-            standing = self._standing(lock, tray)
+        moved = [] if before is None else changed(frame, before, self._standing(lock, tray))
+        names = tuple(dict.fromkeys((package.name, *moved)))
+        there = {}
+        for name in names:  # the newest first: what it was pushed against is seen beside it
+            before_mm = self._without(lock, name, tray, frame)
+            there[name] = self._see_tray(lock, Entity(name), frame, before_mm)
+        for name in names:  # where all of them stand is known only now
             if name != package.name or request.kind not in {"reject", "look"}:
                 at = Entity(f"place/{lock[self.sightings][Entity(name)].first_stop}")
-                seen = Observation(frame, before_mm, (name,) if there else (), now_ns)
+                before_mm = self._without(lock, name, tray, frame)
+                seen = Observation(frame, before_mm, (name,) if there[name] else (), now_ns)
                 lock[self.observations].put(at, seen, stamp_ns=now_ns)
         lock[self.last] = frame
         judged = request.kind not in {"reject", "look"}
         return Look(request.number, lock[self.sightings][package].frame, now_ns if judged else 0)
+
+    def _without(self, lock: Lock, name: str, tray: int, frame: DepthFrame) -> Depth:
+        """Return the picture of a tray as it would be without a package."""
+        standing = self._standing(lock, tray)
+        others = [standing[other] for other in standing if other != name]
+        return without(frame, lock[self.empty_tray].depth_mm, others)
 
     def _standing(self, lock: Lock, tray: int) -> dict[str, tuple[Surface, F64]]:
         """Return what stands on a tray: surface and tray_from_product by name of the package."""

@@ -1,0 +1,155 @@
+"""Claims about perception where a robot packs: the physical cell before its sensors, no robot."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("open3d", exc_type=ImportError)
+pytest.importorskip("mujoco", exc_type=ImportError)
+
+from actors.palletizing import vocabulary as words
+from actors.palletizing.deviation import DeviationDetection
+from actors.palletizing.handling import aside_net
+from actors.palletizing.handling_perception import EmptyBelt, HandlingPerception
+from actors.palletizing.nets import Execution
+from actors.palletizing.planning import RowPlanning
+from actors.palletizing.simulation.cell_scene import CellLayout
+from actors.palletizing.simulation.physical_sensors import PhysicalBeltSensor, PhysicalTraySensor
+from actors.palletizing.simulation.physics import PhysicalCell
+from enact_dist import Entity, Lock, View, ViewEach, Write, testing
+
+NAMES = ("milk_carton", "meal_tray")
+LAYOUT = CellLayout()
+
+
+@pytest.fixture
+def physical():
+    return PhysicalCell(2, seed=4)
+
+
+@pytest.fixture
+def cell(trained, physical, monkeypatch):
+    """A planned cell whose sensors look at the physical one."""
+    sensors = {
+        "belt": PhysicalBeltSensor(physical.shown, seed=4),
+        "tray": PhysicalTraySensor(physical.shown, seed=4),
+    }
+    opened = "actors.palletizing.handling_perception.open_sensor"
+    monkeypatch.setattr(opened, sensors.__getitem__)
+    with testing.worlds("training", "online") as cell:
+        training = cell.world("training")
+        for name in NAMES:
+            training.init(words.product_entity(name), words.SURFACE, trained(name))
+        frames = "actors.palletizing.simulation.remote_cell:cell_frames"
+        testing.run_once(RowPlanning(2, " ".join(NAMES), frames), cell)
+        training.init(words.TRAY, words.EMPTY, sensors["tray"].capture_empty())
+        testing.run_once(EmptyBelt("belt"), cell)
+        yield cell
+
+
+def write(cell, entity, aspect, datum):
+    request = Write(cell.world("online"), entity, aspect)
+    with Lock(request) as lock:
+        lock[request] = datum
+
+
+def read(cell, entity, aspect):
+    request = View(cell.world("online"), entity, aspect)
+    return cell.world("online").view(request).get(request)
+
+
+def each(cell, world, pattern, aspect):
+    request = ViewEach(cell.world(world), pattern, aspect)
+    return dict(cell.world(world).view(request)[request])
+
+
+def ended(cell, number, package, place, *, stage="push", success=True):
+    """Let the robot have ended a request and gone aside."""
+    request = words.Request(number, "pack", place, package, "test")
+    write(cell, words.SYSTEM, words.REQUEST, request)
+    outcome = words.Outcome(number, stage, "any", success, 7)
+    write(cell, words.SYSTEM, words.OUTCOME, outcome)
+    net = aside_net(turned=False)
+    write(cell, words.SYSTEM, words.NET, words.Attached(number, number, "aside", net, {}))
+    doing = Execution("go_aside", number, "go", 7, (), "aside", np.zeros(6), 0.07, np.eye(4))
+    write(cell, words.ROBOT, words.EXECUTION, doing)
+
+
+def on_belt(physical, number):
+    """Put a package into the light barrier, as the belt brings it; return its true pose."""
+    pose = np.array(LAYOUT.base_from_belt)
+    pose[:3, 3] += pose[:3, :3] @ [-0.1, 0.0, 0.0]
+    physical.put(number, pose)
+    return pose
+
+
+def on_tray(cell, physical, number, *, beside_m=0.0):
+    plan = each(cell, "training", words.PLACES, words.PLAN)[Entity(f"place/{number}")]
+    pose = np.array(plan.tray_from_product)
+    pose[1, 3] += beside_m
+    physical.put(number, LAYOUT.base_from_tray @ pose)
+
+
+def test_a_package_has_one_entity_from_the_belt_to_the_tray(cell, physical):
+    """It is recognised where it comes, and judged where it goes; so is its neighbour, when moved."""
+    perception, detection = HandlingPerception("belt", "tray", frames=2), DeviationDetection()
+    true = on_belt(physical, 0)
+    write(cell, words.CONVEYOR, words.ARRIVAL, words.Arrival(0, 7))
+    testing.run_once(perception, cell)
+    ((package, seen),) = each(cell, "online", words.PACKAGES, words.SIGHTING).items()
+    assert (seen.product, seen.frame, seen.first_stop) == ("milk_carton", "belt", 0)
+    found = LAYOUT.base_from_belt @ seen.frame_from_package
+    assert np.hypot(*(found - true)[:2, 3]) < 0.012  # the sensor is off by some millimetres
+
+    on_tray(cell, physical, 0)
+    ended(cell, 1, package.name, "place/0")
+    testing.run_once(perception, cell)
+    testing.run_once(detection, cell)
+    assert read(cell, words.SYSTEM, words.LOOK).seen == "tray"
+    assert read(cell, words.SYSTEM, words.DEVIATIONS)["place/0"].verdict == "ok"
+
+    on_belt(physical, 1)
+    write(cell, words.CONVEYOR, words.ARRIVAL, words.Arrival(1, 8))
+    testing.run_once(perception, cell)
+    sightings = each(cell, "online", words.PACKAGES, words.SIGHTING)
+    (second,) = sightings.keys() - {package}
+    assert sightings[second].product == "meal_tray"
+    on_tray(cell, physical, 1)
+    on_tray(cell, physical, 0, beside_m=0.03)  # as if it had been pushed away
+    ended(cell, 2, second.name, "place/1")
+    testing.run_once(perception, cell)
+    testing.run_once(detection, cell)
+    flags = read(cell, words.SYSTEM, words.DEVIATIONS)
+    assert {place: flag.verdict for place, flag in flags.items()} == {
+        "place/0": "moved",
+        "place/1": "ok",
+    }
+    assert len(each(cell, "online", words.PACKAGES, words.SIGHTING)) == 2
+
+
+def test_a_package_that_was_missed_is_seen_on_the_belt_again(cell, physical):
+    """After a grasp that failed only the belt is looked at; the tray is not judged."""
+    perception = HandlingPerception("belt", "tray", frames=2)
+    on_belt(physical, 0)
+    write(cell, words.CONVEYOR, words.ARRIVAL, words.Arrival(0, 7))
+    testing.run_once(perception, cell)
+    (package,) = each(cell, "online", words.PACKAGES, words.SIGHTING)
+    ended(cell, 1, package.name, "place/0", stage="grasp", success=False)
+    testing.run_once(perception, cell)
+    look = read(cell, words.SYSTEM, words.LOOK)
+    assert (look.seen, look.captured_ns) == ("belt", 0)
+    assert each(cell, "online", words.PLACES, words.OBSERVATION) == {}
+
+
+def test_a_package_that_is_nowhere_is_missing(cell, physical):
+    """Lost on the way: not on the tray; the place is flagged, the package has left the cell."""
+    perception = HandlingPerception("belt", "tray", frames=2)
+    on_belt(physical, 0)
+    write(cell, words.CONVEYOR, words.ARRIVAL, words.Arrival(0, 7))
+    testing.run_once(perception, cell)
+    (package,) = each(cell, "online", words.PACKAGES, words.SIGHTING)
+    physical.take_away(0)
+    ended(cell, 1, package.name, "place/0", stage="place", success=False)
+    testing.run_once(perception, cell)
+    testing.run_once(DeviationDetection(), cell)
+    assert read(cell, words.SYSTEM, words.LOOK).seen == ""
+    assert read(cell, words.SYSTEM, words.DEVIATIONS)["place/0"].verdict == "missing"
