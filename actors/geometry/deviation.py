@@ -1,7 +1,10 @@
-"""Compare a place of the tray with its expected content: missing, extra, moved, deformed.
+"""Compare a place of the tray with its expected content: missing, extra, tipped, moved, deformed.
 
 what is new -> register the trained surface -> render it into the sensor -> compare pixel by pixel
 (median 5, mean 7x7, limit from the sensor's spread, a band along edges left out) -> largest blob
+what an upright package does not explain -> the same surface with six freedoms: does it lean?
+
+Packages in contact are told apart by the image before, in which the neighbours stand already.
 
 Rules a change must keep: depth is the only evidence; limits carry the numbers they come from;
 what an overhead sensor cannot see (a dent in a side, one below `Limits` on top) is not claimed.
@@ -17,8 +20,8 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from actors.geometry.depth import mean_known, median_known, metres, spread_m
-from actors.geometry.poses import yaw_between, yaw_of
-from actors.geometry.registration import register
+from actors.geometry.poses import moved, yaw_between, yaw_of
+from actors.geometry.registration import Registration, leaning, register, tilt_of
 from actors.geometry.rendering import render_depth
 from actors.geometry.segmentation import Piece, new_pieces, pixel_area_m2, rise
 
@@ -31,7 +34,18 @@ if TYPE_CHECKING:
     Image = npt.NDArray[np.float32]
     Mask = npt.NDArray[np.bool_]
 
-VERDICTS: Final = ("ok", "missing", "extra", "moved", "deformed")
+VERDICTS: Final = ("ok", "missing", "extra", "tipped", "moved", "deformed")
+
+LEANS_CLEARLY: Final = 0.6
+"""A package leans if that leaves at most this share of the distance that standing leaves …"""
+
+LEANS_M: Final = 0.002
+"""… and at most this: leaning packages of right shape left 0.5 mm (one image: 1.3), the best tilt
+of a bulge of 15 mm left 2.4."""
+
+
+OPEN_FOOT: Final = 4.0
+"""Beside a leaning package more counts as foreign: its model is open where it used to stand."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +68,7 @@ class Limits:
         extra_m2: Least area of a foreign object outside the band, square metres.
         moved_m: Largest shift of a package in its place, metres.
         turned_rad: Largest turn.
+        tipped_rad: Largest tilt.
         present_share: Share of the product's area that must have come for it to be there.
     """
 
@@ -66,6 +81,7 @@ class Limits:
     extra_m2: float = 0.00025
     moved_m: float = 0.010
     turned_rad: float = float(np.deg2rad(8.0))
+    tipped_rad: float = float(np.deg2rad(5.0))
     present_share: float = 0.35
 
 
@@ -76,11 +92,14 @@ class Finding:
     Attributes:
         verdict: One of `VERDICTS`; of several the first that applies in that order.
         deviation_mm: deformed: 95th percentile of the depth difference over the blob; moved: the
-            shift; missing: height of what is not there; extra: height of what is too much.
+            shift; missing: height of what is not there; extra: height of what is too much; tipped:
+            how far the highest point of the product is off its height.
         area_mm2: Area of the deviating region.
         shift_mm: Distance of the registered from the planned position.
         turn_deg: Yaw of the registered against the planned pose.
-        tray_from_product: Registered pose, (4, 4); the planned one if missing.
+        tilt_deg: Tilt of the registered pose; 0 unless tipped.
+        tray_from_product: Registered pose, (4, 4), upright unless tipped; the planned one if
+            missing.
         region: (H, W) bool, the deviating pixels.
     """
 
@@ -89,13 +108,14 @@ class Finding:
     area_mm2: float
     shift_mm: float
     turn_deg: float
+    tilt_deg: float
     tray_from_product: Pose
     region: Mask
 
 
 def inspect_place(
     frame: DepthFrame,
-    before_mm: npt.NDArray[np.uint16],
+    before_mm: npt.NDArray[np.uint16 | np.float32],
     surface: Surface,
     planned: Pose,
     *,
@@ -105,7 +125,7 @@ def inspect_place(
 
     Args:
         frame: The image now; its world is the tray frame.
-        before_mm: (H, W) uint16, the image before the package came, millimetres.
+        before_mm: (H, W), the image before the package came, millimetres.
         surface: The trained product, product frame.
         planned: tray_from_product as planned, (4, 4).
         limits: Where a difference becomes a deviation; the calibrated ones when absent.
@@ -121,7 +141,8 @@ def inspect_place(
     if not pieces or pieces[0].area_m2 < limits.present_share * product_m2:
         return _missing(expected, before_mm, frame, planned)
     piece = pieces[0]
-    pose = register(piece.cloud, piece.outline_m, surface, planned).tray_from_product
+    found = register(piece.cloud, piece.outline_m, surface, planned, seen_by=frame.acquisition)
+    pose = found.tray_from_product
     shift_m = float(np.hypot(*(pose[:2, 3] - planned[:2, 3])))
     turn = yaw_between(yaw_of(planned), yaw_of(pose))
     rendered = render_depth([(surface, pose)], frame.acquisition)
@@ -138,14 +159,27 @@ def inspect_place(
             area_mm2=1e6 * float(area_m2[region].sum()),
             shift_mm=1000.0 * shift_m,
             turn_deg=float(np.rad2deg(turn)),
+            tilt_deg=float(np.rad2deg(tilt_of(pose))),
             tray_from_product=pose,
             region=region,
         )
 
-    if area_m2[foreign].sum() >= limits.extra_m2:
+    too_much = area_m2[foreign].sum() >= limits.extra_m2
+    off = shift_m > limits.moved_m or abs(turn) > limits.turned_rad
+    if too_much or off or bent_m2 >= limits.deformed_m2:
+        lies = _tipped(piece, surface, found, limits)
+        if lies is not None:
+            pose = lies
+            shift_m = _beside(surface, pose, planned)
+            rendered = render_depth([(surface, pose)], frame.acquisition)
+            foreign = _foreign(pieces, np.isfinite(rendered), limits)
+            too_much = area_m2[foreign].sum() >= OPEN_FOOT * limits.extra_m2
+    if too_much:
         height = rise(frame, before_mm)[foreign]
         return finding("extra", float(np.nanpercentile(height, 95)), foreign)
-    if shift_m > limits.moved_m or abs(turn) > limits.turned_rad:
+    if tilt_of(pose) > limits.tipped_rad:
+        return finding("tipped", _higher(surface, pose), np.isfinite(rendered))
+    if off:
         return finding("moved", shift_m, np.isfinite(rendered))
     if bent_m2 >= limits.deformed_m2:
         return finding("deformed", float(np.percentile(np.abs(difference[bent]), 95)), bent)
@@ -182,7 +216,10 @@ def depth_difference(frame: DepthFrame, rendered_m: Image, limits: Limits) -> tu
 
 
 def _missing(
-    expected_m: Image, before_mm: npt.NDArray[np.uint16], frame: DepthFrame, planned: Pose
+    expected_m: Image,
+    before_mm: npt.NDArray[np.uint16 | np.float32],
+    frame: DepthFrame,
+    planned: Pose,
 ) -> Finding:
     region = np.isfinite(expected_m)
     height = metres(before_mm)[region] - expected_m[region]
@@ -192,6 +229,7 @@ def _missing(
         area_mm2=1e6 * float(_areas_of(expected_m, frame).sum()),
         shift_mm=0.0,
         turn_deg=0.0,
+        tilt_deg=0.0,
         tray_from_product=planned,
         region=region,
     )
@@ -202,6 +240,27 @@ def _foreign(pieces: list[Piece], product: Mask, limits: Limits) -> Mask:
     beside = ~_grown(product, limits.beside_px)
     every = np.any([piece.mask for piece in pieces], axis=0)
     return np.asarray(every & beside)
+
+
+def _tipped(piece: Piece, surface: Surface, upright: Registration, limits: Limits) -> Pose | None:
+    """Return the pose of a package that leans or lies; None if it stands, whatever its shape."""
+    found = leaning(piece.cloud, surface, upright.tray_from_product)
+    if tilt_of(found.tray_from_product) <= limits.tipped_rad:
+        return None
+    clearly = found.distance_m < min(LEANS_M, LEANS_CLEARLY * upright.distance_m)
+    return found.tray_from_product if clearly else None
+
+
+def _beside(surface: Surface, pose: Pose, planned: Pose) -> float:
+    """Return how far the middle of a product is beside where it should be, metres."""
+    middle = (surface.vertices_m.min(axis=0) + surface.vertices_m.max(axis=0))[None] / 2.0
+    return float(np.hypot(*(moved(middle, pose) - moved(middle, planned))[0, :2]))
+
+
+def _higher(surface: Surface, pose: Pose) -> float:
+    """Return how far the highest point of a product is off its height, metres."""
+    top = float(moved(surface.vertices_m, pose)[:, 2].max())
+    return abs(top - float(surface.vertices_m[:, 2].max()))
 
 
 def _largest_blob(mask: Mask, area_m2: Image) -> Mask:

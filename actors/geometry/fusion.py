@@ -37,6 +37,12 @@ POSE_PRIOR_M: Final = 0.001
 POSE_PRIOR_RAD: Final = 0.003
 """The same for rotations: 1.4 mm at 0.45 m."""
 
+STEEP_COS: Final = 0.7
+STEEP_SHARE: Final = 0.05
+FLAT_SHARE: Final = 0.3
+"""A pose by the plate is off by 0.05 mm where the sensor looks down by more than 45 degrees, by 0.3
+mm where the plate's far edge is seen flat: shares of the priors above."""
+
 PAIR_REACH_M: Final = 0.006
 """Points of two views that lie farther apart are no pair: twice what pose and noise can do."""
 
@@ -61,6 +67,7 @@ def fuse_views(
     acquisitions: Sequence[Acquisition],
     *,
     voxel_m: float = VOXEL_M,
+    by_plate: bool = False,
 ) -> Surface:
     """Merge the surfaces of single views into the complete surface of a product.
 
@@ -68,6 +75,7 @@ def fuse_views(
         views: At least one, each in its camera's frame, from `reconstruct_view`.
         acquisitions: Camera and pose of each view; the world is the product frame.
         voxel_m: Edge of the fusion grid in metres, > 0.
+        by_plate: Whether the poses are those of `plate.seen_from`.
 
     Returns:
         Surface in the product frame, outward normals, closed but for its foot on z = 0.
@@ -80,7 +88,8 @@ def fuse_views(
             f"asked for views with a pose each, found {len(views)} views and"
             f" {len(acquisitions)} poses"
         )
-    poses = refined_poses(views, [each.world_from_camera for each in acquisitions])
+    reported = [each.world_from_camera for each in acquisitions]
+    poses = refined_poses(views, reported, by_plate=by_plate)
     seen = np.concatenate(
         [
             moved(view.vertices_m[np.unique(view.triangles)], pose)
@@ -113,7 +122,7 @@ def fuse_views(
 
 
 def refined_poses(
-    views: Sequence[Surface], poses: Sequence[Pose], *, rounds: int = 4
+    views: Sequence[Surface], poses: Sequence[Pose], *, rounds: int = 4, by_plate: bool = False
 ) -> list[Pose]:
     """Fit the views to each other, starting from and held by their acquisition poses.
 
@@ -123,6 +132,7 @@ def refined_poses(
         views: Surfaces in their camera frames.
         poses: world_from_camera of each, (4, 4), metres.
         rounds: How often each view moves.
+        by_plate: Whether the poses are those of `plate.seen_from`: far more certain.
 
     Returns:
         world_from_camera of each view, refined.
@@ -166,6 +176,7 @@ def refined_poses(
                     np.concatenate(targets),
                     np.concatenate(target_normals),
                     drift,
+                    _certainty(np.asarray(poses[number])) if by_plate else 1.0,
                 )
                 refined[number] = step @ refined[number]
     return _without_common_drift(refined, poses)
@@ -195,7 +206,12 @@ def vertex_normals(
     return np.asarray(normals / np.where(length > 0.0, length, 1.0))
 
 
-def _step(sources: Pose, targets: Pose, normals: Pose, drift: Pose) -> Pose:
+def _certainty(pose: Pose) -> float:
+    """Return what the spread expected of a pose by the plate is, in those of the robot."""
+    return STEEP_SHARE if abs(pose[2, 2]) > STEEP_COS else FLAT_SHARE
+
+
+def _step(sources: Pose, targets: Pose, normals: Pose, drift: Pose, share: float) -> Pose:
     """Solve one Gauss-Newton step, point to plane with a prior; return the motion in the world.
 
     The rotation turns about the centre of the points: about the origin of the world, or the
@@ -209,7 +225,7 @@ def _step(sources: Pose, targets: Pose, normals: Pose, drift: Pose) -> Pose:
     weight = 1.0 / (1.0 + (error / (2.0 * spread)) ** 2)
     # Pairs of one patch share their error, so that thousands of them are no thousand witnesses.
     weight *= 100.0 / len(error) / spread**2
-    prior = np.repeat([POSE_PRIOR_RAD**-2, POSE_PRIOR_M**-2], 3)
+    prior = np.repeat([POSE_PRIOR_RAD**-2, POSE_PRIOR_M**-2], 3) / share**2
     from scipy.spatial.transform import Rotation
 
     turned = Rotation.from_matrix(drift[:3, :3]).as_rotvec()
@@ -223,12 +239,16 @@ def _step(sources: Pose, targets: Pose, normals: Pose, drift: Pose) -> Pose:
 
 
 def _without_common_drift(refined: Sequence[Pose], poses: Sequence[Pose]) -> list[Pose]:
-    """Take out what all views moved together: no pair of views can know it, the robot does."""
+    """Take out what all views moved together: no pair of views can know it, their poses do.
+
+    Views from above count most: what flat ones know of the plate's edges is off by ten times more.
+    """
     from scipy.spatial.transform import Rotation
 
     drifts = [after @ inverse(before) for after, before in zip(refined, poses, strict=True)]
-    turn = Rotation.from_matrix([drift[:3, :3] for drift in drifts]).mean()
-    shift = np.mean([drift[:3, 3] for drift in drifts], axis=0)
+    weights = [max(float(abs(pose[2, 2])), 0.1) ** 4 for pose in poses]
+    turn = Rotation.from_matrix([drift[:3, :3] for drift in drifts]).mean(weights)
+    shift = np.average([drift[:3, 3] for drift in drifts], axis=0, weights=weights)
     common = np.eye(4)
     common[:3, :3], common[:3, 3] = turn.as_matrix(), shift
     return [inverse(common) @ pose for pose in refined]

@@ -3,8 +3,10 @@
 expected pose and six turns -> ICP (point to plane, Tukey) -> outline onto outline, seen from above
 -> of the turns that explain the cloud equally well the one nearest to the expected
 
-Rules a change must keep: the result has three freedoms. Six let a dent pass as a tilt: measured,
-crushes of 10 % were found in 1 of 10 cases with six and in 10 of 10 with three.
+What does not stand, `leaning` finds with six freedoms.
+
+Rules a change must keep: the result of `register` has three freedoms. Six let a dent pass as a
+tilt: measured, crushes of 10 % were found in 1 of 10 cases with six and in 10 of 10 with three.
 The outline decides x, y and yaw, since damage on top leaves it alone: distances to the surface
 drew a carton crushed by 20 % out of its place by 7 to 11 mm, outlines by 1.
 """
@@ -16,18 +18,20 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from actors.geometry.depth import points_grid
 from actors.geometry.fusion import vertex_normals
 from actors.geometry.open3d_arrays import point_cloud, tensor
 from actors.geometry.open3d_on_use import open3d
-from actors.geometry.poses import inverse, moved, on_tray, yaw_between, yaw_of
-from actors.geometry.rendering import ray_scene
+from actors.geometry.poses import inverse, moved, on_tray, turned, yaw_between, yaw_of
+from actors.geometry.rendering import ray_scene, render_depth
+from actors.geometry.segmentation import RISE_MIN_M, outline_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     import numpy.typing as npt
 
-    from actors.geometry.shapes import PointCloud, Surface
+    from actors.geometry.shapes import Acquisition, PointCloud, Surface
 
     Pose = npt.NDArray[np.float64]
 
@@ -36,6 +40,9 @@ TURNS: Final = 6
 
 POINTS_MAX: Final = 1000
 """Points that take part; more change the pose by less than 0.1 mm."""
+
+SEED_POINTS: Final = 250
+"""Points that tell which of many seeds is worth more."""
 
 INLIER_M: Final = 0.004
 """Scale of the robust losses: twice the sensor's spread at the tray."""
@@ -49,6 +56,13 @@ OUTLINE_CELL_M: Final = 0.001
 
 OUTLINE_MARGIN_M: Final = 0.05
 """How far around the product the distances reach; farther points count like the border."""
+
+STANDING: Final = ((0.0, 0.0),)
+LYING: Final = tuple(
+    (quarters[0] * np.pi / 2.0, quarters[1] * np.pi / 2.0)
+    for quarters in ((1, 0), (-1, 0), (0, 1), (0, -1), (2, 0))
+)
+"""Roll and pitch of a product on its foot; on its sides and its head."""
 
 HEIGHTS_M: Final = (0.0, -0.005, -0.01, -0.015, -0.02)
 """Heights tried when turns are compared: a crushed package is lower, but turned no differently."""
@@ -68,7 +82,12 @@ class Registration:
 
 
 def register(
-    cloud: PointCloud, outline_m: npt.NDArray[np.floating], surface: Surface, expected: Pose
+    cloud: PointCloud,
+    outline_m: npt.NDArray[np.floating],
+    surface: Surface,
+    expected: Pose,
+    *,
+    seen_by: Acquisition | None = None,
 ) -> Registration:
     """Find where on the tray a product stands.
 
@@ -77,6 +96,8 @@ def register(
         outline_m: (K, 2), the points along its outline, tray frame, metres.
         surface: Its trained surface, product frame.
         expected: tray_from_product as planned, (4, 4).
+        seen_by: The camera that saw the outline, and its pose in the tray frame; takes out what
+            outlines are off in its images.
 
     Returns:
         The pose, and how well the cloud lies on the surface there.
@@ -93,10 +114,14 @@ def register(
     fitted = distinct([field.fitted(outline_m, pose) for pose in rough])
     finals = [Registration(pose, mean_distance(scene, points, pose)) for pose in fitted]
     best_m = min(each.distance_m for each in finals)
-    return min(
+    found = min(
         (each for each in finals if each.distance_m < best_m + EQUAL_COST_M),
         key=lambda each: abs(yaw_between(yaw_of(expected), yaw_of(each.tray_from_product))),
     )
+    if seen_by is None:
+        return found
+    pose = field.without_bias(surface, found.tray_from_product, seen_by)
+    return Registration(pose, found.distance_m)
 
 
 class OutlineField:
@@ -120,8 +145,10 @@ class OutlineField:
         rays[..., 2], rays[..., 5] = surface.vertices_m[:, 2].max() + 0.1, -1.0
         hit = np.isfinite(scene.cast_rays(tensor(rays))["t_hit"].numpy())
         inside = binary_closing(hit, iterations=2) | hit
-        outwards = distance_transform_edt(~inside) + distance_transform_edt(inside) - 0.5
-        self._distance_m = OUTLINE_CELL_M * outwards
+        outwards = distance_transform_edt(~inside) - distance_transform_edt(inside)
+        # The outline runs between the last point inside and the first outside.
+        self._distance_m = OUTLINE_CELL_M * (outwards - 0.5 * np.sign(outwards))
+        self._slope = np.gradient(self._distance_m, OUTLINE_CELL_M)[::-1]
 
     def fitted(self, outline_m: npt.NDArray[np.floating], start: Pose) -> Pose:
         """Return the upright pose near `start` that puts points onto the outline, robustly.
@@ -134,34 +161,63 @@ class OutlineField:
         from scipy.optimize import least_squares
 
         centre = outline_m.mean(axis=0)
+        back = inverse(start)
 
-        def pose_of(freedoms: Pose) -> Pose:
+        def local(freedoms: Pose) -> tuple[Pose, Pose, Pose]:
             # Turning about the middle of the points keeps the freedoms independent.
-            turn = on_tray(0.0, 0.0, freedoms[2])
-            turn[:2, 3] = centre + freedoms[:2] - turn[:2, :2] @ centre
-            return np.asarray(turn @ start)
+            turn = back[:2, :2] @ on_tray(0.0, 0.0, -freedoms[2])[:2, :2]
+            beside = outline_m - centre - freedoms[:2]
+            at = beside @ turn.T + back[:2, :2] @ centre + back[:2, 3]
+            return turn, beside, (at - self._low).T[::-1] / OUTLINE_CELL_M
 
         def distances(freedoms: Pose) -> Pose:
-            pose = inverse(pose_of(freedoms))
-            local = outline_m @ pose[:2, :2].T + pose[:2, 3]
-            cell = (local - self._low) / OUTLINE_CELL_M
-            return np.asarray(
-                map_coordinates(self._distance_m, cell.T[::-1], order=1, mode="nearest")
+            cell = local(freedoms)[2]
+            return np.asarray(map_coordinates(self._distance_m, cell, order=1, mode="nearest"))
+
+        def slopes(freedoms: Pose) -> Pose:
+            turn, beside, cell = local(freedoms)
+            slope = np.stack(
+                [map_coordinates(each, cell, order=1, mode="nearest") for each in self._slope], 1
             )
+            round_it = np.column_stack([beside[:, 1], -beside[:, 0]]) @ turn.T
+            return np.column_stack([-slope @ turn, np.einsum("ij,ij->i", slope, round_it)])
 
         solved = least_squares(
             distances,
             np.zeros(3),
+            jac=slopes,
             loss="arctan",
             f_scale=0.004,
-            diff_step=1e-3,
             x_scale=[0.01, 0.01, 0.1],
-            max_nfev=30,
-            xtol=1e-4,
-            ftol=1e-4,
+            max_nfev=40,
+            xtol=1e-6,
+            ftol=1e-6,
         )
-        pose = pose_of(solved.x)
+        found = on_tray(0.0, 0.0, solved.x[2])
+        found[:2, 3] = centre + solved.x[:2] - found[:2, :2] @ centre
+        pose = found @ start
         return on_tray(pose[0, 3], pose[1, 3], yaw_of(pose))
+
+    def without_bias(self, surface: Surface, pose: Pose, seen_by: Acquisition) -> Pose:
+        """Return a fitted pose without what fitting outlines of this product is off there.
+
+        An outline in an image is not quite that from right above: walls are seen aslant, and low
+        parts count as ground. What the fit makes of the product's own image tells by how much.
+
+        Args:
+            surface: Product frame.
+            pose: What `fitted` found.
+            seen_by: The camera that saw the outline, and its pose in the tray frame.
+        """
+        depth_m = render_depth([(surface, pose)], seen_by)
+        world = points_grid(depth_m, seen_by.camera) @ seen_by.world_from_camera[:3, :3].T
+        world += seen_by.world_from_camera[:3, 3]
+        with np.errstate(invalid="ignore"):
+            outline = outline_of(world[..., 2] > RISE_MIN_M)
+        if not outline.any():
+            return pose
+        again = self.fitted(world[outline][:, :2].astype(float), pose)
+        return np.asarray(pose @ inverse(again) @ pose)
 
 
 def _seeds(surface: Surface, centre_m: Pose, expected: Pose) -> list[Pose]:
@@ -174,6 +230,74 @@ def _seeds(surface: Surface, centre_m: Pose, expected: Pose) -> list[Pose]:
         shift = centre_m[:2] - on_tray(0.0, 0.0, yaw)[:2, :2] @ middle
         seeds.append(on_tray(shift[0], shift[1], yaw))
     return seeds
+
+
+def leaning(cloud: PointCloud, surface: Surface, upright: Pose) -> Registration:
+    """Find how a product lies that does not stand: six freedoms.
+
+    Starts from the upright pose and from the product on its foot, then on its sides and its head,
+    turned by multiples of 45 degrees.  To be asked only where an upright product does not explain
+    the cloud.
+
+    Args:
+        cloud: Its points, tray frame, metres; at least one.
+        surface: Its trained surface, product frame.
+        upright: tray_from_product as `register` found it.
+
+    Returns:
+        The pose; its distance is to the surface as posed, not lowered, and more the farther its
+        lowest point is from the tray: a lifted product looks like one that lies on its side.
+    """
+    random = np.random.default_rng(0)
+    points = cloud.points_m[random.permutation(len(cloud))[:POINTS_MAX]].astype(float)
+    scene = ray_scene(surface.vertices_m, surface.triangles)
+    normals = vertex_normals(surface.vertices_m, surface.triangles)
+    rough = point_cloud(points[:SEED_POINTS]), point_cloud(surface.vertices_m[::6], normals[::6])
+    fine = point_cloud(points), point_cloud(surface.vertices_m, normals)
+    middle = points.mean(axis=0)
+
+    def fitted(pose: Pose, clouds: tuple[Any, Any], rounds: int) -> Registration:
+        free = _free_icp(*clouds, pose, rounds)
+        lowest_m = abs(float((surface.vertices_m @ free[2, :3]).min() + free[2, 3]))
+        hovers_m = 0.1 * max(0.0, lowest_m - 0.005)
+        return Registration(free, _clipped(scene, points, free) + hovers_m)
+
+    found: list[Registration] = []
+    for seeds in (
+        [upright, *_resting(surface, middle, STANDING)],
+        _resting(surface, middle, LYING),
+    ):
+        found += [fitted(seed, rough, 15) for seed in seeds]
+        found.sort(key=lambda each: each.distance_m)
+        found = [fitted(each.tray_from_product, fine, 40) for each in found[:3]]
+        if min(each.distance_m for each in found) < INLIER_M / 2.0:
+            break
+    return min(found, key=lambda each: each.distance_m)
+
+
+def tilt_of(pose: Pose) -> float:
+    """Return the angle between a pose's z axis and the vertical, radians, 0 … pi."""
+    return float(np.arctan2(np.hypot(pose[0, 2], pose[1, 2]), pose[2, 2]))
+
+
+def _resting(surface: Surface, middle_m: Pose, rests: Sequence[tuple[float, float]]) -> list[Pose]:
+    """Return a product at rest on some of its sides, in eight turns, on the tray.
+
+    Args:
+        surface: Product frame.
+        middle_m: (2,) or more, what its middle is over.
+        rests: Roll and pitch of each side.
+    """
+    centre = (surface.vertices_m.min(axis=0) + surface.vertices_m.max(axis=0)) / 2.0
+    poses = []
+    for roll, pitch in rests:
+        for turn in range(8):
+            pose = np.eye(4)
+            pose[:3, :3] = turned(roll, pitch, turn * np.pi / 4.0)
+            pose[:2, 3] = middle_m[:2] - (pose[:3, :3] @ centre)[:2]
+            pose[2, 3] = -float((surface.vertices_m @ pose[2, :3]).min())
+            poses.append(pose)
+    return poses
 
 
 def distinct(poses: Sequence[Pose]) -> list[Pose]:
@@ -197,6 +321,12 @@ def upright_icp(source: Any, target: Any, seed: Pose) -> Pose:
         target: Open3D cloud of the surface with normals, product frame.
         seed: tray_from_product to start from.
     """
+    pose = _free_icp(source, target, seed, 15)
+    return on_tray(pose[0, 3], pose[1, 3], yaw_of(pose))
+
+
+def _free_icp(source: Any, target: Any, seed: Pose, rounds: int) -> Pose:
+    """Return what ICP with six freedoms makes of a seed pose; arguments as of `upright_icp`."""
     registration = open3d().pipelines.registration
     found = registration.registration_icp(
         source,
@@ -204,10 +334,9 @@ def upright_icp(source: Any, target: Any, seed: Pose) -> Pose:
         0.03,
         inverse(seed),
         registration.TransformationEstimationPointToPlane(registration.TukeyLoss(k=INLIER_M * 2.0)),
-        registration.ICPConvergenceCriteria(max_iteration=15),
+        registration.ICPConvergenceCriteria(max_iteration=rounds),
     )
-    pose = inverse(np.asarray(found.transformation))
-    return on_tray(pose[0, 3], pose[1, 3], yaw_of(pose))
+    return inverse(np.asarray(found.transformation))
 
 
 def mean_distance(scene: Any, points_m: Pose, pose: Pose) -> float:
@@ -225,9 +354,13 @@ def mean_distance(scene: Any, points_m: Pose, pose: Pose) -> float:
     for height_m in HEIGHTS_M:
         lowered = pose.copy()
         lowered[2, 3] += height_m
-        clipped = np.minimum(_distances(scene, points_m, lowered), 3.0 * INLIER_M)
-        means.append(float(clipped.mean()))
+        means.append(_clipped(scene, points_m, lowered))
     return min(means)
+
+
+def _clipped(scene: Any, points_m: Pose, pose: Pose) -> float:
+    """Return the mean distance of points to a placed surface, each clipped at 3 x `INLIER_M`."""
+    return float(np.minimum(_distances(scene, points_m, pose), 3.0 * INLIER_M).mean())
 
 
 def _distances(scene: Any, points_m: Pose, pose: Pose) -> Pose:

@@ -57,7 +57,7 @@ class Piece:
     centre_m: npt.NDArray[np.float64]
 
 
-def new_pieces(frame: DepthFrame, before_mm: npt.NDArray[np.uint16]) -> list[Piece]:
+def new_pieces(frame: DepthFrame, before_mm: npt.NDArray[np.uint16 | np.float32]) -> list[Piece]:
     """Return the pieces that are in a frame and were not there before, the largest first.
 
     Args:
@@ -65,7 +65,7 @@ def new_pieces(frame: DepthFrame, before_mm: npt.NDArray[np.uint16]) -> list[Pie
         before_mm: (H, W) uint16, the same camera's image before (the empty tray, or the last
             stop), millimetres.
     """
-    from scipy.ndimage import binary_erosion, binary_opening, label
+    from scipy.ndimage import binary_opening, label
 
     rise_m = rise(frame, before_mm)
     with np.errstate(invalid="ignore"):
@@ -85,13 +85,22 @@ def new_pieces(frame: DepthFrame, before_mm: npt.NDArray[np.uint16]) -> list[Pie
             break
         mask = labels == number
         cloud = points[mask & raised]
-        outline = points[mask & raised & ~binary_erosion(mask)][:, :2].astype(float)
+        outline = points[raised & outline_of(mask)][:, :2].astype(float)
         centre = cloud.mean(axis=0, dtype=float)
         pieces.append(Piece(mask, PointCloud(cloud), outline, float(areas[number]), centre))
     return pieces
 
 
-def rise(frame: DepthFrame, before_mm: npt.NDArray[np.uint16]) -> npt.NDArray[np.float32]:
+def outline_of(mask: Mask) -> Mask:
+    """Return the outermost pixels of a mask."""
+    from scipy.ndimage import binary_erosion
+
+    return np.asarray(mask & ~binary_erosion(mask))
+
+
+def rise(
+    frame: DepthFrame, before_mm: npt.NDArray[np.uint16 | np.float32]
+) -> npt.NDArray[np.float32]:
     """Return how much nearer to the sensor each pixel is than before, (H, W) float32, metres."""
     now, before = (median_known(metres(each), 5) for each in (frame.depth_mm, before_mm))
     return np.asarray(before - now, np.float32)

@@ -123,7 +123,9 @@ def _recognised(
     for product, surface in models.items():
         if abs(float(surface.vertices_m[:, 2].max()) - top_m) > HEIGHT_OFF_M:
             continue
-        pose = register(piece.cloud, piece.outline_m, surface, expected).tray_from_product
+        pose = register(
+            piece.cloud, piece.outline_m, surface, expected, seen_by=frame.acquisition
+        ).tray_from_product
         rendered_m = render_depth([(surface, pose)], frame.acquisition)
         sight = BeltSight(product, pose, _misfit(seen_m, rendered_m, piece.mask))
         if not best.product or sight.misfit_m < best.misfit_m:

@@ -33,6 +33,7 @@ import sys
 import time
 from collections import Counter
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -40,8 +41,11 @@ import numpy as np
 from actors.geometry.depth_reconstruction import reconstruct_view
 from actors.geometry.deviation import VERDICTS, Finding, Limits, inspect_place
 from actors.geometry.fusion import fuse_views
+from actors.geometry.plate import seen_from
 from actors.geometry.segmentation import product_on_plate
 from actors.palletizing.pallet import tray_of
+from actors.palletizing.sensor import PLATE_M, steady
+from actors.palletizing.simulation.noise import DARK, Light
 from actors.palletizing.simulation.packages import (
     KINDS,
     VERDICT_OF_KIND,
@@ -85,17 +89,21 @@ class Case:
         return 1000.0 * float(np.hypot(*(found[:2, 3] - true[:2, 3])))
 
 
-def train(product: str, sensor: OrbitSensor, *, views: int = 14) -> Surface:
+def train(product: str, sensor: OrbitSensor, *, views: int = 14, frames: int = 1) -> Surface:
     """Return the complete surface of a product from an orbit around it.
 
     Args:
         product: Name of the product on the plate.
         sensor: Eye-in-hand depth sensor.
         views: How many viewpoints the orbit has.
+        frames: How many images are fused at each.
     """
-    frames = [sensor.capture(product, number, views) for number in range(views)]
-    surfaces = [reconstruct_view(product_on_plate(f), f.acquisition.camera) for f in frames]
-    return fuse_views(surfaces, [frame.acquisition for frame in frames])
+    seen = [
+        steady(partial(sensor.capture, product, number, views), frames=frames)
+        for number in range(views)
+    ]
+    surfaces = [reconstruct_view(product_on_plate(f), f.acquisition.camera) for f in seen]
+    return fuse_views(surfaces, [seen_from(frame, PLATE_M) for frame in seen], by_plate=True)
 
 
 def judge(
@@ -104,6 +112,8 @@ def judge(
     *,
     seed: int,
     limits: Limits | None = None,
+    frames: int = 1,
+    light: Light = DARK,
 ) -> list[Case]:
     """Inspect a sequence of packages, one per stop, and keep what was found.
 
@@ -112,14 +122,16 @@ def judge(
         models: Trained surface of each product.
         seed: Seed of the sensor's noise.
         limits: Of the inspection; the calibrated ones when absent.
+        frames: How many images are fused at each stop.
+        light: Around the sensor.
     """
-    sensor = SimulatedTraySensor(packages, seed=seed)
-    empty_mm = sensor.capture_empty().depth_mm
+    sensor = SimulatedTraySensor(packages, seed=seed, light=light)
+    empty_mm = steady(sensor.capture_empty, frames=frames).depth_mm
     cases, before_mm = [], empty_mm
     for stop, package in enumerate(packages):
         if stop == 0 or tray_of(stop) != tray_of(stop - 1):
             before_mm = empty_mm
-        frame = sensor.capture(stop)
+        frame = steady(partial(sensor.capture, stop), frames=frames)
         start = time.perf_counter()
         finding = inspect_place(
             frame, before_mm, models[package.product], package.planned, limits=limits

@@ -29,6 +29,9 @@ class Fusion(Actor):
 
     One update per view, which looks at the views of its product alone: whatever an update looks at
     counts as a cause of the surface.
+
+    Args:
+        by_plate: Whether training perception knows its viewpoints by the plate.
     """
 
     training = World("training")
@@ -39,6 +42,9 @@ class Fusion(Actor):
     models = WriteEach(training, PRODUCTS, SURFACE)
     newest = WriteEach(training, PRODUCTS, NEWEST_VIEW)
     triggers = (new,)
+
+    def __init__(self, *, by_plate: bool = True) -> None:
+        self.by_plate = by_plate
 
     def update(self, lock: Lock) -> None:
         """Fuse the product of the view, if its scan is complete and newer than its surface."""
@@ -53,5 +59,6 @@ class Fusion(Actor):
             lock[self.models][product] = fuse_views(
                 [surfaces[view] for view in seen],
                 [viewpoints[view].acquisition for view in seen],
+                by_plate=self.by_plate,
             )
             lock[self.newest][product] = newest_ns

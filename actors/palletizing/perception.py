@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import time
+from functools import partial
 from typing import TYPE_CHECKING
 
+from actors.geometry.plate import seen_from
 from actors.geometry.segmentation import assigned, footprint_pose, new_pieces, product_on_plate
-from actors.palletizing.sensor import open_sensor
+from actors.palletizing.sensor import PLATE_M, open_sensor, steady
 from actors.palletizing.vocabulary import (
     CLOUD,
     CONVEYOR,
@@ -45,6 +47,9 @@ class TrainingPerception(Actor):
     Args:
         sensor: Address of the eye-in-hand sensor (`OrbitSensor`), see `open_sensor`.
         tray_sensor: Address of the overhead sensor (`TraySensor`), for the empty tray.
+        plate_m: Edge of the square plate that products stand on, metres, by which the pose of a
+            view is known better than by the robot; 0 if the plate's edges cannot be seen.
+        frames: How many images are fused at each viewpoint.
     """
 
     training = World("training")
@@ -54,7 +59,10 @@ class TrainingPerception(Actor):
     empty = Write(training, TRAY, EMPTY)
     every_s = 0.1
 
-    def __init__(self, sensor: str, tray_sensor: str) -> None:
+    def __init__(
+        self, sensor: str, tray_sensor: str, plate_m: float = PLATE_M, frames: int = 4
+    ) -> None:
+        self.plate_m, self.frames = plate_m, frames
         self.sensor: OrbitSensor = open_sensor(sensor)
         self.tray_sensor: TraySensor = open_sensor(tray_sensor)
 
@@ -69,8 +77,10 @@ class TrainingPerception(Actor):
             for number in range(wanted):
                 view = view_entity(name, number)
                 if view not in done:
-                    frame, now_ns = self.sensor.capture(name, number, wanted), time.time_ns()
-                    cloud, viewpoint = product_on_plate(frame), Viewpoint(frame.acquisition, now_ns)
+                    capture = partial(self.sensor.capture, name, number, wanted)
+                    frame, now_ns = steady(capture, frames=self.frames), time.time_ns()
+                    taken = seen_from(frame, self.plate_m) if self.plate_m else frame.acquisition
+                    cloud, viewpoint = product_on_plate(frame), Viewpoint(taken, now_ns)
                     lock[self.clouds].put(view, cloud, stamp_ns=now_ns)
                     lock[self.viewpoints].put(view, viewpoint, stamp_ns=now_ns)
                     return

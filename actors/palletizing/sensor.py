@@ -20,6 +20,10 @@ if TYPE_CHECKING:
 FRAMES: Final = 8
 """Images that are fused into one: 0.27 s of a sensor that takes 30 a second."""
 
+PLATE_M: Final = 0.36
+"""Edge of the square plate that a product is scanned on: so small that a sensor 0.45 m above sees
+its edges, by which each view knows better than the robot where it was taken from."""
+
 
 def steady(capture: Callable[[], DepthFrame], *, frames: int = FRAMES) -> DepthFrame:
     """Return one image of several that are taken one after the other.
@@ -50,7 +54,8 @@ class TraySensor(Protocol):
 class OrbitSensor(Protocol):
     """A depth sensor in the hand of a robot that orbits one product on a plate.
 
-    The world of its poses is the product frame: origin on the plate, z up.
+    The world of its poses is the product frame: origin in the middle of the plate, z up, the plate
+    square with its edges along x and y.
     """
 
     def capture(self, product: str, view: int, views: int) -> DepthFrame:

@@ -10,6 +10,7 @@ dropouts   1 % of all pixels                              independent
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -23,12 +24,31 @@ LATERAL_PX: Final = 0.5
 DROPOUT_SHARE: Final = 0.01
 
 
-def sensed(depth_m: npt.NDArray[np.float32], random: np.random.Generator) -> npt.NDArray[np.uint16]:
+@dataclass(frozen=True, slots=True)
+class Light:
+    """What light does to the sensor: its pattern pales, noise and dropouts grow.
+
+    Attributes:
+        noise: Axial noise, in that of the sensor in the dark.
+        dropout_share: Share of the pixels that know nothing.
+    """
+
+    noise: float = 1.0
+    dropout_share: float = DROPOUT_SHARE
+
+
+DARK: Final = Light()
+
+
+def sensed(
+    depth_m: npt.NDArray[np.float32], random: np.random.Generator, light: Light = DARK
+) -> npt.NDArray[np.uint16]:
     """Return what the sensor reports for a true depth image.
 
     Args:
         depth_m: (H, W) float32, metres, NaN where nothing is hit.
         random: Source of the noise; the same state gives the same image.
+        light: Around the sensor.
 
     Returns:
         (H, W) uint16, millimetres, 0 where unknown.
@@ -41,6 +61,6 @@ def sensed(depth_m: npt.NDArray[np.float32], random: np.random.Generator) -> npt
     column = np.clip(np.arange(width)[None, :] + column_shift, 0, width - 1)
     seen = depth_m[row, column]
     noise = random.standard_normal((height, width), np.float32)
-    seen = seen + noise * spread_m(seen).astype(np.float32)
-    seen[random.random((height, width), np.float32) < DROPOUT_SHARE] = np.nan
+    seen = seen + noise * (light.noise * spread_m(seen)).astype(np.float32)
+    seen[random.random((height, width), np.float32) < light.dropout_share] = np.nan
     return millimetres(seen)

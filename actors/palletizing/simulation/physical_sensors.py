@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final, Protocol
 import numpy as np
 
 from actors.geometry.kinematics import link_poses
-from actors.geometry.poses import inverse, looking_at, moved
+from actors.geometry.poses import inverse, moved
 from actors.geometry.shapes import VGA, Acquisition, DepthFrame
 from actors.palletizing.simulation.cell_scene import (
     ARM,
@@ -36,6 +36,7 @@ from actors.palletizing.simulation.sensors import (
     OVERHEAD_M,
     Repeats,
     captured,
+    looking_down,
     shifted,
     tray_meshes,
     true_depth,
@@ -143,7 +144,7 @@ class PhysicalTraySensor(_FixedSensor):
         self, shown: Callable[[], ShownCell], *, seed: int, layout: CellLayout | None = None
     ) -> None:
         layout = layout or CellLayout()
-        true = looking_at(np.array([0.0, 0.0, OVERHEAD_M]), np.zeros(3))
+        true = looking_down(np.array([0.0, 0.0, OVERHEAD_M]))
         super().__init__(shown, layout, layout.base_from_tray, true, seed)
 
 
@@ -163,8 +164,7 @@ class PhysicalBeltSensor(_FixedSensor):
         self, shown: Callable[[], ShownCell], *, seed: int, layout: CellLayout | None = None
     ) -> None:
         layout = layout or CellLayout()
-        target = np.array([BELT_LOOKS_AT_M, 0.0, 0.0])
-        true = looking_at(np.array([BELT_LOOKS_AT_M, 0.0, BELT_OVERHEAD_M]), target)
+        true = looking_down(np.array([BELT_LOOKS_AT_M, 0.0, BELT_OVERHEAD_M]))
         super().__init__(shown, layout, layout.base_from_belt, true, seed + 1_000_003)
 
     def _reported(self, shown: ShownCell) -> Acquisition:

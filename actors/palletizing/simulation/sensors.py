@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from actors.geometry.poses import inverse, looking_at, moved, small_motion
+from actors.geometry.poses import inverse, looking_at, moved, on_tray, small_motion
 from actors.geometry.rendering import cast, directions, ray_scene
 from actors.geometry.shapes import VGA, Acquisition, DepthFrame
-from actors.palletizing.simulation.noise import sensed
+from actors.palletizing.sensor import PLATE_M
+from actors.palletizing.simulation.noise import DARK, Light, sensed
 from actors.palletizing.simulation.packages import (
     DEMO_PRODUCTS,
     Package,
@@ -52,6 +53,12 @@ ROBOT_SPREAD_RAD: Final = 0.0015
 """The same as rotation per axis: 0.7 mm at the distance of the orbit."""
 
 
+OVERHEAD_ASKEW_RAD: Final = float(np.deg2rad(8.0))
+ASKEW_RAD: Final = float(np.deg2rad(10.0))
+"""How far sensors are turned against plate and tray: an edge that runs along a row of pixels is
+known to a pixel only, one that crosses ten rows to a tenth."""
+
+
 class Repeats:
     """Counts how often the same thing was looked at: each image of it has its own noise."""
 
@@ -72,16 +79,16 @@ class SimulatedTraySensor:
     Args:
         packages: What comes, one package per stop.
         seed: Seed of the noise.
+        light: Around it.
     """
 
-    def __init__(self, packages: Sequence[Package], *, seed: int) -> None:
+    def __init__(self, packages: Sequence[Package], *, seed: int, light: Light = DARK) -> None:
         self._packages = packages
         self._seed = seed
+        self._light = light
         self._stop = Repeats()
         self._last: tuple[int, npt.NDArray[np.float32]] | None = None
-        self._acquisition = Acquisition(
-            VGA, looking_at(np.array([0.0, 0.0, OVERHEAD_M]), np.zeros(3))
-        )
+        self._acquisition = Acquisition(VGA, looking_down(np.array([0.0, 0.0, OVERHEAD_M])))
 
     def capture_empty(self) -> DepthFrame:
         """Return an image of the tray with nothing on it."""
@@ -97,7 +104,7 @@ class SimulatedTraySensor:
             visible = on_the_tray(self._packages, stop) if stop >= 0 else []
             meshes = [*tray_meshes(), *(mesh for package in visible for mesh in package.meshes())]
             self._last = stop, true_depth(meshes, self._acquisition)
-        return DepthFrame(sensed(self._last[1], random), self._acquisition)
+        return DepthFrame(sensed(self._last[1], random, self._light), self._acquisition)
 
 
 class SimulatedOrbitSensor:
@@ -109,6 +116,8 @@ class SimulatedOrbitSensor:
 
     def __init__(self, *, seed: int) -> None:
         self._seed = seed
+        self._view = Repeats()
+        self._last: tuple[npt.NDArray[np.float32], Acquisition] | None = None
 
     def capture(self, product: str, view: int, views: int) -> DepthFrame:
         """Return the image of one viewpoint; its reported pose differs a little from the true one.
@@ -118,14 +127,18 @@ class SimulatedOrbitSensor:
             view: Number of the viewpoint.
             views: How many the orbit has.
         """
-        mesh = product_mesh(product)
-        random = np.random.default_rng([self._seed, view, *product.encode()])
-        centre = np.array([0.0, 0.0, mesh[0][:, 2].max() / 2.0])
-        reported = looking_at(centre + ORBIT_M * orbit_direction(view, views), centre)
-        error = random.standard_normal(6) * np.repeat([ROBOT_SPREAD_RAD, ROBOT_SPREAD_M], 3)
-        true = reported @ small_motion(error)
-        plate = shifted(box_mesh((0.6, 0.6, 0.02)), [0.0, 0.0, -0.02])
-        return captured([mesh, plate], Acquisition(VGA, true), Acquisition(VGA, reported), random)
+        again = self._view.again(view, views, *product.encode())[2 + len(product) :]
+        random = np.random.default_rng([self._seed, view, *product.encode(), *again])
+        if not again or self._last is None:  # the robot stands still while it takes more than one
+            mesh = product_mesh(product)
+            centre = np.array([0.0, 0.0, mesh[0][:, 2].max() / 2.0])
+            reported = looking_at(centre + ORBIT_M * orbit_direction(view, views), centre)
+            error = random.standard_normal(6) * np.repeat([ROBOT_SPREAD_RAD, ROBOT_SPREAD_M], 3)
+            true = Acquisition(VGA, reported @ small_motion(error))
+            plate = shifted(box_mesh((PLATE_M, PLATE_M, 0.02)), [0.0, 0.0, -0.02])
+            self._last = true_depth([mesh, plate], true), Acquisition(VGA, reported)
+        depth_m, acquisition = self._last
+        return DepthFrame(sensed(depth_m, random), acquisition)
 
 
 def orbit_direction(view: int, views: int) -> npt.NDArray[np.float64]:
@@ -145,7 +158,18 @@ def orbit_direction(view: int, views: int) -> npt.NDArray[np.float64]:
         turn, rise = 2.0 * np.pi * view / low, np.deg2rad(30.0 if view % 2 else 12.0)
     else:
         turn, rise = 2.0 * np.pi * (view - low + 0.5) / (views - 1 - low), np.deg2rad(60.0)
+    turn += ASKEW_RAD
     return np.array([np.cos(turn) * np.cos(rise), np.sin(turn) * np.cos(rise), np.sin(rise)])
+
+
+def looking_down(eye_m: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Return world_from_camera of a sensor that looks down, a little askew; see `ASKEW_RAD`.
+
+    Args:
+        eye_m: (3,), metres.
+    """
+    straight = looking_at(eye_m, eye_m * [1.0, 1.0, 0.0])
+    return straight @ on_tray(0.0, 0.0, OVERHEAD_ASKEW_RAD)
 
 
 def orbit_sensor(seed: str = "1") -> SimulatedOrbitSensor:

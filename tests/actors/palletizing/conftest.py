@@ -10,12 +10,12 @@ os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo chooses what draws when it i
 
 @pytest.fixture(scope="session")
 def trained():
-    """Return a function from a product's name to the surface that 14 noisy views of it give."""
+    """Return a function from a product's name to the surface that 14 views of it give, of four images each."""
     pytest.importorskip("open3d", exc_type=ImportError)
     from actors.palletizing.evaluation import train
     from actors.palletizing.simulation.sensors import SimulatedOrbitSensor
 
-    return lru_cache(lambda product: train(product, SimulatedOrbitSensor(seed=5)))
+    return lru_cache(lambda product: train(product, SimulatedOrbitSensor(seed=5), frames=4))
 
 
 @pytest.fixture(scope="session")

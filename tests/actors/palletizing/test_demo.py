@@ -14,6 +14,7 @@ import pytest
 
 pytest.importorskip("open3d", exc_type=ImportError)
 
+from actors.geometry.deviation import VERDICTS
 from actors.geometry.shapes import Surface
 from actors.palletizing.demo import SEED, run_demo
 from actors.palletizing.demo_cell import TEMPLATE, RunningCell, configured, watched_cell
@@ -111,7 +112,7 @@ def test_report_counts_wrong_verdicts_and_false_alarms():
     assert json.loads(report_bytes(rows, seed=SEED))["right"] == sum(row.correct for row in rows)
 
 
-@pytest.mark.parametrize("verdict", ["ok", "missing", "extra", "moved", "deformed"])
+@pytest.mark.parametrize("verdict", VERDICTS)
 def test_sentence_names_place_and_product(verdict):
     """Whatever was found, the user reads where and what."""
     text = sentence("place/3", flag(verdict))

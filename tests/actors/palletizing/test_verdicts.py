@@ -7,7 +7,12 @@ import pytest
 
 pytest.importorskip("open3d", exc_type=ImportError)
 
+from actors.geometry.deviation import inspect_place
+from actors.geometry.poses import moved, on_tray, small_motion
+from actors.geometry.shapes import VGA, Acquisition, DepthFrame
 from actors.palletizing.evaluation import confusion, graded, judge
+from actors.palletizing.sensor import steady
+from actors.palletizing.simulation.noise import sensed
 from actors.palletizing.simulation.packages import (
     KINDS,
     VERDICT_OF_KIND,
@@ -15,7 +20,13 @@ from actors.palletizing.simulation.packages import (
     on_the_tray,
     package_sequence,
 )
-from actors.palletizing.simulation.sensors import SimulatedTraySensor
+from actors.palletizing.simulation.products import product_mesh
+from actors.palletizing.simulation.sensors import (
+    SimulatedTraySensor,
+    looking_down,
+    tray_meshes,
+    true_depth,
+)
 
 SEED = 59
 PRODUCTS = ("milk_carton", "meal_tray")
@@ -75,6 +86,79 @@ def test_what_the_sensor_cannot_see_is_not_claimed(trained, kind, amount):
     found = judge(packages, {name: trained(name) for name in PRODUCTS}, seed=3)
 
     assert [case.finding.verdict for case in found] == ["ok", "ok"]
+
+
+def looked_at(*packages, seed=1):
+    """An image of packages on the tray, (product, tray_from_product) each, eight images fused."""
+    seen_by = Acquisition(VGA, looking_down(np.array([0.0, 0.0, 0.95])))
+    meshes = [
+        (moved(product_mesh(product)[0], pose), product_mesh(product)[1])
+        for product, pose in packages
+    ]
+    depth_m, random = true_depth([*tray_meshes(), *meshes], seen_by), np.random.default_rng(seed)
+    return steady(lambda: DepthFrame(sensed(depth_m, random), seen_by))
+
+
+def leaning(planned, tilt_deg, azimuth_rad, product):
+    """The pose of a product that is tilted and rests on its lowest point."""
+    axis = np.array([np.cos(azimuth_rad), np.sin(azimuth_rad), 0.0])
+    pose = planned @ small_motion(np.concatenate([np.deg2rad(tilt_deg) * axis, np.zeros(3)]))
+    pose[2, 3] = -moved(product_mesh(product)[0], pose)[:, 2].min()
+    return pose
+
+
+@pytest.mark.parametrize(
+    ("product", "tilt_deg", "azimuth_rad"),
+    [
+        ("milk_carton", 6.5, 0.9), ("milk_carton", 25.0, 4.0), ("milk_carton", 90.0, 1.2),
+        ("meal_tray", 8.0, 2.0), ("yoghurt_cup", 90.0, 0.3),
+    ],
+)  # fmt: skip
+def test_package_that_leans_or_lies_is_tipped(trained, product, tilt_deg, azimuth_rad):
+    """A tilt beyond 5 degrees is found and measured within half a degree, also on its side."""
+    planned = on_tray(0.05, -0.08, 0.7)
+    pose = leaning(planned, tilt_deg, azimuth_rad, product)
+
+    found = inspect_place(
+        looked_at((product, pose)), looked_at().depth_mm, trained(product), planned
+    )
+
+    assert found.verdict == "tipped"
+    assert found.tilt_deg == pytest.approx(tilt_deg, abs=0.5)
+    assert found.deviation_mm > 3.0
+
+
+def test_bulge_is_no_tilt(trained):
+    """A bulge that a tilt explains in part stays a deformation, and so does a crush."""
+    models = {"milk_carton": trained("milk_carton")}
+
+    found = [
+        case
+        for kind in ("bulge", "crush")
+        for case in judge(graded(kind, 15, 2, seed=4, products=list(models)), models, seed=4)
+    ]
+
+    assert {case.finding.verdict for case in found} == {"deformed"}
+    assert {case.finding.tilt_deg for case in found} == {0.0}
+
+
+def test_package_in_contact_is_told_from_its_neighbours(trained):
+    """Between two cartons that touch it a third is sound, moved or tipped as it is."""
+    row = [("milk_carton", on_tray(0.0, y, 0.0)) for y in (-0.0951, 0.0951)]
+    planned, model = on_tray(0.0, 0.0, 0.0), trained("milk_carton")
+    before_mm = looked_at(*row).depth_mm
+
+    def verdict(pose):
+        frame = looked_at(*row, ("milk_carton", pose), seed=2)
+        return inspect_place(frame, before_mm, model, planned)
+
+    sound, along = verdict(on_tray(0.002, 0.0, 0.0)), verdict(on_tray(0.016, 0.0, 0.0))
+
+    assert sound.verdict == "ok"
+    assert np.hypot(*(sound.tray_from_product[:2, 3] - [0.002, 0.0])) < 0.0015
+    assert along.verdict == "moved"
+    assert along.shift_mm == pytest.approx(16.0, abs=1.5)
+    assert verdict(leaning(planned, 8.0, np.pi / 2.0, "milk_carton")).verdict == "tipped"
 
 
 def test_dent_is_measured(trained):
