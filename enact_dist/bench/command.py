@@ -148,7 +148,13 @@ def run(arguments: argparse.Namespace) -> int:
         floors = stack.enter_context(Floors(folder, memory))
         told = stack.enter_context(_progress())
         seconds_s = arguments.seconds_s or SECONDS_S
-        packing = Asked(arguments.packages, arguments.seed, arguments.processes, arguments.spread)
+        packing = Asked(
+            arguments.packages,
+            arguments.seed,
+            arguments.processes,
+            arguments.spread,
+            arguments.perception,
+        )
         measured = Run(
             place, floors, seconds_s=seconds_s, told=told, seeds=arguments.seeds, packing=packing
         )

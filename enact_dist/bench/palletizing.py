@@ -25,12 +25,14 @@ class Asked(NamedTuple):
         seed: Of all that is random.
         processes: How many trays are packed side by side.
         spread: How far the belt's sensor is off (one sigma, mm) and friction; None: several.
+        perception: Whether perception alone is scored, on drawn packages without physics.
     """
 
     packages: int = 36
     seed: int = 1
     processes: int = 2
     spread: tuple[float, float] | None = None
+    perception: bool = False
 
 
 def run_palletizing(run: Run) -> None:
@@ -49,6 +51,9 @@ def run_palletizing(run: Run) -> None:
             " pip install -e '.[actors]' in the clone of enact-dist"
         ) from error
     asked = run.packing
+    if asked.perception:
+        _score_perception(run, asked)
+        return
     settings = [asked.spread] if asked.spread else packing.SETTINGS
     trays = packing.trays_of(asked.packages, seed=asked.seed, settings=settings)
     found = packing.played(trays, processes=asked.processes, told=run.told)
@@ -66,3 +71,19 @@ def run_palletizing(run: Run) -> None:
     for (truth, verdict), count in sorted(packing.confusion(found).items()):
         title = f"truth {truth}, judged {verdict}"
         run.add_row(value_row(NAME, title, count, "places", asked.packages))
+
+
+def _score_perception(run: Run, asked: Asked) -> None:
+    """Judge drawn packages, over noise and light of the sensor; no robot, no physics."""
+    from actors.palletizing import perception_scores as scores
+
+    seed = scores.HELD_OUT + asked.seed
+    for series, scored in scores.played(asked.packages, seed=seed, processes=asked.processes):
+        for what, value, unit, goal in scores.figures(series, scored):
+            least = goal.startswith(">=")
+            limit = float(goal.split()[-1]) if goal else 0.0
+            met = (value >= limit if least else value <= limit) if goal else None
+            run.add_row(value_row(NAME, what, value, unit, len(scored), goal or None, met=met))
+        for (kind, verdict), count in sorted(scores.confusion(scored).items()):
+            title = f"{series.name}: truth {kind}, judged {verdict}"
+            run.add_row(value_row(NAME, title, count, "packages", len(scored)))

@@ -176,6 +176,11 @@ def _add_packing(bench: Verb) -> None:
         help="how far the belt's sensor is off, and friction (default: 2, 6 and 12 mm with 0.2, 0.4"
         " and 0.6, in turn)",
     )
+    packing.add_argument(
+        "--perception",
+        action="store_true",
+        help="score perception alone, on drawn packages: verdicts, pose, dents, noise and light",
+    )
 
 
 def _line(name: str) -> str:
