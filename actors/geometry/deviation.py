@@ -153,16 +153,8 @@ def inspect_place(
     bent_m2 = float(area_m2[bent].sum())
 
     def finding(verdict: str, deviation_m: float, region: Mask) -> Finding:
-        return Finding(
-            verdict=verdict,
-            deviation_mm=1000.0 * deviation_m,
-            area_mm2=1e6 * float(area_m2[region].sum()),
-            shift_mm=1000.0 * shift_m,
-            turn_deg=float(np.rad2deg(turn)),
-            tilt_deg=float(np.rad2deg(tilt_of(pose))),
-            tray_from_product=pose,
-            region=region,
-        )
+        area = float(area_m2[region].sum())
+        return _finding(verdict, deviation_m, region, area, shift_m, turn, pose)
 
     too_much = area_m2[foreign].sum() >= limits.extra_m2
     off = shift_m > limits.moved_m or abs(turn) > limits.turned_rad
@@ -184,6 +176,27 @@ def inspect_place(
     if bent_m2 >= limits.deformed_m2:
         return finding("deformed", float(np.percentile(np.abs(difference[bent]), 95)), bent)
     return finding("ok", 0.0, np.zeros_like(bent))
+
+
+def _finding(
+    verdict: str,
+    deviation_m: float,
+    region: Mask,
+    area_m2: float,
+    shift_m: float,
+    turn_rad: float,
+    pose: Pose,
+) -> Finding:
+    return Finding(
+        verdict=verdict,
+        deviation_mm=1000.0 * deviation_m,
+        area_mm2=1e6 * area_m2,
+        shift_mm=1000.0 * shift_m,
+        turn_deg=float(np.rad2deg(turn_rad)),
+        tilt_deg=float(np.rad2deg(tilt_of(pose))),
+        tray_from_product=pose,
+        region=region,
+    )
 
 
 def depth_difference(frame: DepthFrame, rendered_m: Image, limits: Limits) -> tuple[Image, Image]:
