@@ -30,8 +30,9 @@ if TYPE_CHECKING:
     from actors.palletizing.controller import ArmController, ArmMeasured
     from actors.palletizing.vocabulary import Attached, GripState
 
-FROZEN_S: Final = 0.3
-"""So long may a controller measure nothing new, by the clock of this host."""
+FROZEN_S: Final = 1.0
+"""So long may a controller measure nothing new, by the clock of this host: meanwhile it gets no
+command, so the arm rests.  A busy host held up the simulated one for more than 0.3 s."""
 SAMPLE_NS: Final = 10_000_000
 """Between two samples of the joints that are published."""
 SNAPSHOT_NS: Final = 100_000_000

@@ -178,7 +178,7 @@ def test_belt_that_stops_delays_the_next_package(trial: Trial) -> None:
 def test_sensor_that_freezes_ends_the_net(trial: Trial) -> None:
     """The arm rests, the operator is asked, and the cell goes on when it measures again."""
     begun = trial.doing("above", "carry")
-    trial.hardware.fail("wrist", 2.0)
+    trial.hardware.fail("wrist", 5.0)
 
     done = trial.ended(begun)
     place = trial.until("the request", lambda: trial.get(SYSTEM, REQUEST)).place
