@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 from actors.geometry.picture import png_bytes
 from actors.palletizing.demo_pictures import model_picture, tray_picture
 from actors.palletizing.net_picture import svg_of_net
+from actors.palletizing.planning import STANDS
 from actors.palletizing.vocabulary import (
     EMPTY,
     EXECUTION,
@@ -92,6 +93,7 @@ def _trays(cell: Cell, seen: Seen) -> dict[int, Picture]:
             if reference[plans][place].tray == tray
             and place.name in seen.flags
             and seen.flags[place.name].verdict != "ok"
+            and seen.results[place.name].result in STANDS
         ]
         pictures[tray] = tray_picture(frame, reference[empty].depth_mm, deviating)
     return pictures

@@ -6,7 +6,7 @@ import time
 from collections import Counter
 from typing import TYPE_CHECKING, Final
 
-from actors.palletizing.handling import IDLE, along_and_across
+from actors.palletizing.handling import IDLE, along_and_across, is_held
 from actors.palletizing.reactions import Case, Reaction, choices_of, react
 from actors.palletizing.vocabulary import (
     DECISION,
@@ -41,12 +41,6 @@ if TYPE_CHECKING:
     from actors.palletizing.vocabulary import Outcome, Sighting
     from enact_dist import Lock
 
-HELD_M: Final = 0.006
-"""A package between the fingers measures at most so much more or less than its width."""
-CARRIES: Final = ("place", "remove")
-"""Stages that begin with the package in the hand."""
-CLOSES: Final = {"go_on": "accepted", "skip": "skipped"}
-"""What is made of a place by answers that move nothing."""
 UNTAKEN: Final = ("tipped", "missing")
 """Verdicts on packages that the robot cannot take to the bin."""
 AGAIN: Final = {"reject": 1, "retry": 3, "regrasp": 3, "push_again": 2}
@@ -204,9 +198,7 @@ class HandlingFeedback(Actor):
         """Return whether the fingers stand as far apart as the package is wide."""
         grasp = lock[self.grasps].get(product_entity(sighting.product))
         doing = lock.get(self.execution)
-        if grasp is None or doing is None or stage not in CARRIES:
-            return False
-        return abs(doing.width_m - grasp.width_m) < HELD_M
+        return doing is not None and is_held(stage, doing.width_m, grasp)
 
     def _decided(self, lock: Lock, last: Request, choice: str) -> None:
         """Do what the operator has decided."""

@@ -52,8 +52,23 @@ SKELETON_OF: Final = {
 }
 RISKY: Final = ("place", "push")
 """Stages that can spoil what stands on the tray."""
+HELD_M: Final = 0.006
+"""A package between the fingers measures at most so much more or less than its width."""
+CARRIES: Final = ("place", "remove")
+"""Stages that begin with the package in the hand."""
 IDLE: Final = ("stop", "ask")
 """Kinds of requests that move nothing."""
+
+
+def is_held(stage: str, width_m: float, grasp: Grasp | None) -> bool:
+    """Return whether the hand still holds a package after a stage that did not succeed.
+
+    Args:
+        stage: The last one.
+        width_m: Between the fingers.
+        grasp: Of the product; None if it is not known.
+    """
+    return grasp is not None and stage in CARRIES and abs(width_m - grasp.width_m) < HELD_M
 
 
 def stages_of(request: Request, plan: Plan | None) -> tuple[str, ...]:

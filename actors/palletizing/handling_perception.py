@@ -13,7 +13,7 @@ from actors.geometry.open3d_on_use import open3d
 from actors.geometry.registration import register
 from actors.geometry.segmentation import new_pieces
 from actors.palletizing.belt_sight import seen_on_belt
-from actors.palletizing.handling import ASIDE
+from actors.palletizing.handling import ASIDE, is_held
 from actors.palletizing.sensor import FRAMES as FRAMES_FUSED
 from actors.palletizing.sensor import open_sensor, steady
 from actors.palletizing.tray_changes import changed, tray_alone, without
@@ -24,6 +24,7 @@ from actors.palletizing.vocabulary import (
     CONVEYOR,
     EMPTY,
     EXECUTION,
+    GRASP,
     LAST,
     LOOK,
     NET,
@@ -95,6 +96,7 @@ class HandlingPerception(Actor):
     execution = View(online, ROBOT, EXECUTION)
     plans = ViewEach(training, PLACES, PLAN)
     models = ViewEach(training, PRODUCTS, SURFACE)
+    grasps = ViewEach(training, PRODUCTS, GRASP)
     empty_tray = View(training, TRAY, EMPTY)
     empty_belt = View(training, BELT, EMPTY)
     last = Write(online, TRAY, LAST)
@@ -172,6 +174,9 @@ class HandlingPerception(Actor):
         missed = not outcome.success and outcome.stage == "grasp"
         if missed and self._see_belt(lock, package, number):  # later, the next one may lie there
             return Look(request.number, "belt", 0)
+        grasp = lock[self.grasps].get(product_entity(lock[self.sightings][package].product))
+        if not outcome.success and is_held(outcome.stage, lock[self.execution].width_m, grasp):
+            return Look(request.number, "", 0)  # it would be seen in the hand, above the tray
         empty = lock[self.empty_tray]
         frame, now_ns = tray_alone(self._tray(), empty), time.time_ns()
         tray = lock[self.plans][place].tray

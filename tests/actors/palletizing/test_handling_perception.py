@@ -1,5 +1,7 @@
 """Claims about perception where a robot packs: the physical cell before its sensors, no robot."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -15,6 +17,7 @@ from actors.palletizing.planning import RowPlanning
 from actors.palletizing.simulation.cell_scene import CellLayout
 from actors.palletizing.simulation.physical_sensors import PhysicalBeltSensor, PhysicalTraySensor
 from actors.palletizing.simulation.physics import PhysicalCell
+from actors.palletizing.training_grasp import TrainingGrasp
 from enact_dist import Entity, Lock, View, ViewEach, Write, testing
 
 NAMES = ("milk_carton", "meal_tray")
@@ -153,3 +156,20 @@ def test_a_package_that_is_nowhere_is_missing(cell, physical):
     testing.run_once(DeviationDetection(), cell)
     assert read(cell, words.SYSTEM, words.LOOK).seen == ""
     assert read(cell, words.SYSTEM, words.DEVIATIONS)["place/0"].verdict == "missing"
+
+
+def test_a_package_in_the_hand_is_not_judged(cell, physical):
+    """What could not be put down hangs above the tray: that says nothing about its place."""
+    perception = HandlingPerception("belt", "tray", frames=2)
+    testing.run_once(TrainingGrasp("milk_carton=0.5 meal_tray=0.35"), cell)
+    on_belt(physical, 0)
+    write(cell, words.CONVEYOR, words.ARRIVAL, words.Arrival(0, 7))
+    testing.run_once(perception, cell)
+    (package,) = each(cell, "online", words.PACKAGES, words.SIGHTING)
+    grasp = each(cell, "training", words.PRODUCTS, words.GRASP)[Entity("product/milk_carton")]
+    ended(cell, 1, package.name, "place/0", stage="place", success=False)
+    doing = read(cell, words.ROBOT, words.EXECUTION)
+    write(cell, words.ROBOT, words.EXECUTION, replace(doing, width_m=grasp.width_m - 0.002))
+    testing.run_once(perception, cell)
+    assert read(cell, words.SYSTEM, words.LOOK).captured_ns == 0
+    assert each(cell, "online", words.PLACES, words.OBSERVATION) == {}
