@@ -50,7 +50,7 @@ BESIDE_M: Final = 0.005
 """Between packages of two rows."""
 FINGER_M: Final = 0.021
 """The same where a finger goes down: its thickness, and what it opens."""
-FINGER_HALF_M: Final = 0.035
+FINGER_HALF_M: Final = 0.030
 """Half of where along the row that may be, from the middle of the package."""
 
 
