@@ -15,7 +15,8 @@ import pytest
 pytest.importorskip("open3d", exc_type=ImportError)
 
 from actors.geometry.deviation import VERDICTS
-from actors.geometry.shapes import Surface
+from actors.geometry.poses import looking_at
+from actors.geometry.shapes import VGA, Acquisition, DepthFrame, Surface
 from actors.palletizing.demo import SEED, run_demo
 from actors.palletizing.demo_cell import TEMPLATE, RunningCell, configured, watched_cell
 from actors.palletizing.demo_packing import run_packing
@@ -137,7 +138,8 @@ def test_model_picture_shows_faces_in_colours():
 
 def test_tray_picture_shows_the_region_in_red(tray):
     """A deviating region is red in the picture, and nothing else is."""
-    frame = tray.capture_empty()
+    straight = Acquisition(VGA, looking_at(np.array([0.0, 0.0, 0.95]), np.zeros(3)))
+    frame = DepthFrame(tray.capture_empty().depth_mm, straight)
     region = np.zeros(frame.depth_mm.shape, bool)
     region[180:290, 280:390] = True
 
@@ -155,7 +157,8 @@ def test_tray_picture_shows_the_region_in_red(tray):
 
 def test_verdict_hides_nothing_of_its_region(tray):
     """Its plate stands above what is red, so that the shape of a dent can be seen."""
-    frame = tray.capture_empty()
+    straight = Acquisition(VGA, looking_at(np.array([0.0, 0.0, 0.95]), np.zeros(3)))
+    frame = DepthFrame(tray.capture_empty().depth_mm, straight)
     region = np.zeros(frame.depth_mm.shape, bool)
     region[180:290, 280:390] = True
 
