@@ -19,7 +19,7 @@ PACKAGES = 2
 def test_packages_are_packed_and_judged_as_on_one_machine(engine, images, tmp_path_factory):
     """Every verdict is that of physics, and the report names what became of each package."""
     folder = tmp_path_factory.mktemp("packing")
-    file = folder / "cell.toml"
+    file = folder / "packing.toml"
     text = TEMPLATE.read_text("utf-8")
     file.write_text(text.replace("packages = 12", f"packages = {PACKAGES}"), "utf-8")
     with Stack(
