@@ -38,6 +38,10 @@ class RobotCell(DemoCell):
         super().__init__(config, log="the logs of its processes")
         self.hardware, self.packages = hardware, packages
 
+    def __exit__(self, *error: object) -> None:
+        self.hardware.close()
+        super().__exit__(*error)
+
 
 class RunningRobotCell(running_cell.RunningCell):
     """A cell with its simulated hardware that is up between entering and leaving the block.
@@ -88,10 +92,15 @@ class RunningRobotCell(running_cell.RunningCell):
             )
         self._port = self._told_port()
         self.hardware = RemoteCell(self._port)
-        return super().__enter__()
+        try:
+            return super().__enter__()
+        except BaseException:
+            self._end_hardware()
+            raise
 
     def __exit__(self, *error: object) -> None:
         super().__exit__(*error)
+        self.hardware.close()
         self._end_hardware()
 
     def check(self) -> None:
