@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 ROBOT_M: Final = 0.0005
 ROBOT_RAD: Final = 0.002
-"""What the robot is taken to be off per axis: a prior where the plate says nothing."""
+"""What the robot is taken to be off per axis: a prior where the plate shows nothing."""
 
 LEVEL_M: Final = 0.008
 """Pixels within this height belong to the plate: what noise and the robot do at 0.8 m."""

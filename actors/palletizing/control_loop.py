@@ -11,6 +11,7 @@ arm whose cell or gripper is silent for longer than the lease ends its net and c
 from __future__ import annotations
 
 import dataclasses
+import logging
 import threading
 import time
 from collections import deque
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from actors.palletizing.controller import ArmController, ArmMeasured
     from actors.palletizing.vocabulary import Attached, GripState
 
+_LOG: Final = logging.getLogger("enact.actor")
 FROZEN_S: Final = 1.0
 """So long may a controller measure nothing new, by the clock of this host: meanwhile it gets no
 command, so the arm rests.  A busy host held up the simulated one for more than 0.3 s."""
@@ -96,7 +98,7 @@ class ControlLoop:
         grip: The newest command to the gripper of this loop; None: it has asked for nothing.
         grip_number: Its number; before it, that of the command which the gripper follows.
         execution: The newest state of an execution; None before the first one.
-        ended: Executions that are over and were not taken by whoever publishes them.
+        ended: Executions that are over and not yet published.
     """
 
     def __init__(self, controller: ArmController, *, lease_s: float) -> None:
@@ -177,6 +179,12 @@ class ControlLoop:
                 started = False
                 self._periods.pause()
                 self._end_now("braked:controller", str(error))
+                self._from_rad = None
+                self._stop.wait(AGAIN_S)
+            except Exception as error:  # noqa: BLE001 (a thread has no caller: the net ends by name)
+                _LOG.exception("the control loop failed")
+                started = False
+                self._end_now("braked:loop", f"{type(error).__name__}: {error}")
                 self._from_rad = None
                 self._stop.wait(AGAIN_S)
         self._end_now("braked:stopped", "the robot's process ends")
@@ -261,7 +269,8 @@ class ControlLoop:
 
     def _look_out(self, executor: Executor, gripper: GripState, host_s: float) -> None:
         """End a net that must not go on."""
-        away_s, silent_s = host_s - self._world_s, host_s - self._gripper_s
+        # A gripper is silent only while the world is not: its state comes from there.
+        away_s, silent_s = host_s - self._world_s, self._world_s - self._gripper_s
         if self._brake:
             executor.brake(self._brake)
         elif away_s > self._lease_s:

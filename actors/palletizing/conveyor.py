@@ -36,7 +36,7 @@ OFF_THE_BELT: Final = ("place", "push", "remove")
 """Stages during which the package is not on the belt."""
 LOOK_S: Final = 0.1
 OVERLOOKED_S: Final = 8.0
-"""When a package that has come was still not seen, it is said again."""
+"""When a package that has come was still not seen, it is reported again."""
 LATE_S: Final = 15.0
 """A belt that has brought nothing for so long is started again, and says so."""
 
@@ -121,10 +121,10 @@ class BeltConveyor(Actor):
         self._runs_s = time.monotonic()
 
     def _is_overlooked(self, lock: Lock, last: Arrival) -> bool:
-        """Return whether nobody asks for what has come: then it was not seen, and is said again.
+        """Return whether no request is about what has come: it was not seen, and is reported again.
 
         A package that fell back onto the belt stops it in the light barrier, too; when that is
-        taken away, the one after it comes with nobody looking.
+        taken away, the one after it comes unseen.
         """
         name, request = place_entity(last.number).name, lock.get(self.request)
         results = lock.get(self.results, {})

@@ -156,7 +156,7 @@ def report_bytes(rows: Sequence[Row], figures: Mapping[str, object]) -> bytes:
     """Return rows and figures as JSON, for `report.json`."""
     content = {
         **figures,
-        "right": sum(row.correct for row in rows),
+        "right": sum(row.correct for row in rows if row.verdict != "-"),
         "packages": [dataclasses.asdict(row) for row in rows],
     }
     return (json.dumps(content, indent=2) + "\n").encode()

@@ -177,7 +177,7 @@ def watched_robot_cell(config: Path) -> RobotCell | None:
         config: Its `cell.toml`.
 
     Raises:
-        ConfigError: The file cannot be used, or nobody knows the truth about its hardware.
+        ConfigError: The file cannot be used, or its hardware is not simulated.
     """
     loaded = load_config(config)
     belt = next((a.options for a in loaded.actors if a.name == "online-perception"), {})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 from actors.geometry.deviation import Limits, inspect_place
@@ -38,6 +39,7 @@ class DeviationDetection(Actor):
     Args:
         moved_m: Largest shift of a sound package.
         deformed_m2: Least area of a deformation; see `Limits` for what the numbers come from.
+        turned_deg: Largest turn of a sound package.
     """
 
     training, online = World("training"), World("online")
@@ -51,9 +53,14 @@ class DeviationDetection(Actor):
     triggers = (observed,)
 
     def __init__(
-        self, moved_m: float = Limits().moved_m, deformed_m2: float = Limits().deformed_m2
+        self,
+        moved_m: float = Limits().moved_m,
+        deformed_m2: float = Limits().deformed_m2,
+        turned_deg: float = math.degrees(Limits().turned_rad),
     ) -> None:
-        self.limits = Limits(moved_m=moved_m, deformed_m2=deformed_m2)
+        self.limits = Limits(
+            moved_m=moved_m, deformed_m2=deformed_m2, turned_rad=math.radians(turned_deg)
+        )
 
     def start(self) -> None:
         """Load Open3D before the first package comes: it takes a second or two."""

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 UNTAKEN: Final = ("tipped", "missing")
 """Verdicts on packages that the robot cannot take to the bin."""
 AGAIN: Final = {"reject": 1, "retry": 3, "regrasp": 3, "push_again": 2}
-"""How often each is done for one place at most, whoever asks for it."""
+"""How often each is done for one place at most, by the operator or by rule."""
 NO_NET: Final = "it cannot be done:"
 HANDS: Final = ("removed", "replaced")
 """Answers of an operator who has moved the package by hand."""
@@ -161,6 +161,8 @@ class HandlingFeedback(Actor):
         reaction = react(case)
         if outcome.result.startswith("no_net:"):
             reaction = Reaction("ask", outcome.result.replace("no_net:", NO_NET))
+        if last.kind == "reject" and reaction.kind != "ask":
+            reaction = Reaction("ask", f"it could not be rejected: {outcome.result}")
         self._tell(lock, last.place, judged, f"{reaction.kind}: {reaction.reason}")
         if reaction.kind == "go_on":
             self._close(lock, last, "placed", reaction.reason)

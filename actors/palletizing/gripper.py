@@ -20,7 +20,7 @@ class Gripper(Actor):
     """Follow the newest command, publish the state at 40 Hz (ENACT 4.2).
 
     A command is a level: after a restart the newest one is followed again.  One that the gripper
-    refuses is told once, and the state goes on naming the command before it.
+    refuses is reported once, and the state goes on naming the command before it.
 
     Args:
         controller: Address of the gripper, ``MODULE:FUNCTION?name=value``, see `GripperController`.

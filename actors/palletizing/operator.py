@@ -71,6 +71,8 @@ class Operator(Actor):
         if question.request != self._asked:
             print(f"{question.text}\n  {' | '.join(question.choices)}", flush=True)
             self._asked = question.request
+            while self._lines is not None and not self._lines.empty():
+                self._lines.get_nowait()  # typed before this question was asked
         choice = self._scripted(question) if self.answers else self._typed(question)
         if not choice:
             return

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 from actors.palletizing.controller import open_controller
 from actors.palletizing.grasps import size_of
 from actors.palletizing.pallet import planned_pose, tray_of
-from actors.palletizing.rows import planned_rows
+from actors.palletizing.rows import contacts_between, planned_rows
 from actors.palletizing.vocabulary import (
     CELL,
     FRAMES,
@@ -117,11 +117,11 @@ class RowPlanning(Actor):
     def _plan(self, lock: Lock, coming: list[int], done: set[str]) -> None:
         """Plan the places of the packages that come, except of those that are there."""
         products = [self.products[number % len(self.products)] for number in coming]
-        sizes = {
-            product: size_of(lock[self.surfaces][product_entity(product)])
-            for product in set(products)
+        models = {
+            product: lock[self.surfaces][product_entity(product)] for product in set(products)
         }
-        slots = planned_rows(products, sizes)
+        sizes = {product: size_of(model) for product, model in models.items()}
+        slots = planned_rows(products, sizes, contacts_between(models))
         for number, product, slot in zip(coming, products, slots, strict=True):
             place = place_entity(number)
             if place.name not in done:

@@ -187,6 +187,8 @@ class RobotJoints(Actor):
         taken, attached = lock.get(self.net_outcome), lock.get(self.net)
         if taken is None or attached is None or taken.state != "interrupted":
             return
+        if taken.version != lock.version(self.net):
+            return  # of an older net; this one is still to be taken
         if before is None or before.net_version != attached.number:
             unbegun = ended_without_step(attached, before, None, "")
             lock[self.execution] = interrupted(unbegun)

@@ -82,7 +82,7 @@ class TrayWatch:
         self.frame = empty
 
     def forget(self) -> None:
-        """Somebody has changed something: the next picture judges every place."""
+        """Something was changed by hand: the next picture judges every place."""
         self._last = None
 
     def judged(self, frame: DepthFrame, places: Places, *, newest: int) -> dict[int, Seen]:

@@ -257,7 +257,9 @@ class Conductor:
                 self._foreign.add(name)
                 x, y, top = track.position_m
                 self._say(
-                    now_s, f"foreign object, {top:.2f} m high, at x {x:.2f} m, y {y:.2f} m ({name})"
+                    now_s,
+                    f"foreign: {name}, {top:.2f} m high, still, at x {x:.2f} m, y {y:.2f} m:"
+                    " an object that was left, or a person who lies",
                 )
 
     def _aside(self, act: Callable[[], None]) -> None:

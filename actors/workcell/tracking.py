@@ -190,6 +190,7 @@ class HumanTracking(Actor):
         now_ns: int,
     ) -> None:
         """Write that a person is hidden, or that they have left."""
+        self._still_since.pop(name, None)
         low, high = grid.origin_m[:2], grid.origin_m[:2] + grid.voxel_m * np.array(grid.shape[:2])
         there = before.position_m[:2] if before.hidden else state[0][:2]
         inside_m = float(np.minimum(there - low, high - there).min())
@@ -198,7 +199,6 @@ class HumanTracking(Actor):
         left = not before.hidden and inside_m < EDGE_M
         if brief or left or hidden_s > self.hidden_s_max:
             self._hidden_since_ns.pop(name, None)
-            self._still_since.pop(name, None)
             lock[self.tracks].pop(name, None)
             lock[self.limbs].pop(name, None)
             lock[self.predictions].pop(name, None)

@@ -176,7 +176,7 @@ class Track:
         first_ns: Stamp of the set in which the track began.
         hidden: No camera sees the person now; they are where none can look.
         seen_ns: Stamp of the set in which they were last seen.
-        foreign: Low and still for a while: an object that was left, or somebody who lies.
+        foreign: Low and still for a while: an object that was left, or a person who lies.
     """
 
     position_m: npt.NDArray[np.float64]

@@ -27,16 +27,16 @@ def test_options_that_do_not_fit_are_refused(enact, words, reason):
 
 def test_missing_extra_is_named_with_its_command(enact, monkeypatch):
     """Without Open3D the error says which extra to install."""
-    monkeypatch.setitem(sys.modules, "actors.palletizing.demo", None)
+    monkeypatch.setitem(sys.modules, "actors.palletizing.demo_packing", None)
     error = ModuleNotFoundError("No module named 'open3d'", name="open3d")
 
     class Finder:
         @staticmethod
         def find_spec(name, *_):
-            if name == "actors.palletizing.demo":
+            if name == "actors.palletizing.demo_packing":
                 raise error
 
-    monkeypatch.delitem(sys.modules, "actors.palletizing.demo")
+    monkeypatch.delitem(sys.modules, "actors.palletizing.demo_packing")
     monkeypatch.setattr(sys, "meta_path", [Finder, *sys.meta_path])
 
     result = enact("demo", "palletizing")

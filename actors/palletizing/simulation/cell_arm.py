@@ -3,7 +3,7 @@
 It stands where the cabinet of a real robot stands.  Commands come at any time from any thread and
 are taken at the next cycle; `measured` returns the state of the last one.
 
-Rules a change must keep: what the drives are told never exceeds the limits of speed, acceleration
+Rules a change must keep: the drives' set points never exceed the limits of speed, acceleration
 and jerk, whatever is commanded; without commands the arm comes to rest; after `brake` it takes
 none before the next `start`; no clock: the cell says what time it is.
 """
@@ -60,14 +60,14 @@ _SECONDS_TO_NS: Final = 1_000_000_000
 class JointLimiter:
     """Follows commanded joints within limits of speed, acceleration and jerk.
 
-    A joint whose command keeps the limits is told just that; any other one gets there by the
+    A joint whose command keeps the limits gets just that; any other one gets there by the
     quickest motion that keeps them (ruckig).
 
     Args:
         q_rad: (7,), where the arm is, at rest.
 
     Attributes:
-        q_rad: (7,), what the drives are told now.
+        q_rad: (7,), set points of the drives now.
         dq_rad_s: (7,), its speed.
         ddq_rad_s2: (7,), its acceleration.
     """
@@ -215,7 +215,7 @@ class SimulatedArm:
 
     @property
     def limiter(self) -> JointLimiter:
-        """What the drives are told."""
+        """Set points of the drives."""
         return self._limiter
 
     def start(self) -> None:
@@ -292,7 +292,7 @@ class SimulatedArm:
         self.brake()
 
     def drive(self, *, slack: bool = False) -> None:
-        """Set what the drives are told for the next cycle.
+        """Set the drives' set points for the next cycle.
 
         Args:
             slack: The fingers open, whatever they were commanded.
@@ -302,7 +302,7 @@ class SimulatedArm:
             self._limiter.aim(commanded)
         self._limiter.advance(braking=not self._started)
         limiter, data = self._limiter, self._data
-        # A drive gives way to what it is not told of: so it is told what speed and inertia take.
+        # A drive gives way to loads that are not in its set point: so speed and inertia are added.
         self._accelerations[:7] = limiter.ddq_rad_s2
         self._mul_m(self._model, data, self._torques, self._accelerations)
         data.ctrl[:7] = (
@@ -312,7 +312,7 @@ class SimulatedArm:
         )
         self.gripping_cycles += 1
         goal_m = (self._width_m - OPEN_M[0]) / 2.0
-        # What a finger is told stays within reach of where it is, so that it presses at once less
+        # A finger's set point stays within reach of where it is, so that it presses at once less
         # when it is opened.
         reach_m = 1.2 * self._force_n / self._model.actuator_gainprm[7, 0]
         if slack:

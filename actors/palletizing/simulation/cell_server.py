@@ -199,7 +199,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--port", type=int, default=7460, help="port to listen at (7460)")
     parser.add_argument("--speed", type=float, default=1.0, help="times real time (1)")
     parser.add_argument(
-        "--until-eof", action="store_true", help="end with whoever holds the standard input open"
+        "--until-eof", action="store_true", help="end with the process that started it"
     )
     options = parser.parse_args(arguments)
     try:

@@ -6,8 +6,9 @@
         with running.stopped() as cell:   # between two cycles
             cell.truth()
 
-Rules a change must keep: whoever reads or changes more than the arm's commands does it between two
-cycles; a cell that was held up goes on from now and never makes up for lost cycles in a burst.
+Rules a change must keep: a thread that reads or changes more than the arm's commands does so
+between two cycles; a cell that was held up goes on from now and never makes up for
+lost cycles in a burst.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ class RunningCell:
     """A physical cell whose time runs by itself; also a `BeltController`.
 
     Args:
-        cell: The cell; nobody else steps it from now on.
+        cell: The cell; no other thread steps it from now on.
         speed: Simulated seconds per second; a slow machine does less.
 
     Attributes:
@@ -154,7 +155,7 @@ class RunningCell:
                 if now_s - next_s > LATE_S:
                     self.lost_s += now_s - next_s
                     next_s = now_s
-                # A lock that is let go and taken at once starves who waits for it.
+                # A lock that is released and taken at once starves the threads that wait for it.
                 time.sleep(max(0.0001, next_s - now_s))
         except Exception as error:  # noqa: BLE001 (who uses the cell gets it: a thread has no caller)
             with self._between:

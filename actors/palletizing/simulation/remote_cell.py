@@ -11,7 +11,7 @@
 ==================================  ================================================================
 
 Rule a change must keep: one request at a time over a connection; a connection that was lost is made
-anew by the next request, but whoever commanded arm or gripper has to start it again.
+anew by the next request, but the process that commanded arm or gripper has to start it again.
 """
 
 from __future__ import annotations

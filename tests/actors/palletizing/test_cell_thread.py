@@ -18,7 +18,7 @@ pytest.importorskip("mujoco", exc_type=ImportError)
 
 
 def test_cell_runs_by_itself():
-    """The belt brings a package and the arm comes where it was commanded, with nobody stepping."""
+    """The belt brings a package and the arm comes where it was commanded, while no caller steps."""
     with RunningCell(PhysicalCell([carton()], seed=1), speed=8.0) as running:
         running.arm.start()
         goal = np.array(HOME_RAD) + 0.2

@@ -239,6 +239,27 @@ def test_operator_answers_and_the_robot_rejects(cell, capsys):
     assert "place/0: it is deformed" in capsys.readouterr().out
 
 
+def test_a_package_that_could_not_be_rejected_is_not_placed_again(cell):
+    """Whatever a failed grasp would else lead to: the operator is asked once more."""
+    come(cell)
+    testing.run_once(HandlingFeedback(), cell)
+    packed(cell, "held", "placed", "in_contact", "aside")
+    on_tray = each(cell, words.PLACES, words.PLAN)[PLACE].tray_from_product
+    write(cell, PACKAGE, words.SIGHTING, words.Sighting(0, on_tray, 0, 0, "tray", "milk_carton"))
+    looked(cell, "tray", "deformed")
+    testing.run_once(HandlingFeedback(), cell)
+    testing.run_once(Operator(answers="reject"), cell)
+    testing.run_once(HandlingFeedback(), cell)
+
+    packed(cell, "missed", "aside")
+    looked(cell, "tray", "ok")
+    testing.run_once(HandlingFeedback(), cell)
+
+    request = read(cell, words.SYSTEM, words.REQUEST)
+    assert request.kind == "ask"
+    assert request.reason == "it could not be rejected: missed"
+
+
 def test_a_package_that_is_too_wide_is_refused_before_anything_moves(cell):
     """One line says so; the operator is asked."""
     come(cell)

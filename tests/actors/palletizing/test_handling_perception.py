@@ -159,7 +159,7 @@ def test_a_package_that_is_nowhere_is_missing(cell, physical):
 
 
 def test_a_package_in_the_hand_is_not_judged(cell, physical):
-    """What could not be put down hangs above the tray: that says nothing about its place."""
+    """What could not be put down hangs above the tray and tells nothing of its place."""
     perception = HandlingPerception("belt", "tray", frames=2)
     testing.run_once(TrainingGrasp("milk_carton=0.5 meal_tray=0.35"), cell)
     on_belt(physical, 0)

@@ -189,7 +189,7 @@ def test_sensor_that_freezes_ends_the_net(trial: Trial) -> None:
 
 
 def test_push_outlives_the_restart_of_its_shard(trial: Trial) -> None:
-    """The shard with the robot's data is killed in midst of it; the net ends, and what it did is seen."""
+    """The shard with what the system requests is killed in midst of it; the net ends, and what it did is seen."""
     begun = trial.doing("push")
     os.kill(trial.processes.shard_pid("right"), signal.SIGKILL)
 

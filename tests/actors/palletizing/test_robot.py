@@ -49,6 +49,7 @@ class SpringController:
     def __init__(self):
         self.arm, self.q, self.grip = SpringArm(lag_s=0.02), HOME_RAD, None
         self.fails, self.starts, self.grips, self.cycles = "", 0, [], 0
+        self.error = ControllerError
         self.changed = threading.Condition()
 
     def start(self):
@@ -57,7 +58,7 @@ class SpringController:
     def measured(self):
         with self.changed:
             if self.fails:
-                raise ControllerError(self.fails)
+                raise self.error(self.fails)
             self.cycles += 1
             self.arm.obey(SimpleNamespace(q=self.q, grip=self.grip))
             self.grip = None
@@ -246,7 +247,7 @@ class SilentGripper(Gripper):
     [(None, "braked:gripper_silent"), (SilentGripper, "braked:gripper_refuses")],
 )
 def test_net_ends_without_its_gripper(trial, other, result):
-    """One that says nothing, and one that does not take its command, end the net by name."""
+    """A silent one, and one that does not take its command, end the net by name."""
     trial.options = {"lease_s": 0.2}
     with trial.running(gripper=False), ExitStack() as stack:
         if other is not None:
@@ -273,7 +274,7 @@ def test_loop_goes_on_while_a_lock_is_held(trial):
 
 
 def test_world_that_is_away_longer_than_the_lease_ends_the_net(trial):
-    """The arm rests by itself, though nobody can tell it anything; the reason is published later."""
+    """The arm rests by itself without a connection; the reason is published later."""
     trial.options = {"lease_s": 0.3}
     blocked = Write(trial.online, ROBOT, EXECUTION)
     with trial.running():
@@ -312,8 +313,16 @@ def test_stopped_robot_brakes(trial):
         assert trial.ended().result == "braked:stopped"
 
 
-def test_controller_that_fails_ends_the_net_and_is_tried_again(trial):
+@pytest.mark.parametrize(
+    ("error", "result", "because"),
+    [
+        (ControllerError, "braked:controller", "the controller does not answer"),
+        (ValueError, "braked:loop", "ValueError: the controller does not answer"),
+    ],
+)
+def test_controller_that_fails_ends_the_net_and_is_tried_again(trial, error, result, because):
     """The result names it, the reason is its own; the next net runs when it is back."""
+    trial.device.error = error
     with trial.running():
         trial.attach(endless())
         trial.until(ROBOT, EXECUTION, lambda now: now.net_version == 1)
@@ -323,8 +332,8 @@ def test_controller_that_fails_ends_the_net_and_is_tried_again(trial):
         trial.device.fails = ""
         again = trial.ended()
 
-    assert done.result == "braked:controller"
-    assert done.trace[-1].because == "the controller does not answer"
+    assert done.result == result
+    assert done.trace[-1].because == because
     assert again.result == "done"
 
 
@@ -377,6 +386,17 @@ def test_net_that_was_taken_and_not_begun_ends_too(trial):
     assert trial.get(ROBOT, EXECUTION).result == "interrupted:drift"
 
 
+def test_what_interrupted_one_net_does_not_end_the_next(trial):
+    """The outcome of the net before still stands there when a new one is attached."""
+    trial.attach(endless())
+    trial.online.init(ROBOT, NET_OUTCOME, Outcome("interrupted", 1, 1))
+    trial.attach(going(0.05))
+
+    testing.run_once(trial.actors()[0], trial.cell)
+
+    assert trial.get(ROBOT, EXECUTION) is None
+
+
 def test_restarted_gripper_follows_the_newest_command(trial):
     """Its command is a level: it is followed again, and the state names it."""
     with trial.running():
@@ -391,7 +411,7 @@ def test_restarted_gripper_follows_the_newest_command(trial):
 
 
 def test_gripper_that_refuses_goes_on_and_one_that_was_lost_is_started_again(trial, capsys):
-    """A refused command is told once; one that did not get through is given again."""
+    """A refused command is reported once; one that did not get through is given again."""
     device, gripper = trial.device, trial.actors()[2]
     width, calls = device.grip_width, []
 
