@@ -11,7 +11,8 @@ if ls "$here"/../wheels/*.whl >/dev/null 2>&1; then
 fi
 pip --python "$python" install "$@" --requirement "$lock"
 cd "$("$python" -c 'import sysconfig; print(sysconfig.get_path("purelib"))')"
-# Tests, bindings of other frameworks, materials of windows, pages for browsers: no actor loads them.
+# Tests, documents, bindings of other frameworks, materials of windows, pages for browsers: no actor
+# loads them.
 while read -r pattern; do
     find . -path "./$pattern" -prune -exec rm -r {} +
 done <"$here/unused.txt"
