@@ -6,7 +6,7 @@ where they stand now, since a push moves the neighbours too.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeVar
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from actors.geometry.rendering import directions, render_depth
 from actors.geometry.shapes import DepthFrame
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Hashable, Mapping, Sequence
 
     import numpy.typing as npt
 
@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     F64 = npt.NDArray[np.float64]
     Depth = npt.NDArray[np.uint16]
     Standing = tuple[Surface, F64]
+
+Key = TypeVar("Key", bound="Hashable")
 
 SEEN_M: Final = (1.00, 0.66)
 """Length and width of what is looked at, along x and y at the height of the tray: the tray, and as
@@ -68,7 +70,7 @@ def without(frame: DepthFrame, empty_mm: Depth, others: Sequence[Standing]) -> D
     return before_mm
 
 
-def changed(now: DepthFrame, before: DepthFrame, packages: Mapping[str, Standing]) -> list[str]:
+def changed(now: DepthFrame, before: DepthFrame, packages: Mapping[Key, Standing]) -> list[Key]:
     """Return the packages whose pixels differ between two pictures of one tray.
 
     Args:

@@ -14,31 +14,23 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from actors.geometry.depth import median_known, metres
 from actors.geometry.deviation import Limits, inspect_place
-from actors.geometry.rendering import directions, render_depth
-from actors.geometry.shapes import DepthFrame
+from actors.geometry.rendering import render_depth
+from actors.palletizing.tray_changes import changed, tray_alone
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     import numpy.typing as npt
 
-    from actors.geometry.shapes import Surface
+    from actors.geometry.shapes import DepthFrame, Surface
 
     F64 = npt.NDArray[np.float64]
     Depth = npt.NDArray[Any]
     Places = Mapping[int, tuple[str, F64]]
 
-SEEN_M: Final = (1.00, 0.66)
-"""Length and width of what is looked at, along x and y at the height of the tray: the tray, and as
-much farther as the top of a package at its rim is seen."""
 LIMITS: Final = replace(Limits(), turned_rad=float(np.deg2rad(5.0)))
 """In a row a package is turned by its neighbours: by more than this it does not touch them."""
-CHANGED_M: Final = 0.004
-"""A pixel that is nearer or farther by more than this has changed."""
-CHANGED_SHARE: Final = 0.03
-"""A place has changed when this share of its pixels has."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,10 +65,6 @@ class TrayWatch:
         self, empty: DepthFrame, models: Mapping[str, Surface], *, limits: Limits | None = None
     ) -> None:
         self._empty, self._models, self._limits = empty, models, limits or LIMITS
-        eye = empty.acquisition.world_from_camera
-        rays = directions(empty.acquisition.camera) @ eye[:3, :3].T
-        on_tray = eye[:2, 3] - rays[..., :2] * (eye[2, 3] / rays[..., 2:])
-        self._outside = (2.0 * np.abs(on_tray) > SEEN_M).any(axis=-1)
         self._last: DepthFrame | None = None
         self.seen: dict[int, Seen] = {}
         self.frame = empty
@@ -93,18 +81,16 @@ class TrayWatch:
             places: Product and tray_from_product as planned of every place that is in use.
             newest: Number of the place that something was done to.
         """
-        # The hand that waits beside the tray is seen beside it.
-        depth_mm = np.where(self._outside, self._empty.depth_mm, frame.depth_mm)
-        self.frame = DepthFrame(depth_mm.astype(frame.depth_mm.dtype), frame.acquisition)
-        changed = self._changed(places) | {newest}
+        self.frame = tray_alone(frame, self._empty)
+        judged = self._changed(places) | {newest}
         self._last = self.frame
         found: dict[int, Seen] = {}
         # The newest first, beside which the others are judged; then again what does not stand as
         # it should, beside where the others are now.
-        for place in sorted(changed, key=lambda each: (each != newest, each)):
+        for place in sorted(judged, key=lambda each: (each != newest, each)):
             found[place] = self.seen[place] = self._inspected(place, places)
-        if len(changed) > 1:
-            for place in [each for each in changed if found[each].verdict != "ok"]:
+        if len(judged) > 1:
+            for place in [each for each in judged if found[each].verdict != "ok"]:
                 found[place] = self.seen[place] = self._inspected(place, places)
         return found
 
@@ -141,15 +127,12 @@ class TrayWatch:
         """Return the places whose pixels differ from those of the picture before."""
         if self._last is None:
             return set(places) & set(self.seen)
-        now, before = (median_known(metres(f.depth_mm), 5) for f in (self.frame, self._last))
-        with np.errstate(invalid="ignore"):
-            differs = np.abs(now - before) > CHANGED_M
-        changed = set()
-        for number, seen in self.seen.items():
-            if number in places:
-                pose = places[number][1] if seen.pose is None else seen.pose
-                model = self._models[places[number][0]]
-                own = np.isfinite(render_depth([(model, pose)], self.frame.acquisition))
-                if own.any() and differs[own].mean() > CHANGED_SHARE:
-                    changed.add(number)
-        return changed
+        standing = {
+            number: (
+                self._models[places[number][0]],
+                places[number][1] if seen.pose is None else seen.pose,
+            )
+            for number, seen in self.seen.items()
+            if number in places
+        }
+        return set(changed(self.frame, self._last, standing))

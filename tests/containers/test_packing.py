@@ -17,7 +17,7 @@ PACKAGES = 2
 
 
 def test_packages_are_packed_in_containers(engine, images, tmp_path_factory):
-    """The report names what became of each package; one at least stands as planned, and is said to.
+    """The report names what became of each package; one at least stands as planned and is judged so.
 
     On processors that others use, too, a grasp may fail and a package be rejected.
     """

@@ -97,7 +97,7 @@ def test_closing_beside_a_package_misses_it():
 
 
 def test_opening_releases():
-    """What is put down and let go of is released, not lost, and lies where it was put."""
+    """What is put down and released counts as released, not lost, and lies where it was put."""
     hand = Hand([carton()])
     hand.cell.put(0, on_belt())
     hand.grasp(0.38, 0.62, 45.0)

@@ -260,7 +260,7 @@ def test_net_ends_without_its_gripper(trial, other, result):
 
 
 def test_loop_goes_on_while_a_lock_is_held(trial):
-    """Nobody's lock stops the loop: a net that runs shorter than the lease goes to its end."""
+    """A held lock does not stop the loop: a net that runs shorter than the lease goes to its end."""
     trial.options = {"lease_s": 60.0}
     blocked = Write(trial.online, ROBOT, EXECUTION)
     with trial.running():
