@@ -72,17 +72,53 @@ def render_depth(
         (H, W) float32, metres along the optical axis, NaN where nothing is hit; of the window's
         size when there is one.
     """
-    rays = directions(acquisition.camera)[window or slice(None)]
-    depth_m = np.full(rays.shape[:2], np.nan, np.float32)
-    if placed and depth_m.size:
+    depth_m = np.full(acquisition.camera.shape, np.nan, np.float32)
+    if placed:
         camera_from_world = inverse(acquisition.world_from_camera)
         vertices, triangles, first = [], [], 0
         for surface, world_from_surface in placed:
             vertices.append(moved(surface.vertices_m, camera_from_world @ world_from_surface))
             triangles.append(surface.triangles + first)
             first += len(surface.vertices_m)
-        depth_m = cast(ray_scene(np.concatenate(vertices), np.concatenate(triangles)), rays)
-    return depth_m
+        mesh = np.concatenate(vertices), np.concatenate(triangles)
+        covered, depth_m[covered] = depth_where_seen(*mesh, acquisition.camera, window=window)
+    return depth_m[window or slice(None)]
+
+
+def depth_where_seen(
+    vertices_m: npt.NDArray[np.floating],
+    triangles: npt.NDArray[np.integer],
+    camera: Camera,
+    *,
+    window: tuple[slice, slice] | None = None,
+) -> tuple[tuple[slice, slice], npt.NDArray[np.float32]]:
+    """Return the rows and columns in which a camera sees a mesh, and its depth there.
+
+    Args:
+        vertices_m: (N, 3), camera frame, metres.
+        triangles: (M, 3), vertex numbers.
+        camera: What looks.
+        window: Rows and columns to look at; the whole image when absent.
+
+    Returns:
+        The pixels around all vertices, and depth of their size, metres, NaN where nothing is hit.
+    """
+    rows, columns = window or (slice(None), slice(None))
+    covered = rows.indices(camera.shape[0]), columns.indices(camera.shape[1])
+    low, high = (np.array([part[end] for part in covered]) for end in (0, 1))
+    away_m = vertices_m[:, 2]
+    if away_m.min() > 0.0:  # else some of it is behind the camera, and may be anywhere
+        row = camera.fy_px * vertices_m[:, 1] / away_m + camera.cy_px
+        column = camera.fx_px * vertices_m[:, 0] / away_m + camera.cx_px
+        seen = np.stack([row, column])
+        low = np.maximum(low, np.floor(seen.min(axis=1)).astype(int))
+        high = np.minimum(high, np.ceil(seen.max(axis=1)).astype(int) + 1)
+    high = np.maximum(low, high)
+    pixels = slice(int(low[0]), int(high[0])), slice(int(low[1]), int(high[1]))
+    rays = directions(camera)[pixels]
+    if not rays.size:
+        return pixels, np.zeros(rays.shape[:2], np.float32)
+    return pixels, cast(ray_scene(vertices_m, triangles), rays)
 
 
 def cast(scene: Any, rays: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:

@@ -219,13 +219,14 @@ def patch_area(points_m: F64, normal: F64) -> float:
     """
     if len(points_m) < 3:
         return 0.0
-    beside = points_m - points_m.mean(axis=0)
-    along = np.cross(normal, [1.0, 0.0, 0.0] if abs(normal[0]) < 0.7 else [0.0, 1.0, 0.0])
-    along /= np.linalg.norm(along)
-    x, y = beside @ along, beside @ np.cross(normal, along)
+    # Seen along the axis that the normal is nearest to; the patch is larger than what is seen.
+    axis = int(np.argmax(np.abs(normal)))
+    seen = points_m[:, [each for each in range(3) if each != axis]]
+    x, y = (seen - seen.sum(axis=0) / len(seen)).T
     order = np.argsort(np.arctan2(y, x))
     x, y = x[order], y[order]
-    return float(0.5 * abs(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1))))
+    twice = x[:-1] @ y[1:] - y[:-1] @ x[1:] + x[-1] * y[0] - y[-1] * x[0]
+    return float(0.5 * abs(twice / normal[axis]))
 
 
 @dataclass(slots=True, eq=False)

@@ -10,7 +10,7 @@ that perception knows no difference.
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Final, Protocol
 
 import numpy as np
@@ -35,7 +35,7 @@ from actors.palletizing.simulation.products import box_mesh, hull_mesh
 from actors.palletizing.simulation.sensors import (
     OVERHEAD_M,
     Repeats,
-    captured,
+    drawn,
     looking_down,
     shifted,
     tray_meshes,
@@ -51,6 +51,7 @@ if TYPE_CHECKING:
 
     F64 = npt.NDArray[np.float64]
     Mesh = tuple[F64, npt.NDArray[np.int32]]
+    Drawn = tuple[tuple[slice, slice], npt.NDArray[np.float32]]
 
 BELT_OVERHEAD_M: Final = 0.80
 """Height of the belt's sensor above the belt."""
@@ -88,12 +89,13 @@ class _FixedSensor:
         self._true = Acquisition(VGA, true)
         self._seed = seed
         self._moment = Repeats()
-        self._last: tuple[bytes, npt.NDArray[np.float32]] | None = None
+        self._still_m: npt.NDArray[np.float32] | None = None
+        self._drawn: dict[bytes, Drawn] = {}
 
     def capture_empty(self) -> DepthFrame:
         """Return an image with nothing but what stands still."""
-        meshes = _in(self._world_from_base, still_meshes(self._layout))
-        return captured(meshes, self._true, self._true, np.random.default_rng([self._seed, 0]))
+        random = np.random.default_rng([self._seed, 0])
+        return DepthFrame(sensed(self._still_depth(), random), self._true)
 
     def capture(self, stop: int) -> DepthFrame:
         """Return an image of what is there now.
@@ -114,18 +116,31 @@ class _FixedSensor:
         """From where it really looks."""
         return self._true
 
-    def _depth(self, shown: ShownCell) -> npt.NDArray[np.float32]:
-        """Return the image without noise; the last one while nothing has moved by a hair."""
-        still = _fingerprint(shown)
-        if self._last is None or self._last[0] != still:
-            self._last = still, true_depth(self._meshes(shown), self._true)
-        return self._last[1]
+    def _still_depth(self) -> npt.NDArray[np.float32]:
+        if self._still_m is None:
+            meshes = _in(self._world_from_base, still_meshes(self._layout))
+            self._still_m = true_depth(meshes, self._true)
+        return self._still_m
 
-    def _meshes(self, shown: ShownCell) -> list[Mesh]:
-        return _in(
-            self._world_from_base,
-            [*still_meshes(self._layout), *package_meshes(shown), *arm_meshes(shown)],
-        )
+    def _depth(self, shown: ShownCell) -> npt.NDArray[np.float32]:
+        """Return the image without noise; only what has moved by a hair is drawn again."""
+        parts: dict[bytes, Callable[[], list[Mesh]]] = {
+            _fingerprint(shown.q, shown.width_m): partial(arm_meshes, shown)
+        }
+        for package in shown.packages:
+            what = package.number, package.product, package.dents
+            name = _fingerprint(package.base_from_product, what=what)
+            parts[name] = partial(package_meshes, package)
+        self._drawn = {
+            name: self._drawn.get(name) or self._draw(meshes()) for name, meshes in parts.items()
+        }
+        depth_m = self._still_depth().copy()
+        for pixels, part_m in self._drawn.values():
+            depth_m[pixels] = np.fmin(depth_m[pixels], part_m)
+        return depth_m
+
+    def _draw(self, meshes: list[Mesh]) -> Drawn:
+        return drawn(_in(self._world_from_base, meshes), self._true)
 
     def _reported(self, shown: ShownCell) -> Acquisition:
         return self._true
@@ -187,12 +202,10 @@ class PhysicalBeltSensor(_FixedSensor):
         return nearest if near else None
 
 
-def _fingerprint(shown: ShownCell) -> bytes:
-    """Return what tells two moments apart in which something moved by 10 micrometres or more."""
-    parts = [np.append(shown.q, shown.width_m), *(p.base_from_product for p in shown.packages)]
-    whole = np.concatenate([part.ravel() for part in parts])
-    which = [(p.number, p.product, p.dents) for p in shown.packages]
-    return np.rint(whole * 1e5).astype(np.int64).tobytes() + repr(which).encode()
+def _fingerprint(*values: npt.ArrayLike, what: object = None) -> bytes:
+    """Return what tells two moments apart in which values differ by 10 micrometres or more."""
+    whole = np.concatenate([np.ravel(value) for value in values])
+    return np.rint(whole * 1e5).astype(np.int64).tobytes() + repr(what).encode()
 
 
 def still_meshes(layout: CellLayout) -> list[Mesh]:
@@ -215,13 +228,9 @@ def still_meshes(layout: CellLayout) -> list[Mesh]:
     ]
 
 
-def package_meshes(shown: ShownCell) -> list[Mesh]:
-    """Return the packages as they are, dents included, in the base frame."""
-    return [
-        mesh
-        for package in shown.packages
-        for mesh in _in(package.base_from_product, [dented_mesh(package.product, package.dents)])
-    ]
+def package_meshes(package: ShownPackage) -> list[Mesh]:
+    """Return a package as it is, dents included, in the base frame."""
+    return _in(package.base_from_product, [dented_mesh(package.product, package.dents)])
 
 
 def arm_meshes(shown: ShownCell) -> list[Mesh]:

@@ -7,12 +7,12 @@ off.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from actors.geometry.poses import inverse, looking_at, moved, on_tray, small_motion
-from actors.geometry.rendering import cast, directions, ray_scene
+from actors.geometry.rendering import depth_where_seen
 from actors.geometry.shapes import VGA, Acquisition, DepthFrame
 from actors.palletizing.sensor import PLATE_M
 from actors.palletizing.simulation.noise import DARK, Light, sensed
@@ -185,33 +185,24 @@ def tray_sensor(packages: str = "16", seed: str = "1", products: str = "") -> Si
     )
 
 
-def captured(
-    meshes: Sequence[Mesh],
-    true: Acquisition,
-    reported: Acquisition,
-    random: np.random.Generator,
-) -> DepthFrame:
-    """Return what a sensor sees of meshes.
-
-    Args:
-        meshes: Everything in view, in the world of the poses.
-        true: From where it looks.
-        reported: From where it says it looks.
-        random: Source of the noise.
-    """
-    depth_m = true_depth(meshes, true)
-    return DepthFrame(sensed(depth_m, random), reported)
-
-
 def true_depth(meshes: Sequence[Mesh], acquisition: Acquisition) -> npt.NDArray[np.float32]:
     """Return the depth image of meshes without noise, (H, W) float32, metres, NaN: nothing hit."""
+    depth_m = np.full(acquisition.camera.shape, np.nan, np.float32)
+    pixels, depth_m[pixels] = drawn(meshes, acquisition)
+    return depth_m
+
+
+def drawn(
+    meshes: Sequence[Mesh], acquisition: Acquisition
+) -> tuple[tuple[slice, slice], npt.NDArray[np.float32]]:
+    """Return rows and columns in which meshes are seen, and their depth there; as `true_depth`."""
     vertices = np.concatenate([mesh[0] for mesh in meshes])
     first = np.cumsum([0] + [len(mesh[0]) for mesh in meshes])
     triangles = np.concatenate(
         [mesh[1] + start for mesh, start in zip(meshes, first, strict=False)]
     )
-    scene: Any = ray_scene(moved(vertices, inverse(acquisition.world_from_camera)), triangles)
-    return cast(scene, directions(acquisition.camera))
+    in_camera = moved(vertices, inverse(acquisition.world_from_camera))
+    return depth_where_seen(in_camera, triangles, acquisition.camera)
 
 
 def tray_meshes(rim_m: float = RIM_M) -> list[Mesh]:

@@ -8,6 +8,7 @@ from actors.geometry.poses import inverse, moved, on_tray
 from actors.geometry.rendering import directions
 from actors.geometry.shapes import VGA
 from actors.palletizing.controller import ControllerError
+from actors.palletizing.simulation import physical_sensors
 from actors.palletizing.simulation.cell_picture import CellPictures
 from actors.palletizing.simulation.packages import Truth, deformed, pressed
 from actors.palletizing.simulation.physical_packages import (
@@ -17,9 +18,16 @@ from actors.palletizing.simulation.physical_packages import (
     face_of,
     patch_area,
 )
-from actors.palletizing.simulation.physical_sensors import PhysicalBeltSensor, PhysicalTraySensor
+from actors.palletizing.simulation.physical_sensors import (
+    PhysicalBeltSensor,
+    PhysicalTraySensor,
+    arm_meshes,
+    package_meshes,
+    still_meshes,
+)
 from actors.palletizing.simulation.physics import PhysicalCell
 from actors.palletizing.simulation.products import product_mesh
+from actors.palletizing.simulation.sensors import true_depth
 
 from .moves import carton
 
@@ -96,6 +104,27 @@ def test_empty_image_has_no_package(cell):
     high = grid[..., 2] < 0.95 - 0.03
     assert change[high].mean() > 0.8
     assert change[~high & np.isfinite(grid[..., 2])].mean() < 0.02
+
+
+def test_image_is_that_of_all_meshes_at_once_and_only_what_has_moved_is_drawn_again(cell):
+    sensor = PhysicalTraySensor(cell.shown, seed=1)
+    shown = cell.shown()
+    meshes = [*still_meshes(cell.layout), *arm_meshes(shown)]
+    meshes += [mesh for package in shown.packages for mesh in package_meshes(package)]
+    tray_from_base = inverse(cell.layout.base_from_tray)
+    placed = [(moved(vertices, tray_from_base), triangles) for vertices, triangles in meshes]
+
+    np.testing.assert_array_equal(sensor.true_depth(), true_depth(placed, sensor.acquisition))
+
+    drawn = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(physical_sensors, "drawn", lambda *what: drawn.append(what) or nothing)
+        nothing = (slice(0, 0), slice(0, 0)), np.zeros((0, 0), np.float32)
+        sensor.true_depth()
+        assert not drawn
+        cell.put(0, cell.pose(0) @ on_tray(0.001, 0.0, 0.0))
+        sensor.true_depth()
+    assert len(drawn) == 1
 
 
 def test_images_of_one_moment_are_equal(cell):
