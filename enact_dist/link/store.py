@@ -59,6 +59,7 @@ from enact_dist.link.store_rows import (
     row_checksum,
     slot_body,
 )
+from enact_dist.link.store_torn_log import cut_torn_commits
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -134,6 +135,7 @@ def _read_locked(folder: Path) -> tuple[Database, Contents]:
         # existing one may be from a start that was killed before the mark was on the disk.
         MarkFile.open(folder, 0).close()
         sync_folder(folder)
+    cut_torn_commits(folder, found)
     database, contents = open_database(folder, found)
     try:
         (folder / BLOB_FOLDER).mkdir(mode=folder.stat().st_mode & 0o777 | 0o700, exist_ok=True)

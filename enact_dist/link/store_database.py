@@ -54,6 +54,7 @@ class Database:
 
     Args:
         path: The database file; made if it does not exist.
+        writable: Otherwise nothing is written, not even at `close`; needs an existing file.
 
     Raises:
         OSError: The file cannot be opened.
@@ -63,13 +64,17 @@ class Database:
 
     __slots__ = ("_connection", "_forced")
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, writable: bool = True) -> None:
+        self._forced = True
+        if not writable:
+            uri = f"{path.absolute().as_uri()}?mode=ro"
+            self._connection = sqlite3.connect(uri, uri=True, isolation_level=None)
+            return
         # SQLite gives the database and its log the mode of an existing empty file.
         os.close(os.open(path, os.O_RDONLY | os.O_CREAT | os.O_CLOEXEC, file_mode(path.parent)))
         self._connection = sqlite3.connect(
             path, isolation_level=None, check_same_thread=False, timeout=0.0
         )
-        self._forced = True
         try:
             for pragma in _PRAGMAS:
                 self._connection.execute(f"PRAGMA {pragma}").fetchall()

@@ -84,6 +84,21 @@ def check_wal(path: Path) -> WalVerdict:
     return WalVerdict(first_bad, page_bytes, offset if damaged else None)
 
 
+def commit_ends(path: Path) -> list[int]:
+    """Return the offset in bytes behind each commit that SQLite reads from the log, oldest first.
+
+    Raises:
+        OSError: As the system reports it.
+    """
+    verdict = check_wal(path)
+    if not verdict.frames:
+        return []
+    frames = _frames(np.memmap(path, dtype=np.uint8, mode="r"), verdict.page_bytes)
+    is_commit = _words(frames[: verdict.frames], 4, 8)[:, 0] != 0
+    length = FRAME_HEADER_BYTES + verdict.page_bytes
+    return [HEADER_BYTES + (int(frame) + 1) * length for frame in np.flatnonzero(is_commit)]
+
+
 def _any_belong_together(raw: NDArray[np.uint8], header: NDArray[np.uint32]) -> bool:
     """Return whether later frames prove that a log's bad header was valid once.
 

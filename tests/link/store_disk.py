@@ -112,7 +112,7 @@ def _on_file(found, texts, opened, number):
 def _on_paths(found, texts, folder):
     paths = [_inside(text.decode(), folder) for text in texts]
     if paths and paths[0] is not None:
-        if found[1] not in {"rename", "unlink", "mkdir"}:
+        if found[1] not in {"rename", "unlink", "mkdir", "link"}:
             raise AssertionError(f"a call that this recorder does not know: {found[0][:200]}")
         yield Call(found[1], *paths[:2])
 
@@ -212,6 +212,9 @@ class Disk:
             other, new = self._around(call.to)
             assert folder is other
             folder.pending.append((self.number, name, new, folder.entries()[name]))
+        elif call.kind == "link":
+            folder, new = self._around(call.to)
+            folder.pending.append((self.number, None, new, self._find(call.path)))
 
     # ---------------------------------------------------------------- what a crash leaves
 

@@ -16,6 +16,7 @@ from enact_dist.link import store_mark
 from enact_dist.link.store import open_store, read_store
 from enact_dist.link.store_folder import DATABASE_FILE
 from enact_dist.link.store_mark import MARK_FILE
+from enact_dist.link.wal_check import check_wal
 from enact_dist.terms import Durability, NullReason
 
 FRAME_BYTES = 24 + 4096
@@ -439,3 +440,51 @@ def test_mark_of_a_first_start_that_was_killed_is_forced_by_the_next(tmp_path, m
     store.close()
 
     assert forced[:2] == [False, False]
+
+
+def torn_unnoticed(folder, *, after):
+    """Tear the last frame of page 1 behind a batch so that its checksum holds: stale page counts."""
+    log = folder / "store.db-wal"
+    raw = bytearray(log.read_bytes())
+    frames = range(frames_of(folder) - 1, -1, -1)
+    first_page = (
+        frame_offset(n) for n in frames if raw[frame_offset(n) :][:4] == (1).to_bytes(4, "big")
+    )
+    begin = next(first_page) + 24
+    assert begin > after
+    for offset, change in ((28, -1), (32, 1), (36, 1)):
+        place = slice(begin + offset, begin + offset + 4)
+        raw[place] = ((int.from_bytes(raw[place], "big") + change) % 2**32).to_bytes(4, "big")
+    log.write_bytes(raw)
+
+
+@pytest.mark.parametrize("durability", [Durability.OS, Durability.DURABLE])
+def test_commit_that_was_torn_without_a_wrong_checksum_goes_after_a_power_cut(
+    tmp_path, durability, caplog
+):
+    """SQLite's sum misses three neighbouring words: unforced commits go, forced ones refuse."""
+    folder = tmp_path / "folder"
+    store, _ = open_store(folder, unix_s=1)
+    store.write([persist(slot_record("forced", 1))])
+    for number in range(4):
+        store.write([persist(slot_record(f"small{number}", 1), durability=Durability.OS)])
+    before = (folder / "store.db-wal").stat().st_size
+    store.write([persist(slot_record("large", 1, size=30_000), durability=durability)])
+    copy = tmp_path / "copy"
+    shutil.copytree(folder, copy)
+    store.close()
+    torn_unnoticed(copy, after=before)
+    assert check_wal(copy / "store.db-wal").damaged_at is None
+    same_boot = tmp_path / "same-boot"
+    shutil.copytree(copy, same_boot)
+    assert "is damaged" in str(refusal(same_boot))
+    after_power_cut(copy)
+    if durability is Durability.DURABLE:
+        with pytest.raises(StoreError, match="is damaged"):
+            open_store(copy, unix_s=1)
+        assert not list(copy.glob("trial*"))
+        return
+    entities = {record.slot.entity for record in reopened(copy).slots}
+    assert entities == {"forced", *(f"small{number}" for number in range(4))}
+    assert f"commits from byte {before} on: 1" in caplog.text
+    assert not list(copy.glob("trial*"))
