@@ -51,6 +51,7 @@ STOPPED: Final = (
     "take_away",
     "change_tray",
     "fail",
+    "failures",
     "truth",
     "shown",
 )

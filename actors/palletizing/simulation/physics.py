@@ -18,6 +18,7 @@ It is not for several threads: `cell_thread` runs it in one of its own.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -70,8 +71,31 @@ FAILURES: Final = {
     "camera": "the depth sensors see what they saw",
 }
 """What can be made to fail for a while, and how it shows."""
+WHEN: Final = {
+    "": "at once",
+    "carried": "when a held package hangs over the tray",
+    "running": "when the belt moves",
+}
+"""What a failure can wait for."""
+HANGS_M: Final = 0.06
+"""A held package whose base is so high above the tray hangs."""
 NEAR_M: Final = 0.3
 """A package farther from the tool than this is not the one that was missed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """Something that fails for a while.
+
+    Attributes:
+        when: What it waits for, one of `WHEN`.
+        cycles: How long it lasts.
+        since: Cycle in which it began; -1: it waits.
+    """
+
+    when: str
+    cycles: int
+    since: int = -1
 
 
 class PhysicalCell:
@@ -123,7 +147,7 @@ class PhysicalCell:
         self._fed = 0
         self._cycles = 0
         self._running = self._interrupted = False
-        self._failing: dict[str, int] = {}
+        self._failing: dict[str, Failure] = {}
         self._seen_last: ShownCell | None = None
         self._grip = GripWatch()
         self._hand = int(model.body("hand").id)
@@ -147,6 +171,7 @@ class PhysicalCell:
     def step(self, cycles: int = 1) -> None:
         """Let the cell go on by cycles of control, 4 ms each."""
         for _ in range(cycles):
+            self._begin_failures()
             self.arm.drive(slack=self._fails("gripper"))
             self._carry()
             self._mujoco.mj_step(self.model, self.data, STEPS)
@@ -158,25 +183,55 @@ class PhysicalCell:
             if not self._fails("wrist"):
                 self.arm.measure(self._stamp_ns())
 
-    def fail(self, kind: str, seconds: float) -> None:
-        """Let something fail from now on.
+    def fail(self, kind: str, seconds: float, when: str = "") -> None:
+        """Let something fail.
 
         Args:
             kind: One of `FAILURES`.
             seconds: Simulated time until it works again; 0 mends it.
+            when: What it waits for, one of `WHEN`.
 
         Raises:
-            ControllerError: No such kind.
+            ControllerError: No such kind, or nothing that can be waited for.
         """
-        if kind not in FAILURES:
-            known = ", ".join(FAILURES)
-            raise ControllerError(f"asked for the failure {kind!r}; this cell has {known}")
-        if kind == "camera":
-            self._seen_last = self.shown()
-        self._failing[kind] = self._cycles + round(seconds / CYCLE_S)
+        for asked, known, what in ((kind, FAILURES, "failure"), (when, WHEN, "moment")):
+            if asked not in known:
+                names = ", ".join(name or "none" for name in known)
+                raise ControllerError(f"asked for the {what} {asked!r}; this cell has {names}")
+        self._failing[kind] = Failure(when, round(seconds / CYCLE_S))
+        self._begin_failures()
+
+    def failures(self) -> dict[str, tuple[float, float]]:
+        """Return from when to when each failure that has begun lasts, simulated seconds."""
+        return {
+            kind: (CYCLE_S * failure.since, CYCLE_S * (failure.since + failure.cycles))
+            for kind, failure in self._failing.items()
+            if failure.since >= 0
+        }
+
+    def _begin_failures(self) -> None:
+        for kind, failure in self._failing.items():
+            if failure.since < 0 and self._is_so(failure.when):
+                if kind == "camera":
+                    self._seen_last = self.shown()
+                self._failing[kind] = replace(failure, since=self._cycles)
+
+    def _is_so(self, when: str) -> bool:
+        """Return whether what a failure waits for is so."""
+        if when == "carried":
+            held = self._grip.held
+            if held < 0:
+                return False
+            frame, (least, most) = self._areas["tray"]
+            at = (inverse(frame) @ self.pose(held))[:3, 3]
+            return bool((least < at[:2]).all() and (at[:2] < most).all() and at[2] > HANGS_M)
+        return when != "running" or (self._running and self._moving)
 
     def _fails(self, kind: str) -> bool:
-        return self._cycles < self._failing.get(kind, 0)
+        failure = self._failing.get(kind)
+        if failure is None or failure.since < 0:
+            return False
+        return self._cycles < failure.since + failure.cycles
 
     # The belt
 

@@ -98,13 +98,18 @@ class RemoteCell:
         found: ShownCell = self.ask("shown")
         return found
 
-    def fail(self, kind: str, seconds: float) -> None:
-        """Let something fail from now on, see `physics.FAILURES`.
+    def fail(self, kind: str, seconds: float, when: str = "") -> None:
+        """Let something fail, at once or when something is so, see `physics.FAILURES`.
 
         Raises:
-            ControllerError: No such kind.
+            ControllerError: No such kind, or nothing that can be waited for.
         """
-        self.ask("fail", kind, float(seconds))
+        self.ask("fail", kind, float(seconds), when)
+
+    def failures(self) -> dict[str, tuple[float, float]]:
+        """Return from when to when each failure that has begun lasts, simulated seconds."""
+        found: dict[str, tuple[float, float]] = self.ask("failures")
+        return found
 
     def picture(self, width: int = 640, height: int = 480) -> npt.NDArray[np.uint8]:
         """Return the cell as a person would see it, (height, width, 3) uint8, red first.

@@ -302,6 +302,19 @@ def test_package_that_falls_is_lost(worker, stage):
     assert worker.cell.arm.measured().tcp[2, 3] > TABLE_M + 0.1
 
 
+def test_package_falls_when_it_hangs_over_the_tray(worker):
+    """A failure that was ordered before the grasp waits for that, whatever the host is busy with."""
+    worker.put(1, *BELT)
+    worker.plan(*SECOND)
+    before = worker.truth(1).lost
+    worker.cell.fail("gripper", 0.4, "carried")
+
+    assert worker.do(1, "grasp_from_belt") == "held"
+    assert worker.cell.failures() == {}
+    assert worker.do(1, "place") == "lost"
+    assert worker.truth(1).lost == before + 1
+
+
 def test_place_without_a_floor_is_told(worker):
     """40 mm above the tray nothing is touched: the hand goes up again with what it holds."""
     worker.put(1, *BELT)

@@ -264,6 +264,27 @@ def test_failures_show_and_end():
         cell.fail("arm", 1.0)
 
 
+def test_failure_waits_until_something_is_so():
+    """The belt fails when it begins to move; from when to when is known."""
+    cell = PhysicalCell([carton()], seed=1)
+    cell.feed()
+    cell.fail("belt", 0.4, "running")
+    cell.step(50)
+    assert cell.failures() == {}
+    cell.run_belt()
+    cell.step(3)
+    ((began_s, ends_s),) = cell.failures().values()
+    along = cell.pose(0)[0, 3]
+    while cell.time_s < ends_s:
+        cell.step()
+    assert cell.pose(0)[0, 3] == pytest.approx(along, abs=5e-3)
+    cell.step(100)
+    assert cell.pose(0)[0, 3] > along + 0.02
+    assert (began_s, ends_s) == (pytest.approx(0.204, abs=0.009), pytest.approx(began_s + 0.4))
+    with pytest.raises(ControllerError, match="the moment 'soon'; this cell has none, carried"):
+        cell.fail("belt", 1.0, "soon")
+
+
 def test_gripper_that_fails_loses_its_package():
     """It opens in the air, and closes on nothing afterwards."""
     hand = Hand([carton()])
