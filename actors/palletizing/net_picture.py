@@ -25,6 +25,8 @@ ROW: Final = 112.0
 COLUMNS: Final = (200.0, 760.0, 1290.0)
 """Left edges of the columns: what can succeed, what only fails, the failures."""
 TOP: Final = 64.0
+LINE: Final = 13.0
+"""From one line of text to the next, pixels."""
 LEGEND: Final = 40.0
 _FILLS: Final = {
     "goes on": ("#c5dcf5", "#3469a5"),
@@ -36,7 +38,8 @@ _RUN: Final = "#1d1d22"
 _ENDED: Final = "#ffb347"
 _STYLE: Final = (
     "text{font:12px 'DejaVu Sans',Arial,sans-serif;fill:#1d1d22}.title{font-weight:bold}"
-    ".note{fill:#55555f;font-size:10px}path{fill:none}"
+    ".note,.exit{fill:#55555f;font-size:10px}path{fill:none}"
+    ".exit{paint-order:stroke;stroke:#ffffff;stroke-width:3px}"
 )
 
 
@@ -142,26 +145,46 @@ def _ways(net: Net, name: str) -> dict[str, list[str]]:
 
 
 def _lines(net: Net, places: dict[str, _Place], taken: set[tuple[str, str]]) -> Iterator[str]:
-    """Draw the exits, those of the run last."""
+    """Draw the exits, those of the run last, and what they wait for above all of them."""
+    conditions: list[str] = []
     lines = [(name, to, texts) for name in places for to, texts in _ways(net, name).items()]
     for name, to, texts in sorted(lines, key=lambda line: line[:2] in taken):
         begin, end = places[name], places[to]
         run = (name, to) in taken
         kind = "run" if run else end.kind
         colour = _RUN if run else _FILLS[end.kind][1]
-        d, x, y, anchor = _way(begin, end, list(_ways(net, name)).index(to))
+        d, x, y, anchor = _way(begin, end, _rows_until(net, places, name, to))
         yield (
             f"<path class={quoteattr(kind)} data-from={quoteattr(name)} data-to={quoteattr(to)}"
             f" d={quoteattr(d)}"
             f' stroke="{colour}" stroke-width="{3.0 if run else 1.3}"'
             f' marker-end="url(#{kind.replace(" ", "-")})"/>'
         )
+        above = 0.0 if begin.column == end.column else LINE * (len(texts) - 1)
         for row, text in enumerate(texts):
-            yield _text(text, x, y + 12.0 * row, "note", anchor)
+            conditions.append(_text(text, x, y + LINE * row - above, "exit", anchor))
+    yield from conditions
 
 
-def _way(begin: _Place, end: _Place, number: int) -> tuple[str, float, float, str]:
-    """Return the curve of an exit, and where its text stands."""
+def _rows_until(net: Net, places: dict[str, _Place], name: str, to: str) -> int:
+    """Return how many lines of text the exits to other columns have, up to the one to a state."""
+    rows = 0
+    for other, texts in _ways(net, name).items():
+        if places[other].column != places[name].column:
+            rows += len(texts)
+        if other == to:
+            break
+    return rows
+
+
+def _way(begin: _Place, end: _Place, rows: int) -> tuple[str, float, float, str]:
+    """Return the curve of an exit, and where its text stands.
+
+    Args:
+        begin: The state that it leaves.
+        end: The state that it leads to.
+        rows: Lines of text down to its own, beside the state that it leaves.
+    """
     if begin.column == end.column:
         if end.row == begin.row + 1:
             x, y = begin.x + WIDTH / 2.0, begin.y + HEIGHT
@@ -170,7 +193,7 @@ def _way(begin: _Place, end: _Place, number: int) -> tuple[str, float, float, st
         out = begin.x - 40.0 - 12.0 * abs(end.row - begin.row)
         text_y = top + (16.0 if end.row > begin.row else -6.0)
         return _curve(begin.x, top, out, end.x, bottom), begin.x - 10.0, text_y, "end"
-    x, y = begin.x + WIDTH, begin.y + 12.0 + 15.0 * min(number, 2)
+    x, y = begin.x + WIDTH, begin.y + LINE * rows + 2.0
     end_y = end.y + HEIGHT / 2.0
     if end.column - begin.column == 1:
         return _curve(x, y, (x + end.x) / 2.0 + 60.0, end.x, end_y), x + 10.0, y - 4.0, "start"
@@ -216,7 +239,7 @@ def _notes(primitive: Primitive) -> Iterator[str]:
     }
     points = [f"{name} {axis.value:.3g}" for name, axis in held.items() if name[0] != "r"]
     moves = [
-        f"{name} {axis.value:g} {unit_of(name, axis.mode)}"
+        f"{name} {axis.value:.4g} {unit_of(name, axis.mode)}"
         for name, axis in zip(AXES, primitive.axes, strict=True)
         if axis.mode == "force" or (axis.mode == "velocity" and axis.value)
     ]
@@ -225,7 +248,7 @@ def _notes(primitive: Primitive) -> Iterator[str]:
     yield ", ".join([*to, *moves]) or "holds"
     tool = ""
     if primitive.tool != "keep":
-        tool = f", {primitive.tool} {primitive.tool_value:g} {TOOLS[primitive.tool]}"
+        tool = f", {primitive.tool} {primitive.tool_value:.4g} {TOOLS[primitive.tool]}"
     tare = ", tare" if primitive.tare else ""
     yield f"{primitive.frame.entity}, {primitive.limit_s:g} s at most{tool}{tare}"
 

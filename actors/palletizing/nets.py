@@ -126,7 +126,7 @@ class Condition:
     def __str__(self) -> str:
         unit = QUANTITIES.get(self.quantity, "")
         held = f" for {self.hold_s:g} s" if self.hold_s else ""
-        return f"{self.quantity} {self.relation} {self.value:g} {unit}{held}"
+        return f"{self.quantity} {self.relation} {self.value:.4g} {unit}{held}"
 
 
 @dataclass(frozen=True, slots=True)
