@@ -146,6 +146,5 @@ class BeltConveyor(Actor):
             and attached is not None
             and request.place == place.name
             and (attached.request == request.number and attached.stage in OFF_THE_BELT)
-            and request.kind != "look"
         )
         return done or taken

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Final
 
 from actors.geometry.picture import png_bytes
 from actors.palletizing.demo_pictures import model_picture, tray_picture
+from actors.palletizing.handling import STANDS
 from actors.palletizing.net_picture import svg_of_net
-from actors.palletizing.planning import STANDS
 from actors.palletizing.vocabulary import (
     EMPTY,
     EXECUTION,

@@ -4,15 +4,26 @@ from __future__ import annotations
 
 import time
 from collections import Counter
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
-from actors.palletizing.handling import IDLE, along_and_across, is_held
-from actors.palletizing.reactions import Case, Reaction, choices_of, react
+from actors.palletizing.handling import GONE, IDLE, NOT_ASIDE, STANDS, along_and_across, is_held
+from actors.palletizing.reactions import (
+    BY_ITSELF,
+    MOST,
+    Case,
+    Reaction,
+    choices_of,
+    react,
+    worst,
+)
 from actors.palletizing.vocabulary import (
+    COMMAND,
+    CONVEYOR,
     DECISION,
     DEVIATIONS,
-    EXECUTION,
     GRASP,
+    GRIPPER,
     LOOK,
     NOTICES,
     OUTCOME,
@@ -23,8 +34,9 @@ from actors.palletizing.vocabulary import (
     QUESTION,
     REQUEST,
     RESULTS,
-    ROBOT,
+    SIGHT,
     SIGHTING,
+    STATE,
     SYSTEM,
     USER,
     Deviation,
@@ -38,16 +50,9 @@ from actors.palletizing.vocabulary import (
 from enact_dist import Actor, Entity, View, ViewEach, World, Write
 
 if TYPE_CHECKING:
-    from actors.palletizing.vocabulary import Outcome, Sighting
     from enact_dist import Lock
 
-UNTAKEN: Final = ("tipped", "missing")
-"""Verdicts on packages that the robot cannot take to the bin."""
-AGAIN: Final = {"reject": 1, "retry": 3, "regrasp": 3, "push_again": 2}
-"""How often each is done for one place at most, by the operator or by rule."""
 NO_NET: Final = "it cannot be done:"
-HANDS: Final = ("removed", "replaced")
-"""Answers of an operator who has moved the package by hand."""
 
 
 class Feedback(Actor):
@@ -90,189 +95,225 @@ class HandlingFeedback(Actor):
     """Decide what the robot does next, by how the last request ended and by what was seen.
 
     `reactions` has the table; every request and every result says why.  What could make it worse
-    is done only when the operator has decided so.
+    is done only when the operator has decided so.  Before the next package comes, a place is
+    opened again whose package was sound and has been spoiled by what was done beside it.
     """
 
     training, online = World("training"), World("online")
     plans = ViewEach(training, PLACES, PLAN)
     grasps = ViewEach(training, PRODUCTS, GRASP)
     sightings = ViewEach(online, PACKAGES, SIGHTING)
+    sight = View(online, CONVEYOR, SIGHT)
     outcome = View(online, SYSTEM, OUTCOME)
     look = View(online, SYSTEM, LOOK)
     flags = View(online, SYSTEM, DEVIATIONS)
-    execution = View(online, ROBOT, EXECUTION)
+    grip = View(online, GRIPPER, COMMAND)
+    gripper = View(online, GRIPPER, STATE)
     decision = View(online, SYSTEM, DECISION)
     request = Write(online, SYSTEM, REQUEST)
     results = Write(online, SYSTEM, RESULTS)
     notices = Write(online, USER, NOTICES)
     question = Write(online, USER, QUESTION)
-    triggers = (sightings, outcome, look, flags, decision)
+    triggers = (sightings, sight, outcome, look, flags, decision)
 
     def update(self, lock: Lock) -> None:
         """Decide, if everything that the decision needs is there."""
         last = lock.get(self.request)
         if last is None or last.place in lock.get(self.results, {}):
             self._next(lock, last)
-        elif last.kind == "ask":
+        elif last.kind in IDLE:
             decision = lock.get(self.decision)
             if decision is not None and decision.request == last.number:
                 self._decided(lock, last, decision.choice)
-        elif last.kind not in IDLE:
+        else:
             self._react(lock, last)
 
+    # What comes next
+
     def _next(self, lock: Lock, last: Request | None) -> None:
-        """Request the next package, if it has come."""
-        number = len(lock.get(self.results, {}))
-        place = place_entity(number)
+        """Open a place that was spoiled again; or request the next package, if it has come."""
+        results = lock.get(self.results, {})
+        spoiled = worst({place: self.flag(lock, place).verdict for place in self._spoiled(lock)})
+        if spoiled is not None and last is not None:
+            self._reopen(lock, last, spoiled)
+            return
+        number, place = len(results), place_entity(len(results))
         if place not in lock[self.plans]:
             return
+        first = Request(0 if last is None else last.number, "", place.name, "", "", seen="")
         for package, seen in lock[self.sightings].items():
             if seen.first_stop == number:
-                first = Request(
-                    0 if last is None else last.number, "", place.name, package.name, ""
-                )
+                first = replace(first, package=package.name, seen="belt")
                 wanted = lock[self.plans][place].product
                 if seen.product == wanted:
-                    self._ask_robot(lock, first, "pack", f"{wanted} has come", ())
+                    self._ask_robot(lock, first, "pack", f"{wanted} has come")
                 else:
                     found = seen.product or "something unknown"
-                    self._question(lock, first, f"{found} has come in place of {wanted}", "", ())
+                    self._question(lock, first, f"{found} has come in place of {wanted}")
+                return
+        sight = lock.get(self.sight)
+        if sight is not None and sight.number == number and sight.error:
+            self._ask_robot(lock, first, "look", sight.error)
+
+    def _spoiled(self, lock: Lock) -> list[str]:
+        """Return the places that stood as was decided, and have been judged otherwise since."""
+        flags = lock.get(self.flags, {})
+        return [
+            place
+            for place, result in lock.get(self.results, {}).items()
+            if result.result in STANDS
+            and place in flags
+            and flags[place].captured_ns > result.captured_ns
+        ]
+
+    def _reopen(self, lock: Lock, last: Request, place: str) -> None:
+        """Do what is to be done about a package that was placed."""
+        results, flag = lock.get(self.results, {}), self.flag(lock, place)
+        before = results[place]
+        lock[self.results] = {name: one for name, one in results.items() if name != place}
+        opened = Request(last.number, "", place, before.package, "", "tray", before.reactions)
+        spoiled = Case("beside", last.place, success=True, seen="tray")
+        case = self._case(lock, opened, spoiled, flag)
+        self._follow(lock, opened, case, flag, react(case))
+
+    # What follows from a request
 
     def _react(self, lock: Lock, last: Request) -> None:
         outcome, look = lock.get(self.outcome), lock.get(self.look)
         if outcome is None or outcome.request != last.number:
             return
-        tried = (*last.tried, last.kind)
-        case = Case(outcome.stage, outcome.result, outcome.success, tried=Counter(tried[1:]))
-        reaction = react(case)
-        if reaction.kind == "stop":
-            self._stop(lock, last, reaction.reason)
+        case = Case(outcome.stage, outcome.result, outcome.success)
+        if outcome.result.startswith(BY_ITSELF):
+            self._stop(lock, last, react(case).reason)
             return
         if look is None or look.request != last.number:
             return
-        flag = lock.get(self.flags, {}).get(last.place)
-        if look.captured_ns and (flag is None or flag.captured_ns != look.captured_ns):
+        if look.error:
+            self._see_nothing(lock, last, look.error)
             return
-        if last.kind in {"reject", "look"} and outcome.success:
-            self._close(lock, last, "rejected" if last.kind == "reject" else "removed", last.reason)
-            return
-        judged = flag if look.captured_ns else None
-        case = self._case(lock, last, outcome, look.seen, judged)
-        reaction = react(case)
-        if outcome.result.startswith("no_net:"):
-            reaction = Reaction("ask", outcome.result.replace("no_net:", NO_NET))
-        if last.kind == "reject" and reaction.kind != "ask":
-            reaction = Reaction("ask", f"it could not be rejected: {outcome.result}")
-        self._tell(lock, last.place, judged, f"{reaction.kind}: {reaction.reason}")
-        if reaction.kind == "go_on":
-            self._close(lock, last, "placed", reaction.reason)
-        elif reaction.kind == "ask":
-            verdict = case.verdict
-            self._question(lock, last, reaction.reason, verdict, tried, seen=case.seen)
+        flags = lock.get(self.flags, {})
+        judged = [flags[place].captured_ns for place in look.judged if place in flags]
+        if judged != [look.captured_ns] * len(look.judged):
+            return  # deviation detection is not done with this picture
+        if not last.package:
+            self._next(lock, replace(last, place=""))
+        elif last.kind in GONE and outcome.success and not look.seen:
+            done = replace(last, tried=(*last.tried, last.kind))
+            self._close(lock, done, GONE[last.kind], last.reason)
         else:
-            self._ask_robot(lock, last, reaction.kind, reaction.reason, tried, seen=case.seen)
+            flag = flags[last.place] if last.place in look.judged else None
+            self._answer(lock, last, replace(case, seen=look.seen), flag)
 
-    def _case(
-        self, lock: Lock, last: Request, outcome: Outcome, seen: str, flag: Deviation | None
-    ) -> Case:
-        """Return what is known of the place."""
+    def _answer(self, lock: Lock, last: Request, case: Case, flag: Deviation | None) -> None:
+        """Do what follows from how a request ended and from what was seen."""
+        done = replace(last, tried=(*last.tried, last.kind))
+        case = self._case(lock, done, case, flag)
+        reaction = react(case)
+        if case.result.startswith("no_net:"):
+            reaction = Reaction("ask", case.result.replace("no_net:", NO_NET))
+        elif last.kind in GONE:
+            why = f"it is still seen: {case.seen}" if case.success else case.result
+            reaction = Reaction("ask", f"it could not be {GONE[last.kind]}: {why}")
+        self._follow(lock, done, case, flag, reaction)
+
+    def _follow(
+        self, lock: Lock, done: Request, case: Case, flag: Deviation | None, reaction: Reaction
+    ) -> None:
+        """Let a reaction follow what was done, and tell it."""
+        self._tell(lock, done.place, flag, f"{reaction.kind}: {reaction.reason}")
+        now = replace(done, seen=case.seen)
+        if reaction.kind == "go_on":
+            self._close(lock, done, "placed", reaction.reason)
+        elif reaction.kind == "ask":
+            self._question(lock, now, reaction.reason, case.verdict)
+        else:
+            self._ask_robot(lock, now, reaction.kind, reaction.reason)
+
+    def _case(self, lock: Lock, last: Request, case: Case, flag: Deviation | None) -> Case:
+        """Return a case with what was found at the place."""
         along = across = turn = 0.0
         if flag is not None and flag.verdict != "missing":
             plan = lock[self.plans][Entity(last.place)]
             along, across = along_and_across(plan, flag.tray_from_product)
             turn = flag.turn_deg
-        sighting = lock[self.sightings][Entity(last.package)]
-        if not outcome.success and self._is_held(lock, sighting, outcome.stage):
-            seen = "hand"
-        return Case(
-            outcome.stage,
-            outcome.result,
-            outcome.success,
+        return replace(
+            case,
             verdict="" if flag is None else flag.verdict,
             along_mm=along,
             across_mm=across,
             turn_deg=turn,
-            seen=seen,
-            tried=Counter((*last.tried, last.kind)[1:]),
+            tried=Counter(last.tried),
         )
 
-    def _is_held(self, lock: Lock, sighting: Sighting, stage: str) -> bool:
-        """Return whether the fingers stand as far apart as the package is wide."""
-        grasp = lock[self.grasps].get(product_entity(sighting.product))
-        doing = lock.get(self.execution)
-        return doing is not None and is_held(stage, doing.width_m, grasp)
+    def _see_nothing(self, lock: Lock, last: Request, error: str) -> None:
+        """Look again, and ask the operator when that was tried often enough."""
+        tried = (*last.tried, last.kind)
+        now = replace(last, tried=tried)
+        self._tell(lock, last.place, None, error)
+        if error.startswith(NOT_ASIDE) or tried.count("look") >= MOST["look"]:
+            self._question(lock, now, error)
+        else:
+            self._ask_robot(lock, now, "look", error)
+
+    # The operator
 
     def _decided(self, lock: Lock, last: Request, choice: str) -> None:
         """Do what the operator has decided."""
         reason = f"the operator: {choice}"
         if choice == "go_on":
-            stands = lock[self.sightings][Entity(last.package)].frame == "tray"
-            self._close(lock, last, "accepted" if stands else "skipped", reason)
-        elif choice == "removed":
-            self._ask_robot(lock, last, "look", reason, last.tried, seen=last.seen)
+            self._close(lock, last, "accepted" if last.seen == "tray" else "skipped", reason)
         elif choice == "stop":
-            self._stop(lock, last, reason)
+            self._ask_robot(lock, last, "stop", reason)
+            text = f"{last.place}: stopped; look: the arm goes aside, and what is seen decides"
+            lock[self.question] = Question(last.number + 1, text, ("look",))
         else:
-            self._ask_robot(lock, last, choice, reason, last.tried, seen=last.seen)
+            self._ask_robot(lock, last, choice, reason)
 
-    def _ask_robot(
-        self,
-        lock: Lock,
-        last: Request,
-        kind: str,
-        reason: str,
-        tried: tuple[str, ...],
-        *,
-        seen: str = "belt",
-    ) -> None:
-        lock[self.request] = Request(
-            last.number + 1, kind, last.place, last.package, reason, seen, tried
-        )
+    def _ask_robot(self, lock: Lock, last: Request, kind: str, reason: str) -> None:
+        """Request something about the same place."""
+        lock[self.request] = replace(last, number=last.number + 1, kind=kind, reason=reason)
 
-    def _question(
-        self,
-        lock: Lock,
-        last: Request,
-        reason: str,
-        verdict: str,
-        tried: tuple[str, ...],
-        *,
-        seen: str = "belt",
-    ) -> None:
+    def _question(self, lock: Lock, last: Request, reason: str, verdict: str = "") -> None:
         """Ask the operator; nothing moves until the answer comes."""
-        self._ask_robot(lock, last, "ask", reason, tried, seen=seen)
-        text = f"{last.place}: {reason}"
-        added = ("removed", "stop") if verdict in UNTAKEN else ("reject", "removed", "stop")
-        refused = {word for word, most in AGAIN.items() if tried.count(word) >= most}
-        if reason.startswith(NO_NET):
-            refused |= AGAIN.keys()
-        refused.add("replaced")  # it is to be seen what the robot can do
-        if seen == "belt":
-            refused.add("go_on")  # it would come again
-        words = dict.fromkeys((*choices_of(verdict), *added))
-        choices = tuple(word for word in words if word not in refused)
-        lock[self.question] = Question(last.number + 1, text, choices)
+        self._ask_robot(lock, last, "ask", reason)
+        choices: tuple[str, ...] = ("stop", "look")
+        if last.package:
+            can_take = not reason.startswith(NO_NET)
+            choices = choices_of(verdict, last.seen, last.tried, can_take=can_take)
+        lock[self.question] = Question(last.number + 1, f"{last.place}: {reason}", choices)
 
     def _stop(self, lock: Lock, last: Request, reason: str) -> None:
-        """Stop, and ask how to go on: nothing moves by itself after the robot has stopped."""
-        outcome, sighting = lock.get(self.outcome), lock[self.sightings][Entity(last.package)]
-        stage = "" if outcome is None else outcome.stage
-        seen = "hand" if self._is_held(lock, sighting, stage) else sighting.frame
-        self._question(lock, last, reason, "", (*last.tried, last.kind), seen=seen)
+        """Ask how to go on: nothing moves by itself after the robot has stopped."""
+        sighting = lock[self.sightings].get(Entity(last.package)) if last.package else None
+        seen = "" if sighting is None else sighting.frame
+        if sighting is not None:
+            grasp = lock[self.grasps].get(product_entity(sighting.product))
+            held = is_held(lock.get(self.grip), lock.get(self.gripper), grasp)
+            seen = "hand" if held else seen
+        now = replace(last, tried=(*last.tried, last.kind), seen=seen)
+        self._question(lock, now, reason)
         self._tell(lock, last.place, None, f"stop: {reason}")
+
+    # What is told
+
+    def flag(self, lock: Lock, place: str) -> Deviation:
+        """Return the last verdict on a place."""
+        flags: dict[str, Deviation] = lock.get(self.flags, {})
+        return flags[place]
 
     def _close(self, lock: Lock, last: Request, result: str, reason: str) -> None:
         """Note what became of the package; the next one can be packed."""
         flag = lock.get(self.flags, {}).get(last.place)
-        sighting = lock[self.sightings].get(Entity(last.package))
-        tried = tuple(kind for kind in (*last.tried, last.kind) if kind and kind != "ask")
+        sighting = lock[self.sightings].get(Entity(last.package)) if last.package else None
+        tried = tuple(kind for kind in last.tried if kind not in {"", "pack", *IDLE})
         closed = Result(
             package=last.package,
             product="" if sighting is None else sighting.product,
             verdict="" if flag is None else flag.verdict,
             result=result,
-            reactions=tried[1:],
+            reactions=tried,
             reason=reason,
+            captured_ns=0 if flag is None else flag.captured_ns,
         )
         lock[self.results] = {**lock.get(self.results, {}), last.place: closed}
         self._next(lock, last)

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
     from actors.geometry.joint_paths import Arm
     from actors.palletizing.grounding import Grasp
-    from actors.palletizing.vocabulary import Plan, Request, Sighting
+    from actors.palletizing.vocabulary import GripCommand, GripState, Plan, Request, Sighting
 
     F64 = npt.NDArray[np.float64]
 
@@ -50,25 +50,41 @@ SKELETON_OF: Final = {
     "push": "push_into_contact",
     "remove": "remove_to_reject",
 }
+STANDS: Final = ("placed", "accepted")
+"""Results after which a place is filled."""
 RISKY: Final = ("place", "push")
 """Stages that can spoil what stands on the tray."""
 HELD_M: Final = 0.006
 """A package between the fingers measures at most so much more or less than its width."""
-CARRIES: Final = ("place", "remove")
-"""Stages that begin with the package in the hand."""
+GONE: Final = {"reject": "rejected", "removed": "removed"}
+"""Requests after which the package shall be seen nowhere, and what became of it then."""
+NOT_ASIDE: Final = "the arm is not aside: "
+"""What a look at the tray needs, and lacks."""
 IDLE: Final = ("stop", "ask")
 """Kinds of requests that move nothing."""
 
 
-def is_held(stage: str, width_m: float, grasp: Grasp | None) -> bool:
-    """Return whether the hand still holds a package after a stage that did not succeed.
+def fills(width_m: float, grasp: Grasp) -> bool:
+    """Return whether fingers that are so far apart hold a product by its faces."""
+    return abs(width_m - grasp.width_m) < HELD_M
+
+
+def is_held(grip: GripCommand | None, gripper: GripState | None, grasp: Grasp | None) -> bool:
+    """Return whether the hand holds a package: it presses, and what is between is as wide.
+
+    Neither the stage nor its result tells that: a net can end while it lifts, and a hand that was
+    braked holds on.
 
     Args:
-        stage: The last one.
-        width_m: Between the fingers.
-        grasp: Of the product; None if it is not known.
+        grip: The last command to the gripper; None: there was none.
+        gripper: What the gripper measures; None if it is not known: a hand that was told to press
+            is not empty then.
+        grasp: Of the product; None if nothing can be known to hold it.
     """
-    return grasp is not None and stage in CARRIES and abs(width_m - grasp.width_m) < HELD_M
+    if grip is None or grasp is None:
+        return False
+    opens = grip.kind == "width" and gripper is not None and gripper.number >= grip.number
+    return not opens and (gripper is None or fills(gripper.width_m, grasp))
 
 
 def stages_of(request: Request, plan: Plan | None) -> tuple[str, ...]:

@@ -33,13 +33,13 @@ class Request:
     Attributes:
         number: Grows by one with each request.
         kind: "pack" (grasp from the belt, place, push), "retry" (the same after a new look at the
-            belt), "push_again", "regrasp" (grasp on
-            the tray, place, push), "reject" (from belt, tray or hand into the bin), "look" (only
-            look again), "stop" (nothing more), "ask" (wait for the operator).
+            belt), "push_again", "regrasp" (grasp on the tray, place, push), "reject" (from belt,
+            tray or hand into the bin), "look" (only look again), "removed" (look whether it is
+            gone), "stop" (nothing moves until the operator says so), "ask" (wait for the operator).
         place: Name of the entity; empty if it is about none.
-        package: Name of the entity; empty if it is about none.
+        package: Name of the entity; empty if what has come was not seen yet.
         reason: Why, in words.
-        seen: Where the package was seen last: "belt", "tray" or "hand".
+        seen: Where the package was seen last: "belt", "tray" or "hand"; "" if nowhere.
         tried: Kinds of the requests for this place before this one.
     """
 
@@ -119,13 +119,31 @@ class Look:
 
     Attributes:
         request: Number of the request.
-        seen: Where its package was seen: "belt", "tray", or "" if nowhere.
-        captured_ns: Capture of the observation of its place; 0: the tray was not looked at.
+        seen: Where its package is: "belt", "tray", "hand", or "" if it was seen nowhere.
+        captured_ns: Capture of the picture of the tray; 0: the tray was not looked at.
+        judged: Names of the places that this picture shows anew: that of the package, and those
+            of its neighbours that have moved.
+        error: Why nothing was seen, in one line; empty if something could be seen.
     """
 
     request: int
     seen: str
     captured_ns: int
+    judged: tuple[str, ...] = ()
+    error: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Sight:
+    """Whether perception has seen what came last (conveyor).
+
+    Attributes:
+        number: Of the arrival.
+        error: Why the sensor did not see it, in one line; empty if it looked.
+    """
+
+    number: int
+    error: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,6 +158,7 @@ class Result:
             its deviation, by the operator).
         reactions: Kinds of all requests for it.
         reason: Why the last of them.
+        captured_ns: Capture of the picture of that verdict; a newer verdict reopens the place.
     """
 
     package: str
@@ -148,6 +167,7 @@ class Result:
     result: str
     reactions: tuple[str, ...]
     reason: str
+    captured_ns: int = 0
 
 
 @dataclass(frozen=True, slots=True)

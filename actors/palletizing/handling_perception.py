@@ -6,25 +6,28 @@ with the arm aside only; a package is judged beside what stands around it now, s
 
 from __future__ import annotations
 
+import math
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from actors.geometry.open3d_on_use import open3d
 from actors.geometry.registration import register
 from actors.geometry.segmentation import new_pieces
 from actors.palletizing.belt_sight import seen_on_belt
-from actors.palletizing.handling import ASIDE, is_held
+from actors.palletizing.handling import ASIDE, GONE, NOT_ASIDE, is_held
 from actors.palletizing.sensor import FRAMES as FRAMES_FUSED
-from actors.palletizing.sensor import open_sensor, steady
+from actors.palletizing.sensor import SensorError, Watched, open_sensor
 from actors.palletizing.tray_changes import changed, tray_alone, without
 from actors.palletizing.vocabulary import (
     ARRIVAL,
     BELT,
     CLOUD,
+    COMMAND,
     CONVEYOR,
     EMPTY,
     EXECUTION,
     GRASP,
+    GRIPPER,
     LAST,
     LOOK,
     NET,
@@ -36,12 +39,15 @@ from actors.palletizing.vocabulary import (
     PRODUCTS,
     REQUEST,
     ROBOT,
+    SIGHT,
     SIGHTING,
+    STATE,
     SURFACE,
     SYSTEM,
     TRAY,
     Look,
     Observation,
+    Sight,
     Sighting,
     product_entity,
 )
@@ -58,6 +64,10 @@ if TYPE_CHECKING:
 
     F64 = npt.NDArray[np.float64]
     Depth = npt.NDArray[np.uint16]
+
+
+GONE_M: Final = 0.15
+"""What is farther from where a package stood is something else, when it shall be gone."""
 
 
 class EmptyBelt(Actor):
@@ -94,6 +104,8 @@ class HandlingPerception(Actor):
     outcome = View(online, SYSTEM, OUTCOME)
     attached = View(online, SYSTEM, NET)
     execution = View(online, ROBOT, EXECUTION)
+    grip = View(online, GRIPPER, COMMAND)
+    gripper = View(online, GRIPPER, STATE)
     plans = ViewEach(training, PLACES, PLAN)
     models = ViewEach(training, PRODUCTS, SURFACE)
     grasps = ViewEach(training, PRODUCTS, GRASP)
@@ -101,15 +113,15 @@ class HandlingPerception(Actor):
     empty_belt = View(training, BELT, EMPTY)
     last = Write(online, TRAY, LAST)
     look = Write(online, SYSTEM, LOOK)
+    sight = Write(online, CONVEYOR, SIGHT)
     observations = WriteEach(online, PLACES, OBSERVATION)
     clouds = WriteEach(online, PACKAGES, CLOUD)
     sightings = WriteEach(online, PACKAGES, SIGHTING)
     triggers = (arrival, outcome, execution)
 
     def __init__(self, belt_sensor: str, tray_sensor: str, frames: int = FRAMES_FUSED) -> None:
-        self.belt_sensor: TraySensor = open_sensor(belt_sensor)
-        self.tray_sensor: TraySensor = open_sensor(tray_sensor)
-        self.frames = frames
+        self.belt_sensor = Watched(open_sensor(belt_sensor), "the belt sensor", frames)
+        self.tray_sensor = Watched(open_sensor(tray_sensor), "the tray sensor", frames)
         self._arrived_ns = 0
         self._is_unseen = False
         self._looked = 0
@@ -121,34 +133,41 @@ class HandlingPerception(Actor):
     def update(self, lock: Lock) -> None:
         """Look at the belt if a package has come, and where a request ended."""
         arrival, outcome = lock.get(self.arrival), lock.get(self.outcome)
-        if arrival is not None and self._looks_for(lock, arrival.stamp_ns):
-            known = lock[self.sightings].values()
-            self._is_unseen = all(seen.first_stop != arrival.number for seen in known)
-            if self._is_unseen:
-                package = Entity.fresh("package")
-                self._is_unseen = not self._see_belt(lock, package, arrival.number)
-        if outcome is None or not self._aside(lock, outcome):
+        went, ended = self._way_aside(lock)
+        if arrival is not None and self._looks_for(arrival.stamp_ns, went if ended == ASIDE else 0):
+            self._see_arrival(lock, arrival.number)
+        attached = lock.get(self.attached)
+        if outcome is None or attached is None or attached.request != outcome.request or not ended:
             return
         before, request = lock.get(self.look), lock[self.request]
         is_new = before is None or before.request != outcome.request
-        if is_new and request.number == outcome.request:
+        if not is_new or request.number != outcome.request:
+            return
+        if ended != ASIDE:
+            lock[self.look] = Look(request.number, "", 0, error=NOT_ASIDE + ended)
+            return
+        try:
             lock[self.look] = self._look(lock, request, outcome)
+        except SensorError as error:
+            print(error, flush=True)
+            lock[self.look] = Look(request.number, "", 0, error=str(error))
 
-    def _looks_for(self, lock: Lock, arrived_ns: int) -> bool:
+    def _way_aside(self, lock: Lock) -> tuple[int, str]:
+        """Return the number of the net that takes the arm aside and how it ended; (0, "") if none.
+
+        An arm that ended otherwise than aside stands anywhere and hides what is below.
+        """
+        attached, doing = lock.get(self.attached), lock.get(self.execution)
+        if attached is None or doing is None or attached.stage != ASIDE:
+            return 0, ""
+        return attached.number, doing.result if doing.net_version == attached.number else ""
+
+    def _looks_for(self, arrived_ns: int, aside: int) -> bool:
         """Return whether to look at the belt for a package that has come.
 
         At once, and as long as it was not seen, each time the arm has gone aside: an arm that
         stopped above the belt hides it.
         """
-        attached, doing = lock.get(self.attached), lock.get(self.execution)
-        is_aside = (
-            attached is not None
-            and doing is not None
-            and attached.stage == ASIDE
-            and doing.net_version == attached.number
-            and bool(doing.result)
-        )
-        aside = attached.number if attached is not None and is_aside else 0
         looks = arrived_ns != self._arrived_ns or (
             self._is_unseen and aside not in {0, self._looked}
         )
@@ -156,46 +175,59 @@ class HandlingPerception(Actor):
             self._arrived_ns, self._looked = arrived_ns, aside
         return looks
 
-    def _aside(self, lock: Lock, outcome: Outcome) -> bool:
-        """Return whether the arm has gone aside after a request."""
-        attached, doing = lock.get(self.attached), lock.get(self.execution)
-        return (
-            attached is not None
-            and doing is not None
-            and (attached.request, attached.stage) == (outcome.request, ASIDE)
-            and doing.net_version == attached.number
-            and bool(doing.result)
-        )
+    def _see_arrival(self, lock: Lock, number: int) -> None:
+        """Create the entity of the package that has come, unless it is known."""
+        known = lock[self.sightings].values()
+        self._is_unseen = all(seen.first_stop != number for seen in known)
+        if not self._is_unseen:
+            return
+        error = ""
+        try:
+            self._is_unseen = not self._see_belt(lock, Entity.fresh("package"), number)
+        except SensorError as failed:
+            error = str(failed)
+            print(error, flush=True)
+        before = lock.get(self.sight)
+        if error or before is not None:
+            lock[self.sight] = Sight(number, error)
 
     def _look(self, lock: Lock, request: Request, outcome: Outcome) -> Look:
-        """Look where the package of a request is; return what was seen."""
+        """Look where the package of a request is; return what was seen.
+
+        Raises:
+            SensorError: The sensor cannot be believed.
+        """
+        if not request.package:  # what has come was looked for just now
+            sight = lock.get(self.sight)
+            return Look(request.number, "", 0, error="" if sight is None else sight.error)
         package, place = Entity(request.package), Entity(request.place)
-        number = lock[self.sightings][package].first_stop
+        before = lock[self.sightings][package]
+        grasp = lock[self.grasps].get(product_entity(before.product))
+        if is_held(lock.get(self.grip), lock.get(self.gripper), grasp):
+            return Look(request.number, "hand", 0)  # it would be seen above the tray
         missed = not outcome.success and outcome.stage == "grasp"
-        if missed and self._see_belt(lock, package, number):  # later, the next one may lie there
-            return Look(request.number, "belt", 0)
-        grasp = lock[self.grasps].get(product_entity(lock[self.sightings][package].product))
-        if not outcome.success and is_held(outcome.stage, lock[self.execution].width_m, grasp):
-            return Look(request.number, "", 0)  # it would be seen in the hand, above the tray
+        on_belt = missed or (before.frame == "belt" and request.kind in {"look", "removed"})
+        if on_belt and self._see_belt(lock, package, before.first_stop):
+            return Look(request.number, "belt", 0)  # later, the next one may lie there
         empty = lock[self.empty_tray]
-        frame, now_ns = tray_alone(self._tray(), empty), time.time_ns()
+        frame, now_ns = tray_alone(self.tray_sensor.image(), empty), time.time_ns()
         tray = lock[self.plans][place].tray
-        before = lock.get(self.last)
-        moved = [] if before is None else changed(frame, before, self._standing(lock, tray))
+        last = lock.get(self.last)
+        moved = [] if last is None else changed(frame, last, self._standing(lock, tray))
         names = tuple(dict.fromkeys((package.name, *moved)))
         there = {}
         for name in names:  # the newest first: what it was pushed against is seen beside it
             before_mm = self._without(lock, name, tray, frame)
-            there[name] = self._see_tray(lock, Entity(name), frame, before_mm)
-        for name in names:  # where all of them stand is known only now
-            if name != package.name or request.kind not in {"reject", "look"}:
-                at = Entity(f"place/{lock[self.sightings][Entity(name)].first_stop}")
-                before_mm = self._without(lock, name, tray, frame)
-                seen = Observation(frame, before_mm, (name,) if there[name] else (), now_ns)
-                lock[self.observations].put(at, seen, stamp_ns=now_ns)
+            near_m = GONE_M if name == package.name and request.kind in GONE else math.inf
+            there[name] = self._see_tray(lock, Entity(name), frame, before_mm, near_m)
+        judged = names[1:] if request.kind in GONE else names
+        places = tuple(f"place/{lock[self.sightings][Entity(name)].first_stop}" for name in judged)
+        for name, at in zip(judged, places, strict=True):  # where all of them stand is known now
+            before_mm = self._without(lock, name, tray, frame)
+            seen = Observation(frame, before_mm, (name,) if there[name] else (), now_ns)
+            lock[self.observations].put(Entity(at), seen, stamp_ns=now_ns)
         lock[self.last] = frame
-        judged = request.kind not in {"reject", "look"}
-        return Look(request.number, lock[self.sightings][package].frame, now_ns if judged else 0)
+        return Look(request.number, lock[self.sightings][package].frame, now_ns, places)
 
     def _without(self, lock: Lock, name: str, tray: int, frame: DepthFrame) -> Depth:
         """Return the picture of a tray as it would be without a package."""
@@ -214,12 +246,9 @@ class HandlingPerception(Actor):
             if seen.frame == "tray" and seen.tray == tray
         }
 
-    def _tray(self) -> DepthFrame:
-        return steady(lambda: self.tray_sensor.capture(0), frames=self.frames)
-
     def _see_belt(self, lock: Lock, package: Entity, number: int) -> bool:
         """Look for a package on the belt; return whether there is one."""
-        frame = steady(lambda: self.belt_sensor.capture(number), frames=self.frames)
+        frame = self.belt_sensor.image(number)
         models = self._models(lock)
         sights = seen_on_belt(frame, lock[self.empty_belt].depth_mm, models)
         if not sights:
@@ -232,11 +261,18 @@ class HandlingPerception(Actor):
         )
         return True
 
-    def _see_tray(self, lock: Lock, package: Entity, frame: DepthFrame, before_mm: Depth) -> bool:
-        """Look for a package on the tray; return whether it is there."""
+    def _see_tray(
+        self, lock: Lock, package: Entity, frame: DepthFrame, before_mm: Depth, near_m: float
+    ) -> bool:
+        """Look for a package on the tray, so near to where it was; return whether it is there."""
         seen = lock[self.sightings][package]
         plan = lock[self.plans][Entity(f"place/{seen.first_stop}")]
-        pieces = new_pieces(frame, before_mm) if seen.product else []
+        was = seen.frame_from_package if seen.frame == "tray" else plan.tray_from_product
+        pieces = [
+            piece
+            for piece in (new_pieces(frame, before_mm) if seen.product else [])
+            if math.dist(piece.centre_m[:2], was[:2, 3]) < near_m
+        ]
         if pieces:
             surface = lock[self.models][product_entity(seen.product)]
             found = register(pieces[0].cloud, pieces[0].outline_m, surface, plan.tray_from_product)

@@ -68,6 +68,8 @@ class Operator(Actor):
         question, before = lock.get(self.question), lock.get(self.decision)
         if question is None or (before is not None and before.request >= question.request):
             return
+        if self.answers and before is not None and before.choice == "stop":
+            return  # what a script has stopped goes on when a person says so
         if question.request != self._asked:
             print(f"{question.text}\n  {' | '.join(question.choices)}", flush=True)
             self._asked = question.request

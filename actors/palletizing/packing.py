@@ -24,9 +24,10 @@ from actors.palletizing.belt_sight import seen_on_belt
 from actors.palletizing.execution import Executor
 from actors.palletizing.grasps import grasp_of, size_of
 from actors.palletizing.grounding import Gripper, Job, easier_turn, ground
+from actors.palletizing.handling import fills
 from actors.palletizing.nets import NetError
 from actors.palletizing.packing_truth import DENTED_MM, gap_m, top_dent_mm, truth_of
-from actors.palletizing.reactions import CHOICES, FELT_M, OTHERWISE, Case, Reaction, react
+from actors.palletizing.reactions import FELT_M, Case, Reaction, react, worst
 from actors.palletizing.rows import contacts_between, planned_rows
 from actors.palletizing.sensor import FRAMES
 from actors.palletizing.simulation.cell_scene import ARM, HOME_RAD, CellLayout
@@ -65,8 +66,6 @@ HELD_N: Final = 40.0
 """With which the fingers move to a width at most."""
 WAIT_S: Final = 8.0
 """A package that the belt does not bring within that time does not come."""
-HELD_M: Final = 0.006
-"""A package in the hand measures at most so much more or less than its width."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,7 +204,7 @@ class Packing:
             self._frames[f"place/{number}"] = pose
         self._last_rad: F64 | None = None
         self._turned, self._felt_m = False, 0.0
-        self._flagged = set[int]()
+        self._flagged = dict[int, str]()
         self._belt_seen, self._arrived_cycles = True, 0
         self.cell.arm.start()
 
@@ -216,10 +215,13 @@ class Packing:
             Packed(package.number, package.product, package.friction) for package in self._packages
         ]
         for each in packed:
+            self._flagged.clear()
             self.pack(each, packed)
             each.cycle_s = each.steps[-1].at_s - each.steps[0].at_s + each.steps[0].seconds
             self._feed_after(each.number)
-            for place in sorted(self._flagged - {each.number}):
+            done = {each.number}
+            while (place := worst(self._flagged, but=done)) is not None:
+                done.add(place)
                 self.pack(packed[place], packed, request="look")
         truth = self.cell.truth().packages
         for each in packed:
@@ -239,7 +241,6 @@ class Packing:
         number = packed.number
         tried, short_mm = dict[str, int](), 0.0
         self._felt_m = 0.0
-        self._flagged.clear()
         while request:
             began_s, before = self.cell.time_s, self._state(number)
             stages, case = self._act(request, number, short_mm)
@@ -397,9 +398,7 @@ class Packing:
         for place, seen in found.items():
             all_packed[place].judgements.append(self._judgement(place, seen, truth[place]))
         for place, seen in found.items():
-            self._flagged.discard(place)
-            if seen.verdict != "ok":
-                self._flagged.add(place)
+            self._flagged[place] = seen.verdict
             if seen.pose is not None:
                 self._frames[f"package/{place}"] = self.layout.base_from_tray @ seen.pose
         return found[number]
@@ -408,7 +407,7 @@ class Packing:
         """Return the case with what was seen."""
         grasp = self._grasps[self._packages[number].product]
         width_m = self.cell.arm.measured().width_m
-        held = self.cell.arm.gripping and abs(width_m - grasp.width_m) < HELD_M
+        held = self.cell.arm.gripping and fills(width_m, grasp)
         where = "hand" if held else "tray" if seen.verdict != "missing" else ""
         if not where and self.cell.arrived():
             where = "belt"
@@ -431,7 +430,7 @@ class Packing:
         if reaction.kind not in {"ask", "stop"}:
             return ""
         packed.by_hand = True
-        return CHOICES.get(case.verdict, OTHERWISE)[0]
+        return "replaced"
 
     def _replace(self, number: int, all_packed: Sequence[Packed]) -> None:
         """Let a person put a sound package to a place, and look at what is there then."""

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from actors.palletizing.controller import open_controller
 from actors.palletizing.grasps import size_of
+from actors.palletizing.handling import STANDS
 from actors.palletizing.pallet import planned_pose, tray_of
 from actors.palletizing.rows import contacts_between, planned_rows
 from actors.palletizing.vocabulary import (
@@ -28,9 +29,6 @@ from enact_dist import Actor, View, ViewEach, World, Write, WriteEach
 
 if TYPE_CHECKING:
     from enact_dist import Lock
-
-STANDS: Final = ("placed", "accepted")
-"""Results after which a place is filled."""
 
 
 class Planning(Actor):

@@ -21,9 +21,11 @@ every reaction has its reason in words.
 
 # The wire reads these annotations: they stay real types, without `from __future__`.
 
-from collections.abc import Mapping
+from collections.abc import Container, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, TypeVar
+
+Place = TypeVar("Place", bound=Hashable)
 
 REACTIONS: Final = ("go_on", "push_again", "regrasp", "retry", "reject", "stop", "ask")
 BY_ITSELF: Final = ("sensor:", "not_following:", "no_frame:", "braked:", "interrupted:")
@@ -37,18 +39,25 @@ FELT_M: Final = {"blocked_left": 0.010, "blocked_right": -0.010}
 axis."""
 TURNED_DEG: Final = 20.0
 """A package that is turned by more is nothing that the robot may take by itself."""
-MOST: Final = {"push_again": 1, "regrasp": 2, "retry": 2, "reject": 1}
+MOST: Final = {"push_again": 1, "regrasp": 2, "retry": 2, "reject": 1, "look": 2}
 """How often each is tried for one place."""
+WORST: Final = ("tipped", "deformed", "extra", "moved", "missing")
+"""Verdicts that something follows from, the worst first."""
 CHOICES: Final = {
-    "tipped": ("replaced", "go_on"),
-    "deformed": ("replaced", "go_on"),
-    "extra": ("replaced", "go_on"),
-    "moved": ("replaced", "regrasp", "go_on"),
-    "missing": ("replaced", "retry", "go_on"),
+    "belt": ("retry", "reject"),
+    "tray": ("regrasp", "go_on", "reject"),
+    "hand": ("reject",),
+    "": ("go_on",),
 }
-"""What an operator may answer, by what was seen; the first is what the rule of a script takes.
-"replaced": a person has put a sound package to the place."""
-OTHERWISE: Final = ("replaced", "retry", "go_on")
+"""What an operator may let the robot do with a package, by where it is."""
+UNFIT: Final = {
+    "tipped": ("regrasp", "reject"),
+    "deformed": ("regrasp",),
+    "extra": ("regrasp",),
+}
+"""What the robot cannot do with a package, by how it stands."""
+AGAIN: Final = {"reject": 1, "retry": 3, "regrasp": 3}
+"""How often each is done for one place at most, by the operator or by rule."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +105,7 @@ def react(case: Case) -> Reaction:
     """Return what follows from a case."""
     if case.result.startswith(BY_ITSELF):
         return Reaction("stop", f"{case.stage} ended with {case.result}")
-    if case.seen == "hand" and not case.success:
+    if case.seen == "hand":
         return _if_left(case, "reject", f"{case.stage}: {case.result}, the package is still held")
     if case.verdict in {"tipped", "deformed", "extra"}:
         return Reaction("ask", f"it is {case.verdict}")
@@ -112,9 +121,35 @@ def react(case: Case) -> Reaction:
     return Reaction("ask", f"{case.stage}: {what}; it is seen nowhere")
 
 
-def choices_of(verdict: str) -> tuple[str, ...]:
-    """Return what an operator may answer to a verdict."""
-    return CHOICES.get(verdict, OTHERWISE)
+def worst(verdicts: Mapping[Place, str], but: Container[Place] = ()) -> Place | None:
+    """Return the place that something is to be done about first, None if all are sound.
+
+    A push can spoil what stood before, so it is asked about all places, not only the newest.
+
+    Args:
+        verdicts: Of each place.
+        but: Places that are left out.
+    """
+    left = [place for place, verdict in verdicts.items() if verdict in WORST and place not in but]
+    return min(left, key=lambda place: WORST.index(verdicts[place]), default=None)
+
+
+def choices_of(
+    verdict: str, seen: str, tried: Sequence[str] = (), *, can_take: bool = True
+) -> tuple[str, ...]:
+    """Return what an operator may answer: what can be carried out now, and no more.
+
+    Args:
+        verdict: Of the place; "" if it was not judged.
+        seen: Where the package is: "belt", "tray", "hand", or "" if nowhere.
+        tried: What was done for the place so far.
+        can_take: Whether the robot can hold and reach it.
+    """
+    robots = CHOICES[seen] if can_take else tuple({"go_on"} & set(CHOICES[seen]))
+    refused = {word for word, most in AGAIN.items() if tried.count(word) >= most}
+    refused |= set(UNFIT.get(verdict, ()))
+    looks = ("look",) if can_take else ()
+    return (*(word for word in robots if word not in refused), "removed", "stop", *looks)
 
 
 def _moved(case: Case) -> Reaction:

@@ -10,6 +10,8 @@ import importlib
 from typing import TYPE_CHECKING, Any, Final, Protocol
 from urllib.parse import parse_qsl
 
+import numpy as np
+
 from actors.geometry.depth import fused
 
 if TYPE_CHECKING:
@@ -33,6 +35,55 @@ def steady(capture: Callable[[], DepthFrame], *, frames: int = FRAMES) -> DepthF
         frames: How many.
     """
     return fused([capture() for _ in range(frames)])
+
+
+class SensorError(RuntimeError):
+    """A sensor cannot be believed, or gave nothing; the text names it and says why."""
+
+
+class Watched:
+    """A fixed sensor whose images are fused, and never believed when it has failed.
+
+    No two images of a depth sensor are the same, whatever they show: their noise differs.  So one
+    whose images are all the same as the last one that it gave stands still.
+
+    Args:
+        sensor: The sensor.
+        name: What it is called when it fails: "the belt sensor".
+        frames: How many images are fused into one.
+    """
+
+    def __init__(self, sensor: TraySensor, name: str, frames: int = FRAMES) -> None:
+        self._sensor, self._name, self._frames = sensor, name, frames
+        self._last: DepthFrame | None = None
+
+    def image(self, stop: int = 0) -> DepthFrame:
+        """Return one image of several that are taken now.
+
+        Args:
+            stop: See `TraySensor.capture`.
+
+        Raises:
+            SensorError: The sensor gave no image, or stands still.
+        """
+        taken: list[DepthFrame] = []
+
+        def capture() -> DepthFrame:
+            taken.append(self._sensor.capture(stop))
+            return taken[-1]
+
+        try:
+            image = steady(capture, frames=self._frames)
+        except Exception as error:  # a driver raises what it likes
+            raise SensorError(f"{self._name} gave no image: {error}") from error
+        before = [] if self._last is None else [self._last]
+        self._last = taken[-1]
+        images = [frame.depth_mm for frame in (*before, *taken)]
+        if len(images) > 1 and all(np.array_equal(one, images[0]) for one in images[1:]):
+            raise SensorError(
+                f"{self._name} stands still: {len(images)} images in a row are the very same"
+            )
+        return image
 
 
 class TraySensor(Protocol):

@@ -51,6 +51,7 @@ from actors.palletizing.handling_data import Outcome as Outcome  # noqa: PLC0414
 from actors.palletizing.handling_data import Question as Question  # noqa: PLC0414
 from actors.palletizing.handling_data import Request as Request  # noqa: PLC0414
 from actors.palletizing.handling_data import Result as Result  # noqa: PLC0414
+from actors.palletizing.handling_data import Sight as Sight  # noqa: PLC0414
 from actors.palletizing.nets import Execution
 from enact_dist import Aspect, Durability, Entities, Entity, Retention, Tolerance
 from enact_dist.outcome import Outcome as NetOutcome
@@ -248,6 +249,8 @@ FRAMES: Final = Aspect("frames", dict[str, npt.NDArray[np.float64]])
 and "bin" (cell, training)."""
 ARRIVAL: Final = Aspect("arrival", Arrival)
 """What has come last (conveyor)."""
+SIGHT: Final = Aspect("sight", Sight)
+"""Whether what came last was seen (conveyor)."""
 REQUEST: Final = Aspect("request", Request)
 """What the robot shall do (system)."""
 CANDIDATE: Final = Aspect("candidate", Candidate)

@@ -129,12 +129,14 @@ class ShownCell:
         q: (7,), joints, rad.
         width_m: Distance between the fingers.
         packages: Those in the cell.
+        camera: How its depth sensors have failed: "frozen", "blind", or "" if they work.
     """
 
     stamp_ns: int
     q: npt.NDArray[np.float64]
     width_m: float
     packages: tuple[ShownPackage, ...]
+    camera: str = ""
 
 
 def place_of(

@@ -18,6 +18,7 @@ import numpy as np
 from actors.geometry.kinematics import link_poses
 from actors.geometry.poses import inverse, moved
 from actors.geometry.shapes import VGA, Acquisition, DepthFrame
+from actors.palletizing.controller import ControllerError
 from actors.palletizing.simulation.cell_scene import (
     ARM,
     BELT_AHEAD_M,
@@ -89,6 +90,7 @@ class _FixedSensor:
         self._true = Acquisition(VGA, true)
         self._seed = seed
         self._moment = Repeats()
+        self._frozen: tuple[int, DepthFrame] | None = None
         self._still_m: npt.NDArray[np.float32] | None = None
         self._drawn: dict[bytes, Drawn] = {}
 
@@ -102,10 +104,19 @@ class _FixedSensor:
 
         Args:
             stop: Ignored, as by a real sensor.
+
+        Raises:
+            ControllerError: The sensor was ordered to fail.
         """
         shown = self._shown()
+        if shown.camera == "blind":
+            raise ControllerError("the sensor gives no image")
+        if shown.camera == "frozen" and self._frozen and self._frozen[0] == shown.stamp_ns:
+            return self._frozen[1]
         random = np.random.default_rng([self._seed, 1, *self._moment.again(shown.stamp_ns)])
-        return DepthFrame(sensed(self._depth(shown), random), self._reported(shown))
+        frame = DepthFrame(sensed(self._depth(shown), random), self._reported(shown))
+        self._frozen = shown.stamp_ns, frame
+        return frame
 
     def true_depth(self) -> npt.NDArray[np.float32]:
         """Return the present image without noise, (H, W) float32, metres, NaN where nothing is."""

@@ -68,7 +68,8 @@ FAILURES: Final = {
     "belt": "the belt does not move",
     "gripper": "the fingers open, whatever is commanded",
     "wrist": "arm and gripper measure nothing new",
-    "camera": "the depth sensors see what they saw",
+    "camera": "the depth sensors give the image of that moment, again and again",
+    "blind": "the depth sensors give no image",
 }
 """What can be made to fail for a while, and how it shows."""
 WHEN: Final = {
@@ -349,12 +350,13 @@ class PhysicalCell:
     def shown(self) -> ShownCell:
         """Return what a sensor can see now."""
         if self._fails("camera") and self._seen_last is not None:
-            return self._seen_last
+            return replace(self._seen_last, camera="frozen")
         measured = self.arm.measured()
         return ShownCell(
             stamp_ns=self._stamp_ns(),
             q=measured.q,
             width_m=measured.width_m,
+            camera="blind" if self._fails("blind") else "",
             packages=tuple(
                 ShownPackage(
                     number=number,

@@ -50,6 +50,11 @@ def cell(trained):
         yield cell
 
 
+def planned(cell):
+    """Let planning have taken note of all results."""
+    testing.run_once(RowPlanning(4, " ".join(NAMES), f"{REMOTE}:cell_frames"), cell)
+
+
 def write(cell, entity, aspect, datum, world="online"):
     request = Write(cell.world(world), entity, aspect)
     with Lock(request) as lock:
@@ -83,18 +88,24 @@ def executed(cell, result):
     write(cell, words.ROBOT, words.EXECUTION, doing)
 
 
-def looked(cell, seen, verdict="", **found):
-    """Let perception and deviation detection have answered the outcome."""
+def looked(cell, seen, verdict="", *, error="", x_m=0.0, captured_ns=9, **neighbours):
+    """Let perception and deviation detection have answered the outcome.
+
+    Neighbours that have moved are verdicts by the number of their place: `place_0="tipped"`.
+    """
     request = read(cell, words.SYSTEM, words.REQUEST)
-    write(cell, words.SYSTEM, words.LOOK, words.Look(request.number, seen, 9 if verdict else 0))
-    if verdict:
-        plan = each(cell, words.PLACES, words.PLAN)[PLACE]
+    found = {request.place: verdict} if verdict else {}
+    found |= {name.replace("_", "/"): one for name, one in neighbours.items()}
+    look = words.Look(request.number, seen, captured_ns if found else 0, tuple(found), error)
+    write(cell, words.SYSTEM, words.LOOK, look)
+    flags = read(cell, words.SYSTEM, words.DEVIATIONS) or {}
+    for place, judged in found.items():
+        plan = each(cell, words.PLACES, words.PLAN)[Entity(place)]
         pose = np.array(plan.tray_from_product)
-        pose[0, 3] += found.pop("x_m", 0.0)
-        flag = words.Deviation(
-            PACKAGE.name, plan.product, verdict, 1.0, 1.0, 1.0, 1.0, 9, tray_from_product=pose
-        )
-        write(cell, words.SYSTEM, words.DEVIATIONS, {PLACE.name: flag})
+        pose[0, 3] += x_m
+        flag = (PACKAGE.name, plan.product, judged, 1.0, 1.0, 1.0, 1.0, captured_ns)
+        flags = {**flags, place: words.Deviation(*flag, tray_from_product=pose)}
+    write(cell, words.SYSTEM, words.DEVIATIONS, flags)
 
 
 def packed(cell, *results):
@@ -341,3 +352,190 @@ def test_why_goes_back_from_a_verdict_to_net_and_grasp(cell, capsys):
     assert "training:product/milk_carton/grasp v1" in printed
     assert "online:system/candidate v1" in printed
     assert "training:product/meal_tray" not in printed
+
+
+def placed(cell, number=0, *, package=PACKAGE, product="milk_carton", captured_ns=9):
+    """Let a package have come, been packed and judged sound."""
+    come(cell, number=number, package=package, product=product)
+    testing.run_once(HandlingFeedback(), cell)
+    packed(cell, "held", "placed", "in_contact", "aside")
+    on_tray = each(cell, words.PLACES, words.PLAN)[Entity(f"place/{number}")].tray_from_product
+    seen = words.Sighting(0, on_tray, number, number, "tray", product)
+    write(cell, package, words.SIGHTING, seen)
+
+
+def test_a_neighbour_that_a_push_has_spoiled_is_answered_before_the_next_package(cell):
+    """Its place is opened again, as soon as it is judged; then the next one comes."""
+    placed(cell)
+    looked(cell, "tray", "ok")
+    feedback = HandlingFeedback()
+    testing.run_once(feedback, cell)
+    planned(cell)
+    second = Entity("package/b")
+    placed(cell, 1, package=second, product="meal_tray")
+    number = read(cell, words.SYSTEM, words.REQUEST).number
+    looked(cell, "tray", "ok", captured_ns=20, place_0="ok")
+    flags = read(cell, words.SYSTEM, words.DEVIATIONS)
+    stale = replace(flags["place/0"], captured_ns=9)
+    write(cell, words.SYSTEM, words.DEVIATIONS, {**flags, "place/0": stale})
+    come(cell, number=2, package=Entity("package/c"))
+    testing.run_once(feedback, cell)
+    assert read(cell, words.SYSTEM, words.REQUEST).number == number  # the neighbour is not judged
+    looked(cell, "tray", "ok", captured_ns=20, place_0="moved", x_m=0.012)
+    testing.run_once(feedback, cell)
+    request = read(cell, words.SYSTEM, words.REQUEST)
+    assert (request.place, request.package, request.kind) == ("place/0", "package/a", "regrasp")
+    assert set(read(cell, words.SYSTEM, words.RESULTS)) == {"place/1"}
+    packed(cell, "held", "placed", "in_contact", "aside")
+    looked(cell, "tray", "ok", captured_ns=30)
+    testing.run_once(feedback, cell)
+    results = read(cell, words.SYSTEM, words.RESULTS)
+    assert {place: one.result for place, one in results.items()} == {
+        "place/0": "placed",
+        "place/1": "placed",
+    }
+    assert results["place/0"].reactions == ("regrasp",)
+    planned(cell)
+    testing.run_once(feedback, cell)
+    assert read(cell, words.SYSTEM, words.REQUEST).place == "place/2"
+
+
+def test_of_two_spoiled_neighbours_the_worse_one_is_answered_and_an_accepted_one_stays(cell):
+    """The operator lets it stand as it is: it is asked about once."""
+    feedback = HandlingFeedback()
+    names = "milk_carton", "meal_tray", "milk_carton"
+    for number, (name, letter) in enumerate(zip(names, "abc", strict=True)):
+        placed(cell, number, package=Entity(f"package/{letter}"), product=name)
+        spoiled = {} if number < 2 else {"place_0": "deformed", "place_1": "tipped"}
+        looked(cell, "tray", "ok", captured_ns=10 * (number + 1), **spoiled)
+        testing.run_once(feedback, cell)
+        planned(cell)
+    request = read(cell, words.SYSTEM, words.REQUEST)
+    assert (request.place, request.kind) == ("place/1", "ask")
+    asked = []
+    for _ in range(2):
+        testing.run_once(Operator(answers="go_on"), cell)
+        asked.append(read(cell, words.SYSTEM, words.REQUEST).place)
+        testing.run_once(feedback, cell)
+    assert asked == ["place/1", "place/0"]
+    results = read(cell, words.SYSTEM, words.RESULTS)
+    assert [results[f"place/{n}"].result for n in range(3)] == ["accepted", "accepted", "placed"]
+
+
+def test_an_arm_that_did_not_come_aside_is_asked_about(cell):
+    """Nothing was seen: the operator is asked, by the name of what stopped it."""
+    come(cell)
+    testing.run_once(HandlingFeedback(), cell)
+    packed(cell, "held", "placed", "in_contact", "blocked")
+    looked(cell, "", error="the arm is not aside: blocked")
+    testing.run_once(HandlingFeedback(), cell)
+    question = read(cell, words.USER, words.QUESTION)
+    assert question.text == "place/0: the arm is not aside: blocked"
+    assert "look" in question.choices
+
+
+@pytest.mark.parametrize(("answer", "done"), [("reject", "rejected"), ("removed", "removed")])
+def test_what_shall_be_gone_and_is_seen_is_asked_about(cell, answer, done):
+    """The place is closed only when the package is seen nowhere."""
+    placed(cell)
+    looked(cell, "tray", "deformed")
+    feedback = HandlingFeedback()
+    testing.run_once(feedback, cell)
+    testing.run_once(Operator(answers=answer), cell)
+    testing.run_once(feedback, cell)
+    assert read(cell, words.SYSTEM, words.REQUEST).kind == answer
+    packed(cell, *(("held", "rejected", "aside") if answer == "reject" else ("aside",)))
+    looked(cell, "tray")
+    testing.run_once(feedback, cell)
+    assert read(cell, words.SYSTEM, words.RESULTS) is None
+    request = read(cell, words.SYSTEM, words.REQUEST)
+    assert (request.kind, request.reason) == (
+        "ask",
+        f"it could not be {done}: it is still seen: tray",
+    )
+    testing.run_once(Operator(answers="removed"), cell)
+    testing.run_once(feedback, cell)
+    packed(cell, "aside")
+    looked(cell, "")
+    testing.run_once(feedback, cell)
+    assert read(cell, words.SYSTEM, words.RESULTS)[PLACE.name].result == "removed"
+
+
+def test_a_sensor_that_fails_is_looked_through_again_before_the_operator_is_asked(cell):
+    """Twice by itself, since it may recover; then the question names the sensor."""
+    error = "the tray sensor gave no image: unplugged"
+    come(cell)
+    feedback = HandlingFeedback()
+    testing.run_once(feedback, cell)
+    packed(cell, "held", "placed", "in_contact", "aside")
+    kinds = []
+    for _ in range(3):
+        looked(cell, "", error=error)
+        testing.run_once(feedback, cell)
+        kinds.append(read(cell, words.SYSTEM, words.REQUEST).kind)
+        if kinds[-1] == "look":
+            packed(cell, "aside")
+    assert kinds == ["look", "look", "ask"]
+    assert read(cell, words.USER, words.QUESTION).text == f"place/0: {error}"
+    testing.run_once(Operator(answers="look"), cell)
+    testing.run_once(feedback, cell)
+    packed(cell, "aside")
+    looked(cell, "tray", "ok")
+    testing.run_once(feedback, cell)
+    assert read(cell, words.SYSTEM, words.RESULTS)[PLACE.name].result == "placed"
+
+
+def test_a_package_that_came_unseen_is_looked_for_and_asked_about(cell):
+    """The belt's sensor failed when it came: no request is about it, so one is made."""
+    error = "the belt sensor stands still: 9 images in a row are the very same"
+    feedback = HandlingFeedback()
+    write(cell, words.CONVEYOR, words.SIGHT, words.Sight(0, error))
+    kinds = []
+    for _ in range(3):
+        testing.run_once(feedback, cell)
+        kinds.append(read(cell, words.SYSTEM, words.REQUEST).kind)
+        if kinds[-1] == "look":
+            packed(cell, "aside")
+            looked(cell, "", error=error)
+    assert kinds == ["look", "look", "ask"]
+    testing.run_once(Operator(answers="look"), cell)
+    testing.run_once(feedback, cell)
+    packed(cell, "aside")
+    write(cell, words.CONVEYOR, words.SIGHT, words.Sight(0, ""))
+    come(cell)
+    looked(cell, "")
+    testing.run_once(feedback, cell)
+    request = read(cell, words.SYSTEM, words.REQUEST)
+    assert (request.kind, request.package) == ("pack", PACKAGE.name)
+
+
+def test_stop_stays_stopped_until_somebody_looks(cell):
+    """A script that said so answers nothing more; a person can let the arm look."""
+    placed(cell)
+    looked(cell, "tray", "deformed")
+    feedback, operator = HandlingFeedback(), Operator(answers="stop")
+    testing.run_once(feedback, cell)
+    for _ in range(3):
+        testing.run_once(operator, cell)
+        testing.run_once(feedback, cell)
+    request = read(cell, words.SYSTEM, words.REQUEST)
+    assert (request.kind, request.number) == ("stop", 3)
+    assert read(cell, words.USER, words.QUESTION).choices == ("look",)
+    write(cell, words.SYSTEM, words.DECISION, words.Decision(3, "look", "a test"))
+    testing.run_once(feedback, cell)
+    assert read(cell, words.SYSTEM, words.REQUEST).kind == "look"
+
+
+def test_a_robot_that_stopped_while_it_lifted_is_asked_about_with_a_full_hand(cell):
+    """What presses and is as wide as the package holds it, whatever the stage was."""
+    come(cell)
+    testing.run_once(HandlingFeedback(), cell)
+    grasp = read(cell, words.product_entity("milk_carton"), words.GRASP, "training")
+    write(cell, words.GRIPPER, words.COMMAND, words.GripCommand(2, "force", 40.0))
+    state = words.GripState(2, grasp.width_m + 0.001, 0.0, 40.0, 7)
+    write(cell, words.GRIPPER, words.STATE, state)
+    packed(cell, "interrupted:lift")
+    testing.run_once(HandlingFeedback(), cell)
+    choices = read(cell, words.USER, words.QUESTION).choices
+    assert choices == ("reject", "removed", "stop", "look")
+    assert read(cell, words.SYSTEM, words.REQUEST).seen == "hand"

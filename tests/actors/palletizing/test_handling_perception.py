@@ -1,7 +1,5 @@
 """Claims about perception where a robot packs: the physical cell before its sensors, no robot."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -65,15 +63,15 @@ def each(cell, world, pattern, aspect):
     return dict(cell.world(world).view(request)[request])
 
 
-def ended(cell, number, package, place, *, stage="push", success=True):
+def ended(cell, number, package, place, *, stage="push", success=True, kind="pack", aside="aside"):
     """Let the robot have ended a request and gone aside."""
-    request = words.Request(number, "pack", place, package, "test")
+    request = words.Request(number, kind, place, package, "test")
     write(cell, words.SYSTEM, words.REQUEST, request)
     outcome = words.Outcome(number, stage, "any", success, 7)
     write(cell, words.SYSTEM, words.OUTCOME, outcome)
     net = aside_net(turned=False)
     write(cell, words.SYSTEM, words.NET, words.Attached(number, number, "aside", net, {}))
-    doing = Execution("go_aside", number, "go", 7, (), "aside", np.zeros(6), 0.07, np.eye(4))
+    doing = Execution("go_aside", number, "go", 7, (), aside, np.zeros(6), 0.07, np.eye(4))
     write(cell, words.ROBOT, words.EXECUTION, doing)
 
 
@@ -168,8 +166,100 @@ def test_a_package_in_the_hand_is_not_judged(cell, physical):
     (package,) = each(cell, "online", words.PACKAGES, words.SIGHTING)
     grasp = each(cell, "training", words.PRODUCTS, words.GRASP)[Entity("product/milk_carton")]
     ended(cell, 1, package.name, "place/0", stage="place", success=False)
-    doing = read(cell, words.ROBOT, words.EXECUTION)
-    write(cell, words.ROBOT, words.EXECUTION, replace(doing, width_m=grasp.width_m - 0.002))
+    state = words.GripState(1, grasp.width_m - 0.002, 0.0, 40.0, 7)
+    write(cell, words.GRIPPER, words.COMMAND, words.GripCommand(1, "force", 40.0))
+    write(cell, words.GRIPPER, words.STATE, state)
     testing.run_once(perception, cell)
-    assert read(cell, words.SYSTEM, words.LOOK).captured_ns == 0
+    look = read(cell, words.SYSTEM, words.LOOK)
+    assert (look.seen, look.captured_ns, look.judged) == ("hand", 0, ())
     assert each(cell, "online", words.PLACES, words.OBSERVATION) == {}
+
+
+@pytest.mark.parametrize("result", ["blocked", "timeout:away", "interrupted:away"])
+def test_an_arm_that_is_not_aside_hides_the_tray(cell, physical, result):
+    """It stopped on its way: nothing is judged below it, and the request is answered by name."""
+    perception = HandlingPerception("belt", "tray", frames=2)
+    on_belt(physical, 0)
+    write(cell, words.CONVEYOR, words.ARRIVAL, words.Arrival(0, 7))
+    testing.run_once(perception, cell)
+    (package,) = each(cell, "online", words.PACKAGES, words.SIGHTING)
+    on_tray(cell, physical, 0)
+    ended(cell, 1, package.name, "place/0", aside=result)
+    testing.run_once(perception, cell)
+    look = read(cell, words.SYSTEM, words.LOOK)
+    assert (look.judged, look.error) == ((), f"the arm is not aside: {result}")
+    assert each(cell, "online", words.PLACES, words.OBSERVATION) == {}
+
+
+@pytest.mark.parametrize("kind", ["reject", "removed"])
+@pytest.mark.parametrize("stays", [True, False])
+def test_what_shall_be_gone_is_looked_for(cell, physical, kind, stays):
+    """After a removal the tray tells whether the package is gone; its place is not judged."""
+    perception = HandlingPerception("belt", "tray", frames=2)
+    on_belt(physical, 0)
+    write(cell, words.CONVEYOR, words.ARRIVAL, words.Arrival(0, 7))
+    testing.run_once(perception, cell)
+    (package,) = each(cell, "online", words.PACKAGES, words.SIGHTING)
+    on_tray(cell, physical, 0)
+    ended(cell, 1, package.name, "place/0")
+    testing.run_once(perception, cell)
+    if not stays:
+        physical.take_away(0)
+    ended(cell, 2, package.name, "place/0", stage="remove", kind=kind)
+    testing.run_once(perception, cell)
+    look = read(cell, words.SYSTEM, words.LOOK)
+    assert (look.request, look.seen, look.judged) == (2, "tray" if stays else "", ())
+
+
+@pytest.mark.parametrize(
+    ("kind", "error"),
+    [
+        ("blind", "the tray sensor gave no image: the sensor gives no image"),
+        ("camera", "the tray sensor stands still: 3 images in a row are the very same"),
+    ],
+)
+def test_a_tray_sensor_that_fails_is_named_and_nothing_is_judged(cell, physical, kind, error):
+    """The look says why; once it works, the next look judges."""
+    perception = HandlingPerception("belt", "tray", frames=2)
+    on_belt(physical, 0)
+    write(cell, words.CONVEYOR, words.ARRIVAL, words.Arrival(0, 7))
+    testing.run_once(perception, cell)
+    (package,) = each(cell, "online", words.PACKAGES, words.SIGHTING)
+    on_tray(cell, physical, 0)
+    ended(cell, 1, package.name, "place/0")
+    testing.run_once(perception, cell)
+    physical.step(5)
+    physical.fail(kind, 60.0)
+    on_tray(cell, physical, 0, beside_m=0.1)
+    for number in (2, 3):
+        ended(cell, number, package.name, "place/0", kind="look")
+        testing.run_once(perception, cell)
+    look = read(cell, words.SYSTEM, words.LOOK)
+    assert (look.request, look.judged, look.error) == (3, (), error)
+    physical.fail(kind, 0.0)
+    ended(cell, 4, package.name, "place/0", kind="look")
+    testing.run_once(perception, cell)
+    testing.run_once(DeviationDetection(), cell)
+    assert read(cell, words.SYSTEM, words.DEVIATIONS)["place/0"].verdict == "moved"
+
+
+@pytest.mark.parametrize("kind", ["blind", "camera"])
+def test_a_package_that_the_belt_sensor_does_not_show_is_not_forgotten(cell, physical, kind):
+    """The arrival says why it was not seen; a request to look sees it when the sensor works."""
+    perception = HandlingPerception("belt", "tray", frames=2)
+    physical.fail(kind, 60.0)
+    on_belt(physical, 0)
+    write(cell, words.CONVEYOR, words.ARRIVAL, words.Arrival(0, 7))
+    testing.run_once(perception, cell)
+    assert each(cell, "online", words.PACKAGES, words.SIGHTING) == {}
+    sight = read(cell, words.CONVEYOR, words.SIGHT)
+    assert sight.number == 0
+    assert sight.error.startswith("the belt sensor ")
+    ended(cell, 1, "", "place/0", kind="look")
+    testing.run_once(perception, cell)
+    assert read(cell, words.SYSTEM, words.LOOK).error.startswith("the belt sensor ")
+    physical.fail(kind, 0.0)
+    ended(cell, 2, "", "place/0", kind="look")
+    testing.run_once(perception, cell)
+    assert read(cell, words.SYSTEM, words.LOOK).error == ""
+    assert len(each(cell, "online", words.PACKAGES, words.SIGHTING)) == 1

@@ -6,7 +6,10 @@ import pytest
 from actors.geometry.reaching import reach
 from actors.geometry.shapes import Surface
 from actors.palletizing.grasps import grasp_of, size_of
-from actors.palletizing.reactions import MOST, REACTIONS, Case, react
+from actors.palletizing.grounding import Grasp
+from actors.palletizing.handling import fills, is_held
+from actors.palletizing.handling_data import GripCommand, GripState
+from actors.palletizing.reactions import MOST, REACTIONS, Case, choices_of, react, worst
 from actors.palletizing.rows import contacts_between, planned_rows
 from actors.palletizing.simulation.cell_scene import (
     ARM,
@@ -133,7 +136,7 @@ def test_a_reaction_follows_from_what_was_seen(case, kind):
     assert react(case).kind == kind
 
 
-@pytest.mark.parametrize("kind", sorted(MOST.keys() - {"push_again"}))
+@pytest.mark.parametrize("kind", sorted(MOST.keys() - {"push_again", "look"}))
 def test_what_was_tried_often_enough_is_asked(kind):
     seen = {"regrasp": "tray", "retry": "belt", "reject": "hand"}[kind]
     case = Case("place", "lost", success=False, seen=seen)
@@ -142,3 +145,60 @@ def test_what_was_tried_often_enough_is_asked(kind):
     assert react(again).kind == "ask"
     assert react(again).reason.endswith(f"{kind} was tried {MOST[kind]} times")
     assert kind in REACTIONS
+
+
+def test_the_worst_place_is_answered_first_wherever_it_is():
+    verdicts = {1: "ok", 2: "moved", 3: "tipped", 4: "moved", 5: "ok"}
+    assert worst(verdicts) == 3
+    assert worst(verdicts, but={3}) == 2
+    assert worst(verdicts, but={2, 3, 4}) is None
+    assert worst({}) is None
+
+
+GRASP = Grasp(np.zeros(3), np.array([0.0, 1.0, 0.0]), 0.095, 40.0, 0.03, 0.5)
+PRESS, OPEN = GripCommand(4, "force", 40.0), GripCommand(4, "width", 0.107)
+
+
+def measured(width_m, number=4):
+    return GripState(number, width_m, 0.0, 40.0, 7)
+
+
+@pytest.mark.parametrize(
+    ("grip", "gripper", "held"),
+    [
+        (PRESS, measured(0.094), True),  # in whatever stage, however it ended
+        (PRESS, measured(0.065), False),  # closed on nothing
+        (PRESS, measured(0.120), False),
+        (PRESS, None, True),  # a gripper that is silent is not empty
+        (OPEN, measured(0.107), False),
+        (OPEN, measured(0.095), False),  # it opens past this width, and presses on nothing
+        (OPEN, measured(0.095, number=3), True),  # it still does what it was told before
+        (None, measured(0.095), False),
+    ],
+)
+def test_what_the_hand_holds_is_known_by_what_it_does(grip, gripper, held):
+    assert is_held(grip, gripper, GRASP) is held
+    assert not is_held(grip, gripper, None)
+    assert fills(0.0, GRASP) is False
+
+
+@pytest.mark.parametrize(
+    ("verdict", "seen", "tried", "wanted"),
+    [
+        ("", "hand", (), ("reject", "removed", "stop", "look")),
+        ("", "hand", ("reject",), ("removed", "stop", "look")),
+        ("", "belt", (), ("retry", "reject", "removed", "stop", "look")),
+        ("", "belt", ("retry",) * 3, ("reject", "removed", "stop", "look")),
+        ("moved", "tray", (), ("regrasp", "go_on", "reject", "removed", "stop", "look")),
+        ("deformed", "tray", (), ("go_on", "reject", "removed", "stop", "look")),
+        ("tipped", "tray", (), ("go_on", "removed", "stop", "look")),
+        ("missing", "", (), ("go_on", "removed", "stop", "look")),
+    ],
+)
+def test_the_operator_is_offered_what_can_be_done_now(verdict, seen, tried, wanted):
+    """A full hand grasps nothing, nothing is grasped where it was not seen."""
+    assert choices_of(verdict, seen, tried) == wanted
+
+
+def test_what_the_robot_cannot_take_is_left_to_the_operator():
+    assert choices_of("", "belt", can_take=False) == ("removed", "stop")
