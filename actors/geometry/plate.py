@@ -49,8 +49,9 @@ POINTS_MAX: Final = 2000
 EDGE_PX: Final = 0.5
 """Spread of an edge's place in the image; neighbours share their error."""
 
-SHARED: Final = 10.0
-"""Pixels that share their error: filters and lateral noise join neighbours."""
+SHARED: Final = 2.0
+"""Pixels that share their error: filters and lateral noise join neighbours. At 10 flat views kept
+most of what the robot is off, and walls lay up to 0.13 mm beside their place."""
 
 
 def seen_from(frame: DepthFrame, plate_m: float) -> Acquisition:

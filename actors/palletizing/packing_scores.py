@@ -128,7 +128,7 @@ def played(
     """
     products = sorted({name for tray in trays for name in tray.products})
     told(f"training: {', '.join(products)}")
-    models = {name: train(name, SimulatedOrbitSensor(seed=HELD_OUT)) for name in products}
+    models = {name: train(name, SimulatedOrbitSensor(seed=HELD_OUT), frames=4) for name in products}
     found = {}
     for tray, packed in _each(trays, models, processes):
         found[tray] = packed
