@@ -6,9 +6,11 @@ import time
 from typing import TYPE_CHECKING, Final
 
 from actors.palletizing.controller import open_controller
+from actors.palletizing.handling import is_current
 from actors.palletizing.vocabulary import (
     ARRIVAL,
     BELT,
+    CELL,
     CONVEYOR,
     DEVIATIONS,
     EMPTY,
@@ -16,6 +18,7 @@ from actors.palletizing.vocabulary import (
     NET,
     PLACES,
     PLAN,
+    PLANNED,
     PRODUCTS,
     REQUEST,
     RESULTS,
@@ -80,6 +83,7 @@ class BeltConveyor(Actor):
 
     training, online = World("training"), World("online")
     plans = ViewEach(training, PLACES, PLAN)
+    planned = View(training, CELL, PLANNED)
     grasps = ViewEach(training, PRODUCTS, GRASP)
     empty = View(training, BELT, EMPTY)
     request = View(online, SYSTEM, REQUEST)
@@ -133,13 +137,18 @@ class BeltConveyor(Actor):
         return is_idle and name not in results and waits_s > OVERLOOKED_S and self.belt.arrived()
 
     def _is_free(self, lock: Lock, number: int) -> bool:
-        """Return whether a package is off the belt; change the tray if it was its last one."""
-        place, plans = place_entity(number), lock[self.plans]
-        done = place.name in lock.get(self.results, {})
+        """Return whether a package is off the belt; change the tray if it was its last one.
+
+        A tray is changed when no place is open any more, and by a plan that knows all results:
+        when a package was rejected, the one after it may still find room.
+        """
+        place, plans, results = place_entity(number), lock[self.plans], lock.get(self.results, {})
+        done = place.name in results
         if plans[place_entity(number + 1)].tray != plans[place].tray:
-            if done:
+            closed = len(results) == number + 1 and is_current(lock.get(self.planned), results)
+            if closed:
                 self.belt.change_tray()
-            return done
+            return closed
         request, attached = lock.get(self.request), lock.get(self.attached)
         taken = (
             request is not None

@@ -7,7 +7,15 @@ from collections import Counter
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
-from actors.palletizing.handling import GONE, IDLE, NOT_ASIDE, STANDS, along_and_across, is_held
+from actors.palletizing.handling import (
+    GONE,
+    IDLE,
+    NOT_ASIDE,
+    STANDS,
+    along_and_across,
+    is_current,
+    is_held,
+)
 from actors.palletizing.reactions import (
     BY_ITSELF,
     MOST,
@@ -18,6 +26,7 @@ from actors.palletizing.reactions import (
     worst,
 )
 from actors.palletizing.vocabulary import (
+    CELL,
     COMMAND,
     CONVEYOR,
     DECISION,
@@ -30,6 +39,7 @@ from actors.palletizing.vocabulary import (
     PACKAGES,
     PLACES,
     PLAN,
+    PLANNED,
     PRODUCTS,
     QUESTION,
     REQUEST,
@@ -101,6 +111,7 @@ class HandlingFeedback(Actor):
 
     training, online = World("training"), World("online")
     plans = ViewEach(training, PLACES, PLAN)
+    planned = View(training, CELL, PLANNED)
     grasps = ViewEach(training, PRODUCTS, GRASP)
     sightings = ViewEach(online, PACKAGES, SIGHTING)
     sight = View(online, CONVEYOR, SIGHT)
@@ -114,7 +125,7 @@ class HandlingFeedback(Actor):
     results = Write(online, SYSTEM, RESULTS)
     notices = Write(online, USER, NOTICES)
     question = Write(online, USER, QUESTION)
-    triggers = (sightings, sight, outcome, look, flags, decision)
+    triggers = (planned, sightings, sight, outcome, look, flags, decision)
 
     def update(self, lock: Lock) -> None:
         """Decide, if everything that the decision needs is there."""
@@ -138,7 +149,7 @@ class HandlingFeedback(Actor):
             self._reopen(lock, last, spoiled)
             return
         number, place = len(results), place_entity(len(results))
-        if place not in lock[self.plans]:
+        if place not in lock[self.plans] or not is_current(lock.get(self.planned), results):
             return
         first = Request(0 if last is None else last.number, "", place.name, "", "", seen="")
         for package, seen in lock[self.sightings].items():

@@ -36,7 +36,15 @@ if TYPE_CHECKING:
 
     from actors.geometry.joint_paths import Arm
     from actors.palletizing.grounding import Grasp
-    from actors.palletizing.vocabulary import GripCommand, GripState, Plan, Request, Sighting
+    from actors.palletizing.vocabulary import (
+        GripCommand,
+        GripState,
+        Plan,
+        Planned,
+        Request,
+        Result,
+        Sighting,
+    )
 
     F64 = npt.NDArray[np.float64]
 
@@ -62,6 +70,16 @@ NOT_ASIDE: Final = "the arm is not aside: "
 """What a look at the tray needs, and lacks."""
 IDLE: Final = ("stop", "ask")
 """Kinds of requests that move nothing."""
+
+
+def is_current(planned: Planned | None, results: Mapping[str, Result]) -> bool:
+    """Return whether the plan of the places knows what became of all packages so far."""
+    return planned is not None and planned.results == results_of(results)
+
+
+def results_of(results: Mapping[str, Result]) -> dict[str, str]:
+    """Return what became of each package, by name of its place."""
+    return {place: result.result for place, result in results.items()}
 
 
 def fills(width_m: float, grasp: Grasp) -> bool:

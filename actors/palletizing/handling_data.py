@@ -254,3 +254,17 @@ class Decision:
     request: int
     choice: str
     by: str
+
+
+@dataclass(frozen=True, slots=True)
+class Planned:
+    """What the plan of the places takes into account (cell, training).
+
+    Attributes:
+        results: What became of each package, by name of its place, when it was made; a plan
+            that does not know all results is out of date.
+        left_out: Numbers of the places that later ones have moved up to fill.
+    """
+
+    results: dict[str, str]
+    left_out: tuple[int, ...]

@@ -6,21 +6,26 @@ from typing import TYPE_CHECKING
 
 from actors.palletizing.controller import open_controller
 from actors.palletizing.grasps import size_of
-from actors.palletizing.handling import STANDS
+from actors.palletizing.handling import STANDS, is_current, results_of
 from actors.palletizing.pallet import planned_pose, tray_of
 from actors.palletizing.rows import contacts_between, planned_rows
 from actors.palletizing.vocabulary import (
     CELL,
+    EMPTY,
     FRAMES,
     PLACES,
     PLAN,
+    PLANNED,
     PRODUCTS,
+    REQUEST,
     RESULTS,
     SCAN,
     STANDING,
     SURFACE,
     SYSTEM,
+    TRAY,
     Plan,
+    Planned,
     Standing,
     place_entity,
     product_entity,
@@ -28,6 +33,9 @@ from actors.palletizing.vocabulary import (
 from enact_dist import Actor, View, ViewEach, World, Write, WriteEach
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from actors.palletizing.vocabulary import Result
     from enact_dist import Lock
 
 
@@ -67,7 +75,9 @@ class RowPlanning(Actor):
     """Order the scans; when all products are trained, plan rows in which packages touch.
 
     A package that does not come onto the tray leaves no gap: the places after its own are planned
-    anew, as if it had not been announced.
+    anew, as if it had not been announced.  One that is taken away from between others leaves its
+    place empty, since those after it stand where they do.  `PLANNED` says which results a plan
+    knows; who acts on a plan waits until that is all of them.
 
     Args:
         packages: How many packages will come.
@@ -78,19 +88,21 @@ class RowPlanning(Actor):
 
     training, online = World("training"), World("online")
     surfaces = ViewEach(training, PRODUCTS, SURFACE)
+    empty = View(training, TRAY, EMPTY)
+    request = View(online, SYSTEM, REQUEST)
     results = View(online, SYSTEM, RESULTS)
     frames = Write(training, CELL, FRAMES)
+    planned = Write(training, CELL, PLANNED)
     scans = WriteEach(training, PRODUCTS, SCAN)
     plans = WriteEach(training, PLACES, PLAN)
     standing = WriteEach(training, PLACES, STANDING)
-    every_s = 0.2
+    triggers = (empty, surfaces, results)  # the tray is seen empty when training begins
 
     def __init__(self, packages: int, products: str, frames: str, views: int = 14) -> None:
         self.packages, self.products, self.views = packages, products.split(), views
         if packages < 1 or views < 3 or not self.products:
             raise ValueError("planning needs a package, a product and three views at least")
         self.cell_frames = open_controller(frames)
-        self._coming: list[int] = []
 
     def update(self, lock: Lock) -> None:
         """Write what is missing; plan anew when a package has left its place empty."""
@@ -102,18 +114,26 @@ class RowPlanning(Actor):
         trained = lock[self.surfaces].keys()
         if any(product_entity(product) not in trained for product in self.products):
             return
-        results = lock.get(self.results, {})
-        coming = [
-            number
-            for number in range(self.packages)
-            if (found := results.get(place_entity(number).name)) is None or found.result in STANDS
-        ]
-        if coming != self._coming:
-            self._plan(lock, coming, set(results))
-            self._coming = coming
+        results, before = lock.get(self.results, {}), lock.get(self.planned)
+        if is_current(before, results):
+            return
+        left_out = self._left_out(results, before)
+        if before is None or left_out != before.left_out:
+            self._plan(lock, [n for n in range(self.packages) if n not in left_out], set(results))
+        lock[self.planned] = Planned(results_of(results), left_out)
+
+    def _left_out(self, results: Mapping[str, Result], before: Planned | None) -> tuple[int, ...]:
+        """Return the packages whose places are filled by later ones."""
+        came = {n: results[name] for n in range(self.packages) if (name := _name(n)) in results}
+        stands = [number for number, result in came.items() if result.result in STANDS]
+        last = max(stands, default=-1)
+        gone = {number for number in came if number > last}
+        return tuple(sorted(gone.union(() if before is None else before.left_out)))
 
     def _plan(self, lock: Lock, coming: list[int], done: set[str]) -> None:
         """Plan the places of the packages that come, except of those that are there."""
+        request = lock.get(self.request)
+        fixed = done if request is None else {*done, request.place}
         products = [self.products[number % len(self.products)] for number in coming]
         models = {
             product: lock[self.surfaces][product_entity(product)] for product in set(products)
@@ -122,8 +142,12 @@ class RowPlanning(Actor):
         slots = planned_rows(products, sizes, contacts_between(models))
         for number, product, slot in zip(coming, products, slots, strict=True):
             place = place_entity(number)
-            if place.name not in done:
+            if place.name not in fixed or place not in lock[self.plans]:
                 lock[self.plans][place] = Plan(
                     product, slot.tray, slot.tray_from_product, slot.push
                 )
                 lock[self.standing][place] = Standing(product, "ok", shift_mm=0.0, turn_deg=0.0)
+
+
+def _name(number: int) -> str:
+    return place_entity(number).name

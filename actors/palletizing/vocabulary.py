@@ -48,6 +48,7 @@ from actors.palletizing.handling_data import GripCommand as GripCommand  # noqa:
 from actors.palletizing.handling_data import GripState as GripState  # noqa: PLC0414
 from actors.palletizing.handling_data import Look as Look  # noqa: PLC0414
 from actors.palletizing.handling_data import Outcome as Outcome  # noqa: PLC0414
+from actors.palletizing.handling_data import Planned as Planned  # noqa: PLC0414
 from actors.palletizing.handling_data import Question as Question  # noqa: PLC0414
 from actors.palletizing.handling_data import Request as Request  # noqa: PLC0414
 from actors.palletizing.handling_data import Result as Result  # noqa: PLC0414
@@ -247,6 +248,8 @@ GRASP: Final = Aspect("grasp", Grasp)
 FRAMES: Final = Aspect("frames", dict[str, npt.NDArray[np.float64]])
 """base_from_tray, base_from_belt and base_from_bin, (4, 4) float64, metres, under "tray", "belt"
 and "bin" (cell, training)."""
+PLANNED: Final = Aspect("planned", Planned)
+"""What the plan of the places takes into account (cell, training)."""
 ARRIVAL: Final = Aspect("arrival", Arrival)
 """What has come last (conveyor)."""
 SIGHT: Final = Aspect("sight", Sight)
