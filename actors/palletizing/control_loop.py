@@ -15,6 +15,7 @@ import logging
 import threading
 import time
 from collections import deque
+from contextlib import suppress
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -177,18 +178,22 @@ class ControlLoop:
                 self._cycles()
             except ControllerError as error:
                 started = False
-                self._periods.pause()
-                self._end_now("braked:controller", str(error))
-                self._from_rad = None
-                self._stop.wait(AGAIN_S)
+                self._fail("braked:controller", str(error))
             except Exception as error:  # noqa: BLE001 (a thread has no caller: the net ends by name)
                 _LOG.exception("the control loop failed")
                 started = False
-                self._end_now("braked:loop", f"{type(error).__name__}: {error}")
-                self._from_rad = None
-                self._stop.wait(AGAIN_S)
+                self._fail("braked:loop", f"{type(error).__name__}: {error}")
         self._end_now("braked:stopped", "the robot's process ends")
         self._controller.close()
+
+    def _fail(self, result: str, because: str) -> None:
+        """Brake after an error, and end the net; the controller is tried again after a while."""
+        with suppress(Exception):  # which may be what the controller cannot do either
+            self._controller.brake()
+        self._periods.pause()
+        self._end_now(result, because)
+        self._from_rad = None
+        self._stop.wait(AGAIN_S)
 
     def _cycles(self) -> None:
         """Cycle until the end or an error of the controller."""

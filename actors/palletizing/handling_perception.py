@@ -206,8 +206,8 @@ class HandlingPerception(Actor):
         if is_held(lock.get(self.grip), lock.get(self.gripper), grasp):
             return Look(request.number, "hand", 0)  # it would be seen above the tray
         missed = not outcome.success and outcome.stage == "grasp"
-        on_belt = missed or (before.frame == "belt" and request.kind in {"look", "removed"})
-        if on_belt and self._see_belt(lock, package, before.first_stop):
+        on_belt = request.seen == "belt" and request.kind in {"look", "removed"}
+        if (missed or on_belt) and self._see_belt(lock, package, before.first_stop):
             return Look(request.number, "belt", 0)  # later, the next one may lie there
         empty = lock[self.empty_tray]
         frame, now_ns = tray_alone(self.tray_sensor.image(), empty), time.time_ns()

@@ -56,7 +56,7 @@ UNFIT: Final = {
     "extra": ("regrasp",),
 }
 """What the robot cannot do with a package, by how it stands."""
-AGAIN: Final = {"reject": 1, "retry": 3, "regrasp": 3}
+AGAIN: Final = {"reject": 1, "retry": 3, "regrasp": 3, "removed": 3}
 """How often each is done for one place at most, by the operator or by rule."""
 
 
@@ -149,7 +149,7 @@ def choices_of(
     refused = {word for word, most in AGAIN.items() if tried.count(word) >= most}
     refused |= set(UNFIT.get(verdict, ()))
     looks = ("look",) if can_take else ()
-    return (*(word for word in robots if word not in refused), "removed", "stop", *looks)
+    return tuple(word for word in (*robots, "removed", "stop", *looks) if word not in refused)
 
 
 def _moved(case: Case) -> Reaction:

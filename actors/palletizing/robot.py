@@ -173,25 +173,36 @@ class RobotJoints(Actor):
             self._ended = loop.ended.popleft()
         if self._ended is not None:
             lock[self.execution] = self._ended
-        elif loop.execution is None:
-            self._tell_interrupted(lock)
-        elif loop.execution is not self._told and not loop.execution.result:
+        elif loop.execution not in (None, self._told) and not loop.execution.result:
             lock[self.execution] = self._told = loop.execution
+        else:
+            self._tell_unexecuted(lock, begun_here=loop.execution is not None)
 
-    def _tell_interrupted(self, lock: Lock) -> None:
-        """Say of a net that an earlier process had begun that it does not go on."""
-        before = lock.get(self.execution)
+    def _tell_unexecuted(self, lock: Lock, *, begun_here: bool) -> None:
+        """Say of a net that was taken, and that nobody executes any more, that it is over.
+
+        An earlier process may have begun it; or `Robot` failed or was stopped before the loop got
+        it.  Without a result nobody would go on.
+        """
+        before, attached = lock.get(self.execution), lock.get(self.net)
         if before is not None and not before.result:
-            lock[self.execution] = interrupted(before)
+            if not begun_here:
+                lock[self.execution] = interrupted(before)
             return
-        taken, attached = lock.get(self.net_outcome), lock.get(self.net)
-        if taken is None or attached is None or taken.state != "interrupted":
+        taken = lock.get(self.net_outcome)
+        if taken is None or attached is None or taken.state == "taken":
             return
         if taken.version != lock.version(self.net):
             return  # of an older net; this one is still to be taken
-        if before is None or before.net_version != attached.number:
+        if before is not None and before.net_version == attached.number:
+            return
+        if taken.state in {"interrupted", "done"}:
             unbegun = ended_without_step(attached, before, None, "")
             lock[self.execution] = interrupted(unbegun)
+        else:
+            unbegun = ended_without_step(attached, before, None, f"braked:{taken.state}")
+            step = TraceStep(unbegun.primitive, unbegun.result, 0.0, taken.text)
+            lock[self.execution] = replace(unbegun, trace=(step,))
 
 
 def _is(found: Execution | None, published: Execution) -> bool:

@@ -49,7 +49,7 @@ class SpringController:
     def __init__(self):
         self.arm, self.q, self.grip = SpringArm(lag_s=0.02), HOME_RAD, None
         self.fails, self.starts, self.grips, self.cycles = "", 0, [], 0
-        self.error = ControllerError
+        self.error, self.brakes = ControllerError, 0
         self.changed = threading.Condition()
 
     def start(self):
@@ -70,7 +70,7 @@ class SpringController:
         self.q = q
 
     def brake(self):
-        pass
+        self.brakes += 1
 
     def close(self):
         self.starts = -1
@@ -335,6 +335,7 @@ def test_controller_that_fails_ends_the_net_and_is_tried_again(trial, error, res
     assert done.result == result
     assert done.trace[-1].because == because
     assert again.result == "done"
+    assert trial.device.brakes >= 1  # at once: not only when it notices that nothing comes any more
 
 
 def test_measurements_that_stand_still_end_the_net(trial):
@@ -384,6 +385,26 @@ def test_net_that_was_taken_and_not_begun_ends_too(trial):
     testing.run_once(trial.actors()[0], trial.cell)
 
     assert trial.get(ROBOT, EXECUTION).result == "interrupted:drift"
+
+
+@pytest.mark.parametrize("earlier", [False, True])
+@pytest.mark.parametrize("state", ["failed", "stopped", "cancelled", "preempted"])
+def test_net_that_the_robot_did_not_execute_ends_by_name(trial, state, earlier):
+    """`Robot` failed before the loop got its net, in this process or in one before."""
+    joints, executes, gripper = trial.actors()
+    with ActorThread(joints, trial.cell), ActorThread(gripper, trial.cell):
+        if earlier:  # the loop has executed a net of its own before
+            with ActorThread(executes, trial.cell):
+                trial.attach(going(0.05))
+                trial.ended()
+        trial.attach(endless())
+        outcome = Write(trial.online, ROBOT, NET_OUTCOME)
+        with Lock(outcome) as lock:
+            lock[outcome] = Outcome(state, trial.attached, 1, text="no arm is open")
+        done = trial.ended()
+
+    assert done.result == f"braked:{state}"
+    assert done.trace[-1].because == "no arm is open"
 
 
 def test_what_interrupted_one_net_does_not_end_the_next(trial):
