@@ -30,11 +30,11 @@ from actors.palletizing.demo import watch_demo
 from actors.palletizing.demo_lineage import show_packing
 from actors.palletizing.demo_packing_files import files_of
 from actors.palletizing.demo_packing_report import (
+    judged_by,
     report_bytes,
     row_of,
     score_of,
     table_of,
-    truth_of,
 )
 from actors.palletizing.demo_report import difference_of
 from actors.palletizing.demo_robot_cell import RunningRobotCell, watched_robot_cell
@@ -272,7 +272,7 @@ def _online(cell: Cell, running: RobotCell | RunningRobotCell, seen: Seen) -> di
         by_name = {place.name: plan for place, plan in planned.items()}
         for place in new:
             number = int(place.rpartition("/")[2])
-            seen.judged[place] = truth_of(truths[number], by_name[place])
+            seen.judged[place] = judged_by(truths[number], by_name[place])
             if found[place].verdict != "ok":
                 _draw(running, seen, f"deviation_{place.replace('/', '_')}.png")
     if seen.started_s and "cell.png" not in seen.pictures and len(found) >= 2:

@@ -7,11 +7,10 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
-from actors.geometry.deviation import Limits
+from actors.palletizing.packing_truth import in_words, truth_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -20,10 +19,6 @@ if TYPE_CHECKING:
 
     from actors.palletizing.simulation.cell_truth import PackageTruth
     from actors.palletizing.vocabulary import Deviation, Plan, Result
-
-DENT_MM: Final = 4.0
-"""A shallower dent is none."""
-TURNED_DEG: Final = 5.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,35 +50,15 @@ class Row:
     reason: str
 
 
-def truth_of(package: PackageTruth, plan: Plan) -> tuple[str, str]:
+def judged_by(package: PackageTruth, plan: Plan) -> tuple[str, str]:
     """Return what became of a package in the words of the verdicts, and in numbers.
 
     Args:
         package: The truth.
         plan: Where it was to stand.
     """
-    if package.where != "tray":
-        return "missing", f"{package.where}{_grip(package)}"
-    shift_m, turn_rad = package.beside_plan(plan.tray_from_product)
-    shift_mm, turn_deg = 1e3 * shift_m, math.degrees(turn_rad)
-    words = [f"{shift_mm:.1f} mm", f"{turn_deg:.1f}°"]
-    if package.tipped:
-        words.append(f"leans {math.degrees(package.tilt_rad):.0f}°")
-    if package.dent_mm > 0.0:
-        words.append(f"dent {package.dent_mm:.1f} mm")
-    kind = "ok"
-    if package.tipped:
-        kind = "tipped"
-    elif package.dent_mm >= DENT_MM:
-        kind = "deformed"
-    elif shift_mm > 1e3 * Limits().moved_m or turn_deg > TURNED_DEG:
-        kind = "moved"
-    return kind, ", ".join(words) + _grip(package)
-
-
-def _grip(package: PackageTruth) -> str:
-    counts = (("missed", package.missed), ("lost", package.lost))
-    return "".join(f", {word} {count}x" for word, count in counts if count)
+    planned = plan.tray_from_product
+    return truth_of(package, planned), in_words(package, planned)
 
 
 def row_of(
@@ -102,9 +77,9 @@ def row_of(
         package: The truth in the end.
         flag: The last verdict about its place; None: there was none.
         result: What became of it.
-        judged: The truth when that verdict was given, as `truth_of` returns it; None: unknown.
+        judged: The truth when that verdict was given, as `judged_by` returns it; None: unknown.
     """
-    truth, physical = truth_of(package, plan)
+    truth, physical = judged_by(package, plan)
     then = judged or (truth, physical)
     x, y = 1e3 * plan.tray_from_product[:2, 3]
     return Row(

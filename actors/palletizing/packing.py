@@ -13,7 +13,8 @@ truth is noted beside each verdict, for the score (`packing_scores`).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
+from math import inf
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -26,11 +27,13 @@ from actors.palletizing.grasps import grasp_of, size_of
 from actors.palletizing.grounding import Gripper, Job, easier_turn, ground
 from actors.palletizing.handling import fills
 from actors.palletizing.nets import NetError
-from actors.palletizing.packing_truth import DENTED_MM, gap_m, top_dent_mm, truth_of
+from actors.palletizing.packing_records import Judgement, Packed, Step
+from actors.palletizing.packing_truth import badness, gap_m, state_of, top_dent_mm, truth_of
 from actors.palletizing.reactions import FELT_M, Case, Reaction, react, worst
 from actors.palletizing.rows import contacts_between, planned_rows
 from actors.palletizing.sensor import FRAMES
 from actors.palletizing.simulation.cell_scene import ARM, HOME_RAD, CellLayout
+from actors.palletizing.simulation.knocks import OPEN_S, knock_at
 from actors.palletizing.simulation.physical_packages import MATERIALS
 from actors.palletizing.simulation.physical_sensors import PhysicalBeltSensor, PhysicalTraySensor
 from actors.palletizing.simulation.physics import PhysicalCell
@@ -43,7 +46,9 @@ if TYPE_CHECKING:
 
     from actors.geometry.shapes import DepthFrame, Surface
     from actors.palletizing.nets import Net
+    from actors.palletizing.rows import Slot
     from actors.palletizing.simulation.cell_truth import PackageTruth
+    from actors.palletizing.simulation.knocks import Knock
     from actors.palletizing.simulation.physical_packages import PhysicalPackage
     from actors.palletizing.tray_watch import Seen
 
@@ -68,93 +73,6 @@ WAIT_S: Final = 8.0
 """A package that the belt does not bring within that time does not come."""
 
 
-@dataclass(frozen=True, slots=True)
-class Judgement:
-    """A verdict on a place beside what was true at that moment.
-
-    Attributes:
-        place: Number of the place.
-        verdict: What was seen: "ok", "missing", "moved", "tipped", "deformed", "extra".
-        truth: What was so, in the same words.
-        shift_mm: Of the true pose against the plan.
-        turn_deg: The same turn.
-        pose_error_mm: Of the found against the true position; NaN if nothing was found.
-        dent_mm: True depth of the deepest dent that the sensor could see.
-        at_s: When, simulated time.
-    """
-
-    place: int
-    verdict: str
-    truth: str
-    shift_mm: float
-    turn_deg: float
-    pose_error_mm: float
-    dent_mm: float
-    at_s: float
-
-
-@dataclass(frozen=True, slots=True)
-class Step:
-    """One request, what became of it, and what followed.
-
-    Attributes:
-        request: "pack", "retry", ...
-        stages: Skeleton and result of each net.
-        succeeded: Whether the last of them did what it is for.
-        reaction: What followed.
-        reason: Why.
-        choice: What the operator chose; "" if not asked.
-        seconds: Simulated time that it took, looking included.
-        before: What was true of the package before.
-        after: What was true afterwards.
-        at_s: When it ended, simulated time.
-    """
-
-    request: str
-    stages: tuple[tuple[str, str], ...]
-    succeeded: bool
-    reaction: str
-    reason: str
-    choice: str
-    seconds: float
-    before: str
-    after: str
-    at_s: float
-
-
-@dataclass(slots=True, eq=False)
-class Packed:
-    """What became of one package.
-
-    Attributes:
-        number: From 0.
-        product: Its name.
-        friction: Coefficient of its contacts.
-        steps: All that was done.
-        judgements: All verdicts on its place.
-        cycle_s: From its first net until the hand was free for the next package.
-        by_hand: The operator had to touch it.
-        along_mm, across_mm, turn_deg: Against its place, in the end; NaN if it is not on the tray.
-        gap_mm: To its neighbour, or the rim, in the end; NaN if it was not pushed.
-        dents_mm: Depth of each dent in the end.
-        dented_by: What made them.
-    """
-
-    number: int
-    product: str
-    friction: float
-    steps: list[Step] = field(default_factory=list)
-    judgements: list[Judgement] = field(default_factory=list)
-    cycle_s: float = float("nan")
-    by_hand: bool = False
-    along_mm: float = float("nan")
-    across_mm: float = float("nan")
-    turn_deg: float = float("nan")
-    gap_mm: float = float("nan")
-    dents_mm: tuple[float, ...] = ()
-    dented_by: tuple[str, ...] = ()
-
-
 class Packing:
     """A closed loop over the packages of one tray.
 
@@ -164,6 +82,9 @@ class Packing:
         seed: Of physics and sensors.
         layout: Where things stand.
         told: Called with a line per step.
+        knocks: What happens to packages from outside, by number, after they were first put down.
+        watch: Called with a package and a moment worth a picture: "before" a knock, "error" when
+            the camera looks at what it did, "after" the reaction.
 
     Raises:
         ValueError: The packages do not find room on one tray.
@@ -177,7 +98,11 @@ class Packing:
         seed: int,
         layout: CellLayout | None = None,
         told: Callable[[str], None] = lambda _: None,
+        knocks: Mapping[int, Knock] | None = None,
+        watch: Callable[[int, str], None] = lambda _number, _moment: None,
     ) -> None:
+        self._knocks, self._watch = dict(knocks or {}), watch
+        self._put, self._gone, self._by_hand = set[int](), set[int](), set[int]()
         self.layout, self._told = layout or CellLayout(), told
         self.cell = PhysicalCell(packages, seed=seed, layout=self.layout)
         self._packages, self._models = tuple(packages), models
@@ -185,9 +110,8 @@ class Packing:
         self._grasps = {
             name: grasp_of(model, mass_kg=MATERIALS[name].mass_kg) for name, model in models.items()
         }
-        self.slots = planned_rows(
-            [package.product for package in packages], self._sizes, contacts_between(models)
-        )
+        self._contacts = contacts_between(models)
+        self.slots = self._planned()
         if self.slots[-1].tray:
             fits = sum(slot.tray == 0 for slot in self.slots)
             raise ValueError(f"{len(packages)} packages for one tray, which takes {fits}")
@@ -199,11 +123,9 @@ class Packing:
         self._pictures: list[DepthFrame] = []
         self._belt_empty_mm = self._belt.capture_empty().depth_mm
         self._frames = {"belt": self.layout.base_from_belt, "bin": self.layout.base_from_bin}
-        for number, slot in enumerate(self.slots):
-            pose = self.layout.base_from_tray @ slot.tray_from_product
-            self._frames[f"place/{number}"] = pose
+        self._set_places()
         self._last_rad: F64 | None = None
-        self._turned, self._felt_m = False, 0.0
+        self._turned, self._felt_m, self._drop_at_s = False, 0.0, inf
         self._flagged = dict[int, str]()
         self._belt_seen, self._arrived_cycles = True, 0
         self.cell.arm.start()
@@ -216,13 +138,14 @@ class Packing:
         ]
         for each in packed:
             self._flagged.clear()
+            began_s = self.cell.time_s
             self.pack(each, packed)
-            each.cycle_s = each.steps[-1].at_s - each.steps[0].at_s + each.steps[0].seconds
             self._feed_after(each.number)
             done = {each.number}
             while (place := worst(self._flagged, but=done)) is not None:
                 done.add(place)
                 self.pack(packed[place], packed, request="look")
+            each.cycle_s = self.cell.time_s - began_s
         truth = self.cell.truth().packages
         for each in packed:
             self._finish(each, truth)
@@ -242,19 +165,28 @@ class Packing:
         tried, short_mm = dict[str, int](), 0.0
         self._felt_m = 0.0
         while request:
-            began_s, before = self.cell.time_s, self._state(number)
+            began_s, before = self.cell.time_s, self._states()
             stages, case = self._act(request, number, short_mm)
+            knock = self._knocked(number)
             self._execute("go_aside", self._job(number))
             seen = self._look(number, all_packed)
+            if knock is not None:
+                packed.knock = knock.kind
+                self._watch(number, "error")
             case = self._case(case, number, seen, tried)
             reaction = react(case)
+            packed.rejected = request == "reject" and case.success and seen.verdict == "missing"
+            if packed.rejected:
+                reaction = Reaction("go_on", "it is in the reject bin")
             choice = self._asked(reaction, case, packed)
-            after = self._state(number)
+            after = self._states()
+            harmed = [n for n in before if n != number and badness(after[n]) > badness(before[n])]
             if choice == "replaced":
-                self._replace(number, all_packed)
+                self._replace(packed, all_packed)
             step = Step(
                 request, tuple(stages), case.success, reaction.kind, reaction.reason, choice,
-                self.cell.time_s - began_s, before, after, self.cell.time_s,
+                self.cell.time_s - began_s, before.get(number, "coming"),
+                after.get(number, "coming"), len(harmed), self.cell.time_s,
             )  # fmt: skip
             packed.steps.append(step)
             self._told(f"{number} {packed.product}: {step}")
@@ -264,6 +196,42 @@ class Packing:
             self._felt_m += FELT_M.get(case.result, 0.0)
             if request:
                 tried[request] = tried.get(request, 0) + 1
+        if packed.rejected:
+            self._drop_place(number)
+        if packed.knock:
+            self._watch(number, "after")
+
+    def _knocked(self, number: int) -> Knock | None:
+        """Let happen to a package what is to happen to it, once; return what it was, if it was."""
+        knock = self._knocks.get(number)
+        if knock is None or number not in self._put:
+            return None
+        del self._knocks[number]
+        if knock.kind != "missing" and self.cell.truth().packages[number].where == "tray":
+            self._watch(number, "before")
+            push = self.layout.base_from_tray[:3, :3] @ self.slots[number].push
+            knock_at(self.cell, self._packages[number], knock, push)
+            self._rest(SETTLING_CYCLES)
+        return knock
+
+    def _planned(self) -> list[Slot]:
+        """Return the place of each package; one that was rejected keeps its old one."""
+        staying = [package for package in self._packages if package.number not in self._gone]
+        rows = planned_rows([each.product for each in staying], self._sizes, self._contacts)
+        found = dict(zip((each.number for each in staying), rows, strict=True))
+        return [found.get(n) or self.slots[n] for n in range(len(self._packages))]
+
+    def _set_places(self) -> None:
+        for number, slot in enumerate(self.slots):
+            pose = self.layout.base_from_tray @ slot.tray_from_product
+            self._frames[f"place/{number}"] = pose
+
+    def _drop_place(self, number: int) -> None:
+        """Leave no gap where a package was rejected: the places after it are planned anew."""
+        self._gone.add(number)
+        self._flagged.pop(number, None)
+        self.slots = self._planned()
+        self._set_places()
 
     def _act(
         self, request: str, number: int, short_mm: float
@@ -286,6 +254,11 @@ class Packing:
                 turned = easier_turn(job, arm=ARM, frames=self._frames.__getitem__, near_rad=near)
                 self._turned = turned
                 job = replace(job, turned=turned)
+            if skeleton == "place":
+                self._put.add(number)
+                if number in self._knocks and self._knocks[number].kind == "missing":
+                    self._watch(number, "before")
+                    self._drop_at_s = self.cell.time_s + self._knocks[number].amount
             result, success = self._execute(skeleton, job)
             stages.append((skeleton, result))
             if not success:
@@ -344,6 +317,9 @@ class Packing:
 
     def _cycle(self) -> None:
         """Let one cycle pass; take pictures of the belt while a package stands there unseen."""
+        if self.cell.time_s >= self._drop_at_s:
+            self.cell.fail("gripper", OPEN_S)
+            self._drop_at_s = inf
         self.cell.step()
         if not self._belt_seen and self.cell.arrived():
             self._arrived_cycles += 1
@@ -388,6 +364,7 @@ class Packing:
         places = {
             each: (self._packages[each].product, self.slots[each].tray_from_product)
             for each in range(number + 1)
+            if each not in self._gone
         }
         pictures = []
         for _ in range(FRAMES):
@@ -396,7 +373,10 @@ class Packing:
         found = self.watch.judged(fused(pictures), places, newest=number)
         truth = self.cell.truth().packages
         for place, seen in found.items():
-            all_packed[place].judgements.append(self._judgement(place, seen, truth[place]))
+            # An empty place that nothing came to, and what a person has put down, prove little.
+            empty = place not in self._put and seen.verdict == "missing"
+            if not empty and place not in self._by_hand:
+                all_packed[place].judgements.append(self._judgement(place, seen, truth[place]))
         for place, seen in found.items():
             self._flagged[place] = seen.verdict
             if seen.pose is not None:
@@ -432,21 +412,37 @@ class Packing:
         packed.by_hand = True
         return "replaced"
 
-    def _replace(self, number: int, all_packed: Sequence[Packed]) -> None:
-        """Let a person put a sound package to a place, and look at what is there then."""
-        pose = self.layout.base_from_tray @ self.slots[number].tray_from_product
-        self.cell.replace(number, pose)
+    def _replace(self, packed: Packed, all_packed: Sequence[Packed]) -> None:
+        """Let a person put a sound package to a place, and look at what is there then.
+
+        The person also puts back what else does not stand where it should.
+        """
+        number = packed.number
+        states = self._states()
+        off = [n for n in sorted(self._put - self._gone) if n != number and states[n] != "ok"]
+        for each in [number, *(n for n in off if states[n] != "missing")]:
+            self._note_dents(all_packed[each])
+            all_packed[each].by_hand = True
+            self._by_hand.add(each)
+            pose = self.layout.base_from_tray @ self.slots[each].tray_from_product
+            self.cell.replace(each, pose)
         self._rest(SETTLING_CYCLES)
-        self.watch.forget()
         self._look(number, all_packed)
 
     # The truth, for the score
 
-    def _state(self, number: int) -> str:
-        truth = self.cell.truth().packages[number]
-        if truth.where != "tray":
-            return "deformed" if top_dent_mm(truth) >= DENTED_MM else truth.where
-        return truth_of(truth, self.slots[number].tray_from_product)
+    def _states(self) -> dict[int, str]:
+        """Return what is true of all packages that have come."""
+        return {
+            truth.number: state_of(truth, self.slots[truth.number].tray_from_product)
+            for truth in self.cell.truth().packages
+            if truth.where != "coming"
+        }
+
+    def _note_dents(self, packed: Packed) -> None:
+        dents = self.cell.truth().packages[packed.number].dents
+        packed.dents_mm += tuple(dent.depth_mm for dent in dents)
+        packed.dented_by += tuple(dent.by for dent in dents)
 
     def _judgement(self, place: int, seen: Seen, truth: PackageTruth) -> Judgement:
         planned = self.slots[place].tray_from_product
@@ -467,8 +463,7 @@ class Packing:
 
     def _finish(self, packed: Packed, truth: Sequence[PackageTruth]) -> None:
         own, slot = truth[packed.number], self.slots[packed.number]
-        packed.dents_mm = tuple(dent.depth_mm for dent in own.dents)
-        packed.dented_by = tuple(dent.by for dent in own.dents)
+        self._note_dents(packed)
         if own.where != "tray":
             return
         off = coordinates(slot.tray_from_product, own.tray_from_product)

@@ -1,32 +1,36 @@
 """Score the whole palletizing cell on what physics did: placements, verdicts, reactions, times.
 
-    python -m actors.palletizing.packing_scores --packages 36 --seed 1
+`enact bench palletizing` packs trays of packages in simulated time, over settings of how far the
+belt's sensor is off and of friction, and prints each figure with its goal and the table of true
+kinds against verdicts.  The same arguments give the same figures on any machine, whatever the
+number of processes.
 
-packs trays of packages in simulated time, over settings of how far the belt's sensor is off and of
-friction, and prints each figure with its goal and the table of true kinds against verdicts.  The
-same arguments give the same figures on any machine, whatever the number of processes.
-
-Rule a change must keep: what was tuned was tuned on seeds below `HELD_OUT`; scores are of others.
+Rules a change must keep: what was tuned was tuned on seeds below `HELD_OUT`; scores are of others.
+How well the robot packs is scored on trays on which nothing was provoked, verdicts and recoveries
+on all.  What has no case has no figure: it neither meets nor misses its goal.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
-import sys
 from collections import Counter
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from multiprocessing import get_context
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from actors.palletizing.evaluation import train
-from actors.palletizing.packing import Packed, Packing
-from actors.palletizing.packing_truth import KINDS
+from actors.palletizing.packing import Packing
+from actors.palletizing.packing_pictures import Strips
+from actors.palletizing.packing_records import line_of
+from actors.palletizing.packing_truth import KINDS, badness
+from actors.palletizing.simulation.knocks import draw_knocks
 from actors.palletizing.simulation.packages import DEMO_PRODUCTS
 from actors.palletizing.simulation.physical_packages import Spread, draw_packages
+from actors.palletizing.simulation.physics import OUTSIDE
 from actors.palletizing.simulation.sensors import SimulatedOrbitSensor
 from actors.workcell.evaluation import Goal
 
@@ -34,7 +38,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
     from actors.geometry.shapes import Surface
-    from actors.palletizing.packing import Step
+    from actors.palletizing.packing_records import Packed, Step
 
 HELD_OUT: Final = 1000
 TRAY: Final = 12
@@ -48,8 +52,9 @@ GENTLE_MM: Final = 2.0
 DAMAGE_MM: Final = 1.0
 """Depth of a dent from which a package counts as damaged."""
 RECOVERIES: Final = ("retry", "regrasp", "push_again")
-WORSE: Final = {"ok": 0, "belt": 1, "held": 1, "moved": 1, "missing": 2, "bin": 2}
-"""How bad a state is; all others are worse."""
+EVERY: Final = 4
+"""Of so many trays one is disturbed, if errors are to be provoked; no divisor of the number of
+settings, so that each of them has its turn."""
 
 GOALS: Final = {
     "packages": Goal("packages"),
@@ -63,6 +68,7 @@ GOALS: Final = {
     "damaged_gentle": Goal("packages damaged at sigma 2 mm", 0, 0),
     "damaged": Goal("packages damaged"),
     "alarms_share": Goal("sound packages that were flagged, share", high=0.001),
+    "provoked": Goal("packages that an error was provoked of"),
     "recoveries": Goal("recoveries tried"),
     "recovered_share": Goal("recoveries that worked, share", low=0.9),
     "worsened": Goal("recoveries that made it worse, the operator not asked", 0, 0),
@@ -84,6 +90,7 @@ class Tray:
         friction: Of all packages.
         count: Packages on it.
         products: That come in turn.
+        provoked: Errors that each package is provoked to in turn, see `simulation.knocks`.
     """
 
     seed: int
@@ -91,6 +98,7 @@ class Tray:
     friction: float
     count: int
     products: tuple[str, ...]
+    provoked: tuple[str, ...] = ()
 
 
 def trays_of(
@@ -99,25 +107,54 @@ def trays_of(
     seed: int = 1,
     settings: Sequence[tuple[float, float]] = SETTINGS,
     products: Sequence[str] = DEMO_PRODUCTS,
+    provoke: Sequence[str] = (),
 ) -> list[Tray]:
-    """Return the trays of a run: the settings in turn, the last tray perhaps not full."""
+    """Return the trays of a run: the settings in turn, the last tray perhaps not full.
+
+    Args:
+        packages: How many, all trays together.
+        seed: The first tray has `HELD_OUT` times that.
+        settings: How far the belt's sensor is off (mm), and friction.
+        products: That come in turn.
+        provoke: Errors that are provoked on one of `EVERY` trays.
+    """
     trays = []
     for number, begun in enumerate(range(0, packages, TRAY)):
+        provoked = tuple(provoke) if number % EVERY == EVERY - 1 else ()
         sigma_mm, friction = settings[number % len(settings)]
         count = min(TRAY, packages - begun)
-        trays.append(Tray(HELD_OUT * seed + number, sigma_mm, friction, count, tuple(products)))
+        held_out = HELD_OUT * seed + number
+        trays.append(Tray(held_out, sigma_mm, friction, count, tuple(products), provoked))
     return trays
 
 
-def packed_tray(tray: Tray, models: Mapping[str, Surface]) -> list[Packed]:
-    """Pack one tray."""
+def packed_tray(
+    tray: Tray, models: Mapping[str, Surface], pictures: Path | None = None
+) -> list[Packed]:
+    """Pack one tray.
+
+    Args:
+        tray: What to pack.
+        models: Trained surface of each product.
+        pictures: Folder for pictures of what is provoked; none are drawn when absent.
+    """
     spread = Spread(pick_m=tray.sigma_mm / 1e3, friction=(tray.friction, tray.friction))
     packages = draw_packages(tray.count, seed=tray.seed, products=tray.products, spread=spread)
-    return Packing(packages, models, seed=tray.seed).run()
+    knocks = draw_knocks(tray.count, kinds=tray.provoked, seed=tray.seed)
+    if not (pictures and knocks):
+        return Packing(packages, models, seed=tray.seed, knocks=knocks).run()
+    strips = Strips(pictures, tray.seed, knocks)
+    packing = Packing(packages, models, seed=tray.seed, knocks=knocks, watch=strips.take)
+    strips.of(packing.cell)
+    return packing.run()
 
 
 def played(
-    trays: Sequence[Tray], *, processes: int = 1, told: Callable[[str], None] = lambda _: None
+    trays: Sequence[Tray],
+    *,
+    processes: int = 1,
+    told: Callable[[str], None] = lambda _: None,
+    out: Path | None = None,
 ) -> dict[Tray, list[Packed]]:
     """Train the products and pack trays, in this process or in several.
 
@@ -125,13 +162,20 @@ def played(
         trays: What to pack.
         processes: How many run side by side.
         told: Called with what is done.
+        out: Folder; what became of each tray is added to its `trays.jsonl` at once, and pictures of
+            the first tray on which errors are provoked are put there.
     """
     products = sorted({name for tray in trays for name in tray.products})
     told(f"training: {', '.join(products)}")
     models = {name: train(name, SimulatedOrbitSensor(seed=HELD_OUT), frames=4) for name in products}
     found = {}
-    for tray, packed in _each(trays, models, processes):
+    drawn = next((tray for tray in trays if tray.provoked), None)
+    for tray, packed in _each(trays, models, processes, {drawn: out}):
         found[tray] = packed
+        if out:
+            with (out / "trays.jsonl").open("a") as file:
+                file.write(json.dumps({"tray": asdict(tray)})[:-1])
+                file.write(f', "packed": {line_of(packed)}}}\n')
         asked = sum(each.by_hand for each in packed)
         told(
             f"tray {len(found)} of {len(trays)}: seed {tray.seed}, sigma {tray.sigma_mm:g} mm,"
@@ -141,57 +185,69 @@ def played(
 
 
 def _each(
-    trays: Sequence[Tray], models: Mapping[str, Surface], processes: int
+    trays: Sequence[Tray],
+    models: Mapping[str, Surface],
+    processes: int,
+    pictures: Mapping[Tray | None, Path | None],
 ) -> Iterator[tuple[Tray, list[Packed]]]:
     if processes < 2:
         for tray in trays:
-            yield tray, packed_tray(tray, models)
+            yield tray, packed_tray(tray, models, pictures.get(tray))
         return
     with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
-        waiting = {pool.submit(packed_tray, tray, models): tray for tray in trays}
+        waiting = {
+            pool.submit(packed_tray, tray, models, pictures.get(tray)): tray for tray in trays
+        }
         for done in as_completed(waiting):
             yield waiting[done], done.result()
 
 
-def scores_of(found: Mapping[Tray, Sequence[Packed]]) -> dict[str, float]:
-    """Return the scores of a run by their names in `GOALS`; those without a case are left out."""
+def scores_of(found: Mapping[Tray, Sequence[Packed]]) -> dict[str, float | None]:
+    """Return the scores of a run by their names in `GOALS`; None: there was no case."""
     every = [each for packed in found.values() for each in packed]
+    own = [each for tray, packed in found.items() if not tray.provoked for each in packed]
     gentle = [
-        each for tray, packed in found.items() if tray.sigma_mm <= GENTLE_MM for each in packed
+        each
+        for tray, packed in found.items()
+        if tray.sigma_mm <= GENTLE_MM and not tray.provoked
+        for each in packed
     ]
-    sound = [each for each in every if not each.by_hand and is_sound(each)]
-    scores = {"packages": float(len(every)), "by_hand_share": _share(e.by_hand for e in every)}
-    shift_mm = [float(np.hypot(each.along_mm, each.across_mm)) for each in sound]
-    scores |= _percentile("shift_p95_mm", shift_mm, 95)
+    sound = [each for each in own if not each.by_hand and is_sound(each)]
     round_ones = {"yoghurt_cup"}
-    turn_deg = [abs(each.turn_deg) for each in sound if each.product not in round_ones]
-    scores |= _percentile("turn_p95_deg", turn_deg, 95)
-    gaps_mm = [each.gap_mm for each in sound if np.isfinite(each.gap_mm)]
-    scores |= _percentile("gap_p50_mm", np.abs(gaps_mm).tolist(), 50)
     judged = [judgement for each in every for judgement in each.judgements]
-    pose_mm = [j.pose_error_mm for j in judged if j.verdict == j.truth == "ok"]
-    scores |= _percentile("pose_p95_mm", pose_mm, 95)
-    cycles_s = [each.cycle_s for each in every]
-    scores |= _percentile("cycle_p50_s", cycles_s, 50) | _percentile("cycle_p95_s", cycles_s, 95)
-    scores["damaged_gentle"] = float(sum(map(is_damaged, gentle)))
-    scores["damaged"] = float(sum(map(is_damaged, every)))
-    scores["alarms_share"] = _share(j.verdict != "ok" for j in judged if j.truth == "ok")
+    cycles_s = [each.cycle_s for each in own]
+    scores: dict[str, float | None] = {
+        "packages": float(len(every)),
+        "by_hand_share": _share(e.by_hand for e in own),
+        "shift_p95_mm": _percentile([np.hypot(e.along_mm, e.across_mm) for e in sound], 95),
+        "turn_p95_deg": _percentile(
+            [abs(e.turn_deg) for e in sound if e.product not in round_ones], 95
+        ),
+        "gap_p50_mm": _percentile([abs(e.gap_mm) for e in sound if np.isfinite(e.gap_mm)], 50),
+        "pose_p95_mm": _percentile(
+            [j.pose_error_mm for j in judged if j.verdict == j.truth == "ok"], 95
+        ),
+        "cycle_p50_s": _percentile(cycles_s, 50),
+        "cycle_p95_s": _percentile(cycles_s, 95),
+        "damaged_gentle": float(sum(map(is_damaged, gentle))) if gentle else None,
+        "damaged": float(sum(map(is_damaged, own))) if own else None,
+        "alarms_share": _share(j.verdict != "ok" for j in judged if j.truth == "ok"),
+        "provoked": float(sum(bool(each.knock) for each in every)),
+    }
     scores |= _recoveries([step for each in every for step in each.steps])
     table = confusion(found)
     for kind in KINDS[1:]:
         true = sum(n for (truth, _), n in table.items() if truth == kind)
         flagged = sum(n for (_, verdict), n in table.items() if verdict == kind)
         scores[f"{kind}_cases"] = float(true)
-        if true:
-            scores[f"{kind}_recall_share"] = table[kind, kind] / true
-        if flagged:
-            scores[f"{kind}_precision_share"] = table[kind, kind] / flagged
-    return {name: scores[name] for name in GOALS if name in scores}
+        scores[f"{kind}_recall_share"] = table[kind, kind] / true if true else None
+        scores[f"{kind}_precision_share"] = table[kind, kind] / flagged if flagged else None
+    return {name: scores[name] for name in GOALS}
 
 
-def missed(scores: Mapping[str, float]) -> list[str]:
-    """Return the names of the scores that do not meet their goals."""
-    return [name for name, value in scores.items() if not GOALS[name].met(value)]
+def missed(scores: Mapping[str, float | None]) -> list[str]:
+    """Return the names of the scores that do not meet their goals; what has no case is none."""
+    return [n for n, value in scores.items() if value is not None and not GOALS[n].met(value)]
 
 
 def confusion(found: Mapping[Tray, Sequence[Packed]]) -> Counter[tuple[str, str]]:
@@ -222,65 +278,27 @@ def is_sound(packed: Packed) -> bool:
 
 
 def is_damaged(packed: Packed) -> bool:
-    """Return whether a package has a dent that counts."""
-    return max(packed.dents_mm, default=0.0) >= DAMAGE_MM
+    """Return whether a package has, or had until it was replaced, a dent of the cell's making."""
+    dents = zip(packed.dents_mm, packed.dented_by, strict=True)
+    return any(depth_mm >= DAMAGE_MM and by != OUTSIDE for depth_mm, by in dents)
 
 
-def _recoveries(steps: Sequence[Step]) -> dict[str, float]:
+def _recoveries(steps: Sequence[Step]) -> dict[str, float | None]:
     tried = [step for step in steps if step.request in RECOVERIES]
-    worse = [step for step in tried if _badness(step.after) > _badness(step.before)]
+    worse = [s for s in tried if s.harmed or badness(s.after) > badness(s.before)]
     noticed = [step for step in steps if step.stages and not step.succeeded]
-    found = {"recoveries": float(len(tried))}
-    if tried:
-        found["recovered_share"] = _share(step.after == "ok" for step in tried)
-    return found | {"worsened": float(len(worse)), "noticed_by_net": float(len(noticed))}
+    return {
+        "recoveries": float(len(tried)),
+        "recovered_share": _share(step.after == "ok" for step in tried),
+        "worsened": float(len(worse)) if tried else None,
+        "noticed_by_net": float(len(noticed)),
+    }
 
 
-def _badness(state: str) -> int:
-    return WORSE.get(state, 3)
-
-
-def _share(holds: Iterable[bool]) -> float:
+def _share(holds: Iterable[bool]) -> float | None:
     values = list(holds)
-    return sum(values) / len(values) if values else 0.0
+    return sum(values) / len(values) if values else None
 
 
-def _percentile(name: str, values: Sequence[float], share: int) -> dict[str, float]:
-    return {name: float(np.percentile(values, share))} if len(values) else {}
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Print scores and the table of verdicts; return 0, or 1 where a goal is missed."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--packages", type=int, default=108)
-    parser.add_argument("--seed", type=int, default=1, help=f"first tray: {HELD_OUT} times it")
-    parser.add_argument("--processes", type=int, default=2)
-    parser.add_argument("--products", nargs="+", default=DEMO_PRODUCTS)
-    parser.add_argument("--spread", type=setting, help="SIGMA_MM,FRICTION alone, such as 2,0.4")
-    options = parser.parse_args(argv)
-    settings = [options.spread] if options.spread else SETTINGS
-    trays = trays_of(
-        options.packages, seed=options.seed, settings=settings, products=options.products
-    )
-    found = played(
-        trays, processes=options.processes, told=lambda text: print(text, file=sys.stderr)
-    )
-    scores = scores_of(found)
-    print(confusion_text(confusion(found)))
-    print(json.dumps({"scores": scores, "missed": missed(scores)}, indent=2))
-    return int(bool(missed(scores)))
-
-
-def setting(text: str) -> tuple[float, float]:
-    """Read "SIGMA_MM,FRICTION"; an `argparse` type."""
-    try:
-        sigma_mm, friction = (float(part) for part in text.split(","))
-    except ValueError:
-        raise argparse.ArgumentTypeError(
-            f"asked for {text!r}; a setting is SIGMA_MM,FRICTION, such as 2,0.4"
-        ) from None
-    return sigma_mm, friction
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+def _percentile(values: Sequence[float], share: int) -> float | None:
+    return float(np.percentile(values, share)) if len(values) else None

@@ -26,8 +26,8 @@ MOVED_MM: Final = 10.0
 TURNED_DEG: Final = 5.0
 DENTED_MM: Final = 4.0
 """A sound package is off, turned and dented by less."""
-ELSEWHERE_MM: Final = 100.0
-"""What is farther from its place is not there."""
+WORSE: Final = {"ok": 0, "belt": 1, "held": 1, "moved": 1, "missing": 2, "bin": 2}
+"""How bad a state is; all others are worse."""
 ROW_M: Final = 0.05
 """Packages are of one row when their middles are no farther apart across it."""
 
@@ -35,13 +35,39 @@ ROW_M: Final = 0.05
 def truth_of(truth: PackageTruth, planned: F64) -> str:
     """Return what is the matter with a package, given its place (tray_from_product)."""
     shift_m, turn_rad = truth.beside_plan(planned)
-    if truth.where != "tray" or 1e3 * shift_m > ELSEWHERE_MM:
+    if truth.where != "tray":
         return "missing"
     if truth.tipped:
         return "tipped"
     if 1e3 * shift_m > MOVED_MM or np.degrees(turn_rad) > TURNED_DEG:
         return "moved"
     return "deformed" if top_dent_mm(truth) >= DENTED_MM else "ok"
+
+
+def state_of(truth: PackageTruth, planned: F64) -> str:
+    """Return what is the matter with a package, or where it is while it is not on the tray."""
+    if truth.where == "tray":
+        return truth_of(truth, planned)
+    return "deformed" if top_dent_mm(truth) >= DENTED_MM else truth.where
+
+
+def badness(state: str) -> int:
+    """Return how bad a state is, 0 if all is well."""
+    return WORSE.get(state, 3)
+
+
+def in_words(truth: PackageTruth, planned: F64) -> str:
+    """Return what physics made of a package, in numbers."""
+    words = [truth.where]
+    if truth.where == "tray":
+        shift_m, turn_rad = truth.beside_plan(planned)
+        words = [f"{1e3 * shift_m:.1f} mm", f"{np.degrees(turn_rad):.1f}°"]
+        if truth.tipped:
+            words.append(f"leans {np.degrees(truth.tilt_rad):.0f}°")
+        if truth.dent_mm > 0.0:
+            words.append(f"dent {truth.dent_mm:.1f} mm")
+    counts = (("missed", truth.missed), ("lost", truth.lost))
+    return ", ".join([*words, *(f"{word} {count}x" for word, count in counts if count)])
 
 
 def top_dent_mm(truth: PackageTruth) -> float:

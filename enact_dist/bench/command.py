@@ -154,6 +154,8 @@ def run(arguments: argparse.Namespace) -> int:
             arguments.processes,
             arguments.spread,
             arguments.perception,
+            arguments.provoke,
+            arguments.out,
         )
         measured = Run(
             place, floors, seconds_s=seconds_s, told=told, seeds=arguments.seeds, packing=packing

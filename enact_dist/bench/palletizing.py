@@ -12,6 +12,8 @@ from enact_dist.bench.rows import value_row
 from enact_dist.errors import MisuseError
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from enact_dist.bench.run import Run
 
 NAME: Final = "palletizing"
@@ -26,6 +28,8 @@ class Asked(NamedTuple):
         processes: How many trays are packed side by side.
         spread: How far the belt's sensor is off (one sigma, mm) and friction; None: several.
         perception: Whether perception alone is scored, on drawn packages without physics.
+        provoke: Errors that are provoked, see `actors.palletizing.simulation.knocks`.
+        out: Folder for what became of each tray, as it comes, and pictures of provoked errors.
     """
 
     packages: int = 36
@@ -33,6 +37,8 @@ class Asked(NamedTuple):
     processes: int = 2
     spread: tuple[float, float] | None = None
     perception: bool = False
+    provoke: tuple[str, ...] = ()
+    out: Path | None = None
 
 
 def run_palletizing(run: Run) -> None:
@@ -55,8 +61,12 @@ def run_palletizing(run: Run) -> None:
         _score_perception(run, asked)
         return
     settings = [asked.spread] if asked.spread else packing.SETTINGS
-    trays = packing.trays_of(asked.packages, seed=asked.seed, settings=settings)
-    found = packing.played(trays, processes=asked.processes, told=run.told)
+    trays = packing.trays_of(
+        asked.packages, seed=asked.seed, settings=settings, provoke=asked.provoke
+    )
+    if asked.out:
+        asked.out.mkdir(parents=True, exist_ok=True)
+    found = packing.played(trays, processes=asked.processes, told=run.told, out=asked.out)
     scores = packing.scores_of(found)
     failed = set(packing.missed(scores))
     first, last = trays[0].seed, trays[-1].seed
@@ -65,8 +75,11 @@ def run_palletizing(run: Run) -> None:
     )
     for name, value in scores.items():
         goal = packing.GOALS[name]
-        met = name not in failed if str(goal) else None
-        row = value_row(NAME, goal.what, value, "", asked.packages, str(goal), met=met)
+        met = name not in failed if str(goal) and value is not None else None
+        note = "" if value is not None else "no case"
+        row = value_row(
+            NAME, goal.what, value, "", asked.packages, str(goal) or None, met=met, note=note
+        )
         run.add_row(row)
     for (truth, verdict), count in sorted(packing.confusion(found).items()):
         title = f"truth {truth}, judged {verdict}"

@@ -169,7 +169,7 @@ class Row:
 def value_row(
     name: str,
     variant: str,
-    value: float,
+    value: float | None,
     unit: str,
     n: int,
     goal: str | None = None,
@@ -177,7 +177,7 @@ def value_row(
     met: bool | None = None,
     note: str = "",
 ) -> Row:
-    """Return a row of a figure that is no time."""
+    """Return a row of a figure that is no time; None: it has no value, and a note says why."""
     return Row(name, variant, None, None, n, None, goal, met, value, unit, note)
 
 

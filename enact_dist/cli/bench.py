@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import textwrap
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -82,6 +83,8 @@ BENCHES: Final = {
     ),
 }
 """The benches, in the order in which they run and stand in the table."""
+PROVOKED: Final = ("moved", "tipped", "deformed", "missing")
+"""Errors of packing that can be provoked; as `KNOCKS` of the simulation, which is an extra."""
 _HEADING: Final = (
     "\n\nbenches (less than a minute each with --seconds 3; [minutes]: one to three):\n"
 )
@@ -99,7 +102,7 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
         "enact bench update --embedded\n"
         "enact bench multi --shards 3\n"
         "enact bench fetch --connect tcp/tray-pc:7447\n"
-        "enact bench palletizing --packages 36 --spread 2,0.4\n"
+        "enact bench palletizing --packages 1000 --provoke all --out scores\n"
         "enact bench --table run1.json run2.json run3.json",
     )
     assert bench.description is not None
@@ -177,6 +180,21 @@ def _add_packing(bench: Verb) -> None:
         " and 0.6, in turn)",
     )
     packing.add_argument(
+        "--provoke",
+        type=_kinds,
+        default=(),
+        metavar="KIND,…",
+        help="provoke errors by physics on every fourth tray: moved, tipped, deformed, missing, or"
+        " all; how well the robot packs is then scored on the other trays",
+    )
+    packing.add_argument(
+        "--out",
+        type=Path,
+        metavar="DIR",
+        help="add what becomes of each tray to DIR/trays.jsonl as it comes, and draw one error of"
+        " each kind that is provoked: before, with the error, after the reaction",
+    )
+    packing.add_argument(
         "--perception",
         action="store_true",
         help="score perception alone, on drawn packages: verdicts, pose, dents, noise and light",
@@ -202,10 +220,23 @@ def _spread(text: str) -> tuple[float, float]:
     try:
         sigma_mm, friction = (float(part) for part in text.split(","))
     except ValueError:
+        sigma_mm = friction = math.nan
+    if not (0.0 <= sigma_mm < math.inf and 0.0 < friction < math.inf):
         raise argparse.ArgumentTypeError(
-            f"asked for {text!r}; it is SIGMA_MM,FRICTION, such as 2,0.4"
-        ) from None
+            f"asked for {text!r}; it is SIGMA_MM,FRICTION, such as 2,0.4: 0 or more, more than 0"
+        )
     return sigma_mm, friction
+
+
+def _kinds(text: str) -> tuple[str, ...]:
+    """Read errors to provoke, or "all"; an `argparse` type."""
+    kinds = PROVOKED if text == "all" else tuple(text.split(","))
+    for kind in kinds:
+        if kind not in PROVOKED:
+            raise argparse.ArgumentTypeError(
+                f"asked for {kind!r}; errors that can be provoked: {', '.join(PROVOKED)}, or all"
+            )
+    return kinds
 
 
 def bench_name(text: str) -> str:

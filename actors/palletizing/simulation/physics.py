@@ -46,6 +46,7 @@ from actors.palletizing.simulation.cell_truth import (
     place_of,
 )
 from actors.palletizing.simulation.physical_packages import (
+    DENT_AREA_M2,
     Damage,
     PhysicalPackage,
     draw_packages,
@@ -80,6 +81,8 @@ WHEN: Final = {
 """What a failure can wait for."""
 HANGS_M: Final = 0.06
 """A held package whose base is so high above the tray hangs."""
+OUTSIDE: Final = "outside"
+"""Name of whatever presses on a package and is no part of the cell."""
 NEAR_M: Final = 0.3
 """A package farther from the tool than this is not the one that was missed."""
 
@@ -149,6 +152,7 @@ class PhysicalCell:
         self._cycles = 0
         self._running = self._interrupted = False
         self._failing: dict[str, Failure] = {}
+        self._loads: dict[int, tuple[F64, F64]] = {}
         self._seen_last: ShownCell | None = None
         self._grip = GripWatch()
         self._hand = int(model.body("hand").id)
@@ -181,6 +185,7 @@ class PhysicalCell:
             self._cycles += 1
             self._drive_belt()
             self._notice()
+            self._unload()
             if not self._fails("wrist"):
                 self.arm.measure(self._stamp_ns())
 
@@ -305,6 +310,21 @@ class PhysicalCell:
         """Put a sound package of the same kind somewhere in place of one: a person's hands."""
         self._damages[number] = Damage(self._packages[number])
         self.put(number, base_from_product)
+
+    def load(self, number: int, force_n: F64, at_m: F64) -> None:
+        """Let a force from outside act on a package in the next cycle: a knock, something on it.
+
+        It dents like a body that touches the package over the area of one dent.
+
+        Args:
+            number: Which.
+            force_n: (3,), base frame.
+            at_m: (3,), where, product frame.
+        """
+        pose, body = self.pose(number), self._bodies[number]
+        lever = pose[:3, :3] @ at_m + pose[:3, 3] - self.data.xipos[body]
+        self.data.xfrc_applied[body] = np.concatenate((force_n, np.cross(lever, force_n)))
+        self._loads[number] = force_n, at_m
 
     def change_tray(self) -> list[int]:
         """Take the tray away with all that is on it; return the numbers of those packages."""
@@ -459,6 +479,15 @@ class PhysicalCell:
             nearest=self._nearest,
             now_s=self.time_s,
         )
+
+    def _unload(self) -> None:
+        """Take the loads of this cycle, and away."""
+        for number, (force_n, at_m) in self._loads.items():
+            strength_n = float(np.linalg.norm(force_n))
+            inwards = self.pose(number)[:3, :3].T @ force_n / strength_n
+            self._damages[number].press(OUTSIDE, strength_n, DENT_AREA_M2, at_m, inwards)
+            self.data.xfrc_applied[self._bodies[number]] = 0.0
+        self._loads.clear()
 
     def _nearest(self) -> int:
         tool = self.arm.measured().tcp[:3, 3]

@@ -241,7 +241,11 @@ def test_robot_packs_from_training_to_table(tmp_path, capsys):
 
     printed = " ".join(capsys.readouterr().out.split())
     assert status == 0
-    assert re.search(r"\d of 4 packages placed as planned", printed)
+    right, placed = re.search(
+        r"(\d) of \d verdicts right; (\d) of 4 packages placed as planned", printed
+    ).groups()
+    assert int(placed) >= 2, "one may slip, and none makes its neighbour fail"
+    assert int(right) >= int(placed)
     assert "enact why online place/" in printed
     report = json.loads((tmp_path / "report.json").read_text())
     assert [row["place"] for row in report["packages"]] == [f"place/{n}" for n in range(4)]

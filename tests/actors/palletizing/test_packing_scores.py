@@ -1,0 +1,177 @@
+"""What the score makes of noted trays: every figure moves with what it is of."""
+
+import dataclasses
+import math
+
+import pytest
+
+from actors.palletizing.packing_records import Judgement, Packed, Step, line_of, packed_of
+from actors.palletizing.packing_scores import (
+    EVERY,
+    GOALS,
+    Tray,
+    confusion,
+    confusion_text,
+    missed,
+    scores_of,
+    trays_of,
+)
+from actors.palletizing.packing_truth import badness
+from actors.palletizing.simulation.packages import DEMO_PRODUCTS
+from enact_dist.cli import bench
+from enact_dist.cli.main import main
+
+TRAY = Tray(1000, 2.0, 0.4, 1, DEMO_PRODUCTS)
+ROUGH = dataclasses.replace(TRAY, seed=1001, sigma_mm=12.0)
+PROVOKED = dataclasses.replace(TRAY, seed=1003, provoked=("moved",))
+
+
+def judged(truth="ok", verdict="ok", pose_mm=0.2):
+    return Judgement(0, verdict, truth, 1.0, 0.1, pose_mm, 0.0, 9.0)
+
+
+def step(request="pack", before="belt", after="ok", *, harmed=0, result="in_contact", works=True):
+    stages = (("push_into_contact", result),)
+    return Step(request, stages, works, "go_on", "", "", 9.0, before, after, harmed, 9.0)
+
+
+def package(*steps, **changes):
+    """Return a sound package; a change spoils it."""
+    sound = Packed(
+        0, "milk_carton", 0.4, steps=list(steps) or [step()], judgements=[judged()], cycle_s=9.0,
+        along_mm=1.0, across_mm=0.0, turn_deg=0.2, gap_mm=0.1,
+    )  # fmt: skip
+    for name, value in changes.items():
+        setattr(sound, name, value)
+    return sound
+
+
+def test_a_sound_package_meets_every_goal_that_it_is_a_case_of():
+    scores = scores_of({TRAY: [package()]})
+    assert list(scores) == list(GOALS)
+    assert not missed(scores)
+    cases = {name for name, value in scores.items() if value is not None}
+    assert cases == {
+        "packages", "by_hand_share", "shift_p95_mm", "turn_p95_deg", "gap_p50_mm", "pose_p95_mm",
+        "cycle_p50_s", "cycle_p95_s", "damaged_gentle", "damaged", "alarms_share", "provoked",
+        "recoveries", "noticed_by_net", "moved_cases", "tipped_cases", "deformed_cases",
+        "missing_cases",
+    }  # fmt: skip
+
+
+DENTED = {"dents_mm": (1.2,), "dented_by": ("left",)}
+KNOCKED = {"dents_mm": (9.0,), "dented_by": ("outside",)}
+
+
+@pytest.mark.parametrize(
+    ("spoilt", "name", "value"),
+    [
+        (package(along_mm=3.1), "shift_p95_mm", 3.1),
+        (package(across_mm=-3.1, along_mm=0.0), "shift_p95_mm", 3.1),
+        (package(turn_deg=-1.6), "turn_p95_deg", 1.6),
+        (package(gap_mm=-1.1), "gap_p50_mm", 1.1),
+        (package(judgements=[judged(pose_mm=0.6)]), "pose_p95_mm", 0.6),
+        (package(cycle_s=10.1), "cycle_p50_s", 10.1),
+        (package(**DENTED), "damaged_gentle", 1),
+        (package(judgements=[judged(verdict="moved")]), "alarms_share", 1.0),
+        (package(step("regrasp", "moved", "moved")), "recovered_share", 0.0),
+        (package(step("regrasp", "moved", "tipped")), "worsened", 1),
+        (package(step("regrasp", "moved", "ok", harmed=2)), "worsened", 1),
+        (package(judgements=[judged("moved", "ok")]), "moved_recall_share", 0.0),
+        (package(judgements=[judged("ok", "tipped")]), "tipped_precision_share", 0.0),
+        (package(judgements=[judged("missing", "extra")]), "missing_recall_share", 0.0),
+    ],
+)
+def test_what_is_spoilt_misses_its_goal(spoilt, name, value):
+    scores = scores_of({TRAY: [spoilt]})
+    assert scores[name] == pytest.approx(value)
+    assert name in missed(scores)
+
+
+def test_what_the_operator_touched_is_no_sound_placement_but_counts_as_damaged():
+    scores = scores_of({TRAY: [package(along_mm=9.0, by_hand=True, **DENTED), package()]})
+    assert scores["shift_p95_mm"] == 1.0
+    assert scores["by_hand_share"] == 0.5
+    assert scores["damaged_gentle"] == 1
+
+
+def test_damage_that_was_provoked_is_not_that_of_the_robot():
+    assert scores_of({TRAY: [package(**KNOCKED)]})["damaged_gentle"] == 0
+    rough = scores_of({ROUGH: [package(**DENTED)]})
+    assert (rough["damaged_gentle"], rough["damaged"]) == (None, 1)
+
+
+def test_provoked_trays_count_for_verdicts_and_recoveries_only():
+    spoilt = package(
+        step("regrasp", "moved", "moved"),
+        judgements=[judged("moved", "ok")],
+        along_mm=9.0,
+        cycle_s=30.0,
+        knock="moved",
+    )
+    scores = scores_of({TRAY: [package()], PROVOKED: [spoilt]})
+    assert (scores["shift_p95_mm"], scores["cycle_p50_s"], scores["provoked"]) == (1.0, 9.0, 1)
+    assert (scores["recovered_share"], scores["moved_recall_share"]) == (0.0, 0.0)
+
+
+def test_a_failure_that_the_net_noticed_is_counted():
+    failed = step("pack", "belt", "belt", result="blocked", works=False)
+    assert scores_of({TRAY: [package(failed, step("retry"))]})["noticed_by_net"] == 1
+
+
+def test_the_table_sets_truth_against_verdict():
+    found = {TRAY: [package(judgements=[judged(), judged("moved", "extra")])]}
+    assert confusion(found) == {("ok", "ok"): 1, ("moved", "extra"): 1}
+    head, ok, moved = (line.split() for line in confusion_text(confusion(found)).splitlines())
+    assert head == ["truth", "ok", "moved", "tipped", "deformed", "missing", "extra"]
+    assert ok == ["ok", "1", *"....."]
+    assert moved == ["moved", *".....", "1"]
+
+
+def test_states_have_an_order():
+    states = ("ok", "moved", "missing", "tipped")
+    assert sorted(states, key=badness) == list(states)
+    assert badness("beside") == badness("deformed") > badness("bin")
+
+
+def test_records_go_through_json():
+    whole = package(judgements=[judged(pose_mm=math.nan)], **DENTED)
+    [back] = packed_of(line_of([whole]))
+    assert dataclasses.astuple(back)[:5] == dataclasses.astuple(whole)[:5]
+    assert math.isnan(back.judgements[0].pose_error_mm)
+    assert (back.dents_mm, back.dented_by) == (whole.dents_mm, whole.dented_by)
+
+
+def test_trays_take_the_settings_in_turn_and_held_out_seeds():
+    trays = trays_of(40, seed=2)
+    assert [tray.seed for tray in trays] == [2000, 2001, 2002, 2003]
+    assert [tray.count for tray in trays] == [12, 12, 12, 4]
+    assert len({(tray.sigma_mm, tray.friction) for tray in trays}) == 4
+
+
+def test_errors_are_provoked_with_every_setting_alike():
+    trays = trays_of(12 * 9 * EVERY, provoke=("moved",))
+    provoked = [(tray.sigma_mm, tray.friction) for tray in trays if tray.provoked]
+    assert len(provoked) == len(set(provoked)) == 9
+
+
+@pytest.mark.parametrize(
+    "spread", ["much", "2", "2,0.4,1", "nan,0.4", "2,nan", "inf,0.4", "2,inf", "-1,0.4", "2,0"]
+)
+def test_the_bench_refuses_what_is_no_spread(spread, capsys):
+    with pytest.raises(SystemExit):
+        main(["bench", "palletizing", f"--spread={spread}"])
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert f"asked for '{spread}'; it is SIGMA_MM,FRICTION, such as 2,0.4" in last
+
+
+def test_the_bench_refuses_an_error_that_cannot_be_provoked(capsys):
+    with pytest.raises(SystemExit):
+        main(["bench", "palletizing", "--provoke", "moved,burnt"])
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert "asked for 'burnt'; errors that can be provoked: moved, tipped" in last
+
+
+def test_the_bench_names_the_errors_of_the_simulation():
+    knocks = pytest.importorskip("actors.palletizing.simulation.knocks", exc_type=ImportError)
+    assert bench.PROVOKED == knocks.KNOCKS
