@@ -74,6 +74,11 @@ class Arm(Chain, Protocol):
         """(n,), rad/s²."""
         ...
 
+    @property
+    def payload_kg(self) -> float:
+        """What its flange may carry: the hand and what it holds."""
+        ...
+
 
 class Line(ABC):
     """A curve of the joints by its parameter, 0 to `length_rad`.

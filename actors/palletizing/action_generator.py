@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from actors.palletizing.controller import open_controller
@@ -17,6 +18,7 @@ from actors.palletizing.handling import (
     Known,
     Stages,
     aside_net,
+    felt,
     frames_of,
     stages_of,
 )
@@ -172,8 +174,13 @@ class ActionGenerator(Actor):
         plans, sightings, place = {}, {}, Entity(request.place) if request.place else None
         if place is not None and place in lock[self.plans]:
             plans[request.place] = lock[self.plans][place]
-        if request.package and Entity(request.package) in lock[self.sightings]:
-            sightings[request.package] = lock[self.sightings][Entity(request.package)]
+        seen = lock[self.sightings].get(Entity(request.package)) if request.package else None
+        if seen is not None:
+            grasp = lock[self.grasps].get(product_entity(seen.product))
+            if seen.frame == "belt" and grasp is not None and request.felt_m:
+                pose = felt(seen.frame_from_package, grasp, request.felt_m)
+                seen = replace(seen, frame_from_package=pose)
+            sightings[request.package] = seen
         return Known(lock.get(self.cell_frames, {}), plans, sightings)
 
     def _ground(self, lock: Lock, request: Request, known: Known) -> Stages:

@@ -18,6 +18,7 @@ from actors.palletizing.handling import (
 )
 from actors.palletizing.reactions import (
     BY_ITSELF,
+    FELT_M,
     MOST,
     Case,
     Reaction,
@@ -217,7 +218,8 @@ class HandlingFeedback(Actor):
 
     def _answer(self, lock: Lock, last: Request, case: Case, flag: Deviation | None) -> None:
         """Do what follows from how a request ended and from what was seen."""
-        done = replace(last, tried=(*last.tried, last.kind))
+        felt_m = last.felt_m + FELT_M.get(case.result, 0.0)
+        done = replace(last, tried=(*last.tried, last.kind), felt_m=felt_m)
         case = self._case(lock, done, case, flag)
         reaction = react(case)
         if case.result.startswith("no_net:"):
@@ -232,7 +234,7 @@ class HandlingFeedback(Actor):
     ) -> None:
         """Let a reaction follow what was done, and tell it."""
         self._tell(lock, done.place, flag, f"{reaction.kind}: {reaction.reason}")
-        now = replace(done, seen=case.seen)
+        now = replace(done, seen=case.seen, short_m=max(0.0, -case.along_mm) / 1e3)
         if reaction.kind == "go_on":
             self._close(lock, done, "placed", reaction.reason)
         elif reaction.kind == "ask":

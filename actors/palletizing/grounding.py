@@ -96,6 +96,8 @@ class Gripper:
         most_m: Between the open fingers.
         play_m: So much wider than a package it opens at least.
         force_n_max: Of the fingers.
+        payload_kg: Greatest mass of what it holds.
+        mass_kg: Its own, which the arm carries as well.
         half_m: Half the hand along the fingers' way when it is closed.
         half_across_m: Half the fingers across it.
         tips_m: So far do the fingers reach beyond the tool.
@@ -105,6 +107,8 @@ class Gripper:
     most_m: float = 0.135
     play_m: float = 0.010
     force_n_max: float = 60.0
+    payload_kg: float = 2.0
+    mass_kg: float = 1.0
     half_m: float = 0.0445
     half_across_m: float = 0.012
     tips_m: float = 0.020
@@ -124,6 +128,7 @@ class Job:
         bin: Entity of the reject bin; "" if the action has none.
         turned: The hand is turned round by π: what was grasped so is placed so.
         gap_m: So far short of its place, against the push, the package is put down or stands.
+        product: Name of its product, for errors.
     """
 
     package: str
@@ -134,6 +139,7 @@ class Job:
     bin: str = ""
     turned: bool = False
     gap_m: float = PUSH_GAP_M
+    product: str = ""
 
 
 def ground(
@@ -157,6 +163,7 @@ def ground(
     file = FOLDER / f"{skeleton}.toml" if skeleton in SKELETONS else Path(skeleton)
     about = f"{file.stem} for {job.package}"
     _check_grip(about, job, gripper)
+    _check_payload(about, job, arm, gripper)
     skeleton_document, values = read_document(file), parameters(job, gripper, frames)
     document = bind(skeleton_document, values, str(file))
     kinds = skeleton_document.get("parameters", {}).items()
@@ -297,6 +304,17 @@ def _check_grip(about: str, job: Job, gripper: Gripper) -> None:
     if not np.hypot(*grasp.axis[:2]) > 0.5:
         found = np.round(grasp.axis, 3).tolist()
         raise NetError(f"{about}: the axis of its grasp {found} is not level")
+
+
+def _check_payload(about: str, job: Job, arm: Arm, gripper: Gripper) -> None:
+    mass_kg = job.grasp.mass_kg
+    limits_kg = {"gripper": gripper.payload_kg, "arm": arm.payload_kg - gripper.mass_kg}
+    weaker = min(limits_kg, key=lambda which: limits_kg[which])
+    if not 0.0 < mass_kg <= limits_kg[weaker]:
+        raise NetError(
+            f"{about}: a {job.product or 'package'} of {mass_kg:g} kg; the {weaker} carries more"
+            f" than 0 and at most {limits_kg[weaker]:g} kg"
+        )
 
 
 def _check_reach(about: str, net: Net, arm: Arm, frames: Frames, near_rad: F64) -> None:

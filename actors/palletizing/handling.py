@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from actors.palletizing.grounding import Gripper, Job, easier_turn, ground
+from actors.palletizing.grounding import PUSH_GAP_M, Gripper, Job, easier_turn, ground
 from actors.palletizing.nets import Axis, Condition, Exit, Net, NetError, Primitive, TaskFrame
 
 if TYPE_CHECKING:
@@ -103,6 +103,28 @@ def is_held(grip: GripCommand | None, gripper: GripState | None, grasp: Grasp | 
         return False
     opens = grip.kind == "width" and gripper is not None and gripper.number >= grip.number
     return not opens and (gripper is None or fills(gripper.width_m, grasp))
+
+
+def felt(frame_from_product: F64, grasp: Grasp, felt_m: float) -> F64:
+    """Return where a package is after a finger has come down on it, (4, 4), metres.
+
+    Args:
+        frame_from_product: Where it was seen.
+        grasp: Of its product.
+        felt_m: So far along the grasp's axis it is beside that, see `reactions.FELT_M`.
+    """
+    pose = np.array(frame_from_product)
+    pose[:3, 3] += felt_m * (pose[:3, :3] @ grasp.axis)
+    return pose
+
+
+def gap_before(short_m: float) -> float:
+    """Return how far short of its place a package is pushed from, metres.
+
+    Args:
+        short_m: So far short of it the package stands.
+    """
+    return max(PUSH_GAP_M, short_m)
 
 
 def stages_of(request: Request, plan: Plan | None) -> tuple[str, ...]:
@@ -189,6 +211,8 @@ class Stages:
             place=request.place,
             push=push,
             bin="bin",
+            product=seen.product if (seen := known.sightings.get(request.package)) else "",
+            gap_m=gap_before(request.short_m if request.kind == "push_again" else 0.0),
         )
         self._known, self._arm, self._gripper = known, arm, gripper
 

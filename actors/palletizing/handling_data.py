@@ -41,6 +41,9 @@ class Request:
         reason: Why, in words.
         seen: Where the package was seen last: "belt", "tray" or "hand"; "" if nowhere.
         tried: Kinds of the requests for this place before this one.
+        felt_m: So far along its grasp's axis the package is beside where it was seen on the belt,
+            by the sides on which fingers came down on it.
+        short_m: So far short of its place it stands.
     """
 
     number: int
@@ -50,6 +53,8 @@ class Request:
     reason: str
     seen: str = "belt"
     tried: tuple[str, ...] = ()
+    felt_m: float = 0.0
+    short_m: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

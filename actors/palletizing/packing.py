@@ -25,7 +25,7 @@ from actors.palletizing.belt_sight import seen_on_belt
 from actors.palletizing.execution import Executor
 from actors.palletizing.grasps import grasp_of, size_of
 from actors.palletizing.grounding import Gripper, Job, easier_turn, ground
-from actors.palletizing.handling import fills
+from actors.palletizing.handling import felt, fills, gap_before
 from actors.palletizing.nets import NetError
 from actors.palletizing.packing_records import Judgement, Packed, Step
 from actors.palletizing.packing_truth import badness, gap_m, state_of, top_dent_mm, truth_of
@@ -244,7 +244,7 @@ class Packing:
             return stages, Case("grasp_from_belt", "not_seen", success=False)
         job = self._job(number)
         if request == "push_again":
-            job = replace(job, gap_m=max(job.gap_m, short_mm / 1e3))
+            job = replace(job, gap_m=gap_before(short_mm / 1e3))
         success, result = True, "seen"
         for skeleton in STAGES[request]:
             if skeleton == "push_into_contact" and not self.slots[number].push.any():
@@ -277,6 +277,7 @@ class Packing:
             push=self.layout.base_from_tray[:3, :3] @ slot.push,
             bin="bin",
             turned=self._turned,
+            product=product,
         )
 
     def _execute(self, skeleton: str, job: Job) -> tuple[str, bool]:
@@ -354,8 +355,8 @@ class Packing:
         for sight in sights:
             if sight.product == self._packages[number].product and sight.known:
                 pose = self.layout.base_from_belt @ sight.belt_from_product
-                pose[:3, 3] += self._felt_m * (pose[:3, :3] @ self._grasps[sight.product].axis)
-                self._frames[f"package/{number}"] = pose
+                grasp = self._grasps[sight.product]
+                self._frames[f"package/{number}"] = felt(pose, grasp, self._felt_m)
                 return True
         return False
 

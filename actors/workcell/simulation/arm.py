@@ -1,8 +1,8 @@
 """The simulated arm as data: kinematics and limits of an LBR iiwa 14 R820, shape of our own.
 
-Lengths, ranges and speeds are those of the data sheet.  It names no accelerations; those here let
-the quickest point of the stretched arm brake with more than 6 m/s².  The shape is five capsules
-that hold the links and a tool of 0.2 m; nothing of it comes from meshes of others.
+Lengths, ranges, speeds and payload are those of the data sheet.  It names no accelerations; those
+here let the quickest point of the stretched arm brake with more than 6 m/s².  The shape is five
+capsules that hold the links and a tool of 0.2 m; nothing of it comes from meshes of others.
 """
 
 from __future__ import annotations
@@ -52,6 +52,7 @@ def _arm() -> ArmModel:
         q_max=np.deg2rad([170.0, 120.0, 170.0, 120.0, 170.0, 120.0, 175.0]),
         dq_max=np.deg2rad([85.0, 85.0, 100.0, 75.0, 130.0, 135.0, 135.0]),
         ddq_max=np.array([8.0, 8.0, 10.0, 10.0, 15.0, 15.0, 20.0]),
+        payload_kg=14.0,
     )
 
 

@@ -210,6 +210,14 @@ def test_the_easier_turn_spares_the_wrist():
             "its grasp asks for 80 N; the gripper has at most 60 N",
         ),
         (
+            "grasp_from_belt", {"grasp": {"mass_kg": 2.4}, "product": "milk_carton"},
+            "a milk_carton of 2.4 kg; the gripper carries more than 0 and at most 2 kg",
+        ),
+        (
+            "regrasp", {"grasp": {"mass_kg": math.nan}},
+            "a package of nan kg; the gripper carries",
+        ),
+        (
             "grasp_from_belt", {"grasp": {"axis": np.array([0.0, 0.0, 1.0])}},
             "the axis of its grasp [0.0, 0.0, 1.0] is not level",
         ),
@@ -246,6 +254,16 @@ def test_what_cannot_be_done_is_refused_before_anything_moves(skeleton, changes,
     assert "\n" not in str(refused.value)
 
 
+def test_the_arm_carries_the_gripper_too():
+    """A gripper that could hold it does not help where the arm cannot lift both."""
+    heavy = dataclasses.replace(JOB, grasp=dataclasses.replace(GRASP, mass_kg=9.5))
+    with pytest.raises(NetError, match=r"of 9\.5 kg; the arm carries more than 0 and at most 9 kg"):
+        ground(
+            "grasp_from_belt", heavy, arm=ARM, gripper=Gripper(payload_kg=50.0, mass_kg=5.0),
+            frames=FRAMES.__getitem__, near_rad=HOME_RAD,
+        )  # fmt: skip
+
+
 @pytest.mark.parametrize(
     ("found", "written", "message"),
     [
@@ -259,11 +277,11 @@ def test_what_cannot_be_done_is_refused_before_anything_moves(skeleton, changes,
         ),
         (
             '"grasp.width_m" = "m"', "",
-            "primitives.carry.exits[1].when[1]: parameter grasp.width_m is not declared; declared:",
+            "primitives.raise_first.exits[1].when[1]: parameter grasp.width_m is not declared; declared:",
         ),
         (
             "{grasp.width_m} - 0.006 m", "{hand.bin_rad} - 0.006 m",
-            "primitives.carry.exits[1].when[1]: hand.bin_rad has the type rad, not m",
+            "primitives.raise_first.exits[1].when[1]: hand.bin_rad has the type rad, not m",
         ),
         ("speed_m_s = 0.8", 'speed_m_s = "{clear_m}"', "speed_m_s: clear_m has the type m, not m/s"),
         ('entity = "{bin}"', 'entity = "{clear_m}"', "frame.entity: it is 0.13; it must be a string"),

@@ -335,17 +335,27 @@ def test_a_package_that_could_not_be_rejected_is_not_placed_again(cell):
     assert request.reason == "it could not be rejected: missed"
 
 
-def test_a_package_that_is_too_wide_is_refused_before_anything_moves(cell):
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ({"width_m": 0.18}, "180 mm wide"),
+        (
+            {"mass_kg": 3.5},
+            "a milk_carton of 3.5 kg; the gripper carries more than 0 and at most 2",
+        ),
+    ],
+)
+def test_a_package_that_cannot_be_carried_is_refused_before_anything_moves(cell, change, why):
     """One line says so; the operator is asked."""
     come(cell)
     carton = words.product_entity("milk_carton")
     grasp = read(cell, carton, words.GRASP, "training")
-    write(cell, carton, words.GRASP, replace(grasp, width_m=0.18), "training")
+    write(cell, carton, words.GRASP, replace(grasp, **change), "training")
     testing.run_once(HandlingFeedback(), cell)
     generator = ActionGenerator(ARM)
     testing.run_once(generator, cell)
     outcome = read(cell, words.SYSTEM, words.OUTCOME)
-    assert "180 mm wide" in outcome.result
+    assert why in outcome.result
     assert "\n" not in outcome.result
     looked(cell, "belt")
     testing.run_once(HandlingFeedback(), cell)
@@ -647,3 +657,42 @@ def test_a_robot_that_stopped_while_it_lifted_is_asked_about_with_a_full_hand(ce
     choices = read(cell, words.USER, words.QUESTION).choices
     assert choices == ("reject", "removed", "stop", "look")
     assert read(cell, words.SYSTEM, words.REQUEST).seen == "hand"
+
+
+def test_a_second_grasp_goes_where_the_hand_has_felt_the_package(cell):
+    """A finger came down on it twice: the net goes 10 mm farther to that side each time."""
+    come(cell)
+    grasp = read(cell, words.product_entity("milk_carton"), words.GRASP, "training")
+    feedback, y_m = HandlingFeedback(), []
+    testing.run_once(feedback, cell)
+    for result in ("blocked_left", "blocked_left"):
+        packed(cell, result, "aside")
+        looked(cell, "belt")
+        testing.run_once(feedback, cell)
+        assert read(cell, words.SYSTEM, words.REQUEST).kind == "retry"
+        testing.run_once(ActionGenerator(ARM), cell)
+        frame = read(cell, words.SYSTEM, words.CANDIDATE).frames[PACKAGE.name]
+        y_m.append(float((CellLayout().base_from_belt[:3, :3] @ grasp.axis) @ frame[:3, 3]))
+    assert y_m[1] - y_m[0] == pytest.approx(0.010)
+    seen = (
+        CellLayout().base_from_belt
+        @ each(cell, words.PACKAGES, words.SIGHTING, "online")[PACKAGE].frame_from_package
+    )
+    at = (CellLayout().base_from_belt[:3, :3] @ grasp.axis) @ seen[:3, 3]
+    assert y_m[0] - at == pytest.approx(0.010)
+
+
+def test_a_package_that_stands_far_short_is_pushed_from_behind_it(cell):
+    """The hand goes down behind where it stands, not behind where packages are put down."""
+    placed(cell)
+    looked(cell, "tray", "moved", x_m=-0.045)
+    testing.run_once(HandlingFeedback(), cell)
+    request = read(cell, words.SYSTEM, words.REQUEST)
+    assert (request.kind, request.short_m) == ("push_again", pytest.approx(0.045))
+    testing.run_once(ActionGenerator(ARM), cell)
+    again = read(cell, words.SYSTEM, words.CANDIDATE).net
+    write(cell, words.SYSTEM, words.REQUEST, replace(request, number=9, short_m=0.0))
+    testing.run_once(ActionGenerator(ARM), cell)
+    usual = read(cell, words.SYSTEM, words.CANDIDATE).net
+    behind = [net.primitives["behind"].axes[0].value for net in (again, usual)]
+    assert behind[0] == pytest.approx(behind[1] - 0.025)

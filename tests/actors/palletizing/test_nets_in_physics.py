@@ -264,6 +264,22 @@ def test_package_is_removed_into_the_bin(worker):
     assert np.abs(worker.cell.pose(0) - stands)[:3, 3].max() < 5e-4
 
 
+def test_package_that_is_held_low_is_raised_before_it_is_removed(worker):
+    """The hand was stopped while it began to lift, another package in the way to the bin."""
+    worker.put(1, *BELT)
+    worker.put(0, BELT[0], BELT[1] - 0.16)
+
+    def stop(executor):
+        if executor.execution().primitive == "lift" and not executor.result:
+            executor.brake("stopped")
+
+    assert worker.run(worker.ground("grasp_from_belt", 1), stop).result == "braked:stopped"
+    assert worker.truth(1).where == "held"
+    assert worker.do(1, "remove_to_reject") == "rejected"
+    worker.cell.step(100)
+    assert worker.truth(1).where == "bin"
+
+
 def test_package_that_is_not_there_is_missed(worker):
     """The fingers close on nothing: the width tells, the hand goes up open."""
     worker.put(1, *BELT)
