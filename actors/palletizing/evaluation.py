@@ -1,9 +1,9 @@
-"""Score the geometry of error monitoring on simulated packages, without any world context.
+"""Train products and judge simulated packages, without any world context.
 
     python -m actors.palletizing.evaluation --packages 200 --seed 1
 
-prints the confusion matrix, the errors of the pose, the times, and the blob areas of sound packages
-that `Limits.deformed_m2` is calibrated on; `--graded` adds series of equal deviations.
+prints the blob areas of sound packages that `Limits.deformed_m2` is calibrated on; `--graded` adds
+series of equal deviations.  `perception_scores` scores what this judges.
 
 Measured on two cores of 2.5 GHz, three products, sensor of 1.7 mm spread at the tray:
 
@@ -39,7 +39,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from actors.geometry.depth_reconstruction import reconstruct_view
-from actors.geometry.deviation import VERDICTS, Finding, Limits, inspect_place
+from actors.geometry.deviation import Finding, Limits, inspect_place
 from actors.geometry.fusion import fuse_views
 from actors.geometry.plate import seen_from
 from actors.geometry.segmentation import product_on_plate
@@ -47,12 +47,10 @@ from actors.palletizing.pallet import tray_of
 from actors.palletizing.sensor import PLATE_M, steady
 from actors.palletizing.simulation.noise import DARK, Light
 from actors.palletizing.simulation.packages import (
-    KINDS,
     VERDICT_OF_KIND,
     Package,
     Truth,
     make_package,
-    package_sequence,
 )
 from actors.palletizing.simulation.sensors import SimulatedOrbitSensor, SimulatedTraySensor
 
@@ -164,19 +162,8 @@ def graded(
     ]
 
 
-def confusion(cases: Sequence[Case]) -> str:
-    """Return the confusion matrix as text: true kinds down, verdicts across."""
-    counts = Counter((case.package.truth.kind, case.finding.verdict) for case in cases)
-    lines = ["truth     " + "".join(f"{verdict:>10}" for verdict in VERDICTS)]
-    for kind in ("ok", *KINDS):
-        row = [counts[kind, verdict] for verdict in VERDICTS]
-        if sum(row):
-            lines.append(f"{kind:<10}" + "".join(f"{count or '.':>10}" for count in row))
-    return "\n".join(lines)
-
-
 def main(argv: Sequence[str] | None = None) -> int:
-    """Train, judge, print; return 0."""
+    """Train, judge sound packages, print the areas of their blobs; return 0."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--packages", type=int, default=100)
     parser.add_argument("--seed", type=int, default=1)
@@ -187,20 +174,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     start = time.perf_counter()
     models = {name: train(name, SimulatedOrbitSensor(seed=options.seed)) for name in products}
     print(f"training: {(time.perf_counter() - start) / len(products):.1f} s per product")
-    packages = package_sequence(options.packages, seed=options.seed, products=products)
-    cases = judge(packages, models, seed=options.seed)
-    print(confusion(cases))
-    for case in cases:
-        if not case.correct:
-            print(f"wrong: {case.package.product} {case.package.truth} -> {case.finding.verdict}")
-    errors = [case.pose_error_mm for case in cases if case.package.truth.kind == "ok"]
-    times = [case.check_s for case in cases]
-    print(f"correct {np.mean([case.correct for case in cases]):.1%}")
-    print(
-        f"position of sound packages: median {np.median(errors):.2f} mm,"
-        f" p95 {np.percentile(errors, 95):.2f} mm"
-    )
-    print(f"check: median {np.median(times):.2f} s, longest {max(times):.2f} s")
     sound = graded("ok", 0.0, options.packages, seed=options.seed, products=products)
     tight = judge(sound, models, seed=options.seed, limits=Limits(deformed_m2=1e-9))
     areas = sorted(case.finding.area_mm2 for case in tight if case.finding.verdict == "deformed")
