@@ -25,7 +25,7 @@ import numpy as np
 from actors.palletizing.evaluation import train
 from actors.palletizing.packing import Packing
 from actors.palletizing.packing_pictures import Strips
-from actors.palletizing.packing_records import line_of
+from actors.palletizing.packing_records import line_of, packed_of
 from actors.palletizing.packing_truth import KINDS, badness
 from actors.palletizing.simulation.knocks import draw_knocks
 from actors.palletizing.simulation.packages import DEMO_PRODUCTS
@@ -52,6 +52,8 @@ GENTLE_MM: Final = 2.0
 DAMAGE_MM: Final = 1.0
 """Depth of a dent from which a package counts as damaged."""
 RECOVERIES: Final = ("retry", "regrasp", "push_again")
+NOTED: Final = "trays.jsonl"
+"""File with a line of JSON per packed tray."""
 EVERY: Final = 4
 """Of so many trays one is disturbed, if errors are to be provoked; no divisor of the number of
 settings, so that each of them has its turn."""
@@ -163,25 +165,51 @@ def played(
         processes: How many run side by side.
         told: Called with what is done.
         out: Folder; what became of each tray is added to its `trays.jsonl` at once, and pictures of
-            the first tray on which errors are provoked are put there.
+            the first tray on which errors are provoked are put there.  Trays that are there
+            already are not packed again.
     """
-    products = sorted({name for tray in trays for name in tray.products})
-    told(f"training: {', '.join(products)}")
-    models = {name: train(name, SimulatedOrbitSensor(seed=HELD_OUT), frames=4) for name in products}
-    found = {}
-    drawn = next((tray for tray in trays if tray.provoked), None)
-    for tray, packed in _each(trays, models, processes, {drawn: out}):
+    found = kept(out) if out else {}
+    left = [tray for tray in trays if tray not in found]
+    if len(left) < len(trays):
+        told(f"{len(trays) - len(left)} of {len(trays)} trays are there already")
+    for tray, packed in _packed(left, processes, told, out):
         found[tray] = packed
-        if out:
-            with (out / "trays.jsonl").open("a") as file:
-                file.write(json.dumps({"tray": asdict(tray)})[:-1])
-                file.write(f', "packed": {line_of(packed)}}}\n')
         asked = sum(each.by_hand for each in packed)
         told(
-            f"tray {len(found)} of {len(trays)}: seed {tray.seed}, sigma {tray.sigma_mm:g} mm,"
-            f" friction {tray.friction:g}, operator asked about {asked} of {tray.count}"
+            f"tray {sum(tray in found for tray in trays)} of {len(trays)}: seed {tray.seed}, sigma"
+            f" {tray.sigma_mm:g} mm, friction {tray.friction:g}, operator asked about {asked} of"
+            f" {tray.count}"
         )
     return {tray: found[tray] for tray in trays}
+
+
+def kept(folder: Path) -> dict[Tray, list[Packed]]:
+    """Return what became of the trays that are noted in a folder, see `played`."""
+    file = folder / NOTED
+    found = {}
+    for line in file.read_text().splitlines() if file.exists() else []:
+        noted = json.loads(line)
+        lists = {name: tuple(noted["tray"][name]) for name in ("products", "provoked")}
+        found[Tray(**{**noted["tray"], **lists})] = packed_of(json.dumps(noted["packed"]))
+    return found
+
+
+def _packed(
+    trays: Sequence[Tray], processes: int, told: Callable[[str], None], out: Path | None
+) -> Iterator[tuple[Tray, list[Packed]]]:
+    """Train the products, pack trays, note and yield each as soon as it is packed."""
+    products = sorted({name for tray in trays for name in tray.products})
+    if not trays:
+        return
+    told(f"training: {', '.join(products)}")
+    models = {name: train(name, SimulatedOrbitSensor(seed=HELD_OUT), frames=4) for name in products}
+    drawn = next((tray for tray in trays if tray.provoked), None)
+    for tray, packed in _each(trays, models, processes, {drawn: out}):
+        if out:
+            with (out / NOTED).open("a") as file:
+                file.write(json.dumps({"tray": asdict(tray)})[:-1])
+                file.write(f', "packed": {line_of(packed)}}}\n')
+        yield tray, packed
 
 
 def _each(

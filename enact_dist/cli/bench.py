@@ -191,8 +191,9 @@ def _add_packing(bench: Verb) -> None:
         "--out",
         type=Path,
         metavar="DIR",
-        help="add what becomes of each tray to DIR/trays.jsonl as it comes, and draw one error of"
-        " each kind that is provoked: before, with the error, after the reaction",
+        help="add what becomes of each tray to DIR/trays.jsonl as it comes, from which an"
+        " interrupted run goes on; and draw one error of each kind that is provoked: before, with"
+        " the error, after the reaction",
     )
     packing.add_argument(
         "--perception",

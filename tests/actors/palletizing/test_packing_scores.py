@@ -5,6 +5,7 @@ import math
 
 import pytest
 
+from actors.palletizing import packing_scores
 from actors.palletizing.packing_records import Judgement, Packed, Step, line_of, packed_of
 from actors.palletizing.packing_scores import (
     EVERY,
@@ -140,6 +141,30 @@ def test_records_go_through_json():
     assert dataclasses.astuple(back)[:5] == dataclasses.astuple(whole)[:5]
     assert math.isnan(back.judgements[0].pose_error_mm)
     assert (back.dents_mm, back.dented_by) == (whole.dents_mm, whole.dented_by)
+
+
+def test_an_interrupted_run_goes_on_with_the_trays_that_are_left(monkeypatch, tmp_path):
+    trays = trays_of(48, provoke=("moved",))
+    packed = []
+
+    def pack(tray, _models, _pictures):
+        if len(packed) == 3:
+            raise KeyboardInterrupt
+        packed.append(tray)
+        return [package(number=tray.seed)]
+
+    monkeypatch.setattr(packing_scores, "packed_tray", pack)
+    monkeypatch.setattr(packing_scores, "train", lambda *_, **__: None)
+    with pytest.raises(KeyboardInterrupt):
+        packing_scores.played(trays, out=tmp_path)
+    packed.clear()
+    found = packing_scores.played(trays, out=tmp_path)
+    assert packed == trays[3:]
+    assert list(found) == trays
+    assert [each.number for [each] in found.values()] == [tray.seed for tray in trays]
+    packed.clear()
+    assert list(packing_scores.played(trays, out=tmp_path)) == trays
+    assert not packed
 
 
 def test_trays_take_the_settings_in_turn_and_held_out_seeds():
