@@ -14,7 +14,9 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from actors.geometry.poses import moved, on_tray
+from actors.geometry.open3d_arrays import tensor
+from actors.geometry.poses import inverse, moved, on_tray
+from actors.geometry.rendering import ray_scene
 from actors.palletizing.pallet import planned_pose, tray_of
 from actors.palletizing.simulation.products import box_mesh, product_mesh
 
@@ -38,12 +40,28 @@ ROOM_M: Final = (0.105, 0.15)
 DEVIATING_SHARE: Final = 0.5
 """Far more than a real line has, so that a short demonstration shows every kind."""
 
+DENT_SIGMA_M: Final = (0.014, 0.022)
+"""Radii of dents and bulges, one sigma, metres."""
+
 KINDS: Final = ("dent", "bulge", "crush", "moved", "missing", "extra")
 """True deviations; dent, bulge and crush are what the verdict calls deformed."""
+
+FACE_DENT: Final = "dent in a face"
+"""A dent wherever the sensor sees the package, not drawn by chance; "dent" is one on its top."""
+
+EYE_M: Final = (0.0, 0.0, 0.95)
+"""Where the overhead sensor is, tray frame."""
+
+FACING_COS: Final = 0.25
+"""A face that is seen flatter than by 14 degrees, with a quarter of its area, counts as hidden."""
+
+FOOT_M: Final = 0.015
+"""Dents in faces have their middle above: the tray cuts off what is lower."""
 
 VERDICT_OF_KIND: Final = {
     "ok": "ok",
     "dent": "deformed",
+    FACE_DENT: "deformed",
     "bulge": "deformed",
     "crush": "deformed",
     "moved": "moved",
@@ -65,7 +83,9 @@ class Truth:
     amount: float
 
     def __str__(self) -> str:
-        unit = {"dent": " mm", "bulge": " mm", "crush": " %", "moved": " mm"}.get(self.kind)
+        unit = {"dent": " mm", FACE_DENT: " mm", "bulge": " mm", "crush": " %", "moved": " mm"}.get(
+            self.kind
+        )
         return self.kind if unit is None else f"{self.kind} {self.amount:.0f}{unit}"
 
 
@@ -138,6 +158,11 @@ def make_package(stop: int, product: str, truth: Truth, random: np.random.Genera
     vertices, triangles = product_mesh(product)
     nothing = (np.empty((0, 3)), np.empty((0, 3), np.int32))
     shape, extra = (deformed(vertices, truth, random), triangles), nothing
+    if truth.kind == FACE_DENT:
+        at, inwards = seen_spot((vertices, triangles), placed, random)
+        depth_m, sigma_m = truth.amount / 1e3, random.uniform(*DENT_SIGMA_M)
+        bent = pressed(vertices, at, inwards, depth_m=depth_m, sigma_m=sigma_m)
+        shape = bent, triangles
     if truth.kind == "missing":
         shape = nothing
     elif truth.kind == "extra":
@@ -168,7 +193,7 @@ def deformed(
     if truth.kind in ("dent", "bulge"):
         half = np.abs(vertices_m[relative > 0.9, :2]).max(axis=0)
         centre = random.uniform(-0.5, 0.5, 2) * half
-        sigma = random.uniform(0.014, 0.022)
+        sigma = random.uniform(*DENT_SIGMA_M)
         sign = 1.0 if truth.kind == "dent" else -1.0
         at, inwards = np.array([*centre, height]), np.array([0.0, 0.0, -1.0])
         bent = pressed(vertices_m, at, inwards, depth_m=sign * truth.amount / 1e3, sigma_m=sigma)
@@ -177,6 +202,35 @@ def deformed(
         bent[:, 2] *= 1.0 - loss
         bent[:, :2] *= 1.0 + 0.3 * loss * np.sin(np.pi * relative)[:, None]
     return bent
+
+
+def seen_spot(
+    mesh: Mesh, tray_from_product: npt.NDArray[np.float64], random: np.random.Generator
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Return a point of a package that the overhead sensor sees, all of them equally likely.
+
+    Args:
+        mesh: Vertices in the product frame, triangles.
+        tray_from_product: Where it stands, (4, 4).
+        random: Chooses.
+
+    Returns:
+        The point, (3,), metres, and the unit vector into the package there; product frame.
+    """
+    vertices, triangles = mesh
+    eye = moved(np.array([EYE_M]), inverse(tray_from_product))[0]
+    a, b, c = (vertices[triangles[:, corner]] for corner in range(3))
+    cross = np.cross(b - a, c - a)
+    area = np.linalg.norm(cross, axis=1)
+    normals = cross / np.maximum(area, 1e-12)[:, None]
+    rays = (a + b + c) / 3.0 - eye
+    facing = -np.einsum("ij,ij->i", normals, rays) / np.linalg.norm(rays, axis=1)
+    lines = np.concatenate([np.broadcast_to(eye, rays.shape), rays], axis=1)
+    hit = ray_scene(vertices, triangles).cast_rays(tensor(lines, np.float32))["t_hit"].numpy()
+    seen = (facing > FACING_COS) & ((a + b + c)[:, 2] > 3.0 * FOOT_M)
+    seen &= np.abs(hit - 1.0) < 1e-3
+    chosen = int(random.choice(len(triangles), p=seen * area / (seen * area).sum()))
+    return (a + b + c)[chosen] / 3.0, -normals[chosen]
 
 
 def pressed(

@@ -18,6 +18,7 @@ from actors.palletizing.sensor import PLATE_M
 from actors.palletizing.simulation.noise import DARK, Light, sensed
 from actors.palletizing.simulation.packages import (
     DEMO_PRODUCTS,
+    EYE_M,
     Package,
     on_the_tray,
     package_sequence,
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
 
     Mesh = tuple[npt.NDArray[np.float64], npt.NDArray[np.int32]]
 
-OVERHEAD_M: Final = 0.95
+OVERHEAD_M: Final = EYE_M[2]
 """Height of the overhead sensor above the tray."""
 
 TRAY_M: Final = (0.90, 0.64)
