@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from actors.palletizing.controller import open_controller
 from actors.palletizing.expectation import Expectations
 from actors.palletizing.grasps import size_of
-from actors.palletizing.grounding import Gripper
+from actors.palletizing.grounding import Gripper, aside_net
 from actors.palletizing.handling import (
     ASIDE,
     IDLE,
@@ -17,7 +17,6 @@ from actors.palletizing.handling import (
     Handled,
     Known,
     Stages,
-    aside_net,
     felt,
     frames_of,
     stages_of,

@@ -31,7 +31,7 @@ clear_m                 m         height above the others while carrying
 # The wire reads these annotations: they stay real types, without `from __future__`.
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -164,16 +164,34 @@ def ground(
     about = f"{file.stem} for {job.package}"
     _check_grip(about, job, gripper)
     _check_payload(about, job, arm, gripper)
-    skeleton_document, values = read_document(file), parameters(job, gripper, frames)
-    document = bind(skeleton_document, values, str(file))
-    kinds = skeleton_document.get("parameters", {}).items()
-    entities = [name for name, kind in kinds if kind == "entity"]
-    document["grounded"] = {
-        name: values[name] for name in {"package": 0, **dict.fromkeys(entities)}
-    }
-    net = net_of_document(document, str(file))
+    net = _bound(file, parameters(job, gripper, frames))
     _check_reach(about, net, arm, frames, near_rad)
     return net
+
+
+def aside_net(*, turned: bool) -> Net:
+    """Return the net that takes the tool between belt and tray, where it hides nothing.
+
+    It needs no package: it is also for a hand that could do nothing with one.
+
+    Args:
+        turned: Whether the hand is turned round.
+    """
+    return _bound(FOLDER / "go_aside.toml", {"belt": "belt", "hand.aside_rad": _aside_rad(turned)})
+
+
+def _aside_rad(turned: bool) -> float:
+    return 0.75 * math.pi if turned else -0.25 * math.pi
+
+
+def _bound(file: Path, values: Mapping[str, Value]) -> Net:
+    """Return the net of a skeleton with its parameters; it names the entities that it is about."""
+    skeleton = read_document(file)
+    document = bind(skeleton, values, str(file))
+    kinds = skeleton.get("parameters", {}).items()
+    entities = ["package", *(name for name, kind in kinds if kind == "entity")]
+    document["grounded"] = {name: values[name] for name in entities if name in values}
+    return net_of_document(document, str(file))
 
 
 def easier_turn(job: Job, *, arm: Arm, frames: Frames, near_rad: F64) -> bool:
@@ -218,7 +236,7 @@ def parameters(job: Job, gripper: Gripper, frames: Frames) -> dict[str, Value]:
         "grasp.height_m": float(grasp.point[2]),
         "grasp.force_n": grasp.force_n,
         "hand.turn_rad": math.pi if job.turned else 0.0,
-        "hand.aside_rad": 0.75 * math.pi if job.turned else -0.25 * math.pi,
+        "hand.aside_rad": _aside_rad(job.turned),
         "hand.bin_rad": 0.5 * math.pi if job.turned else -0.5 * math.pi,
         "belt": "belt",
         "gripper.closed_m": gripper.least_m + 0.001,

@@ -10,7 +10,7 @@ regrasp         regrasp
 place           place
 push            push_into_contact
 remove          remove_to_reject
-aside           none: the tool goes between belt and tray, where it hides nothing
+aside           go_aside
 ==============  ====================================================================================
 
 Rule a change must keep: a stage names its frames by entity; where these are is fixed when the net
@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from actors.palletizing.grounding import PUSH_GAP_M, Gripper, Job, easier_turn, ground
-from actors.palletizing.nets import Axis, Condition, Exit, Net, NetError, Primitive, TaskFrame
+from actors.palletizing.nets import NetError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 
     from actors.geometry.joint_paths import Arm
     from actors.palletizing.grounding import Grasp
+    from actors.palletizing.nets import Net
     from actors.palletizing.vocabulary import (
         GripCommand,
         GripState,
@@ -49,8 +50,6 @@ if TYPE_CHECKING:
     F64 = npt.NDArray[np.float64]
 
 ASIDE: Final = "aside"
-ASIDE_M: Final = (-0.10, -0.25, 0.30)
-"""Where the tool hides neither belt nor tray from the sensors above them, frame of the belt."""
 SKELETON_OF: Final = {
     "grasp": "grasp_from_belt",
     "regrasp": "regrasp",
@@ -255,28 +254,6 @@ class Stages:
             else:
                 return turned
         raise errors[0]
-
-
-def aside_net(*, turned: bool) -> Net:
-    """Return the net that takes the tool between belt and tray, where it hides nothing.
-
-    Args:
-        turned: Whether the hand is turned round.
-    """
-    there = (Condition("error", "<", 0.03), Condition("turn_error", "<", 0.2))
-    pressed = (Condition("force", ">", 60.0, 0.02),)
-    yaw = 0.75 * math.pi if turned else -0.25 * math.pi
-    primitive = Primitive(
-        frame=TaskFrame("belt", np.eye(4)),
-        axes=tuple(Axis("position", value) for value in (*ASIDE_M, math.pi, 0.0, yaw)),
-        tool="keep",
-        tool_value=0.0,
-        speed_m_s=0.8,
-        tare=True,
-        exits=(Exit(pressed, "blocked"), Exit(there, "aside")),
-        limit_s=8.0,
-    )
-    return Net("go_aside", "go", {"go": primitive}, {"aside": True, "blocked": False})
 
 
 def frames_of(net: Net, known: Known) -> dict[str, F64]:

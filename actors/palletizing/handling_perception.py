@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from actors.geometry.open3d_on_use import open3d
 from actors.geometry.registration import register
@@ -63,7 +63,7 @@ if TYPE_CHECKING:
     from enact_dist import Lock
 
     F64 = npt.NDArray[np.float64]
-    Depth = npt.NDArray[np.uint16]
+    Depth = npt.NDArray[Any]
 
 
 GONE_M: Final = 0.15

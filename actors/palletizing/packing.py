@@ -24,7 +24,7 @@ from actors.geometry.poses import coordinates
 from actors.palletizing.belt_sight import seen_on_belt
 from actors.palletizing.execution import Executor
 from actors.palletizing.grasps import grasp_of, size_of
-from actors.palletizing.grounding import Gripper, Job, easier_turn, ground
+from actors.palletizing.grounding import Gripper, Job, aside_net, easier_turn, ground
 from actors.palletizing.handling import felt, fills, gap_before
 from actors.palletizing.nets import NetError
 from actors.palletizing.packing_records import Judgement, Packed, Step
@@ -168,7 +168,7 @@ class Packing:
             began_s, before = self.cell.time_s, self._states()
             stages, case = self._act(request, number, short_mm)
             knock = self._knocked(number)
-            self._execute("go_aside", self._job(number))
+            self._run_net(aside_net(turned=self._turned))
             seen = self._look(number, all_packed)
             if knock is not None:
                 packed.knock = knock.kind

@@ -6,7 +6,7 @@ where they stand now, since a push moves the neighbours too.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import numpy as np
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from actors.geometry.shapes import Surface
 
     F64 = npt.NDArray[np.float64]
-    Depth = npt.NDArray[np.uint16]
+    Depth = npt.NDArray[Any]
     Standing = tuple[Surface, F64]
 
 Key = TypeVar("Key", bound="Hashable")
@@ -54,19 +54,21 @@ def tray_alone(frame: DepthFrame, empty: DepthFrame) -> DepthFrame:
 
 
 def without(frame: DepthFrame, empty_mm: Depth, others: Sequence[Standing]) -> Depth:
-    """Return the picture as it would be with nothing but the others on the tray, (H, W) mm.
+    """Return the picture as it would be with nothing but the others on the tray.
 
     Args:
         frame: The picture now; its world is the tray frame.
         empty_mm: (H, W), the empty tray.
         others: Trained surface and tray_from_product of every other package on it.
+
+    Returns:
+        (H, W) float32, millimetres; not rounded, as the picture is of several images.
     """
-    if not others:
-        return empty_mm
-    rendered_m = render_depth(list(others), frame.acquisition)
-    covered = np.isfinite(rendered_m)
-    before_mm = np.array(empty_mm)
-    before_mm[covered] = np.round(1000.0 * rendered_m[covered]).astype(before_mm.dtype)
+    before_mm = empty_mm.astype(np.float32)
+    if others:
+        rendered_m = render_depth(list(others), frame.acquisition)
+        covered = np.isfinite(rendered_m)
+        before_mm[covered] = 1000.0 * rendered_m[covered]
     return before_mm
 
 

@@ -10,13 +10,12 @@ it now, not against what stood there before, since a push moves the neighbours t
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from actors.geometry.deviation import Limits, inspect_place
-from actors.geometry.rendering import render_depth
-from actors.palletizing.tray_changes import changed, tray_alone
+from actors.palletizing.tray_changes import changed, tray_alone, without
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -26,7 +25,6 @@ if TYPE_CHECKING:
     from actors.geometry.shapes import DepthFrame, Surface
 
     F64 = npt.NDArray[np.float64]
-    Depth = npt.NDArray[Any]
     Places = Mapping[int, tuple[str, F64]]
 
 LIMITS: Final = replace(Limits(), turned_rad=float(np.deg2rad(5.0)))
@@ -96,7 +94,12 @@ class TrayWatch:
 
     def _inspected(self, place: int, places: Places) -> Seen:
         product, planned = places[place]
-        before_mm = self._without(place, places)
+        others = [
+            (self._models[places[number][0]], seen.pose)
+            for number, seen in self.seen.items()
+            if number != place and number in places and seen.pose is not None
+        ]
+        before_mm = without(self.frame, self._empty.depth_mm, others)
         found = inspect_place(
             self.frame, before_mm, self._models[product], planned, limits=self._limits
         )
@@ -107,21 +110,6 @@ class TrayWatch:
             turn_deg=found.turn_deg,
             deviation_mm=found.deviation_mm,
         )
-
-    def _without(self, place: int, places: Places) -> Depth:
-        """Return the picture as it would be without the package of a place, (H, W) millimetres."""
-        others = [
-            (self._models[places[number][0]], seen.pose)
-            for number, seen in self.seen.items()
-            if number != place and number in places and seen.pose is not None
-        ]
-        if not others:
-            return self._empty.depth_mm
-        rendered = render_depth(others, self.frame.acquisition)
-        covered = np.isfinite(rendered)
-        before_mm = self._empty.depth_mm.astype(np.float32)
-        before_mm[covered] = 1000.0 * rendered[covered]
-        return before_mm
 
     def _changed(self, places: Places) -> set[int]:
         """Return the places whose pixels differ from those of the picture before."""

@@ -30,7 +30,7 @@ perception looks, deviation detection judges, and feedback requests what comes n
 
 import math
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -108,14 +108,14 @@ class Observation:
 
     Attributes:
         frame: The image; its world is the tray frame.
-        before_mm: (H, W) uint16, the image of the stop before, millimetres; of the empty tray
-            for the first package of a tray.
+        before_mm: (H, W), the image of the stop before, millimetres; of the empty tray for the
+            first package of a tray.  Where a robot packs, float32: the tray without this package.
         packages: Names of the package entities that are new in it.
         captured_ns: When, nanoseconds since 1970.
     """
 
     frame: DepthFrame
-    before_mm: npt.NDArray[np.uint16]
+    before_mm: npt.NDArray[Any]
     packages: tuple[str, ...]
     captured_ns: int
 

@@ -14,9 +14,11 @@ from actors.palletizing.grounding import (
     Grasp,
     Gripper,
     Job,
+    aside_net,
     easier_turn,
     ground,
 )
+from actors.palletizing.net_files import text_of_net
 from actors.palletizing.nets import NetError
 from actors.palletizing.resolved_rate import ACCELERATION_RAD_S2
 
@@ -252,6 +254,13 @@ def test_what_cannot_be_done_is_refused_before_anything_moves(skeleton, changes,
 
     assert message in str(refused.value)
     assert "\n" not in str(refused.value)
+
+
+def test_the_way_aside_needs_no_package():
+    """A hand that could do nothing with a package goes aside all the same, by the same file."""
+    net = aside_net(turned=True)
+    assert (net.grounded, net.ends) == ({"belt": "belt"}, {"aside": True, "blocked": False})
+    assert text_of_net(net) == text_of_net(grounded("go_aside", turned=True))
 
 
 def test_the_arm_carries_the_gripper_too():

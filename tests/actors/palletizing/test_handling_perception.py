@@ -8,7 +8,7 @@ pytest.importorskip("mujoco", exc_type=ImportError)
 
 from actors.palletizing import vocabulary as words
 from actors.palletizing.deviation import DeviationDetection
-from actors.palletizing.handling import aside_net
+from actors.palletizing.grounding import aside_net
 from actors.palletizing.handling_perception import EmptyBelt, HandlingPerception
 from actors.palletizing.nets import Execution
 from actors.palletizing.planning import RowPlanning
@@ -65,7 +65,7 @@ def each(cell, world, pattern, aspect):
 
 def ended(cell, number, package, place, *, stage="push", success=True, kind="pack", aside="aside"):
     """Let the robot have ended a request and gone aside."""
-    request = words.Request(number, kind, place, package, "test")
+    request = words.Request(number, kind, place, package, "test", "tray" if package else "")
     write(cell, words.SYSTEM, words.REQUEST, request)
     outcome = words.Outcome(number, stage, "any", success, 7)
     write(cell, words.SYSTEM, words.OUTCOME, outcome)
@@ -125,6 +125,8 @@ def test_a_package_has_one_entity_from_the_belt_to_the_tray(cell, physical):
         "place/1": "ok",
     }
     assert len(each(cell, "online", words.PACKAGES, words.SIGHTING)) == 2
+    before_mm = each(cell, "online", words.PLACES, words.OBSERVATION)[Entity("place/1")].before_mm
+    assert (before_mm % 1.0 != 0.0).any()  # the neighbour is drawn as exactly as it was seen
 
 
 def test_a_package_that_was_missed_is_seen_on_the_belt_again(cell, physical):
