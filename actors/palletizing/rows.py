@@ -40,8 +40,6 @@ ROW_END_M: Final = 0.360
 """Where a row ends, so counted: behind it the closed hand goes down within the rim."""
 WIDTH_MAX_M: Final = 0.125
 """No wider may a package be across its row."""
-TOUCHING_M: Final = 0.0005
-"""Between neighbours of a row, as planned: what a push leaves."""
 RIM_M: Final = 0.030
 """Height of the tray's rim."""
 APART_M: Final = 0.020
@@ -180,7 +178,7 @@ class _Rows:
                 x_m = ROW_START_M + self._contacts_m.get(("", product), half_m)
             if not pushed:
                 x_m += APART_M
-            new = _Taken(product, row, x_m + TOUCHING_M, half_m, width_m / 2.0)
+            new = _Taken(product, row, x_m, half_m, width_m / 2.0)
             if new.x_m + new.half_length_m <= ROW_END_M and self._has_room(new):
                 self._pushed[row] = pushed
                 self._taken.append(new)

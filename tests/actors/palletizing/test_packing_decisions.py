@@ -49,16 +49,16 @@ def test_rows_stay_on_the_tray_and_never_overlap():
         for other in range(number):
             if slots[other].tray == slots[number].tray:
                 apart = np.maximum(placed[other][0] - high, low - placed[other][1])
-                assert apart.max() > 0.0
+                assert apart.max() > -1e-9, "neighbours of a row touch"
 
 
 def test_neighbours_of_a_row_touch_and_lie_where_the_push_goes():
     products = ["milk_carton", "meal_tray"] * 2
     slots = planned_rows(products, SIZES)
     placed = list(boxes(slots, products))
-    assert placed[0][1][0] == pytest.approx(0.4475)  # at the rim
+    assert placed[0][1][0] == pytest.approx(0.448)  # at the rim
     for one, next_one, slot in zip(placed, placed[1:], slots, strict=False):
-        assert one[0][0] - next_one[1][0] == pytest.approx(0.0005)
+        assert one[0][0] == pytest.approx(next_one[1][0])
         assert slot.push.tolist() == [1.0, 0.0, 0.0]
 
 
