@@ -15,6 +15,9 @@ PURE, as `actor_triggers`.  Rules that a change must keep:
    than the last one that ran.
 5. What was incomplete before the actor started is not its business: at the start only the newest
    complete set runs.
+6. Stamps of one member grow.  Where those of more than half of the members fall by more than
+   `SET_BACK_NS`, the clock of their sensors was set back: sets are counted anew from there.  One
+   member alone that falls back is late, as in rule 4.
 """
 
 from __future__ import annotations
@@ -33,6 +36,8 @@ if TYPE_CHECKING:
 
 TOLD_MAX: Final = 16
 """Incomplete sets that are kept by name."""
+SET_BACK_NS: Final = 1_000_000_000
+"""Versions of one datum are captured out of order by less than this."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +97,7 @@ class PendingSets:
     """
 
     __slots__ = (
-        "_due_ns", "_entity", "_floor_ns", "_known", "_least", "_least_after_ns", "_names",
+        "_due_ns", "_entity", "_floor_ns", "_known", "_last", "_least", "_least_after_ns", "_names",
         "_newest", "_newest_only", "_open", "_open_max", "_over", "_ready", "_taken_ns",
         "_unstamped", "_within_ns",
         "incomplete", "last_partial", "late", "partial", "skipped", "told", "unstamped",
@@ -118,6 +123,7 @@ class PendingSets:
         self._newest_only = newest_only
         self._known: dict[int, tuple[int, int]] = {}
         self._newest = [0] * len(self._names)
+        self._last = [0] * len(self._names)
         self._unstamped = [0] * len(self._names)
         self._open: list[_Set] = []
         self._over: list[_Set] = []
@@ -232,8 +238,25 @@ class PendingSets:
                 self.unstamped += 1
                 self._unstamped[member] += 1
                 continue
+            self._last[member] = captured_ns
             self._newest[member] = max(self._newest[member], captured_ns)
+            self._notice_set_back()
             self._arrived(member, captured_ns, now_ns)
+
+    def _notice_set_back(self) -> None:
+        """Count anew where the sensors' clock was set back (rule 6)."""
+        each = list(zip(self._last, self._newest, strict=True))
+        back = [last_ns for last_ns, newest_ns in each if last_ns < newest_ns - SET_BACK_NS]
+        if 2 * len(back) <= len(each):
+            return
+        now_ns = max(back)
+        self._newest = [min(last_ns, now_ns) for last_ns in self._last]
+        self._over, self._floor_ns, self._taken_ns = [], 0, 0
+        self.skipped += sum(ready.captured_ns > now_ns for ready in self._ready)
+        self._ready = deque(ready for ready in self._ready if ready.captured_ns <= now_ns)
+        for one in [one for one in self._open if one.low_ns > now_ns]:
+            self._open.remove(one)
+            self._tell(one.low_ns, one.missing())
 
     def _arrived(self, member: int, stamp_ns: int, now_ns: int) -> None:
         within_ns = self._within_ns

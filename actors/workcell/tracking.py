@@ -24,6 +24,7 @@ from actors.workcell.vocabulary import (
     LIMBS,
     PERIOD_S,
     PREDICTION,
+    SET_BACK_NS,
     TRACK,
     WORKSPACE,
     Prediction,
@@ -97,6 +98,9 @@ class HumanTracking(Actor):
         if lock.is_null(self.grid):
             return
         hull, grid, now_ns = lock[self.hull], lock[self.grid], lock.stamp_ns(self.hull)
+        if now_ns < self._last_ns - SET_BACK_NS:
+            self._last_ns = 0
+            self._hidden_since_ns, self._still_since = {}, {}
         seconds = (now_ns - self._last_ns) / 1e9 if self._last_ns else PERIOD_S
         if seconds <= 0.0:
             return
@@ -156,7 +160,7 @@ class HumanTracking(Actor):
     ) -> None:
         """Write what is known of a person who is seen."""
         height_m = body.top_m if before is None else 0.8 * before.height_m + 0.2 * body.top_m
-        first_ns = now_ns if before is None else before.first_ns
+        first_ns = now_ns if before is None else min(before.first_ns, now_ns)
         lock[self.tracks][name] = _track(
             state,
             body.top_m,

@@ -21,6 +21,7 @@ from actors.workcell.vocabulary import (
     CAMERAS,
     IMAGES_COMPARED,
     PERIOD_S,
+    SET_BACK_NS,
     SILHOUETTE,
     SYSTEM,
     CameraState,
@@ -58,7 +59,7 @@ class Seen(NamedTuple):
 
     def after(self, silhouette: Silhouette, captured_ns: int) -> Seen:
         """Return what is known when another silhouette has come."""
-        if silhouette.stand_in or captured_ns <= self.last_ns:
+        if silhouette.stand_in or self.last_ns - SET_BACK_NS <= captured_ns <= self.last_ns:
             return self
         checksum = silhouette.image_checksum
         same = checksum != 0 and checksum in self.checksums

@@ -415,3 +415,43 @@ def test_no_datum_of_near_stamps_is_lost_without_a_count(seed):
         left = came - ran - given_up - open_ - feed.sets.late
         assert feed.sets.skipped <= left <= 3 * feed.sets.skipped  # data, or whole sets
     assert ran > 200
+
+
+SECOND_NS = 1_000_000_000
+
+
+def test_clock_of_the_sensors_that_was_set_back_ends_nothing():
+    """A clock an hour ahead is corrected: sets go on; what was open by the old clock is named."""
+    hour_ns = 3600 * SECOND_NS
+    feed = Feed(newest_only=True)
+    feed.come(hour_ns)
+    feed.come(hour_ns + 1, LEFT)
+    assert feed.runs() == [hour_ns]
+    for number in range(1, 4):
+        feed.come(number * SECOND_NS)
+        assert feed.runs() == ([number * SECOND_NS] if number > 1 else [])
+    assert (hour_ns + 1, ("middle", "right")) in feed.told()
+
+
+def test_member_that_is_silent_does_not_hide_that_a_clock_was_set_back():
+    """More than half of the members suffice; the silent one is missing, as before."""
+    feed = Feed(least=2, least_after_ns=50)
+    feed.come(3600 * SECOND_NS)
+    assert feed.runs() == [3600 * SECOND_NS]
+    for number in range(1, 4):
+        feed.come(number * SECOND_NS, LEFT, MIDDLE)
+    assert [stamp_ns for stamp_ns, _ in feed.members(50)][-1] == 3 * SECOND_NS
+
+
+def test_one_member_whose_clock_is_set_back_is_late():
+    """Two tell the time against one: their sets end without it, none of its own begins."""
+    feed = Feed(least=1, least_after_ns=50)
+    feed.come(3600 * SECOND_NS)
+    feed.come(SECOND_NS, LEFT)
+    feed.come(3601 * SECOND_NS, MIDDLE, RIGHT)
+    feed.come(2 * SECOND_NS, LEFT)
+    runs = [stamp_ns for stamp_ns, _ in feed.members(50)]
+    assert [stamp_ns for stamp_ns in runs if stamp_ns >= 3600 * SECOND_NS] == [
+        3600 * SECOND_NS,
+        3601 * SECOND_NS,
+    ]

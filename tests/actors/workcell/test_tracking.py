@@ -235,6 +235,20 @@ def test_restarted_tracking_goes_on(cell):
     assert human_entity(0).name in tracks
 
 
+def test_tracking_goes_on_when_the_clock_of_the_cameras_was_set_back(cell):
+    """A clock an hour ahead is corrected: the same person is followed, and can be lost again."""
+    cell.now_ns += 3600 * 10**9
+    for _ in range(5):
+        cell.see(body((0.5, -0.75)))
+    cell.now_ns = START_NS
+    for place in line((0.5, -0.75), (0.9, -0.75), 5):
+        tracks = cell.see(body(place))
+
+    track = tracks["human/0"]
+    np.testing.assert_allclose(track.position_m[:2], [0.9, -0.75], atol=0.05)
+    assert (list(tracks), track.first_ns) == (["human/0"], START_NS + PERIOD_NS)
+
+
 def test_limbs_of_a_cross_are_its_arms():
     """A trunk with two stretched arms: an end of a capsule at each hand, head and foot."""
     t = np.linspace(0.0, 1.0, 120)[:, None]

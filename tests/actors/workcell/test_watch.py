@@ -135,6 +135,20 @@ def test_stamps_that_stand_still_are_silence(cell):
     assert cell.newest(2)[0].stand_in
 
 
+def test_camera_whose_clock_was_set_back_is_watched_by_its_new_stamps(cell):
+    """Stamps an hour ahead are corrected, then the camera dies: it is silent, not ahead."""
+    for number in range(2):
+        cell.tick(0, 1)
+        cell.give(2, stamp_ns=cell.tick_ns + 3600 * 10**9, checksum=100 + number)
+    cell.tick(0, 1, 2)
+    assert cell.tick(0, 1, 2)["camera/2"].alive
+
+    cell.tick(0, 1)
+    cell.tick(0, 1)
+
+    assert cell.troubles() == ["", "", "silent"]
+
+
 def test_image_that_repeats_is_stuck(cell):
     """Images equal bit by bit under new stamps: not alive, though silhouettes come."""
     cell.tick(0, 1, 2)
