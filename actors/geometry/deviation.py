@@ -23,7 +23,7 @@ from actors.geometry.depth import mean_known, median_known, metres, spread_m
 from actors.geometry.poses import moved, yaw_between, yaw_of
 from actors.geometry.registration import Registration, leaning, register, tilt_of
 from actors.geometry.rendering import render_depth
-from actors.geometry.segmentation import Piece, new_pieces, pixel_area_m2, rise
+from actors.geometry.segmentation import Piece, new_pieces, pixel_area_m2, rise, unhidden
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -143,13 +143,16 @@ def inspect_place(
     if not pieces or pieces[0].area_m2 < limits.present_share * product_m2:
         return _missing(expected, before_mm, frame, planned)
     piece = pieces[0]
-    found = register(piece.cloud, piece.outline_m, surface, planned, seen_by=frame.acquisition)
+    before_m = metres(before_mm)
+    found = register(
+        piece.cloud, piece.outline_m, surface, planned, seen_by=frame.acquisition, before_m=before_m
+    )
     pose = found.tray_from_product
     shift_m = float(np.hypot(*(pose[:2, 3] - planned[:2, 3])))
     turn = yaw_between(yaw_of(planned), yaw_of(pose))
     rendered = render_depth([(surface, pose)], frame.acquisition)
     foreign = _foreign(pieces, np.isfinite(rendered), limits)
-    difference, limit_m = depth_difference(frame, rendered, limits)
+    difference, limit_m = depth_difference(frame, unhidden(rendered, before_m), limits)
     with np.errstate(invalid="ignore"):
         bent = _largest_blob(np.abs(difference) > limit_m, area_m2)
     bent_m2 = float(area_m2[bent].sum())

@@ -88,6 +88,7 @@ def register(
     expected: Pose,
     *,
     seen_by: Acquisition | None = None,
+    before_m: npt.NDArray[np.float32] | None = None,
 ) -> Registration:
     """Find where on the tray a product stands.
 
@@ -98,6 +99,8 @@ def register(
         expected: tray_from_product as planned, (4, 4).
         seen_by: The camera that saw the outline, and its pose in the tray frame; takes out what
             outlines are off in its images.
+        before_m: (H, W), its image without the product, metres; a neighbour hides part of an
+            outline. A bare tray when absent.
 
     Returns:
         The pose, and how well the cloud lies on the surface there.
@@ -120,7 +123,7 @@ def register(
     )
     if seen_by is None:
         return found
-    pose = field.without_bias(surface, found.tray_from_product, seen_by)
+    pose = field.without_bias(surface, found.tray_from_product, seen_by, before_m)
     return Registration(pose, found.distance_m)
 
 
@@ -198,7 +201,13 @@ class OutlineField:
         pose = found @ start
         return on_tray(pose[0, 3], pose[1, 3], yaw_of(pose))
 
-    def without_bias(self, surface: Surface, pose: Pose, seen_by: Acquisition) -> Pose:
+    def without_bias(
+        self,
+        surface: Surface,
+        pose: Pose,
+        seen_by: Acquisition,
+        before_m: npt.NDArray[np.float32] | None = None,
+    ) -> Pose:
         """Return a fitted pose without what fitting outlines of this product is off there.
 
         An outline in an image is not quite that from right above: walls are seen aslant, and low
@@ -208,8 +217,11 @@ class OutlineField:
             surface: Product frame.
             pose: What `fitted` found.
             seen_by: The camera that saw the outline, and its pose in the tray frame.
+            before_m: See `register`.
         """
         depth_m = render_depth([(surface, pose)], seen_by)
+        if before_m is not None:
+            depth_m[~(before_m - depth_m > RISE_MIN_M)] = np.nan
         world = points_grid(depth_m, seen_by.camera) @ seen_by.world_from_camera[:3, :3].T
         world += seen_by.world_from_camera[:3, 3]
         with np.errstate(invalid="ignore"):

@@ -31,6 +31,9 @@ PIECE_AREA_MIN_M2: Final = 0.0004
 """4 cm2: a piece below is a ragged edge or a crumb; a foreign object of 2 cm width counts."""
 
 
+HIDDEN_M: Final = 0.002
+"""What is no more than this in front of what was there is not told from it."""
+
 PLATE_M: Final = 0.004
 """Height above the plate from where points belong to the product: three spreads at 0.45 m."""
 
@@ -104,6 +107,15 @@ def rise(
     """Return how much nearer to the sensor each pixel is than before, (H, W) float32, metres."""
     now, before = (median_known(metres(each), 5) for each in (frame.depth_mm, before_mm))
     return np.asarray(before - now, np.float32)
+
+
+def unhidden(
+    rendered_m: npt.NDArray[np.float32], before_m: npt.NDArray[np.float32]
+) -> npt.NDArray[np.float32]:
+    """Return the image of a thing without what stood in front of it before, (H, W), metres."""
+    with np.errstate(invalid="ignore"):
+        hidden = before_m < rendered_m + HIDDEN_M
+    return np.where(hidden, np.float32(np.nan), rendered_m)
 
 
 def pixel_area_m2(frame: DepthFrame) -> npt.NDArray[np.float32]:
