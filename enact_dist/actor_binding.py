@@ -7,7 +7,8 @@ the pattern stands for the triggering entity, that entity.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from weakref import WeakKeyDictionary
 
 from enact_dist.actor import (
     Actor,
@@ -50,6 +51,36 @@ class Watched:
     triggers: Mapping[str, tuple[int, ...]]
 
 
+class Joined(NamedTuple):
+    """Where an actor runs.
+
+    Attributes:
+        cell: Its cell.
+        worlds: The world context of each of its roles.
+    """
+
+    cell: Cell
+    worlds: Mapping[str, WorldContext]
+
+
+_JOINED: Final[WeakKeyDictionary[Actor, Joined]] = WeakKeyDictionary()
+
+
+def joined(actor: Actor) -> Joined:
+    """Return where an actor runs: for what is done beside its lock, such as a fork.
+
+    A thread that holds a lock, as `update` does, can neither fork nor drop a world context: it lets
+    another thread do so.
+
+    Raises:
+        MisuseError: It does not run yet.
+    """
+    found = _JOINED.get(actor)
+    if found is None:
+        raise MisuseError(f"{type(actor).__name__} runs in no cell yet; ask in start or update")
+    return found
+
+
 class BoundActor:
     """An actor, its cell, and the world context of each role.
 
@@ -79,6 +110,7 @@ class BoundActor:
         names = self._names(worlds)
         self.contexts = {role: cell.world(name) for role, name in names.items()}
         self._check(names)
+        _JOINED[actor] = Joined(cell, self.contexts)
         self._by_entity: dict[Entity | None, Mapping[Declared, Declared]] = {}
 
     def register(self) -> None:

@@ -47,6 +47,7 @@ from actors.palletizing.vocabulary import (
 )
 from actors.workcell.vocabulary import JOINTS
 from enact_dist import Actor, Entity, View, ViewEach, World, Write
+from enact_dist.actor_binding import joined
 
 if TYPE_CHECKING:
     import numpy as np
@@ -65,7 +66,6 @@ class ActionGenerator(Actor):
 
     Args:
         controller: Address of the arm, for its kinematics, see `open_controller`.
-        cell: The `cell.toml`, or an endpoint of the cell, for the forks; empty: no forks.
     """
 
     training, online = World("training"), World("online")
@@ -83,19 +83,13 @@ class ActionGenerator(Actor):
     outcome = Write(online, SYSTEM, OUTCOME)
     triggers = (request, attached, execution)
 
-    def __init__(self, controller: str, cell: str = "") -> None:
-        self.controller = controller
-        self.expectations = Expectations(cell) if cell else None
+    def __init__(self, controller: str) -> None:
+        self.controller, self.expectations = controller, Expectations()
         self._arm: ArmController | None = None
 
     def start(self) -> None:
         """Look up the arm; it is not started here."""
         self._arm = open_controller(self.controller)
-
-    def stop(self) -> None:
-        """Leave the cell of the forks."""
-        if self.expectations is not None:
-            self.expectations.close()
 
     def update(self, lock: Lock) -> None:
         """Go on with the request, if the robot has ended what it did for it."""
@@ -142,9 +136,9 @@ class ActionGenerator(Actor):
             frames = frames_of(net, known)
         except NetError as error:
             return str(error)
-        if left[0] in RISKY and self.expectations is not None:
-            plan = known.plans[request.place]
-            self.expectations.before(request, plan, lock.get(self.flags, {}))
+        if left[0] in RISKY:
+            plan, flags = known.plans[request.place], lock.get(self.flags, {})
+            self.expectations.before(joined(self), request, plan, flags)
         self._write(lock, Candidate(request.number, left[0], net, "", frames, turned))
         return ""
 

@@ -73,7 +73,6 @@ class RunningRobotCell(running_cell.RunningCell):
                 data=data,
                 ports=ports,
                 hardware=self._port,
-                config=self.config,
             )
 
         super().__init__(out, name="packing", template=TEMPLATE, configured=of_this_run)
@@ -144,7 +143,6 @@ def configured(
     data: Path,
     ports: Sequence[int],
     hardware: int,
-    config: Path,
 ) -> str:
     """Return a `cell.toml` for one run: its own ports, folders, packages and seed.
 
@@ -155,7 +153,6 @@ def configured(
         data: Parent of the shards' folders.
         ports: One of this host for each shard.
         hardware: Port of the simulated hardware.
-        config: Where the text is going to be; the action generator forks the cell by it.
     """
     parsed = tomllib.loads(template)
     placed(parsed, data, ports)
@@ -166,7 +163,6 @@ def configured(
                     f"seed={seed}", _PORT.sub(f"port={hardware}", value)
                 )
     parsed["actors"]["planning"]["options"]["packages"] = packages
-    parsed["actors"]["action-generator"]["options"]["cell"] = str(config.resolve())
     return toml_of(parsed)
 
 

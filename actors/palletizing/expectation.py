@@ -8,12 +8,13 @@ So the deviation is ``diff(expected, observed)``, over all that the step should 
 
 from __future__ import annotations
 
+import logging
 import threading
 from contextlib import suppress
 from typing import TYPE_CHECKING, Final
 
 from actors.palletizing.vocabulary import STANDING, Standing
-from enact_dist import Entity, Lock, Write, connect
+from enact_dist import Entity, Lock, Write
 from enact_dist.errors import EnactError
 
 if TYPE_CHECKING:
@@ -21,7 +22,9 @@ if TYPE_CHECKING:
 
     from actors.palletizing.vocabulary import Deviation, Plan, Request
     from enact_dist import Cell
+    from enact_dist.actor_binding import Joined
 
+_LOG: Final = logging.getLogger("enact.actor")
 PREFIX: Final = "expected-"
 KEPT: Final = 4
 """So many forks of deviating places stay, the newest ones."""
@@ -30,25 +33,23 @@ WAIT_S: Final = 2.0
 
 
 class Expectations:
-    """Makes the forks and drops those that are not needed any more.
+    """Makes the forks and drops those that are not needed any more."""
 
-    Args:
-        cell: The `cell.toml`, or an endpoint.
-    """
-
-    def __init__(self, cell: str) -> None:
-        self._address = cell
-        self._cell: Cell | None = None
+    def __init__(self) -> None:
         self._places: dict[str, str] = {}
         self._thread: threading.Thread | None = None
+        self._is_new = True
 
-    def before(self, request: Request, plan: Plan, flags: Mapping[str, Deviation]) -> None:
+    def before(
+        self, where: Joined, request: Request, plan: Plan, flags: Mapping[str, Deviation]
+    ) -> None:
         """Fork the online context, unless that was done for this request.
 
         A thread of its own does it, since the caller holds a lock; without a fork the robot goes on
         all the same.
 
         Args:
+            where: The cell, and the world context of the role "online".
             request: What is going to be done.
             plan: What shall stand at its place.
             flags: Verdicts by place, to see which forks are not needed any more.
@@ -58,37 +59,37 @@ class Expectations:
             return
         self._places[name] = request.place
         self._thread = threading.Thread(
-            target=self._fork, args=(name, request.place, plan, dict(flags)), daemon=True
+            target=self._fork, args=(where, name, plan, dict(flags)), daemon=True
         )
         self._thread.start()
         self._thread.join(WAIT_S)
 
-    def close(self) -> None:
-        """Leave the cell; the forks stay."""
-        if self._cell is not None:
-            self._cell.close()
-            self._cell = None
-
-    def _fork(self, name: str, place: str, plan: Plan, flags: Mapping[str, Deviation]) -> None:
-        with suppress(EnactError):
-            if self._cell is None:
-                self._cell = connect(self._address, actor="expectations")
-            fork = self._cell.world("online").fork(name)
-            standing = Write(fork, Entity(place), STANDING)
+    def _fork(self, where: Joined, name: str, plan: Plan, flags: Mapping[str, Deviation]) -> None:
+        try:
+            if self._is_new:  # nobody knows any more what those of an earlier process are about
+                old = {one for one in where.cell.worlds() if one.startswith(PREFIX)}
+                self._drop(where.cell, old - {name})
+                self._is_new = False
+            fork = where.worlds["online"].fork(name)
+            standing = Write(fork, Entity(self._places[name]), STANDING)
             with Lock(standing) as lock:
                 lock[standing] = Standing(plan.product, "ok", shift_mm=0.0, turn_deg=0.0)
-            self._drop(name, flags)
+            self._drop(where.cell, self._needless(name, flags))
+        except EnactError as error:
+            _LOG.warning("%s was not made: %s", name, error)
 
-    def _drop(self, newest: str, flags: Mapping[str, Deviation]) -> None:
-        """Drop the forks of sound places, and all but the newest of the others."""
-        assert self._cell is not None
+    def _needless(self, newest: str, flags: Mapping[str, Deviation]) -> set[str]:
+        """Return the forks of sound places, and all but the newest of the others."""
         before = [name for name in self._places if name != newest]
         deviating = [
             name
             for name in before
             if (flag := flags.get(self._places[name])) is not None and flag.verdict != "ok"
         ]
-        for name in set(before) - set(deviating[-KEPT:]):
+        return set(before) - set(deviating[-KEPT:])
+
+    def _drop(self, cell: Cell, names: set[str]) -> None:
+        for name in sorted(names):
             with suppress(EnactError):
-                self._cell.drop_world(name)
-            del self._places[name]
+                cell.drop_world(name)
+            self._places.pop(name, None)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from enact_dist.actor import Actor
-from enact_dist.actor_binding import BoundActor
+from enact_dist.actor_binding import BoundActor, joined
 from enact_dist.connecting import local
-from enact_dist.errors import ReadonlyError
+from enact_dist.errors import MisuseError, ReadonlyError
 from enact_dist.lock import Lock
 from enact_dist.lock_trigger import Triggered
 from enact_dist.terms import Aspect, Entities, Entity, Read, View, World, Write
@@ -110,3 +110,16 @@ def test_declared_request_that_only_reads_is_refused_where_it_would_write(bound)
     """The error names the datum of this update, not the role."""
     with bound.lock(A) as lock, pytest.raises(ReadonlyError, match=r"training.*panel"):
         lock.new(Meshing.limit, (3,))
+
+
+def test_an_actor_knows_its_cell_for_what_is_done_beside_its_lock() -> None:
+    """It forks the context that a role is bound to, in another thread; before it runs it cannot."""
+    actor = Meshing()
+    with pytest.raises(MisuseError, match="Meshing runs in no cell yet"):
+        joined(actor)
+    with local(worlds=["other"]) as cell:
+        BoundActor(actor, cell, {"model": "other"})
+        where = joined(actor)
+        assert where.cell is cell
+        where.worlds["model"].fork("what_if")
+        assert set(cell.worlds()) == {"other", "what_if"}

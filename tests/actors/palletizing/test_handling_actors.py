@@ -133,12 +133,10 @@ def test_cell_of_a_run_has_its_own_hardware_seed_and_folders():
         data=Path("/data"),
         ports=(7001, 7002),
         hardware=7999,
-        config=Path("/run/cell.toml"),
     )
     run = tomllib.loads(text)
     assert run["actors"].keys() == tomllib.loads(TEMPLATE.read_text())["actors"].keys()
     assert run["actors"]["planning"]["options"]["packages"] == 5
-    assert run["actors"]["action-generator"]["options"]["cell"] == "/run/cell.toml"
     assert "7460" not in text
     assert "seed=59" not in text
 
@@ -696,3 +694,38 @@ def test_a_package_that_stands_far_short_is_pushed_from_behind_it(cell):
     usual = read(cell, words.SYSTEM, words.CANDIDATE).net
     behind = [net.primitives["behind"].axes[0].value for net in (again, usual)]
     assert behind[0] == pytest.approx(behind[1] - 0.025)
+
+
+def test_what_is_expected_is_written_into_a_fork_before_a_risky_stage(cell):
+    """So the deviation is a difference; forks of sound places, and of an earlier run, go."""
+    online = cell.world("online")
+    online.fork("expected-0")  # of a generator that has ended
+    feedback, generator, action = HandlingFeedback(), ActionGenerator(ARM), Action()
+    come(cell)
+    testing.run_once(feedback, cell)
+    for result in ("held", "placed", "in_contact", "aside"):
+        testing.run_once(generator, cell)
+        testing.run_once(action, cell)
+        executed(cell, result)
+    testing.run_once(generator, cell)
+    assert [one for one in cell.worlds() if one.startswith("expected-")] == ["expected-1"]
+    looked(cell, "tray", "moved", x_m=0.02)
+    wrong = words.Standing("milk_carton", "moved", 20.0, 0.0)
+    write(cell, PLACE, words.STANDING, wrong)
+    [found] = cell.world("expected-1").diff(online, words.PLACES, [words.STANDING])
+    assert found.entity == PLACE
+    on_tray = each(cell, words.PLACES, words.PLAN)[PLACE].tray_from_product
+    write(cell, PACKAGE, words.SIGHTING, words.Sighting(0, on_tray, 0, 0, "tray", "milk_carton"))
+    request = read(cell, words.SYSTEM, words.REQUEST)
+    executed(cell, "aside")
+    for number, kept in ((2, ["expected-1", "expected-2"]), (3, ["expected-3"])):
+        again = replace(request, number=number, kind="regrasp", seen="tray")
+        write(cell, words.SYSTEM, words.REQUEST, again)
+        testing.run_once(generator, cell)
+        testing.run_once(action, cell)
+        executed(cell, "held")
+        testing.run_once(generator, cell)
+        assert sorted(one for one in cell.worlds() if one.startswith("expected-")) == kept
+        testing.run_once(action, cell)
+        executed(cell, "lost")
+        looked(cell, "tray", "ok")
