@@ -17,7 +17,9 @@ import numpy as np
 from actors.geometry.open3d_arrays import tensor
 from actors.geometry.poses import inverse, moved, on_tray
 from actors.geometry.rendering import ray_scene
-from actors.palletizing.pallet import planned_pose, tray_of
+from actors.geometry.shapes import Surface
+from actors.palletizing.pallet import TRAY_PLACES, planned_pose, tray_of
+from actors.palletizing.rows import contacts_between, planned_rows
 from actors.palletizing.simulation.products import box_mesh, product_mesh
 
 if TYPE_CHECKING:
@@ -25,6 +27,7 @@ if TYPE_CHECKING:
 
     import numpy.typing as npt
 
+    Pose = npt.NDArray[np.float64]
     Mesh = tuple[npt.NDArray[np.float64], npt.NDArray[np.int32]]
 
 DEMO_PRODUCTS: Final = ("milk_carton", "meal_tray")
@@ -33,6 +36,9 @@ DEMO_PRODUCTS: Final = ("milk_carton", "meal_tray")
 JITTER_M: Final = 0.003
 JITTER_RAD: Final = np.deg2rad(1.5)
 """Largest error of a sound placement."""
+
+ACROSS_M: Final = 0.002
+"""How far packages of a row are off across it at most."""
 
 ROOM_M: Final = (0.105, 0.15)
 """Half of the room around a place, x and y: nothing of one package leaves its own."""
@@ -134,6 +140,37 @@ def package_sequence(
     return sequence
 
 
+def rows_in_contact(count: int, *, seed: int, products: Sequence[str]) -> list[Package]:
+    """Return packages that touch the one before in their row, as after a push.
+
+    Three of five are sound; the others are dented on top by 4 to 10 mm, or missing.
+
+    Args:
+        count: How many packages.
+        seed: Seed of everything random about them.
+        products: Products that come in turn.
+    """
+    shapes = {name: Surface.free_form(*product_mesh(name)) for name in products}
+    sizes_m = {name: np.ptp(product_mesh(name)[0], axis=0) for name in products}
+    contacts_m = contacts_between(shapes)
+    sequence: list[Package] = []
+    for stop in range(count):
+        random = np.random.default_rng([seed, 13, stop])
+        first = stop - stop % len(TRAY_PLACES)
+        on_it = [products[each % len(products)] for each in range(first, stop + 1)]
+        slot = planned_rows(on_it, sizes_m, contacts_m)[-1]
+        kind = str(
+            random.choice(("ok", "ok", "ok", "dent", "missing"), p=(0.2, 0.2, 0.2, 0.3, 0.1))
+        )
+        truth = Truth(kind, float(random.uniform(4.0, 10.0)) if kind == "dent" else 0.0)
+        at = slot.tray_from_product, slot.tray_from_product
+        if slot.push.any():
+            across_m = random.uniform(-1.0, 1.0) * ACROSS_M
+            at = at[0], on_tray(0.0, across_m, 0.0) @ at[0]
+        sequence.append(make_package(stop, on_it[-1], truth, random, at=at))
+    return sequence
+
+
 def on_the_tray(packages: Sequence[Package], stop: int) -> Sequence[Package]:
     """Return what lies on the tray at a stop; an empty tray replaces a full one."""
     return [
@@ -141,7 +178,14 @@ def on_the_tray(packages: Sequence[Package], stop: int) -> Sequence[Package]:
     ]
 
 
-def make_package(stop: int, product: str, truth: Truth, random: np.random.Generator) -> Package:
+def make_package(
+    stop: int,
+    product: str,
+    truth: Truth,
+    random: np.random.Generator,
+    *,
+    at: tuple[Pose, Pose] | None = None,
+) -> Package:
     """Return a package with a given truth; where and how exactly is drawn at random.
 
     Args:
@@ -149,19 +193,20 @@ def make_package(stop: int, product: str, truth: Truth, random: np.random.Genera
         product: Name of the product.
         truth: Kind and amount of the deviation.
         random: Source of all else.
+        at: tray_from_product as planned and as placed; the place of the stop when absent.
     """
     planned = planned_pose(stop)
     jitter = random.uniform(-1.0, 1.0, 3) * [JITTER_M, JITTER_M, JITTER_RAD]
-    placed = planned @ on_tray(*jitter)
+    planned, placed = at or (planned, planned @ on_tray(*jitter))
     if truth.kind == "moved":
         placed = _shift(truth.amount / 1000.0, random) @ placed
     vertices, triangles = product_mesh(product)
     nothing = (np.empty((0, 3)), np.empty((0, 3), np.int32))
     shape, extra = (deformed(vertices, truth, random), triangles), nothing
     if truth.kind == FACE_DENT:
-        at, inwards = seen_spot((vertices, triangles), placed, random)
+        spot, inwards = seen_spot((vertices, triangles), placed, random)
         depth_m, sigma_m = truth.amount / 1e3, random.uniform(*DENT_SIGMA_M)
-        bent = pressed(vertices, at, inwards, depth_m=depth_m, sigma_m=sigma_m)
+        bent = pressed(vertices, spot, inwards, depth_m=depth_m, sigma_m=sigma_m)
         shape = bent, triangles
     if truth.kind == "missing":
         shape = nothing

@@ -43,8 +43,21 @@ def test_packing_gives_a_row_per_score_and_per_cell_of_the_table(monkeypatch, tm
     assert rows["moved: cases"].goal is None
 
 
+def test_perception_is_scored_on_faces_noise_light_and_contact():
+    """A thousand packages come with 200 dents each of 3 and 4 mm, and each series has its seed."""
+    series = perception_scores.series_of(1000, 7001)
+    by_name = {each.name: each for each in series}
+
+    assert by_name["mixed"].packages == 1000
+    assert by_name["dent 3 mm"].packages == by_name["dent 4 mm"].packages == 200
+    assert {each.light.noise for each in series} >= {0.5, 1.0, 2.0}
+    assert max(each.light.dropout_share for each in series) == 0.20
+    assert by_name["touching"].touching
+    assert len({each.seed for each in series}) == len(series)
+
+
 def test_perception_alone_gives_rows_for_each_series(monkeypatch):
-    series = perception_scores.series_of(8, 7001)[0]
+    (series,) = (s for s in perception_scores.series_of(8, 7001) if s.name == "mixed")
     sound = [Scored("milk_carton", "ok", 0.0, "ok", mm / 10, 0.1) for mm in range(8)]
     missed = Scored("milk_carton", "missing", 0.0, "ok", 0.0, 0.1)
     monkeypatch.setattr(

@@ -8,7 +8,9 @@ import pytest
 pytest.importorskip("open3d", exc_type=ImportError)
 
 from actors.geometry.deviation import inspect_place
+from actors.geometry.open3d_arrays import tensor
 from actors.geometry.poses import moved, on_tray, small_motion
+from actors.geometry.rendering import ray_scene
 from actors.geometry.shapes import VGA, Acquisition, DepthFrame
 from actors.palletizing.evaluation import graded, judge
 from actors.palletizing.sensor import steady
@@ -20,6 +22,7 @@ from actors.palletizing.simulation.packages import (
     Truth,
     on_the_tray,
     package_sequence,
+    rows_in_contact,
 )
 from actors.palletizing.simulation.products import product_mesh
 from actors.palletizing.simulation.sensors import (
@@ -228,6 +231,26 @@ def test_sequence_is_a_function_of_the_seed():
 
     np.testing.assert_array_equal(images[0], images[1])
     assert (images[0] != images[2]).any()
+
+
+def test_rows_in_contact_touch_and_do_not_penetrate():
+    """Hulls of neighbours touch: between a wedge and a tapered wall 3.6 mm are left, else none."""
+    packages = rows_in_contact(8, seed=3, products=PRODUCTS)
+    whole = [each for each in packages if len(each.shape[0])]
+
+    gaps = []
+    for number, one in enumerate(whole):
+        for other in whole[:number]:
+            away = moved(other.shape[0], other.placed)
+            scene = ray_scene(moved(one.shape[0], one.placed), one.shape[1])
+            gaps.append(float(scene.compute_signed_distance(tensor(away, np.float32)).min().item()))
+
+    assert len(whole) > 5
+    assert sum(gap < 0.004 for gap in gaps) >= 3
+    assert min(gaps) > -0.001
+    assert {each.truth.kind for each in rows_in_contact(40, seed=3, products=PRODUCTS)} == {
+        "ok", "dent", "missing"
+    }  # fmt: skip
 
 
 def test_packages_never_penetrate_each_other():
