@@ -263,8 +263,11 @@ class HandlingFeedback(Actor):
         tried = (*last.tried, last.kind)
         now = replace(last, tried=tried)
         self._tell(lock, last.place, None, error)
-        if error.startswith(NOT_ASIDE) or tried.count("look") >= MOST["look"]:
+        looks = tried.count("look")
+        if error.startswith(NOT_ASIDE):
             self._question(lock, now, error)
+        elif looks >= MOST["look"]:
+            self._question(lock, now, f"{error}; look was tried {looks} times")
         else:
             self._ask_robot(lock, now, "look", error)
 

@@ -71,7 +71,9 @@ GONE_M: Final = 0.15
 
 
 class EmptyBelt(Actor):
-    """Take the image of the empty belt; runs once, before the first package comes.
+    """Take the image of the empty belt, before the first package comes.
+
+    It tries once a second until the sensor has given one: no package comes before.
 
     Args:
         sensor: Address of the sensor above the belt; the world of its poses is the belt frame.
@@ -79,14 +81,19 @@ class EmptyBelt(Actor):
 
     training = World("training")
     empty = Write(training, BELT, EMPTY)
+    every_s = 1.0
 
     def __init__(self, sensor: str) -> None:
         self.sensor: TraySensor = open_sensor(sensor)
 
     def update(self, lock: Lock) -> None:
         """Take it, unless it is there."""
-        if lock.is_null(self.empty):
+        if not lock.is_null(self.empty):
+            return
+        try:
             lock[self.empty] = self.sensor.capture_empty()
+        except Exception as error:  # a driver raises what it likes
+            raise SensorError(f"the belt sensor gave no image: {error}") from error
 
 
 class HandlingPerception(Actor):

@@ -592,7 +592,8 @@ def test_a_sensor_that_fails_is_looked_through_again_before_the_operator_is_aske
         if kinds[-1] == "look":
             packed(cell, "aside")
     assert kinds == ["look", "look", "ask"]
-    assert read(cell, words.USER, words.QUESTION).text == f"place/0: {error}"
+    asked = read(cell, words.USER, words.QUESTION).text
+    assert asked == f"place/0: {error}; look was tried 2 times"
     testing.run_once(Operator(answers="look"), cell)
     testing.run_once(feedback, cell)
     packed(cell, "aside")

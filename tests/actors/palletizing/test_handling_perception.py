@@ -12,6 +12,7 @@ from actors.palletizing.grounding import aside_net
 from actors.palletizing.handling_perception import EmptyBelt, HandlingPerception
 from actors.palletizing.nets import Execution
 from actors.palletizing.planning import RowPlanning
+from actors.palletizing.sensor import SensorError
 from actors.palletizing.simulation.cell_scene import CellLayout
 from actors.palletizing.simulation.physical_sensors import PhysicalBeltSensor, PhysicalTraySensor
 from actors.palletizing.simulation.physics import PhysicalCell
@@ -265,3 +266,25 @@ def test_a_package_that_the_belt_sensor_does_not_show_is_not_forgotten(cell, phy
     testing.run_once(perception, cell)
     assert read(cell, words.SYSTEM, words.LOOK).error == ""
     assert len(each(cell, "online", words.PACKAGES, words.SIGHTING)) == 1
+
+
+def test_an_empty_belt_that_could_not_be_seen_is_looked_at_again(physical, monkeypatch):
+    """The sensor is not there yet: the error names it, and the next try finds it."""
+    sensor, errors = PhysicalBeltSensor(physical.shown, seed=4), [OSError("no such device")]
+
+    class Late:
+        def capture_empty(self):
+            if errors:
+                raise errors.pop()
+            return sensor.capture_empty()
+
+    opened = "actors.palletizing.handling_perception.open_sensor"
+    monkeypatch.setattr(opened, lambda _: Late())
+    with testing.worlds("training", "online") as cell:
+        belt = EmptyBelt("late")
+        with pytest.raises(SensorError, match="the belt sensor gave no image: no such device"):
+            testing.run_once(belt, cell)
+        testing.run_once(belt, cell)
+        view = View(cell.world("training"), words.BELT, words.EMPTY)
+        assert cell.world("training").view(view)[view].depth_mm.any()
+    assert belt.every_s
