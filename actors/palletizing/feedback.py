@@ -145,7 +145,7 @@ class HandlingFeedback(Actor):
     def _next(self, lock: Lock, last: Request | None) -> None:
         """Open a place that was spoiled again; or request the next package, if it has come."""
         results = lock.get(self.results, {})
-        spoiled = worst({place: self.flag(lock, place).verdict for place in self._spoiled(lock)})
+        spoiled = worst({place: self._flag(lock, place).verdict for place in self._spoiled(lock)})
         if spoiled is not None and last is not None:
             self._reopen(lock, last, spoiled)
             return
@@ -180,7 +180,7 @@ class HandlingFeedback(Actor):
 
     def _reopen(self, lock: Lock, last: Request, place: str) -> None:
         """Do what is to be done about a package that was placed."""
-        results, flag = lock.get(self.results, {}), self.flag(lock, place)
+        results, flag = lock.get(self.results, {}), self._flag(lock, place)
         before = results[place]
         lock[self.results] = {name: one for name, one in results.items() if name != place}
         opened = Request(last.number, "", place, before.package, "", "tray", before.reactions)
@@ -312,7 +312,7 @@ class HandlingFeedback(Actor):
 
     # What is told
 
-    def flag(self, lock: Lock, place: str) -> Deviation:
+    def _flag(self, lock: Lock, place: str) -> Deviation:
         """Return the last verdict on a place."""
         flags: dict[str, Deviation] = lock.get(self.flags, {})
         return flags[place]
