@@ -262,7 +262,7 @@ def scores_of(found: Mapping[Tray, Sequence[Packed]]) -> dict[str, float | None]
         "alarms_share": _share(j.verdict != "ok" for j in judged if j.truth == "ok"),
         "provoked": float(sum(bool(each.knock) for each in every)),
     }
-    scores |= _recoveries([step for each in every for step in each.steps])
+    scores |= _recoveries(every)
     table = confusion(found)
     for kind in KINDS[1:]:
         true = sum(n for (truth, _), n in table.items() if truth == kind)
@@ -311,8 +311,11 @@ def is_damaged(packed: Packed) -> bool:
     return any(depth_mm >= DAMAGE_MM and by != OUTSIDE for depth_mm, by in dents)
 
 
-def _recoveries(steps: Sequence[Step]) -> dict[str, float | None]:
-    tried = [step for step in steps if step.request in RECOVERIES]
+def _recoveries(packages: Sequence[Packed]) -> dict[str, float | None]:
+    steps = [step for each in packages for step in each.steps]
+    knocked = [_knocked(each) for each in packages if each.knock]
+    # What was knocked as soon as it was put down says nothing about the request that put it there.
+    tried = [step for step in steps if step.request in RECOVERIES and step not in knocked]
     worse = [s for s in tried if s.harmed or badness(s.after) > badness(s.before)]
     noticed = [step for step in steps if step.stages and not step.succeeded]
     return {
@@ -321,6 +324,12 @@ def _recoveries(steps: Sequence[Step]) -> dict[str, float | None]:
         "worsened": float(len(worse)) if tried else None,
         "noticed_by_net": float(len(noticed)),
     }
+
+
+def _knocked(packed: Packed) -> Step | None:
+    """Return the step in which a package was knocked: the first that put it down."""
+    placing = (s for s in packed.steps if any(stage == "place" for stage, _ in s.stages))
+    return next(placing, None)
 
 
 def _share(holds: Iterable[bool]) -> float | None:

@@ -115,6 +115,15 @@ def test_provoked_trays_count_for_verdicts_and_recoveries_only():
     assert (scores["recovered_share"], scores["moved_recall_share"]) == (0.0, 0.0)
 
 
+def test_a_retry_whose_package_was_knocked_is_no_failed_recovery():
+    knocked = dataclasses.replace(step("retry", "belt", "tipped"), stages=(("place", "placed"),))
+    blocked = step("pack", "belt", "belt", result="blocked", works=False)
+    scores = scores_of({PROVOKED: [package(blocked, knocked, knock="tipped")]})
+    assert (scores["recoveries"], scores["worsened"]) == (0, None)
+    scores = scores_of({TRAY: [package(blocked, knocked)]})
+    assert (scores["recoveries"], scores["recovered_share"], scores["worsened"]) == (1, 0.0, 1)
+
+
 def test_a_failure_that_the_net_noticed_is_counted():
     failed = step("pack", "belt", "belt", result="blocked", works=False)
     assert scores_of({TRAY: [package(failed, step("retry"))]})["noticed_by_net"] == 1
