@@ -5,25 +5,10 @@
 prints the blob areas of sound packages that `Limits.deformed_m2` is calibrated on; `--graded` adds
 series of equal deviations.  `perception_scores` scores what this judges.
 
-Measured on two cores of 2.5 GHz, three products, sensor of 1.7 mm spread at the tray:
+What was measured is in `enact_dist/docs/palletizing.md`, "Perception, scored alone".
 
-===================  ==========================================================================
-900 mixed packages   99.8 % right (seeds 31, 41, 51): none of 453 sound ones flagged, and 2 of 66
-                     extra objects overlooked, 70 % of which lay in the shadow of a cup of 102 mm
-24 of each amount    found: dent 2 / 3 / 4 / 5 / 8 / 12 / 20 mm 12 / 24 / 24 / 24 / 24 / 24 / 24,
-(seed 51)            bulge 3 / 5 / 8 mm and crush 5 / 10 / 20 % all, shift 12 / 20 / 40 mm
-                     19 / 24 / 24 (10 mm is the limit, and the robot is off by 3)
-position, sound      median 0.8 mm, 95th percentile 1.3 mm
-training             4.2 s per product: 14 views rendered, reconstructed, fused
-check                median 0.33 s
-===================  ==========================================================================
-
-Since surfaces are closed down to the plate (`actors.geometry.solid`) only 150 mixed packages, seed
-51, were measured again: 100 % right, 68 sound ones among them; position of sound ones median
-0.6 mm, 95th percentile 1.3 mm. The table is of the surfaces before.
-
-Cannot be seen from above: dents in a side, dents of 2 mm and less (1.2 spreads), what lies in the
-shadow of a taller package, and damage within 13 mm of an outline.
+Cannot be seen from above: dents in a face that is seen flatter than by 14 degrees, what lies in the
+shadow of a taller package, and damage within 4 pixels (6 mm) of an outline.
 """
 
 from __future__ import annotations
