@@ -22,7 +22,7 @@ from actors.palletizing.handling import (
     stages_of,
 )
 from actors.palletizing.nets import NetError
-from actors.palletizing.reactions import BY_ITSELF
+from actors.palletizing.reactions import BY_ITSELF, NO_NET
 from actors.palletizing.vocabulary import (
     CANDIDATE,
     CELL,
@@ -107,7 +107,7 @@ class ActionGenerator(Actor):
             error = self._propose(lock, request, left, mine)
             if not error:
                 return
-            self._end(lock, request, left[0], f"no_net: {error}", success=False)
+            self._end(lock, request, left[0], f"{NO_NET} {error}", success=False)
         else:
             error = ""
             self._end(lock, request, "" if mine is None else mine.stage, result, success=success)
@@ -183,9 +183,26 @@ class ActionGenerator(Actor):
         product = product_entity(seen.product)
         if product not in lock[self.grasps]:
             raise NetError(f"{request.kind}: no grasp of {seen.product} is known")
-        handled = Handled(lock[self.grasps][product], size_of(lock[self.surfaces][product]))
+        size_m = size_of(lock[self.surfaces][product])
+        handled = Handled(lock[self.grasps][product], size_m, self._beside(lock, request))
         assert self._arm is not None
         return Stages(request, handled, known, arm=self._arm.model, gripper=Gripper())
+
+    def _beside(
+        self, lock: Lock, request: Request
+    ) -> tuple[tuple[str, npt.NDArray[np.float64], npt.NDArray[np.float64]], ...]:
+        """Return what stands beside a package that is to be taken from the tray."""
+        if "regrasp" not in self._stages(lock, request):
+            return ()
+        plans, base_from_tray = lock[self.plans], lock[self.cell_frames]["tray"]
+        tray = plans[Entity(request.place)].tray
+        return tuple(
+            (place, base_from_tray @ flag.tray_from_product, size_of(lock[self.surfaces][product]))
+            for place, flag in lock.get(self.flags, {}).items()
+            if place != request.place and flag.verdict != "missing"
+            if (plan := plans.get(Entity(place))) is not None and plan.tray == tray
+            for product in [product_entity(flag.product)]
+        )
 
     def _near_rad(self, lock: Lock) -> npt.NDArray[np.float64]:
         joints = lock.get(self.joints)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from actors.palletizing.handling import (
     GONE,
@@ -18,8 +18,10 @@ from actors.palletizing.handling import (
 )
 from actors.palletizing.reactions import (
     BY_ITSELF,
+    CANNOT,
     FELT_M,
     MOST,
+    NO_NET,
     Case,
     Reaction,
     choices_of,
@@ -62,8 +64,6 @@ from enact_dist import Actor, Entity, View, ViewEach, World, Write
 
 if TYPE_CHECKING:
     from enact_dist import Lock
-
-NO_NET: Final = "it cannot be done:"
 
 
 class Feedback(Actor):
@@ -222,9 +222,7 @@ class HandlingFeedback(Actor):
         done = replace(last, tried=(*last.tried, last.kind), felt_m=felt_m)
         case = self._case(lock, done, case, flag)
         reaction = react(case)
-        if case.result.startswith("no_net:"):
-            reaction = Reaction("ask", case.result.replace("no_net:", NO_NET))
-        elif last.kind in GONE:
+        if last.kind in GONE and not case.result.startswith(NO_NET):
             why = f"it is still seen: {case.seen}" if case.success else case.result
             reaction = Reaction("ask", f"it could not be {GONE[last.kind]}: {why}")
         self._follow(lock, done, case, flag, reaction)
@@ -294,7 +292,7 @@ class HandlingFeedback(Actor):
         self._ask_robot(lock, last, "ask", reason)
         choices: tuple[str, ...] = ("stop", "look")
         if last.package:
-            can_take = not reason.startswith(NO_NET)
+            can_take = not reason.startswith(CANNOT)
             choices = choices_of(verdict, last.seen, last.tried, can_take=can_take)
         lock[self.question] = Question(last.number + 1, f"{last.place}: {reason}", choices)
 

@@ -62,6 +62,10 @@ BESIDE_M: Final = 0.022
 """Between the closed hand and the package before a push."""
 OVER_M: Final = 0.003
 """Between the tips and the package before they go down beside it."""
+REGRASP_OPEN_M: Final = 0.014
+"""So much wider than the package the hand opens where others stand, see skeletons/regrasp.toml."""
+FINGER_ROOM_M: Final = 0.002
+"""Between a finger and what stands beside the package, at least."""
 SQUEEZE_M: Final = 0.006
 """So much less or more than its width a package between the fingers measures at most."""
 
@@ -129,6 +133,8 @@ class Job:
         turned: The hand is turned round by π: what was grasped so is placed so.
         gap_m: So far short of its place, against the push, the package is put down or stands.
         product: Name of its product, for errors.
+        beside: Of each other package on the tray its entity, where it stands, base_from_product,
+            (4, 4), metres, and the box of its product, (3,), metres.
     """
 
     package: str
@@ -140,6 +146,7 @@ class Job:
     turned: bool = False
     gap_m: float = PUSH_GAP_M
     product: str = ""
+    beside: tuple[tuple[str, F64, F64], ...] = ()
 
 
 def ground(
@@ -157,13 +164,16 @@ def ground(
 
     Raises:
         NetError: One line: a parameter lacks or is ill-typed, the package is too wide, too narrow
-            or too heavy to hold, or a pose is out of the arm's reach.
+            or too heavy to hold, a finger has no room beside it on the tray, or a pose is out of
+            the arm's reach.
         OSError: The skeleton cannot be read.
     """
     file = FOLDER / f"{skeleton}.toml" if skeleton in SKELETONS else Path(skeleton)
     about = f"{file.stem} for {job.package}"
     _check_grip(about, job, gripper)
     _check_payload(about, job, arm, gripper)
+    if file.stem == "regrasp":
+        _check_room(about, job, gripper, frames)
     net = _bound(file, parameters(job, gripper, frames))
     _check_reach(about, net, arm, frames, near_rad)
     return net
@@ -322,6 +332,31 @@ def _check_grip(about: str, job: Job, gripper: Gripper) -> None:
     if not np.hypot(*grasp.axis[:2]) > 0.5:
         found = np.round(grasp.axis, 3).tolist()
         raise NetError(f"{about}: the axis of its grasp {found} is not level")
+
+
+def _check_room(about: str, job: Job, gripper: Gripper, frames: Frames) -> None:
+    """Refuse a grasp on the tray of which a finger would come down on another package."""
+    base_from_grasp = _known(frames, job.package) @ _grasp_frame(job.grasp)
+    thick_m = gripper.half_m - 0.5 * gripper.least_m
+    finger = 0.5 * thick_m + FINGER_ROOM_M
+    half = np.array([gripper.half_across_m + FINGER_ROOM_M, finger])
+    for side in (-1.0, 1.0):
+        out_m = 0.5 * (job.grasp.width_m + REGRASP_OPEN_M + thick_m)
+        base_from_finger = base_from_grasp.copy()
+        base_from_finger[:3, 3] += side * out_m * base_from_grasp[:3, 1]
+        for entity, base_from_product, size_m in job.beside:
+            if _overlap(base_from_finger, half, base_from_product, 0.5 * size_m[:2]):
+                raise NetError(f"{about}: {entity} leaves no room for a finger beside it")
+
+
+def _overlap(first: F64, first_half: F64, second: F64, second_half: F64) -> bool:
+    """Return whether two upright boxes overlap seen from above: no level axis parts them."""
+    apart = second[:2, 3] - first[:2, 3]
+    for axis in (*first[:2, :2].T, *second[:2, :2].T):
+        reach = np.abs(axis @ first[:2, :2]) @ first_half
+        if abs(axis @ apart) >= reach + np.abs(axis @ second[:2, :2]) @ second_half:
+            return False
+    return True
 
 
 def _check_payload(about: str, job: Job, arm: Arm, gripper: Gripper) -> None:

@@ -179,10 +179,12 @@ class Handled:
     Attributes:
         grasp: Of its product.
         size_m: (3,), box of its product.
+        beside: What stands on the tray beside it, see `grounding.Job`.
     """
 
     grasp: Grasp
     size_m: F64
+    beside: tuple[tuple[str, F64, F64], ...] = ()
 
 
 class Stages:
@@ -207,6 +209,7 @@ class Stages:
             package=request.package,
             grasp=handled.grasp,
             size_m=handled.size_m,
+            beside=handled.beside,
             place=request.place,
             push=push,
             bin="bin",

@@ -29,7 +29,7 @@ from actors.palletizing.handling import felt, fills, gap_before
 from actors.palletizing.nets import NetError
 from actors.palletizing.packing_records import Judgement, Packed, Step
 from actors.palletizing.packing_truth import badness, gap_m, state_of, top_dent_mm, truth_of
-from actors.palletizing.reactions import FELT_M, Case, Reaction, react, worst
+from actors.palletizing.reactions import FELT_M, NO_NET, Case, Reaction, react, worst
 from actors.palletizing.rows import contacts_between, planned_rows
 from actors.palletizing.sensor import FRAMES
 from actors.palletizing.simulation.cell_scene import ARM, HOME_RAD, CellLayout
@@ -278,6 +278,12 @@ class Packing:
             bin="bin",
             turned=self._turned,
             product=product,
+            beside=tuple(
+                (entity, self._frames[entity], self._sizes[self._packages[other].product])
+                for other, verdict in self._flagged.items()
+                if other != number and verdict != "missing"
+                for entity in [f"package/{other}"]
+            ),
         )
 
     def _execute(self, skeleton: str, job: Job) -> tuple[str, bool]:
@@ -288,7 +294,7 @@ class Packing:
                 skeleton, job, arm=ARM, gripper=Gripper(), frames=frames, near_rad=arm.measured().q
             )
         except NetError as error:
-            return f"refused: {error}", False
+            return f"{NO_NET} {error}", False
         return self._run_net(net)
 
     def _run_net(self, net: Net) -> tuple[str, bool]:

@@ -12,6 +12,7 @@ moved farther, tipped,         ask the operator
 deformed, extra
 anything a second or third     ask the operator
 time, or unforeseen
+no net can be grounded         ask the operator
 robot stopped by itself        stop
 =============================  =====================================================================
 
@@ -30,6 +31,10 @@ Place = TypeVar("Place", bound=Hashable)
 REACTIONS: Final = ("go_on", "push_again", "regrasp", "retry", "reject", "stop", "ask")
 BY_ITSELF: Final = ("sensor:", "not_following:", "no_frame:", "braked:", "interrupted:")
 """Results of a robot that has stopped by itself: it must not move before someone has looked."""
+NO_NET: Final = "no_net:"
+"""Result of a request that cannot be grounded; the reason follows."""
+CANNOT: Final = "it cannot be done:"
+"""Begin of the reason of the question that follows: the robot cannot take the package."""
 NEAR_MM: Final = 30.0
 """A package that stands farther from its place has not just slipped."""
 SHORT_MM: Final = 70.0
@@ -105,6 +110,8 @@ def react(case: Case) -> Reaction:
     """Return what follows from a case."""
     if case.result.startswith(BY_ITSELF):
         return Reaction("stop", f"{case.stage} ended with {case.result}")
+    if case.result.startswith(NO_NET):
+        return Reaction("ask", case.result.replace(NO_NET, CANNOT))
     if case.seen == "hand":
         return _if_left(case, "reject", f"{case.stage}: {case.result}, the package is still held")
     if case.verdict in {"tipped", "deformed", "extra"}:
@@ -114,6 +121,8 @@ def react(case: Case) -> Reaction:
     if case.verdict == "moved":
         return _moved(case)
     what = case.result if not case.success else "not at its place"
+    if what == "not_seen" and case.tried.get("retry"):
+        return Reaction("ask", f"{case.stage}: it is not recognised on the belt")
     if case.seen == "belt":
         return _if_left(case, "retry", f"{case.stage}: {what}; it is on the belt")
     if case.seen == "tray":

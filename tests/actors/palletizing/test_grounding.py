@@ -126,6 +126,34 @@ def tool_pose(primitive, base_from_entity):
     return base_from_entity @ primitive.frame.offset @ target
 
 
+@pytest.mark.parametrize(
+    ("along_m", "across_m", "turn_rad", "room"),
+    [
+        (0.201, 0.0, 0.0, True),  # behind it, where no finger goes
+        (0.0, 0.0975, 0.0, False),  # beside it, in contact
+        (0.0, 0.115, 0.0, False),
+        (0.0, 0.117, 0.0, True),  # 7 mm on each side, 12 mm of finger, 2 mm to spare
+        (0.0, -0.115, 0.0, False),
+        (0.0, 0.117, 0.3, False),  # a corner stands in the way
+        (0.13, 0.0975, 0.0, True),  # beside it, but past the fingers
+    ],
+)
+def test_a_package_among_others_is_taken_only_where_the_fingers_have_room(
+    along_m, across_m, turn_rad, room
+):
+    """A finger that came down on a neighbour would spoil it; on the belt nothing stands beside."""
+    from actors.geometry.poses import turned
+
+    stands = FRAMES["package/17"] @ pose(along_m, across_m, 0.0, turned(0.0, 0.0, turn_rad))
+    beside = (("place/2", stands, JOB.size_m),)
+    assert grounded("grasp_from_belt", beside=beside)
+    if room:
+        assert grounded("regrasp", beside=beside)
+        return
+    with pytest.raises(NetError, match="place/2 leaves no room for a finger beside it"):
+        grounded("regrasp", beside=beside)
+
+
 def test_a_package_is_grasped_placed_and_pushed_into_contact():
     """The three nets one after another, on springs: the floor and the neighbour press back."""
     arm = SpringArm(held_m=None)
