@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
-from weakref import WeakKeyDictionary
 
 from enact_dist.actor import (
     Actor,
@@ -63,7 +62,8 @@ class Joined(NamedTuple):
     worlds: Mapping[str, WorldContext]
 
 
-_JOINED: Final[WeakKeyDictionary[Actor, Joined]] = WeakKeyDictionary()
+_JOINED: Final = "_enact_joined"
+"""Attribute of a running actor, which may be a dataclass that is frozen or compares by value."""
 
 
 def joined(actor: Actor) -> Joined:
@@ -75,7 +75,7 @@ def joined(actor: Actor) -> Joined:
     Raises:
         MisuseError: It does not run yet.
     """
-    found = _JOINED.get(actor)
+    found: Joined | None = getattr(actor, _JOINED, None)
     if found is None:
         raise MisuseError(f"{type(actor).__name__} runs in no cell yet; ask in start or update")
     return found
@@ -110,7 +110,7 @@ class BoundActor:
         names = self._names(worlds)
         self.contexts = {role: cell.world(name) for role, name in names.items()}
         self._check(names)
-        _JOINED[actor] = Joined(cell, self.contexts)
+        object.__setattr__(actor, _JOINED, Joined(cell, self.contexts))
         self._by_entity: dict[Entity | None, Mapping[Declared, Declared]] = {}
 
     def register(self) -> None:

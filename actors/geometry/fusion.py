@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from actors.geometry.depth import depth_of_points
-from actors.geometry.open3d_on_use import open3d
+from actors.geometry.open3d_arrays import mesh
 from actors.geometry.poses import inverse, moved, small_motion
 from actors.geometry.shapes import FREE_FORM, Acquisition, Surface
 from actors.geometry.solid import SeenDepth, solid_surface
@@ -306,11 +306,8 @@ def _thinned(
     """Return a mesh of at most `TRIANGLES_MAX` triangles; what is open stays where it is."""
     if len(triangles) <= TRIANGLES_MAX:
         return vertices, triangles
-    legacy, utility = open3d().geometry, open3d().utility
-    mesh = legacy.TriangleMesh(
-        utility.Vector3dVector(vertices.astype(np.float64)), utility.Vector3iVector(triangles)
-    )
-    thin = mesh.simplify_quadric_decimation(TRIANGLES_MAX, boundary_weight=THE_FOOT_STAYS)
+    whole = mesh(vertices, triangles)
+    thin = whole.simplify_quadric_decimation(TRIANGLES_MAX, boundary_weight=THE_FOOT_STAYS)
     return np.asarray(thin.vertices, np.float32), np.asarray(thin.triangles, np.int64)
 
 

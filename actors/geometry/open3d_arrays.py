@@ -55,6 +55,19 @@ def point_cloud(
     return cloud
 
 
+def mesh(vertices_m: npt.NDArray[np.floating], triangles: npt.NDArray[np.integer]) -> Any:
+    """Return a legacy Open3D mesh, with memory of its own.
+
+    Args:
+        vertices_m: (V, 3), metres.
+        triangles: (T, 3), indices into the vertices.
+    """
+    legacy, utility = open3d().geometry, open3d().utility
+    return legacy.TriangleMesh(
+        _vectors(vertices_m), utility.Vector3iVector(np.array(triangles, np.int32, order="C"))
+    )
+
+
 def _vectors(array: npt.NDArray[np.floating]) -> Any:
     # Open3D copies, but float32 one by one (half a second for 300,000 points), and it refuses
     # read-only arrays.

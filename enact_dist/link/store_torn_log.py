@@ -41,20 +41,22 @@ def cut_torn_commits(folder: Path, found: Found) -> None:
         sqlite3.Error: As SQLite reports it, except for damage.
     """
     log = folder / LOG_FILE
-    if found.mark is None or not found.power_cut or not (ends := commit_ends(log)):
+    if found.mark is None or not found.power_cut or not (commits := commit_ends(log)):
         return
+    ends = [0, *commits]
     with _trial(folder) as trial:
-        if _batch_of_sound(trial, log, None, found) is not None:
+        if _batch_of_sound(trial, log, ends[-1], found) is not None:
             return
-        sound, damaged, batch = -1, len(ends) - 1, -1
-        while damaged - sound > 1:
+        batch = _batch_of_sound(trial, log, 0, found)
+        sound, damaged = 0, len(ends) - 1
+        while batch is not None and damaged - sound > 1:
             middle = (sound + damaged) // 2
             read = _batch_of_sound(trial, log, ends[middle], found)
             if read is None:
                 damaged = middle
             else:
                 sound, batch = middle, read
-    if batch < found.mark.needed():
+    if batch is None or batch < found.mark.needed():
         return
     with log.open("r+b") as file:
         file.truncate(ends[sound])
@@ -86,7 +88,7 @@ def _trial(folder: Path) -> Iterator[Path]:
             file.unlink(missing_ok=True)
 
 
-def _batch_of_sound(trial: Path, log: Path, end: int | None, found: Found) -> int | None:
+def _batch_of_sound(trial: Path, log: Path, end: int, found: Found) -> int | None:
     """Return the newest batch of the database with its log up to `end`; None if it is damaged."""
     trial.with_name(f"{trial.name}-wal").write_bytes(log.read_bytes()[:end])
     try:
@@ -99,4 +101,6 @@ def _batch_of_sound(trial: Path, log: Path, end: int | None, found: Found) -> in
     except sqlite3.Error as failure:
         if is_damage(failure):
             return None
+        if found.is_first and isinstance(failure, sqlite3.OperationalError):
+            return 0  # it has no table yet
         raise

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -110,6 +111,20 @@ def test_declared_request_that_only_reads_is_refused_where_it_would_write(bound)
     """The error names the datum of this update, not the role."""
     with bound.lock(A) as lock, pytest.raises(ReadonlyError, match=r"training.*panel"):
         lock.new(Meshing.limit, (3,))
+
+
+def test_an_actor_may_be_a_dataclass_that_compares_by_value() -> None:
+    """Such a one cannot be hashed; two equal ones run in cells of their own."""
+
+    @dataclass
+    class Counting(Meshing):
+        step: int = 1
+
+    with local(worlds=["model"]) as one, local(worlds=["model"]) as other:
+        first, second = Counting(), Counting()
+        BoundActor(first, one, {"model": "model"})
+        BoundActor(second, other, {"model": "model"})
+        assert (joined(first).cell, joined(second).cell) == (one, other)
 
 
 def test_an_actor_knows_its_cell_for_what_is_done_beside_its_lock() -> None:

@@ -12,11 +12,12 @@ from store_writer import contents, outcome_record, persist, reopened, slot_recor
 from enact_dist.core.datum import Slot
 from enact_dist.core.records import SlotRecord
 from enact_dist.errors import StoreError
+from enact_dist.link import store as store_module
 from enact_dist.link import store_mark
 from enact_dist.link.store import open_store, read_store
 from enact_dist.link.store_folder import DATABASE_FILE
 from enact_dist.link.store_mark import MARK_FILE
-from enact_dist.link.wal_check import check_wal
+from enact_dist.link.wal_check import check_wal, commit_ends
 from enact_dist.terms import Durability, NullReason
 
 FRAME_BYTES = 24 + 4096
@@ -488,3 +489,24 @@ def test_commit_that_was_torn_without_a_wrong_checksum_goes_after_a_power_cut(
     assert entities == {"forced", *(f"small{number}" for number in range(4))}
     assert f"commits from byte {before} on: 1" in caplog.text
     assert not list(copy.glob("trial*"))
+
+
+def test_first_commit_of_a_log_may_be_the_torn_one(tmp_path, monkeypatch):
+    """After a checkpoint the log begins anew over its older generation: the database alone is left."""
+    monkeypatch.setattr(store_module, "LOG_BYTES", 60_000)
+    folder = tmp_path / "folder"
+    store, _ = open_store(folder, unix_s=1)
+    for number in range(8):
+        store.write([persist(slot_record(f"forced{number}", 1, size=9_000))])
+    store.rest()
+    store.write([persist(slot_record("large", 1, size=30_000), durability=Durability.OS)])
+    copy = tmp_path / "copy"
+    shutil.copytree(folder, copy)
+    store.close()
+    log = copy / "store.db-wal"
+    assert len(commit_ends(log)) == 1
+    os.truncate(log, commit_ends(log)[0])  # what follows is of the older generation
+    torn_unnoticed(copy, after=0)
+    after_power_cut(copy)
+    found = {record.slot.entity for record in reopened(copy).slots}
+    assert found == {f"forced{number}" for number in range(8)}
