@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
     from actors.geometry.shapes import Surface
-    from actors.palletizing.packing_records import Packed, Step
+    from actors.palletizing.packing_records import Judgement, Packed, Step
 
 HELD_OUT: Final = 1000
 TRAY: Final = 12
@@ -51,6 +51,11 @@ GENTLE_MM: Final = 2.0
 """Up to that sigma the robot may damage nothing."""
 DAMAGE_MM: Final = 1.0
 """Depth of a dent from which a package counts as damaged."""
+SOUND_MM: Final = 1.5
+"""A place with a deeper dent is not sound, though physics counts dents from 4 mm as deformed and
+perception has to find those from 3 mm: whether such a dent is flagged is counted apart."""
+DENTED: Final = "dented"
+"""Row of these in the table."""
 RECOVERIES: Final = ("retry", "regrasp", "push_again")
 NOTED: Final = "trays.jsonl"
 """File with a line of JSON per packed tray."""
@@ -70,6 +75,9 @@ GOALS: Final = {
     "damaged_gentle": Goal("packages damaged at sigma 2 mm", 0, 0),
     "damaged": Goal("packages damaged"),
     "alarms_share": Goal("sound packages that were flagged, share", high=0.001),
+    "dented": Goal("places with a dent of 1.5 to 4 mm"),
+    "dented_flagged_share": Goal("of these flagged as deformed, share"),
+    "flagged_share": Goal("deviations that were flagged, as whatever kind, share", low=0.99),
     "provoked": Goal("packages that an error was provoked of"),
     "recoveries": Goal("recoveries tried"),
     "recovered_share": Goal("recoveries that worked, share", low=0.9),
@@ -172,7 +180,8 @@ def played(
     left = [tray for tray in trays if tray not in found]
     if len(left) < len(trays):
         told(f"{len(trays) - len(left)} of {len(trays)} trays are there already")
-    for tray, packed in _packed(left, processes, told, out):
+    drawn = next((tray for tray in trays if tray.provoked), None)
+    for tray, packed in _packed(left, processes, told, out, drawn):
         found[tray] = packed
         asked = sum(each.by_hand for each in packed)
         told(
@@ -187,7 +196,9 @@ def kept(folder: Path) -> dict[Tray, list[Packed]]:
     """Return what became of the trays that are noted in a folder, see `played`."""
     file = folder / NOTED
     found = {}
-    for line in file.read_text().splitlines() if file.exists() else []:
+    for line in file.read_text().splitlines(keepends=True) if file.exists() else []:
+        if not line.endswith("\n"):
+            break  # the process was killed while it wrote this one
         noted = json.loads(line)
         lists = {name: tuple(noted["tray"][name]) for name in ("products", "provoked")}
         found[Tray(**{**noted["tray"], **lists})] = packed_of(json.dumps(noted["packed"]))
@@ -195,7 +206,11 @@ def kept(folder: Path) -> dict[Tray, list[Packed]]:
 
 
 def _packed(
-    trays: Sequence[Tray], processes: int, told: Callable[[str], None], out: Path | None
+    trays: Sequence[Tray],
+    processes: int,
+    told: Callable[[str], None],
+    out: Path | None,
+    drawn: Tray | None,
 ) -> Iterator[tuple[Tray, list[Packed]]]:
     """Train the products, pack trays, note and yield each as soon as it is packed."""
     products = sorted({name for tray in trays for name in tray.products})
@@ -203,13 +218,21 @@ def _packed(
         return
     told(f"training: {', '.join(products)}")
     models = {name: train(name, SimulatedOrbitSensor(seed=HELD_OUT), frames=4) for name in products}
-    drawn = next((tray for tray in trays if tray.provoked), None)
     for tray, packed in _each(trays, models, processes, {drawn: out}):
         if out:
-            with (out / NOTED).open("a") as file:
-                file.write(json.dumps({"tray": asdict(tray)})[:-1])
-                file.write(f', "packed": {line_of(packed)}}}\n')
+            _note(
+                out / NOTED,
+                f'{json.dumps({"tray": asdict(tray)})[:-1]}, "packed": {line_of(packed)}}}\n',
+            )
         yield tray, packed
+
+
+def _note(file: Path, line: str) -> None:
+    """Add a line to a file, in place of a last one that was cut short."""
+    with file.open("a+b") as noted:
+        noted.seek(0)
+        noted.truncate(noted.read().rfind(b"\n") + 1)
+        noted.write(line.encode())
 
 
 def _each(
@@ -259,7 +282,12 @@ def scores_of(found: Mapping[Tray, Sequence[Packed]]) -> dict[str, float | None]
         "cycle_p95_s": _percentile(cycles_s, 95),
         "damaged_gentle": float(sum(map(is_damaged, gentle))) if gentle else None,
         "damaged": float(sum(map(is_damaged, own))) if own else None,
-        "alarms_share": _share(j.verdict != "ok" for j in judged if j.truth == "ok"),
+        "alarms_share": _share(j.verdict != "ok" for j in judged if _row_of(j) == "ok"),
+        "dented": float(sum(_row_of(j) == DENTED for j in judged)),
+        "dented_flagged_share": _share(
+            j.verdict == "deformed" for j in judged if _row_of(j) == DENTED
+        ),
+        "flagged_share": _share(j.verdict != "ok" for j in judged if j.truth != "ok"),
         "provoked": float(sum(bool(each.knock) for each in every)),
     }
     scores |= _recoveries(every)
@@ -267,6 +295,7 @@ def scores_of(found: Mapping[Tray, Sequence[Packed]]) -> dict[str, float | None]
     for kind in KINDS[1:]:
         true = sum(n for (truth, _), n in table.items() if truth == kind)
         flagged = sum(n for (_, verdict), n in table.items() if verdict == kind)
+        flagged -= table[DENTED, kind] if kind == "deformed" else 0
         scores[f"{kind}_cases"] = float(true)
         scores[f"{kind}_recall_share"] = table[kind, kind] / true if true else None
         scores[f"{kind}_precision_share"] = table[kind, kind] / flagged if flagged else None
@@ -279,9 +308,9 @@ def missed(scores: Mapping[str, float | None]) -> list[str]:
 
 
 def confusion(found: Mapping[Tray, Sequence[Packed]]) -> Counter[tuple[str, str]]:
-    """Return how often each true kind was judged as each verdict."""
+    """Return how often each true kind was judged as each verdict; see `DENTED`."""
     return Counter(
-        (judgement.truth, judgement.verdict)
+        (_row_of(judgement), judgement.verdict)
         for packed in found.values()
         for each in packed
         for judgement in each.judgements
@@ -292,11 +321,17 @@ def confusion_text(table: Mapping[tuple[str, str], int]) -> str:
     """Return the table of true kinds (down) against verdicts (across)."""
     verdicts = [*KINDS, "extra"]
     lines = ["truth     " + "".join(f"{verdict:>10}" for verdict in verdicts)]
-    for kind in KINDS:
+    for kind in ("ok", DENTED, *KINDS[1:]):
         row = [table.get((kind, verdict), 0) for verdict in verdicts]
         if sum(row):
             lines.append(f"{kind:<10}" + "".join(f"{count or '.':>10}" for count in row))
     return "\n".join(lines)
+
+
+def _row_of(judgement: Judgement) -> str:
+    """Return what was true of a place, as a row of the table."""
+    slight = judgement.truth == "ok" and judgement.dent_mm >= SOUND_MM
+    return DENTED if slight else judgement.truth
 
 
 def is_sound(packed: Packed) -> bool:
@@ -314,7 +349,7 @@ def is_damaged(packed: Packed) -> bool:
 def _recoveries(packages: Sequence[Packed]) -> dict[str, float | None]:
     steps = [step for each in packages for step in each.steps]
     knocked = [_knocked(each) for each in packages if each.knock]
-    # What was knocked as soon as it was put down says nothing about the request that put it there.
+    # A knock right after a package was put down is not held against the request that put it there.
     tried = [step for step in steps if step.request in RECOVERIES and step not in knocked]
     worse = [s for s in tried if s.harmed or badness(s.after) > badness(s.before)]
     noticed = [step for step in steps if step.stages and not step.succeeded]

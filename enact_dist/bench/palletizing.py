@@ -45,7 +45,7 @@ def run_palletizing(run: Run) -> None:
     """Pack trays.
 
     Raises:
-        MisuseError: The extras of the cell are not installed.
+        MisuseError: The extras of the cell are not installed, or options do not fit together.
     """
     try:
         import mujoco  # noqa: F401
@@ -58,12 +58,20 @@ def run_palletizing(run: Run) -> None:
         ) from error
     asked = run.packing
     if asked.perception:
+        if asked.provoke or asked.out:
+            raise MisuseError("--provoke and --out are about packing; leave them with --perception")
         _score_perception(run, asked)
         return
     settings = [asked.spread] if asked.spread else packing.SETTINGS
     trays = packing.trays_of(
         asked.packages, seed=asked.seed, settings=settings, provoke=asked.provoke
     )
+    if asked.provoke and not any(tray.provoked for tray in trays):
+        least = packing.TRAY * (packing.EVERY - 1) + 1
+        raise MisuseError(
+            f"asked to provoke errors with {asked.packages} packages; every {packing.EVERY}th tray"
+            f" of {packing.TRAY} is provoked, so that needs {least} packages or more"
+        )
     if asked.out:
         asked.out.mkdir(parents=True, exist_ok=True)
     found = packing.played(trays, processes=asked.processes, told=run.told, out=asked.out)

@@ -55,7 +55,7 @@ def test_a_sound_package_meets_every_goal_that_it_is_a_case_of():
     assert cases == {
         "packages", "by_hand_share", "shift_p95_mm", "turn_p95_deg", "gap_p50_mm", "pose_p95_mm",
         "cycle_p50_s", "cycle_p95_s", "damaged_gentle", "damaged", "alarms_share", "provoked",
-        "recoveries", "noticed_by_net", "moved_cases", "tipped_cases", "deformed_cases",
+        "dented", "recoveries", "noticed_by_net", "moved_cases", "tipped_cases", "deformed_cases",
         "missing_cases",
     }  # fmt: skip
 
@@ -129,6 +129,19 @@ def test_a_failure_that_the_net_noticed_is_counted():
     assert scores_of({TRAY: [package(failed, step("retry"))]})["noticed_by_net"] == 1
 
 
+@pytest.mark.parametrize(("dent_mm", "slight"), [(1.4, False), (1.6, True)])
+def test_a_slight_dent_is_neither_sound_nor_deformed(dent_mm, slight):
+    """Flagged or not, it is counted apart; a wrong kind of flag is held against that kind."""
+    dented = dataclasses.replace(judged("ok", "deformed"), dent_mm=dent_mm)
+    scores = scores_of({TRAY: [package(judgements=[dented, judged()])]})
+    assert scores["dented"] == slight
+    assert scores["dented_flagged_share"] == (1.0 if slight else None)
+    assert scores["alarms_share"] == (0.0 if slight else 0.5)
+    assert scores["deformed_precision_share"] == (None if slight else 0.0)
+    wrong = dataclasses.replace(dented, verdict="moved")
+    assert scores_of({TRAY: [package(judgements=[wrong])]})["moved_precision_share"] == 0.0
+
+
 def test_the_table_sets_truth_against_verdict():
     found = {TRAY: [package(judgements=[judged(), judged("moved", "extra")])]}
     assert confusion(found) == {("ok", "ok"): 1, ("moved", "extra"): 1}
@@ -174,6 +187,12 @@ def test_an_interrupted_run_goes_on_with_the_trays_that_are_left(monkeypatch, tm
     packed.clear()
     assert list(packing_scores.played(trays, out=tmp_path)) == trays
     assert not packed
+    noted = tmp_path / packing_scores.NOTED
+    whole = noted.read_bytes()
+    noted.write_bytes(whole[:-20])  # killed while it wrote the last line
+    packing_scores.played(trays, out=tmp_path)
+    assert noted.read_bytes() == whole
+    assert packed == trays[-1:]
 
 
 def test_trays_take_the_settings_in_turn_and_held_out_seeds():

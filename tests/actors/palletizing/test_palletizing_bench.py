@@ -8,6 +8,7 @@ from actors.palletizing import packing_scores, perception_scores
 from actors.palletizing.packing_records import Judgement, Packed
 from actors.palletizing.perception_scores import Scored
 from enact_dist.bench.palletizing import Asked, run_palletizing
+from enact_dist.errors import MisuseError
 
 pytest.importorskip("mujoco", exc_type=ImportError)
 
@@ -41,6 +42,18 @@ def test_packing_gives_a_row_per_score_and_per_cell_of_the_table(monkeypatch, tm
     nothing = rows["sound packages that were flagged, share"]
     assert (nothing.value, nothing.met, nothing.note) == (None, None, "no case")
     assert rows["moved: cases"].goal is None
+
+
+@pytest.mark.parametrize(
+    ("asked", "why"),
+    [
+        (Asked(36, provoke=("moved",)), "with 36 packages; .* needs 37 packages or more"),
+        (Asked(perception=True, provoke=("moved",)), "about packing"),
+    ],
+)
+def test_options_that_would_do_nothing_are_refused(asked, why):
+    with pytest.raises(MisuseError, match=why):
+        rows_of(asked)
 
 
 def test_perception_is_scored_on_faces_noise_light_and_contact():
