@@ -61,8 +61,8 @@ if TYPE_CHECKING:
 class ActionGenerator(Actor):
     """Ground the next stage of the request; say how the request ended, and take the arm aside.
 
-    Before a stage that can spoil what stands on the tray it forks the online context and writes
-    there what it expects, see `expectation`.
+    Before the first stage of a request that can spoil what stands on the tray it forks the online
+    context and writes there what it expects, see `expectation`.
 
     Args:
         controller: Address of the arm, for its kinematics, see `open_controller`.

@@ -1,14 +1,15 @@
-"""What the planner expects, written into a fork of the online context before a risky step.
+"""What the planner expects, written into a fork of the online context before the first risky stage.
 
     online ── fork "expected-7" ── standing of the place: as planned
       └─ what is observed later
 
-So the deviation is ``diff(expected, observed)``, over all that the step should have left alone.
+So the deviation is ``diff(expected, observed)``, over all that the request should have left alone.
 """
 
 from __future__ import annotations
 
 import logging
+import re
 import threading
 from contextlib import suppress
 from typing import TYPE_CHECKING, Final
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 
 _LOG: Final = logging.getLogger("enact.actor")
 PREFIX: Final = "expected-"
+_NAME: Final = re.compile(PREFIX + "[0-9]+")
 KEPT: Final = 4
 """So many forks of deviating places stay, the newest ones."""
 WAIT_S: Final = 2.0
@@ -65,18 +67,30 @@ class Expectations:
         self._thread.join(WAIT_S)
 
     def _fork(self, where: Joined, name: str, plan: Plan, flags: Mapping[str, Deviation]) -> None:
+        place = self._places[name]
         try:
-            if self._is_new:  # nobody knows any more what those of an earlier process are about
-                old = {one for one in where.cell.worlds() if one.startswith(PREFIX)}
-                self._drop(where.cell, old - {name})
+            if self._is_new:  # what those of an earlier process are about is not known any more
+                self._drop(where.cell, self._earlier(where))
                 self._is_new = False
+            self._places[name] = place
             fork = where.worlds["online"].fork(name)
-            standing = Write(fork, Entity(self._places[name]), STANDING)
+            standing = Write(fork, Entity(place), STANDING)
             with Lock(standing) as lock:
                 lock[standing] = Standing(plan.product, "ok", shift_mm=0.0, turn_deg=0.0)
             self._drop(where.cell, self._needless(name, flags))
         except EnactError as error:
             _LOG.warning("%s was not made: %s", name, error)
+
+    def _earlier(self, where: Joined) -> set[str]:
+        """Return the forks that a process before this one made; one may lack its expectation."""
+        online = where.worlds["online"].name
+        return {
+            one
+            for one in where.cell.worlds()
+            if _NAME.fullmatch(one)
+            and (origin := where.cell.world(one).forked_from) is not None
+            and origin[0] == online
+        }
 
     def _needless(self, newest: str, flags: Mapping[str, Deviation]) -> set[str]:
         """Return the forks of sound places, and all but the newest of the others."""

@@ -12,6 +12,7 @@ from actors.palletizing.handling import (
     IDLE,
     NOT_ASIDE,
     STANDS,
+    UNRECOGNISED,
     along_and_across,
     is_current,
     is_held,
@@ -143,7 +144,7 @@ class HandlingFeedback(Actor):
     # What comes next
 
     def _next(self, lock: Lock, last: Request | None) -> None:
-        """Open a place that was spoiled again; or request the next package, if it has come."""
+        """Reopen a place that was spoiled; or request the next package, if it has come."""
         results = lock.get(self.results, {})
         spoiled = worst({place: self._flag(lock, place).verdict for place in self._spoiled(lock)})
         if spoiled is not None and last is not None:
@@ -166,6 +167,8 @@ class HandlingFeedback(Actor):
         sight = lock.get(self.sight)
         if sight is not None and sight.number == number and sight.error:
             self._ask_robot(lock, first, "look", sight.error)
+        elif last is not None and last.place == place.name:  # a look for what has come has ended
+            self._see_nothing(lock, last, UNRECOGNISED)
 
     def _spoiled(self, lock: Lock) -> list[str]:
         """Return the places that stood as was decided, and have been judged otherwise since."""
@@ -176,6 +179,7 @@ class HandlingFeedback(Actor):
             if result.result in STANDS
             and place in flags
             and flags[place].captured_ns > result.captured_ns
+            and flags[place].verdict != result.verdict
         ]
 
     def _reopen(self, lock: Lock, last: Request, place: str) -> None:
@@ -183,8 +187,10 @@ class HandlingFeedback(Actor):
         results, flag = lock.get(self.results, {}), self._flag(lock, place)
         before = results[place]
         lock[self.results] = {name: one for name, one in results.items() if name != place}
-        opened = Request(last.number, "", place, before.package, "", "tray", before.reactions)
-        spoiled = Case("beside", last.place, success=True, seen="tray")
+        sighting = lock[self.sightings].get(Entity(before.package)) if before.package else None
+        seen = "" if sighting is None else sighting.frame
+        opened = Request(last.number, "", place, before.package, "", seen, before.reactions)
+        spoiled = Case("beside", last.place, success=True, seen=seen)
         case = self._case(lock, opened, spoiled, flag)
         self._follow(lock, opened, case, flag, react(case))
 
@@ -208,7 +214,7 @@ class HandlingFeedback(Actor):
         if judged != [look.captured_ns] * len(look.judged):
             return  # deviation detection is not done with this picture
         if not last.package:
-            self._next(lock, replace(last, place=""))
+            self._next(lock, last)
         elif last.kind in GONE and outcome.success and not look.seen:
             done = replace(last, tried=(*last.tried, last.kind))
             self._close(lock, done, GONE[last.kind], last.reason)
@@ -288,9 +294,15 @@ class HandlingFeedback(Actor):
         lock[self.request] = replace(last, number=last.number + 1, kind=kind, reason=reason)
 
     def _question(self, lock: Lock, last: Request, reason: str, verdict: str = "") -> None:
-        """Ask the operator; nothing moves until the answer comes."""
+        """Ask the operator; nothing moves until the answer comes.
+
+        A package that was not judged now is on the tray as it was judged last.
+        """
         self._ask_robot(lock, last, "ask", reason)
         choices: tuple[str, ...] = ("stop", "look")
+        flags = lock.get(self.flags, {})
+        if not verdict and last.seen == "tray" and last.place in flags:
+            verdict = flags[last.place].verdict
         if last.package:
             can_take = not reason.startswith(CANNOT)
             choices = choices_of(verdict, last.seen, last.tried, can_take=can_take)

@@ -67,6 +67,8 @@ GONE: Final = {"reject": "rejected", "removed": "removed"}
 """Requests after which the package shall be seen nowhere, and what became of it then."""
 NOT_ASIDE: Final = "the arm is not aside: "
 """What a look at the tray needs, and lacks."""
+UNRECOGNISED: Final = "something is in the light barrier, but no package is recognised there"
+"""What follows from looks at the belt, again and again, that show nothing."""
 IDLE: Final = ("stop", "ask")
 """Kinds of requests that move nothing."""
 

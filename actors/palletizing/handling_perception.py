@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import math
 import time
+from collections import Counter
 from typing import TYPE_CHECKING, Any, Final
 
 from actors.geometry.open3d_on_use import open3d
 from actors.geometry.registration import register
 from actors.geometry.segmentation import new_pieces
 from actors.palletizing.belt_sight import seen_on_belt
-from actors.palletizing.handling import ASIDE, GONE, NOT_ASIDE, is_held
+from actors.palletizing.handling import ASIDE, GONE, NOT_ASIDE, UNRECOGNISED, is_held
 from actors.palletizing.sensor import FRAMES as FRAMES_FUSED
 from actors.palletizing.sensor import SensorError, Watched, open_sensor
 from actors.palletizing.tray_changes import changed, tray_alone, without
@@ -68,6 +69,8 @@ if TYPE_CHECKING:
 
 GONE_M: Final = 0.15
 """What is farther from where a package stood is something else, when it shall be gone."""
+UNSEEN_LOOKS: Final = 3
+"""After so many looks that show nothing of what has come, the sight says so as an error."""
 
 
 class EmptyBelt(Actor):
@@ -131,6 +134,7 @@ class HandlingPerception(Actor):
         self.tray_sensor = Watched(open_sensor(tray_sensor), "the tray sensor", frames)
         self._arrived_ns = 0
         self._is_unseen = False
+        self._unseen: Counter[int] = Counter()
         self._looked = 0
 
     def start(self) -> None:
@@ -191,6 +195,9 @@ class HandlingPerception(Actor):
         error = ""
         try:
             self._is_unseen = not self._see_belt(lock, Entity.fresh("package"), number)
+            self._unseen[number] += self._is_unseen
+            if self._is_unseen and self._unseen[number] >= UNSEEN_LOOKS:
+                error = UNRECOGNISED
         except SensorError as failed:
             error = str(failed)
             print(error, flush=True)

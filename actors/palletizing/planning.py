@@ -123,12 +123,16 @@ class RowPlanning(Actor):
         lock[self.planned] = Planned(results_of(results), left_out)
 
     def _left_out(self, results: Mapping[str, Result], before: Planned | None) -> tuple[int, ...]:
-        """Return the packages whose places are filled by later ones."""
+        """Return the packages whose places are filled by later ones.
+
+        One that has no result has not come yet, whatever an online context before this one held.
+        """
         came = {n: results[name] for n in range(self.packages) if (name := _name(n)) in results}
         stands = [number for number, result in came.items() if result.result in STANDS]
         last = max(stands, default=-1)
         gone = {number for number in came if number > last}
-        return tuple(sorted(gone.union(() if before is None else before.left_out)))
+        left_before = set() if before is None else set(before.left_out)
+        return tuple(sorted(gone | (left_before & came.keys())))
 
     def _plan(self, lock: Lock, coming: list[int], done: set[str]) -> None:
         """Plan the places of the packages that come, except of those that are there."""

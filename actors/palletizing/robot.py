@@ -179,10 +179,10 @@ class RobotJoints(Actor):
             self._tell_unexecuted(lock, begun_here=loop.execution is not None)
 
     def _tell_unexecuted(self, lock: Lock, *, begun_here: bool) -> None:
-        """Say of a net that was taken, and that nobody executes any more, that it is over.
+        """Say of a net that was taken, and that no process executes any more, that it is over.
 
         An earlier process may have begun it; or `Robot` failed or was stopped before the loop got
-        it.  Without a result nobody would go on.
+        it.  Without a result the cell would stand still.
         """
         before, attached = lock.get(self.execution), lock.get(self.net)
         if before is not None and not before.result:

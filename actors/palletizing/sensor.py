@@ -45,7 +45,8 @@ class Watched:
     """A fixed sensor whose images are fused, and never believed when it has failed.
 
     No two images of a depth sensor are the same, whatever they show: their noise differs.  So one
-    whose images are all the same as the last one that it gave stands still.
+    whose images of one look are all the same stands still; a single image is compared with the one
+    of the look before.
 
     Args:
         sensor: The sensor.
@@ -78,7 +79,8 @@ class Watched:
             raise SensorError(f"{self._name} gave no image: {error}") from error
         before = [] if self._last is None else [self._last]
         self._last = taken[-1]
-        images = [frame.depth_mm for frame in (*before, *taken)]
+        compared = taken if len(taken) > 1 else [*before, *taken]
+        images = [frame.depth_mm for frame in compared]
         if len(images) > 1 and all(np.array_equal(one, images[0]) for one in images[1:]):
             raise SensorError(
                 f"{self._name} stands still: {len(images)} images in a row are the very same"

@@ -17,6 +17,7 @@ from actors.palletizing.conveyor import BeltConveyor
 from actors.palletizing.demo_lineage import show_packing
 from actors.palletizing.demo_robot_cell import TEMPLATE, configured
 from actors.palletizing.feedback import HandlingFeedback
+from actors.palletizing.handling import UNRECOGNISED
 from actors.palletizing.nets import Execution
 from actors.palletizing.operator import Operator
 from actors.palletizing.planning import RowPlanning
@@ -212,7 +213,21 @@ def test_a_place_in_progress_is_not_planned_anew(cell):
     assert (after[third].tray_from_product != before[third].tray_from_product).any()
 
 
-def test_nobody_acts_on_a_plan_that_does_not_know_the_last_result(cell):
+def test_a_plan_begins_anew_with_the_online_context(cell):
+    """What was left out before has not come yet: all packages have places of their own."""
+    before = each(cell, words.PLACES, words.PLAN)
+    closed(cell, place_0="placed", place_1="rejected")
+    planned(cell)
+    assert read(cell, words.CELL, words.PLANNED, "training").left_out == (1,)
+    write(cell, words.SYSTEM, words.RESULTS, {})
+    planned(cell)
+    assert read(cell, words.CELL, words.PLANNED, "training").left_out == ()
+    after = each(cell, words.PLACES, words.PLAN)
+    for place, plan in before.items():
+        np.testing.assert_array_equal(after[place].tray_from_product, plan.tray_from_product)
+
+
+def test_a_plan_that_does_not_know_the_last_result_is_waited_for(cell):
     """The next package is requested when the plan has moved up, not before."""
     closed(cell, place_0="rejected")
     come(cell, product="meal_tray", number=1, package=Entity("package/b"))
@@ -626,7 +641,90 @@ def test_a_package_that_came_unseen_is_looked_for_and_asked_about(cell):
     assert (request.kind, request.package) == ("pack", PACKAGE.name)
 
 
-def test_stop_stays_stopped_until_somebody_looks(cell):
+def test_what_has_come_and_is_not_recognised_is_asked_about(cell):
+    """The belt's sensor works again and shows no package: two looks, then a question."""
+    feedback = HandlingFeedback()
+    write(cell, words.CONVEYOR, words.SIGHT, words.Sight(0, "the belt sensor gave no image"))
+    testing.run_once(feedback, cell)
+    write(cell, words.CONVEYOR, words.SIGHT, words.Sight(0, ""))
+    kinds = []
+    for _ in range(2):
+        packed(cell, "aside")
+        looked(cell, "")
+        testing.run_once(feedback, cell)
+        kinds.append(read(cell, words.SYSTEM, words.REQUEST).kind)
+    assert kinds == ["look", "ask"]
+    question = read(cell, words.USER, words.QUESTION)
+    assert question.text == f"place/0: {UNRECOGNISED}; look was tried 2 times"
+    assert question.choices == ("stop", "look")
+    testing.run_once(Operator(answers="look"), cell)
+    testing.run_once(feedback, cell)
+    packed(cell, "aside")
+    come(cell)
+    looked(cell, "")
+    testing.run_once(feedback, cell)
+    assert read(cell, words.SYSTEM, words.REQUEST).kind == "pack"
+
+
+def test_what_the_operator_accepted_is_not_asked_about_again(cell):
+    """A newer picture shows the same: the place stays closed; another verdict opens it."""
+    feedback = HandlingFeedback()
+    placed(cell)
+    looked(cell, "tray", "deformed")
+    testing.run_once(feedback, cell)
+    testing.run_once(Operator(answers="go_on"), cell)
+    testing.run_once(feedback, cell)
+    planned(cell)
+    placed(cell, 1, package=Entity("package/b"), product="meal_tray")
+    looked(cell, "tray", "ok", captured_ns=20, place_0="deformed")
+    testing.run_once(feedback, cell)
+    results = read(cell, words.SYSTEM, words.RESULTS)
+    assert {place: one.result for place, one in results.items()} == {
+        "place/0": "accepted",
+        "place/1": "placed",
+    }
+    planned(cell)
+    placed(cell, 2, package=Entity("package/c"))
+    looked(cell, "tray", "ok", captured_ns=30, place_0="tipped")
+    testing.run_once(feedback, cell)
+    request = read(cell, words.SYSTEM, words.REQUEST)
+    assert (request.place, request.reason) == ("place/0", "it is tipped")
+
+
+def test_a_neighbour_that_is_missing_is_sought_nowhere_on_the_tray(cell):
+    """A push swept it away: it cannot be taken from where it is not seen."""
+    feedback = HandlingFeedback()
+    placed(cell)
+    looked(cell, "tray", "ok")
+    testing.run_once(feedback, cell)
+    planned(cell)
+    placed(cell, 1, package=Entity("package/b"), product="meal_tray")
+    seen = each(cell, words.PACKAGES, words.SIGHTING, "online")[PACKAGE]
+    write(cell, PACKAGE, words.SIGHTING, replace(seen, frame=""))
+    looked(cell, "tray", "ok", captured_ns=20, place_0="missing")
+    testing.run_once(feedback, cell)
+    request = read(cell, words.SYSTEM, words.REQUEST)
+    assert (request.place, request.kind, request.seen) == ("place/0", "ask", "")
+    assert read(cell, words.USER, words.QUESTION).choices == ("go_on", "removed", "stop", "look")
+
+
+def test_a_tipped_package_that_is_still_there_is_not_offered_to_the_robot(cell):
+    """A removal is not judged: what was last seen of the package holds."""
+    feedback = HandlingFeedback()
+    placed(cell)
+    looked(cell, "tray", "tipped")
+    testing.run_once(feedback, cell)
+    first = read(cell, words.USER, words.QUESTION).choices
+    testing.run_once(Operator(answers="removed"), cell)
+    testing.run_once(feedback, cell)
+    packed(cell, "aside")
+    looked(cell, "tray")
+    testing.run_once(feedback, cell)
+    assert read(cell, words.USER, words.QUESTION).choices == first
+    assert not {"regrasp", "reject"} & set(first)
+
+
+def test_stop_stays_stopped_until_the_operator_looks(cell):
     """A script that said so answers nothing more; a person can let the arm look."""
     placed(cell)
     looked(cell, "tray", "deformed")
@@ -730,3 +828,24 @@ def test_what_is_expected_is_written_into_a_fork_before_a_risky_stage(cell):
         testing.run_once(action, cell)
         executed(cell, "lost")
         looked(cell, "tray", "ok")
+
+
+def test_forks_of_an_earlier_generator_are_dropped_and_no_others(cell):
+    """One that was cut short has no expectation and is made again; a person's stays."""
+    online = cell.world("online")
+    for name in ("expected-0", "expected-1", "expected-by-me", "expected-1-copy"):
+        online.fork(name)
+    online.fork("idea").fork("expected-5")
+    cell.create_world("expected-6")
+    come(cell)
+    testing.run_once(HandlingFeedback(), cell)
+    packed(cell, "held")
+    assert sorted(one for one in cell.worlds() if one.startswith("expected-")) == [
+        "expected-1",
+        "expected-1-copy",
+        "expected-5",
+        "expected-6",
+        "expected-by-me",
+    ]
+    standing = View(cell.world("expected-1"), PLACE, words.STANDING)
+    assert cell.world("expected-1").view(standing).get(standing).state == "ok"

@@ -9,7 +9,8 @@ pytest.importorskip("mujoco", exc_type=ImportError)
 from actors.palletizing import vocabulary as words
 from actors.palletizing.deviation import DeviationDetection
 from actors.palletizing.grounding import aside_net
-from actors.palletizing.handling_perception import EmptyBelt, HandlingPerception
+from actors.palletizing.handling import UNRECOGNISED
+from actors.palletizing.handling_perception import UNSEEN_LOOKS, EmptyBelt, HandlingPerception
 from actors.palletizing.nets import Execution
 from actors.palletizing.planning import RowPlanning
 from actors.palletizing.sensor import SensorError
@@ -218,7 +219,7 @@ def test_what_shall_be_gone_is_looked_for(cell, physical, kind, stays):
     ("kind", "error"),
     [
         ("blind", "the tray sensor gave no image: the sensor gives no image"),
-        ("camera", "the tray sensor stands still: 3 images in a row are the very same"),
+        ("camera", "the tray sensor stands still: 2 images in a row are the very same"),
     ],
 )
 def test_a_tray_sensor_that_fails_is_named_and_nothing_is_judged(cell, physical, kind, error):
@@ -237,8 +238,8 @@ def test_a_tray_sensor_that_fails_is_named_and_nothing_is_judged(cell, physical,
     for number in (2, 3):
         ended(cell, number, package.name, "place/0", kind="look")
         testing.run_once(perception, cell)
-    look = read(cell, words.SYSTEM, words.LOOK)
-    assert (look.request, look.judged, look.error) == (3, (), error)
+        look = read(cell, words.SYSTEM, words.LOOK)
+        assert (look.request, look.judged, look.error) == (number, (), error)
     physical.fail(kind, 0.0)
     ended(cell, 4, package.name, "place/0", kind="look")
     testing.run_once(perception, cell)
@@ -265,6 +266,23 @@ def test_a_package_that_the_belt_sensor_does_not_show_is_not_forgotten(cell, phy
     ended(cell, 2, "", "place/0", kind="look")
     testing.run_once(perception, cell)
     assert read(cell, words.SYSTEM, words.LOOK).error == ""
+    assert len(each(cell, "online", words.PACKAGES, words.SIGHTING)) == 1
+
+
+def test_what_is_seen_again_and_again_nowhere_is_reported(cell, physical):
+    """Something is in the light barrier; after a few looks the sight says that none is recognised."""
+    perception = HandlingPerception("belt", "tray", frames=2)
+    errors = []
+    for stamp_ns in range(1, UNSEEN_LOOKS + 1):
+        write(cell, words.CONVEYOR, words.ARRIVAL, words.Arrival(0, stamp_ns))
+        testing.run_once(perception, cell)
+        sight = read(cell, words.CONVEYOR, words.SIGHT)
+        errors.append("" if sight is None else sight.error)
+    assert errors == [*[""] * (UNSEEN_LOOKS - 1), UNRECOGNISED]
+    on_belt(physical, 0)
+    write(cell, words.CONVEYOR, words.ARRIVAL, words.Arrival(0, UNSEEN_LOOKS + 1))
+    testing.run_once(perception, cell)
+    assert read(cell, words.CONVEYOR, words.SIGHT).error == ""
     assert len(each(cell, "online", words.PACKAGES, words.SIGHTING)) == 1
 
 
