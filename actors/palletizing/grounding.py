@@ -361,6 +361,8 @@ def _overlap(first: F64, first_half: F64, second: F64, second_half: F64) -> bool
 
 def _check_payload(about: str, job: Job, arm: Arm, gripper: Gripper) -> None:
     mass_kg = job.grasp.mass_kg
+    if not arm.payload_kg > 0.0:
+        raise NetError(f"{about}: the payload of the arm is not known; its model has to state it")
     limits_kg = {"gripper": gripper.payload_kg, "arm": arm.payload_kg - gripper.mass_kg}
     weaker = min(limits_kg, key=lambda which: limits_kg[which])
     if not 0.0 < mass_kg <= limits_kg[weaker]:

@@ -7,6 +7,9 @@ It does what the actors do, with the same functions, as fast as it goes: a packa
 sensor sees it, nets are grounded and executed, the hand goes aside, the tray sensor looks, every
 place whose neighbourhood has changed is judged, and what was seen decides what follows.
 
+Two things differ.  A package that is lost on its way to the tray and lies on the belt is tried
+again, where the actors ask the operator.  The operator is a rule.
+
 Rules a change must keep: decisions see pictures and measurements only, never the truth of physics;
 truth is noted beside each verdict, for the score (`packing_scores`).
 """
@@ -28,7 +31,7 @@ from actors.palletizing.grounding import Gripper, Job, aside_net, easier_turn, g
 from actors.palletizing.handling import felt, fills, gap_before
 from actors.palletizing.nets import NetError
 from actors.palletizing.packing_records import Judgement, Packed, Step
-from actors.palletizing.packing_truth import badness, gap_m, state_of, top_dent_mm, truth_of
+from actors.palletizing.packing_truth import KINDS, badness, gap_m, state_of, top_dent_mm, truth_of
 from actors.palletizing.reactions import FELT_M, NO_NET, Case, Reaction, react, worst
 from actors.palletizing.rows import contacts_between, planned_rows
 from actors.palletizing.sensor import FRAMES
@@ -427,7 +430,7 @@ class Packing:
         number = packed.number
         states = self._states()
         off = [n for n in sorted(self._put - self._gone) if n != number and states[n] != "ok"]
-        for each in [number, *(n for n in off if states[n] != "missing")]:
+        for each in [number, *(n for n in off if states[n] in KINDS)]:
             self._note_dents(all_packed[each])
             all_packed[each].by_hand = True
             self._by_hand.add(each)

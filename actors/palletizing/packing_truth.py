@@ -26,7 +26,7 @@ MOVED_MM: Final = 10.0
 TURNED_DEG: Final = 5.0
 DENTED_MM: Final = 4.0
 """A sound package is off, turned and dented by less."""
-WORSE: Final = {"ok": 0, "belt": 1, "held": 1, "moved": 1, "missing": 2, "bin": 2}
+WORSE: Final = {"ok": 0, "belt": 1, "held": 1, "moved": 1, "bin": 2}
 """How bad a state is; all others are worse."""
 ROW_M: Final = 0.05
 """Packages are of one row when their middles are no farther apart across it."""

@@ -222,7 +222,7 @@ class ArmModel:
         q_max: (7,) float64, rad; the limits are symmetric.
         dq_max: (7,) float64, rad/s.
         ddq_max: (7,) float64, rad/s².
-        payload_kg: What the flange may carry: the hand and what it holds.
+        payload_kg: What the flange may carry, the hand and what it holds; 0: not known, so nothing.
     """
 
     dh: npt.NDArray[np.float64]
@@ -231,7 +231,7 @@ class ArmModel:
     q_max: npt.NDArray[np.float64]
     dq_max: npt.NDArray[np.float64]
     ddq_max: npt.NDArray[np.float64]
-    payload_kg: float = 14.0
+    payload_kg: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
