@@ -187,7 +187,7 @@ def test_belt_that_stops_delays_the_next_package(trial: Trial) -> None:
 def test_sensor_that_freezes_ends_the_net(trial: Trial) -> None:
     """The arm rests, the operator is asked, and the cell goes on when it measures again."""
     net = trial.until("a net", lambda: trial.get(SYSTEM, NET)).number
-    trial.failed("wrist", 5.0, "carried")
+    trial.failed("wrist", 3.0, "carried")
 
     done = trial.ended(net, "sensor:frozen")
     request = trial.request_of(done)
