@@ -27,3 +27,13 @@ def tray():
 
     packages = graded("missing", 0.0, 1, seed=1, products=["milk_carton"])
     return SimulatedTraySensor(packages, seed=2)
+
+
+@pytest.fixture
+def cell(trained):
+    """A cell with two trained products, grasps, and a plan of four packages."""
+    pytest.importorskip("mujoco", exc_type=ImportError)
+    from .handled_cell import handled_cell
+
+    with handled_cell(trained) as opened:
+        yield opened

@@ -1,0 +1,204 @@
+"""Plans, belt and trays: what comes when, and whether the plan knows what became of the rest."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("open3d", exc_type=ImportError)
+pytest.importorskip("mujoco", exc_type=ImportError)
+
+from actors.palletizing import vocabulary as words
+from actors.palletizing.action import Action
+from actors.palletizing.conveyor import BeltConveyor
+from actors.palletizing.feedback import HandlingFeedback
+from actors.palletizing.planning import RowPlanning
+from enact_dist import Entity, testing
+
+from .handled_cell import (
+    NAMES,
+    PLACE,
+    REMOTE,
+    closed,
+    come,
+    each,
+    packed,
+    planned,
+    read,
+    write,
+)
+
+
+def test_planning_makes_rows_and_closes_the_gap_of_a_rejected_package(cell):
+    """All places touch; the place of the next package moves up when one was rejected."""
+    before = each(cell, words.PLACES, words.PLAN)
+    assert len(before) == 4
+    assert all(plan.push.any() for plan in before.values())
+    rejected = words.Result("package/a", "milk_carton", "deformed", "rejected", (), "why")
+    write(cell, words.SYSTEM, words.RESULTS, {PLACE.name: rejected})
+    planned(cell)
+    after = each(cell, words.PLACES, words.PLAN)
+    np.testing.assert_array_equal(after[PLACE].tray_from_product, before[PLACE].tray_from_product)
+    first, second = Entity("place/1"), Entity("place/2")
+    assert after[first].product == before[first].product
+    x = after[first].tray_from_product[0, 3], before[first].tray_from_product[0, 3]
+    assert abs(x[0]) > abs(x[1]) + 0.1
+    assert abs(after[second].tray_from_product[0, 3]) < abs(x[0])
+
+
+def test_scans_are_ordered_as_soon_as_the_tray_was_seen_empty(trained):
+    """No product is trained yet; planning waits for what happens and looks at nothing else."""
+    from actors.palletizing.simulation.physical_sensors import PhysicalTraySensor
+    from actors.palletizing.simulation.physics import PhysicalCell
+
+    planning = RowPlanning(4, " ".join(NAMES), f"{REMOTE}:cell_frames")
+    with testing.worlds("training", "online") as cell:
+        assert testing.run_once(planning, cell) == 0
+        empty = PhysicalTraySensor(PhysicalCell(1, seed=1).shown, seed=1).capture_empty()
+        cell.world("training").init(words.TRAY, words.EMPTY, empty)
+        testing.run_once(planning, cell)
+        assert len(each(cell, words.PRODUCTS, words.SCAN)) == 2
+        assert read(cell, words.CELL, words.FRAMES, "training").keys() == {"tray", "belt", "bin"}
+        assert testing.run_once(planning, cell) == 0
+    assert planning.every_s is None
+
+
+def test_a_place_between_others_stays_empty_and_the_plan_after_it_stands(cell):
+    """What stands behind a package that was taken away does not move up, nor what comes."""
+    closed(cell, place_0="placed", place_1="placed", place_2="placed")
+    planned(cell)
+    before = each(cell, words.PLACES, words.PLAN)
+    closed(cell, place_0="placed", place_1="removed", place_2="placed")
+    planned(cell)
+    after = each(cell, words.PLACES, words.PLAN)
+    for place, plan in before.items():
+        np.testing.assert_array_equal(after[place].tray_from_product, plan.tray_from_product)
+    assert read(cell, words.CELL, words.PLANNED, "training").left_out == ()
+
+
+def test_a_place_in_progress_is_not_planned_anew(cell):
+    """A place that was opened again keeps its plan, though one after it was rejected."""
+    closed(cell, place_0="placed", place_2="rejected")
+    write(cell, words.SYSTEM, words.REQUEST, words.Request(7, "regrasp", "place/1", "b", "why"))
+    before = each(cell, words.PLACES, words.PLAN)
+    write(
+        cell, Entity("place/1"), words.PLAN, replace(before[Entity("place/1")], tray=9), "training"
+    )
+    planned(cell)
+    after = each(cell, words.PLACES, words.PLAN)
+    assert after[Entity("place/1")].tray == 9
+    third = Entity("place/3")
+    assert (after[third].tray_from_product != before[third].tray_from_product).any()
+
+
+def test_a_plan_begins_anew_with_the_online_context(cell):
+    """What was left out before has not come yet: all packages have places of their own."""
+    before = each(cell, words.PLACES, words.PLAN)
+    closed(cell, place_0="placed", place_1="rejected")
+    planned(cell)
+    assert read(cell, words.CELL, words.PLANNED, "training").left_out == (1,)
+    write(cell, words.SYSTEM, words.RESULTS, {})
+    planned(cell)
+    assert read(cell, words.CELL, words.PLANNED, "training").left_out == ()
+    after = each(cell, words.PLACES, words.PLAN)
+    for place, plan in before.items():
+        np.testing.assert_array_equal(after[place].tray_from_product, plan.tray_from_product)
+
+
+def test_a_plan_that_does_not_know_the_last_result_is_waited_for(cell):
+    """The next package is requested when the plan has moved up, not before."""
+    closed(cell, place_0="rejected")
+    come(cell, product="meal_tray", number=1, package=Entity("package/b"))
+    feedback = HandlingFeedback()
+    testing.run_once(feedback, cell)
+    assert read(cell, words.SYSTEM, words.REQUEST) is None
+    planned(cell)
+    testing.run_once(feedback, cell)
+    assert read(cell, words.SYSTEM, words.REQUEST).place == "place/1"
+
+
+class Belt:
+    """A belt that brings a package as soon as it is run."""
+
+    def __init__(self):
+        self.runs, self.changed, self.there = 0, 0, False
+
+    def run_belt(self):
+        self.runs += 1
+        self.there = True
+
+    def arrived(self):
+        return self.there
+
+    def change_tray(self):
+        self.changed += 1
+
+
+def empty_belt():
+    """Return an image of the empty belt."""
+    from actors.palletizing.simulation.physical_sensors import PhysicalBeltSensor
+    from actors.palletizing.simulation.physics import PhysicalCell
+
+    return PhysicalBeltSensor(PhysicalCell(1, seed=1).shown, seed=1).capture_empty()
+
+
+def test_belt_waits_until_the_package_before_is_off_it(cell, monkeypatch):
+    """The next one comes while the robot places the one before, not earlier."""
+    belt = Belt()
+    monkeypatch.setattr("actors.palletizing.conveyor.open_controller", lambda _: belt)
+    conveyor = BeltConveyor("any")
+    testing.run_once(conveyor, cell)
+    assert belt.runs == 0  # the belt has not been seen empty
+    empty = each(cell, words.PRODUCTS, words.SCAN)
+    assert empty
+    write(cell, words.BELT, words.EMPTY, empty_belt(), "training")
+    for _ in range(4):
+        testing.run_once(conveyor, cell)
+    assert (belt.runs, read(cell, words.CONVEYOR, words.ARRIVAL).number) == (1, 0)
+    come(cell)
+    testing.run_once(HandlingFeedback(), cell)
+    packed(cell, "held")
+    testing.run_once(Action(), cell)
+    for _ in range(3):
+        testing.run_once(conveyor, cell)
+    assert (belt.runs, read(cell, words.CONVEYOR, words.ARRIVAL).number) == (2, 1)
+
+
+def test_a_tray_is_changed_by_a_plan_that_knows_all_results(cell, monkeypatch):
+    """The last one was rejected: the plan before that ended the tray, the one after does not."""
+    belt = Belt()
+    monkeypatch.setattr("actors.palletizing.conveyor.open_controller", lambda _: belt)
+    conveyor = BeltConveyor("any")
+    write(cell, words.CONVEYOR, words.ARRIVAL, words.Arrival(1, 7))
+    write(cell, words.BELT, words.EMPTY, empty_belt(), "training")
+    for number in (2, 3):  # as if two packages filled a tray
+        place = Entity(f"place/{number}")
+        plan = each(cell, words.PLACES, words.PLAN)[place]
+        write(cell, place, words.PLAN, replace(plan, tray=1), "training")
+    closed(cell, place_0="placed", place_1="rejected")
+    testing.run_once(conveyor, cell)
+    assert (belt.changed, belt.runs) == (0, 0)
+    planned(cell)
+    testing.run_once(conveyor, cell)
+    assert (belt.changed, belt.runs) == (0, 1)  # the third finds room in place of the second
+
+
+def test_a_tray_is_changed_when_all_of_its_places_are_closed(cell, monkeypatch):
+    """A neighbour that was opened again keeps it there."""
+    belt = Belt()
+    monkeypatch.setattr("actors.palletizing.conveyor.open_controller", lambda _: belt)
+    conveyor = BeltConveyor("any")
+    write(cell, words.CONVEYOR, words.ARRIVAL, words.Arrival(1, 7))
+    write(cell, words.BELT, words.EMPTY, empty_belt(), "training")
+    for number in (2, 3):
+        place = Entity(f"place/{number}")
+        plan = each(cell, words.PLACES, words.PLAN)[place]
+        write(cell, place, words.PLAN, replace(plan, tray=1), "training")
+    closed(cell, place_1="placed")
+    planned(cell)
+    testing.run_once(conveyor, cell)
+    assert (belt.changed, belt.runs) == (0, 0)
+    closed(cell, place_0="placed", place_1="placed")
+    planned(cell)
+    testing.run_once(conveyor, cell)
+    assert (belt.changed, belt.runs) == (1, 1)
